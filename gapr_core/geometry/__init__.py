@@ -1,0 +1,1 @@
+"""Geometry without policy: rigid motions, neighbours, distance fields, visibility, curvature."""

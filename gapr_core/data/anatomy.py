@@ -1,0 +1,166 @@
+"""Bones of real people: corresponded meshes with splits by person, CT surfaces, and a folder of one's own meshes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.clouds import READERS, Surface, load
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError
+
+Array = NDArray[np.float64]
+BONES = ("femur", "tibia", "pelvis", "thoracic")
+SPLITS = ("train", "val", "test")
+ENVIRONMENT_VARIABLE = "GAPR_ANATOMY"
+
+
+@dataclass(frozen=True)
+class Corresponded:
+    """Meshes in vertex correspondence: points (P, N, 3) mm, faces (F, 3), person (P,), and the cohort's name."""
+
+    points: Array
+    faces: NDArray[np.int64]
+    person: tuple[str, ...]
+    bone: str
+    cohort: str
+
+    def of(self, people: Iterable[str]) -> Corresponded:
+        """Only the meshes of these people."""
+        wanted = set(people)
+        rows = [row for row, person in enumerate(self.person) if person in wanted]
+        kept = tuple(self.person[row] for row in rows)
+        return Corresponded(self.points[rows], self.faces, kept, self.bone, self.cohort)
+
+    def specimens(self) -> list[Specimen]:
+        """One specimen a person."""
+        return [
+            Specimen(Surface(points, self.faces), self.bone, person, self.cohort)
+            for points, person in zip(self.points, self.person, strict=True)
+        ]
+
+
+def default_folder() -> Path:
+    """The folder named by GAPR_ANATOMY, else `../shared/anatomy` beside the repository; it may not exist."""
+    named = os.environ.get(ENVIRONMENT_VARIABLE)
+    return Path(named) if named else Path(__file__).resolve().parents[2].parent / "shared" / "anatomy"
+
+
+def splits(folder: str | Path) -> dict[str, list[str]]:
+    """People of train, val and test from `splits.json`; a person stands in one split only, over all bones.
+
+    Raises:
+        ConfigError: no such file, another key, or a person in two splits.
+    """
+    path = Path(folder) / "splits.json"
+    if not path.is_file():
+        raise ConfigError("splits.json with people of train, val and test", f"none in {folder}", "write one")
+    people = json.loads(path.read_text())
+    if set(people) != set(SPLITS):
+        raise ConfigError(f"the keys {', '.join(SPLITS)}", f"{', '.join(people)} in {path}", "rename them")
+    everybody = [person for split in SPLITS for person in people[split]]
+    twice = sorted({person for person in everybody if everybody.count(person) > 1})
+    if twice:
+        raise ConfigError("each person once over all splits", f"{', '.join(twice)} more than once", "keep one of them")
+    return {split: list(people[split]) for split in SPLITS}
+
+
+def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
+    """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), person (P,)); may be empty."""
+    found = []
+    for path in sorted(Path(folder).glob(f"{bone}_*.npz")):
+        with np.load(path, allow_pickle=False) as data:
+            points, faces = data["points"].astype(np.float64), data["faces"].astype(np.int64)
+            person = tuple(str(p) for p in data["person"])
+        found.append(Corresponded(points, faces, person, bone, path.stem.removeprefix(f"{bone}_")))
+    return found
+
+
+def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | None = None) -> list[Specimen]:
+    """The bones of one type of the people of one split, ordered by cohort and person.
+
+    Args:
+        folder: layout as in `../shared/anatomy`.
+        bone: "femur", "tibia", "pelvis" or any other name that the folder has.
+        split: "train", "val", "test" or "all".
+        cohort: None for every corresponded set; "gias2" and the like for the single meshes `surfaces/<bone>/<cohort>_*`,
+            which carry the ids of the same people ("gias2_2008_0051_l.ply" is person "llp26_2008_0051").
+
+    Raises:
+        ConfigError: no such folder or an unknown split.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ConfigError("a folder with anatomy", f"{folder}, which is none", f"check the path or {ENVIRONMENT_VARIABLE}")
+    sets = corresponded(folder, bone)
+    specimens = [s for c in sets for s in c.specimens() if cohort in (None, c.cohort)]
+    if cohort is not None and not specimens:
+        specimens = _single_meshes(folder, bone, cohort)
+    return specimens if split == "all" else _of_split(specimens, split, splits(folder))
+
+
+def _single_meshes(folder: Path, bone: str, cohort: str) -> list[Specimen]:
+    paths = sorted((folder / "surfaces" / bone).glob(f"{cohort}_*.ply"))
+    return [Specimen(load(path), bone, _person_of(path.stem), cohort) for path in paths]
+
+
+def _person_of(stem: str) -> str:
+    """gias2_<id>_l and llp26_<id> are scans of the same person."""
+    return stem.removesuffix("_l").removesuffix("_r").replace("gias2_", "llp26_")
+
+
+def meshes(folder: str | Path, bone: str | None = None, split: str = "all", units: str = "mm") -> list[Specimen]:
+    """A user's own meshes, one file per person, in any format that `clouds.load` reads.
+
+    `folder/<person>.stl` are all of one bone, named `bone` or after the folder; `folder/<bone>/<person>.stl` are of
+    several. With `splits.json` in the folder people are split by it, else 60/20/20 in an order drawn once from a fixed
+    seed (adding people changes it: write `splits.json` to freeze it).
+
+    Raises:
+        ConfigError: no meshes there, or an unknown split.
+        InvalidPointCloudError: an unreadable file, one without faces, or one of a size that no bone has.
+    """
+    folder = Path(folder)
+    flat, nested = _mesh_files(folder), {d.name: _mesh_files(d) for d in sorted(folder.glob("*")) if d.is_dir()}
+    of_bone = {bone or folder.resolve().name: flat} if flat else {b: f for b, f in nested.items() if bone in (None, b)}
+    specimens = [Specimen(load(f, units), b, f.stem, "meshes") for b, files in of_bone.items() for f in files]
+    if not specimens:
+        raise ConfigError(f"meshes ({' '.join(READERS)})", f"none for {bone or 'any bone'} in {folder}",
+                          "put one mesh per person there, or one sub-folder per bone")
+    if split == "all":
+        return specimens
+    known = splits(folder) if (folder / "splits.json").is_file() else _draw_splits({s.person for s in specimens})
+    return _of_split(specimens, split, known)
+
+
+def _mesh_files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in READERS)
+
+
+def _draw_splits(people: set[str]) -> dict[str, list[str]]:
+    order = [str(p) for p in np.random.default_rng(0).permutation(sorted(people))]
+    held_out = max(1, round(0.2 * len(order)))
+    return {"test": order[:held_out], "val": order[held_out : 2 * held_out], "train": order[2 * held_out :]}
+
+
+def _of_split(specimens: list[Specimen], split: str, people: dict[str, list[str]]) -> list[Specimen]:
+    if split not in people:
+        raise ConfigError(f"a split of {', '.join(SPLITS)} or all", repr(split), "choose one of these")
+    wanted = set(people[split])
+    return [specimen for specimen in specimens if specimen.person in wanted]
+
+
+def mirrored(specimen: Specimen) -> Specimen:
+    """The other side of the body: x negated, faces turned so that normals stay outward; the same person."""
+    surface = specimen.surface
+    assert surface.faces is not None
+    mirror = np.array([-1.0, 1.0, 1.0])
+    normals = None if surface.normals is None else surface.normals * mirror
+    flipped = Surface(surface.points * mirror, surface.faces[:, ::-1].copy(), normals)
+    return Specimen(flipped, specimen.bone, specimen.person, specimen.cohort)

@@ -1,0 +1,66 @@
+"""What a real acquisition does to clean surface points: density, noise, smooth bias, outliers. All in mm, all seeded."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.data.specimen import Specimen
+
+Array = NDArray[np.float64]
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Array:
+    """(count, 3) unit vectors, uniform on the sphere."""
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def half_extent(points: Array) -> float:
+    """Half the longest edge of the axis-aligned box of (N, 3): the paper's normalisation scale."""
+    return float(np.ptp(points, axis=0).max() / 2.0)
+
+
+def vary_density(points: Array, scale: float, rng: np.random.Generator, rounds: int = 6) -> Array:
+    """Paper, section II: thin out or fill up balls of 0.10-0.15 x `scale` (the half extent) around random points.
+
+    Thinning discards half of a ball, filling adds half as many points again, each alpha p1 + (1 - alpha) p2 of two
+    points of the ball; either with even chance, `rounds` times (the paper says "multiple").
+    """
+    for _ in range(rounds):
+        centre, radius = points[rng.integers(len(points))], scale * rng.uniform(0.10, 0.15)
+        inside = np.flatnonzero(((points - centre) ** 2).sum(axis=1) < radius**2)
+        if rng.random() < 0.5:
+            points = np.delete(points, rng.choice(inside, len(inside) // 2, replace=False), axis=0)
+        else:
+            first, second = points[rng.choice(inside, (2, (len(inside) + 1) // 2))]
+            alpha = rng.random((len(first), 1))
+            points = np.vstack([points, alpha * first + (1.0 - alpha) * second])
+    return points
+
+
+def bias_along_normals(
+    points: Array, normals: Array, rms_mm: float, rng: np.random.Generator, waves: int = 4
+) -> Array:
+    """(N, 3) offsets along the normals from a smooth field of plane waves of 60-120 mm wavelength.
+
+    `rms_mm` is the root mean square of the field over exactly these points (not its amplitude).
+    """
+    wave_vectors = random_directions(waves, rng) * (2.0 * np.pi / rng.uniform(60.0, 120.0, (waves, 1)))
+    phases, weights = rng.uniform(0.0, 2.0 * np.pi, waves), rng.normal(size=waves)
+    field = np.sin(points @ wave_vectors.T + phases) @ weights
+    return normals * (rms_mm * field / np.sqrt((field**2).mean()))[:, None]
+
+
+def scatter_outliers(
+    specimen: Specimen, points: Array, rng: np.random.Generator, nearest_mm: float = 3.0, farthest_mm: float = 15.0
+) -> Array:
+    """Surface points (K, 3) thrown in random directions until each is 3-15 mm off the whole surface."""
+    outliers, pending = points.copy(), np.arange(len(points))
+    for _ in range(50):
+        if not len(pending):
+            break
+        reach = rng.uniform(nearest_mm, farthest_mm, (len(pending), 1))
+        outliers[pending] = points[pending] + reach * random_directions(len(pending), rng)
+        pending = pending[specimen.distance(outliers[pending]) < nearest_mm]
+    return np.delete(outliers, pending, axis=0)

@@ -1,0 +1,76 @@
+"""One bone of one person, with the ray-casting state that protocols need, built once and kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.clouds import Surface
+from gapr_core.errors import InvalidPointCloudError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Specimen:
+    """One bone surface and whose it is.
+
+    Attributes:
+        surface: points (N, 3) mm and faces (F, 3), in the frame of the scan.
+        bone: bone type, for example "femur".
+        person: identity that splits and `wrong` pairs go by; the same for all bones of one person.
+        cohort: the data the surface comes from, for example "llp26", "parametric", "ct".
+    """
+
+    surface: Surface
+    bone: str
+    person: str
+    cohort: str = ""
+
+    def __post_init__(self) -> None:
+        if self.surface.faces is None or len(self.surface.faces) == 0:
+            raise InvalidPointCloudError(
+                "a mesh with faces", f"a cloud without faces for {self.bone} of {self.person}",
+                "give a surface mesh (STL, PLY, OBJ): views and new points are drawn from its faces",
+            )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travels to worker processes without its ray-casting state."""
+        return type(self), (self.surface, self.bone, self.person, self.cohort)
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """(count, 3) points and unit normals, uniform over the area, drawn anew at every call."""
+        return self.surface.sample(count, rng)
+
+    def visible_from(self, points: Array, direction: Array, clearance_mm: float = 0.1) -> NDArray[np.bool_]:
+        """Which surface points (N, 3) see a far probe in `direction` (3,) with nothing of the bone in between.
+
+        Orientation of the faces does not matter: a ray from the far side runs through the bone and hits it.
+        """
+        start = points - self._centre + clearance_mm * direction
+        rays = np.hstack([start, np.broadcast_to(direction, start.shape)]).astype(np.float32)
+        return ~self._scene.test_occlusions(rays).numpy()
+
+    def distance(self, points: Array) -> Array:
+        """Unsigned distance (N,) mm from points (N, 3) to the surface."""
+        queries = (points - self._centre).astype(np.float32)
+        return self._scene.compute_distance(queries).numpy().astype(np.float64)
+
+    @cached_property
+    def _centre(self) -> Array:
+        return self.surface.points.mean(axis=0)
+
+    @cached_property
+    def _scene(self) -> Any:
+        """Open3D RaycastingScene, centred so that its float32 is fine enough."""
+        import open3d as o3d
+
+        assert self.surface.faces is not None
+        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        vertices = np.ascontiguousarray(self.surface.points - self._centre, dtype=np.float32)
+        scene.add_triangles(vertices, np.ascontiguousarray(self.surface.faces, dtype=np.uint32))
+        return scene

@@ -1,0 +1,33 @@
+"""Other people's methods behind the interface of `Registrar`; each library is imported when the method is used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from gapr_core.baselines.base import Baseline, BaselineTarget, RegistrationMethod
+from gapr_core.baselines.kiss_matcher import KissMatcher, kiss4
+from gapr_core.baselines.refined import Refined
+from gapr_core.baselines.small_gicp import Gicp, PointToPlane
+from gapr_core.errors import ConfigError
+
+REGISTRY: dict[str, Callable[[], RegistrationMethod]] = {
+    "gicp": Gicp,
+    "point_to_plane": PointToPlane,
+    "kiss_matcher": KissMatcher,
+    "kiss_matcher+point_to_plane": lambda: Refined(KissMatcher(), PointToPlane()),
+    "kiss4": kiss4,
+}
+
+
+def make(name: str) -> RegistrationMethod:
+    """A new instance of a registered method.
+
+    Raises:
+        ConfigError: for a name that is not in `REGISTRY`.
+    """
+    if name not in REGISTRY:
+        raise ConfigError(f"one of {', '.join(sorted(REGISTRY))}", repr(name), "name one of them")
+    return REGISTRY[name]()
+
+
+__all__ = ["REGISTRY", "Baseline", "BaselineTarget", "RegistrationMethod", "Refined", "make"]

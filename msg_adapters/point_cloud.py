@@ -1,0 +1,158 @@
+"""PointCloud2 of any legal layout to (N, 3) and back, through one strided view over its bytes."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
+
+from msg_adapters.errors import InvalidMessageError
+
+DTYPES: dict[int, str] = {
+    PointField.INT8: "i1",
+    PointField.UINT8: "u1",
+    PointField.INT16: "i2",
+    PointField.UINT16: "u2",
+    PointField.INT32: "i4",
+    PointField.UINT32: "u4",
+    PointField.FLOAT32: "f4",
+    PointField.FLOAT64: "f8",
+}
+CODES = {code: kind for kind, code in DTYPES.items()}
+
+
+def cloud_to_xyz(
+    cloud: PointCloud2, *, dtype: DTypeLike = np.float64, keep_nan: bool = False, drop_zeros: bool = False
+) -> NDArray[Any]:
+    """The x, y, z of every point, row by row, in the unit of the message.
+
+    Args:
+        cloud: any legal layout: padding, either byte order, float32 or float64 coordinates in any order among other
+            fields, organised or not. Two common slips of drivers are read as meant: `row_step` 0, and `row_step` of
+            the whole cloud.
+        dtype: of the result.
+        keep_nan: keep the points that are not finite, so that rows stay aligned with other fields.
+        drop_zeros: drop points that are exactly (0, 0, 0), which depth cameras send for "nothing seen".
+
+    Returns:
+        (N, 3) new array, independent of the message.
+
+    Raises:
+        InvalidMessageError: for a layout that contradicts itself or has no float x, y, z.
+    """
+    if not len(cloud.data) and not cloud.width * cloud.height:
+        return np.empty((0, 3), dtype=dtype)
+    records = _view(cloud, _coordinate_dtype(cloud))
+    xyz = np.empty((records.size, 3), dtype=dtype)
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32: becomes infinite
+        for column, name in enumerate("xyz"):
+            xyz[:, column].reshape(records.shape)[...] = records[name]
+    keep = np.ones(len(xyz), dtype=bool) if keep_nan else np.isfinite(xyz).all(axis=1)
+    if drop_zeros:
+        keep &= xyz.any(axis=1)
+    return xyz if keep.all() else xyz[keep]
+
+
+def xyz_to_cloud(
+    points: ArrayLike, header: Header | None = None, *, fields: Mapping[str, ArrayLike] | None = None
+) -> PointCloud2:
+    """A little-endian cloud without padding.
+
+    Args:
+        points: (N, 3), or (H, W, 3) for an organised cloud; float64 stays float64, everything else becomes float32.
+        header: frame and stamp.
+        fields: further fields by name, each (N,) or (H, W), in their own dtype.
+
+    Raises:
+        InvalidMessageError: for another shape, or a dtype that PointField does not have.
+    """
+    points = np.asarray(points)
+    if points.ndim not in (2, 3) or points.shape[-1] != 3:
+        raise InvalidMessageError(f"points must be (N, 3) or (H, W, 3), got {points.shape}")
+    kind = "f8" if points.dtype == np.float64 else "f4"
+    columns = {name: points[..., i].astype(kind) for i, name in enumerate("xyz")}
+    columns |= {name: np.asarray(values) for name, values in (fields or {}).items()}
+    records = _pack(columns, points.shape[:-1])
+    height, width = (1, *records.shape) if records.ndim == 1 else records.shape
+    step = records.dtype.itemsize
+    return PointCloud2(
+        header=header or Header(), height=height, width=width, fields=_describe(records.dtype), is_bigendian=False,
+        point_step=step, row_step=step * width, data=array.array("B", records.tobytes()),
+        is_dense=bool(np.isfinite(points).all()),
+    )  # fmt: skip
+
+
+def _coordinate_dtype(cloud: PointCloud2) -> np.dtype[Any]:
+    fields = {name: _coordinate_field(cloud, name) for name in "xyz"}
+    order = ">" if cloud.is_bigendian else "<"
+    formats = [order + DTYPES[field.datatype] for field in fields.values()]
+    offsets = [field.offset for field in fields.values()]
+    for name, code, offset in zip(fields, formats, offsets, strict=True):
+        if offset + np.dtype(code).itemsize > cloud.point_step:
+            raise InvalidMessageError(f"field {name} ends beyond point_step {cloud.point_step}")
+    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
+
+
+def _coordinate_field(cloud: PointCloud2, name: str) -> PointField:
+    found = [field for field in cloud.fields if field.name == name]
+    if len(found) != 1:
+        names = ", ".join(field.name for field in cloud.fields) or "none"
+        raise InvalidMessageError(f"need exactly one field {name}, the cloud has: {names}")
+    field = found[0]
+    if field.datatype not in (PointField.FLOAT32, PointField.FLOAT64):
+        kind = DTYPES.get(field.datatype, f"unknown ({field.datatype})")
+        raise InvalidMessageError(f"field {name} must be FLOAT32 or FLOAT64, got {kind}")
+    if field.count != 1:
+        raise InvalidMessageError(f"field {name} must have count 1, got {field.count}")
+    return field
+
+
+def _view(cloud: PointCloud2, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """(height, width) records over the bytes of the message, nothing copied."""
+    packed = cloud.width * cloud.point_step
+    row_step = _row_step(cloud, packed)
+    unpadded_end = row_step * (cloud.height - 1) + packed if cloud.height else 0
+    legal = {row_step * cloud.height, unpadded_end}
+    if len(cloud.data) not in legal:
+        raise InvalidMessageError(
+            f"{cloud.height} rows of {row_step} bytes need {row_step * cloud.height} bytes of data, "
+            f"got {len(cloud.data)}"
+        )
+    shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)
+    return np.ndarray(shape, dtype, buffer=memoryview(cloud.data), strides=strides)
+
+
+def _row_step(cloud: PointCloud2, packed: int) -> int:
+    whole_cloud = cloud.height > 1 and cloud.row_step == packed * cloud.height == len(cloud.data)
+    if cloud.row_step == 0 or whole_cloud:
+        return packed
+    if cloud.row_step < packed:
+        raise InvalidMessageError(
+            f"row_step {cloud.row_step} is shorter than {cloud.width} points of {cloud.point_step} bytes"
+        )
+    return int(cloud.row_step)
+
+
+def _pack(columns: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> NDArray[Any]:
+    for name, values in columns.items():
+        if values.shape != shape:
+            raise InvalidMessageError(f"field {name} must have shape {shape}, got {values.shape}")
+        if values.dtype.str[1:] not in CODES:
+            raise InvalidMessageError(f"field {name}: PointField has no type for {values.dtype}")
+    records = np.empty(shape, np.dtype([(name, "<" + values.dtype.str[1:]) for name, values in columns.items()]))
+    for name, values in columns.items():
+        records[name] = values
+    return records
+
+
+def _describe(dtype: np.dtype[Any]) -> list[PointField]:
+    assert dtype.fields is not None
+    return [
+        PointField(name=name, offset=entry[1], datatype=CODES[entry[0].str[1:]], count=1)
+        for name, entry in dtype.fields.items()
+    ]

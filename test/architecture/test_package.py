@@ -1,0 +1,70 @@
+"""The package as ROS and pip see it."""
+
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
+
+
+def setup_py(field):
+    return re.search(rf'{field}="([^"]+)"', (ROOT / "setup.py").read_text())[1]
+
+
+@pytest.mark.parametrize("field", ["version", "license", "maintainer"])
+def test_package_xml_and_setup_py_agree_on(field):
+    assert MANIFEST.find(field).text == setup_py(field)
+
+
+def test_the_changelog_has_an_entry_for_the_version_or_for_the_one_to_come():
+    changelog = (ROOT / "CHANGELOG.rst").read_text()
+    assert "Forthcoming" in changelog or MANIFEST.find("version").text in changelog
+
+
+def test_every_entry_point_leads_to_something_that_can_be_called():
+    ours = [e for group in ("console_scripts", "gapr.commands") for e in entry_points(group=group)
+            if e.dist.name.replace("-", "_") == "gapr_ros"]
+    assert {"gapr", "register_node", "bag_replay", "demo"} <= {e.name for e in ours}
+    for entry in ours:
+        loaded = entry.load()
+        assert callable(loaded) or (callable(loaded.add_arguments) and callable(loaded.run))
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A colcon workspace with this package, built."""
+    base = tmp_path_factory.mktemp("workspace")
+    folders = [f"--{kind}-base={base / kind}" for kind in ("build", "install")]
+    colcon = [sys.executable, "-m", "colcon", f"--log-base={base / 'log'}", "build", *folders]
+    run = subprocess.run([*colcon, "--base-paths", str(ROOT)], cwd=base, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return base
+
+
+def test_colcon_build_gives_an_executable_that_ros2_run_finds(workspace):
+    prefix = workspace / "install" / "gapr_ros"
+    assert (prefix / "share/ament_index/resource_index/packages/gapr_ros").is_file()
+    assert (prefix / "share/gapr_ros/package.xml").is_file()
+    assert (prefix / "share/gapr_ros/config/register_node.yaml").is_file()
+    for name in ("register_node", "bag_replay", "gapr"):
+        assert os.access(prefix / "lib/gapr_ros" / name, os.X_OK)
+
+
+def test_the_node_that_colcon_built_starts_and_uses_the_installed_code(workspace):
+    node = workspace / "install/gapr_ros/lib/gapr_ros/register_node"
+    setup = workspace / "install/setup.bash"
+    command = f"source {setup} && python3 -c 'import gapr_ros; print(gapr_ros.__file__)'"
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    run = subprocess.run(
+        ["bash", "-c", f"{command} && timeout -s INT 5 {node} --ros-args -p model_path:=/no/such/file.stl"],
+        cwd=workspace, env={**os.environ, "PATH": path}, capture_output=True, text=True,
+    )
+    assert str(workspace / "install") in run.stdout, run.stdout + run.stderr
+    assert "file.stl" in run.stdout + run.stderr

@@ -89,7 +89,7 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
         folder: layout as in `../shared/anatomy`.
         bone: "femur", "tibia", "pelvis" or any other name that the folder has.
         split: "train", "val", "test" or "all".
-        cohort: None for every corresponded set; "gias2" and the like for the single meshes `surfaces/<bone>/<cohort>_*`,
+        cohort: None for every corresponded set; "gias2" and the like for single meshes, `surfaces/<bone>/<cohort>_*`,
             which carry the ids of the same people ("gias2_2008_0051_l.ply" is person "llp26_2008_0051").
 
     Raises:
@@ -97,7 +97,7 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ConfigError("a folder with anatomy", f"{folder}, which is none", f"check the path or {ENVIRONMENT_VARIABLE}")
+        raise ConfigError("a folder with anatomy", f"{folder}, which is none", f"name it or set {ENVIRONMENT_VARIABLE}")
     sets = corresponded(folder, bone)
     specimens = [s for c in sets for s in c.specimens() if cohort in (None, c.cohort)]
     if cohort is not None and not specimens:

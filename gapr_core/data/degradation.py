@@ -1,4 +1,4 @@
-"""What a real acquisition does to clean surface points: density, noise, smooth bias, outliers. All in mm, all seeded."""
+"""What a real acquisition does to clean surface points: density, noise, smooth bias, outliers. In mm, seeded."""
 
 from __future__ import annotations
 
@@ -40,16 +40,17 @@ def vary_density(points: Array, scale: float, rng: np.random.Generator, rounds: 
 
 
 def bias_along_normals(
-    points: Array, normals: Array, rms_mm: float, rng: np.random.Generator, waves: int = 4
+    points: Array, normals: Array, peak_mm: float, rng: np.random.Generator, waves: int = 4
 ) -> Array:
     """(N, 3) offsets along the normals from a smooth field of plane waves of 60-120 mm wavelength.
 
-    `rms_mm` is the root mean square of the field over exactly these points (not its amplitude).
+    `peak_mm` is the largest absolute offset over exactly these points: "a 1 mm bias" is nowhere more than 1 mm. (Taken
+    as a root mean square, refinement from the truth itself would fail on a tenth of L2 and four tenths of L3.)
     """
     wave_vectors = random_directions(waves, rng) * (2.0 * np.pi / rng.uniform(60.0, 120.0, (waves, 1)))
     phases, weights = rng.uniform(0.0, 2.0 * np.pi, waves), rng.normal(size=waves)
     field = np.sin(points @ wave_vectors.T + phases) @ weights
-    return normals * (rms_mm * field / np.sqrt((field**2).mean()))[:, None]
+    return normals * (peak_mm * field / np.abs(field).max())[:, None]
 
 
 def scatter_outliers(

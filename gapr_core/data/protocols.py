@@ -58,7 +58,7 @@ class Level:
 
     share: tuple[float, float]
     noise_mm: float
-    bias_rms_mm: float
+    bias_mm: float
     outlier_share: float
     max_points: int
 
@@ -122,10 +122,10 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
     points, normals = points[chosen], normals[chosen]
     outliers = round(level.outlier_share * len(points))
     dirty = points + rng.normal(0.0, level.noise_mm, points.shape)
-    if level.bias_rms_mm:
-        dirty += degradation.bias_along_normals(points, normals, level.bias_rms_mm, rng)
+    if level.bias_mm:
+        dirty += degradation.bias_along_normals(points, normals, level.bias_mm, rng)
     dirty = np.vstack([dirty[outliers:], degradation.scatter_outliers(specimen, points[:outliers], rng)])
-    metadata |= {"noise_mm": level.noise_mm, "bias_mm": level.bias_rms_mm, "outlier_share": level.outlier_share}
+    metadata |= {"noise_mm": level.noise_mm, "bias_mm": level.bias_mm, "outlier_share": level.outlier_share}
     rotation = Rotation.random(random_state=rng).as_matrix()  # uniform on SO(3)
     return _place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)
 
@@ -230,8 +230,8 @@ def _best_view(
         if shown >= wanted:
             break
     if best is None:
-        raise ConfigError("a surface that can be seen from outside", f"{specimen.bone} of {specimen.person}, all hidden",
-                          "check the mesh: it seems to lie inside another closed one")
+        given = f"{specimen.bone} of {specimen.person}, all hidden"
+        raise ConfigError("a surface that can be seen from outside", given, "check that no closed mesh surrounds it")
     return best[1:]
 
 

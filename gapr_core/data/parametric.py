@@ -1,0 +1,58 @@
+"""Bones that need no data: thousands of different ones, each from a seed, watertight, in mm.
+
+Frame of every bone: x to the person's left, y backwards, z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from zlib import crc32
+
+import numpy as np
+
+from gapr_core.clouds import Surface
+from gapr_core.data import deformation
+from gapr_core.data.bones.femur import FemurParameters, femur_surface
+from gapr_core.data.parameters import draw
+from gapr_core.data.solid import simplify
+from gapr_core.errors import ConfigError
+
+
+def make_bone(name: str, seed: int) -> Surface:
+    """One bone of person `seed`: a closed mesh in mm, the same one for the same arguments.
+
+    Args:
+        name: a key of `BONES`. Femur and tibia are a left or a right one, as the seed decides.
+        seed: the person, any non-negative integer.
+
+    Raises:
+        ConfigError: an unknown bone.
+    """
+    if name not in BONES:
+        raise ConfigError(f"a bone of {', '.join(BONES)}", repr(name), "choose one of these")
+    return BONES[name](np.random.default_rng([seed, crc32(name.encode())]))
+
+
+def femur(seed: int) -> Surface:
+    """`make_bone("femur", seed)`."""
+    return make_bone("femur", seed)
+
+
+def _femur(rng: np.random.Generator) -> Surface:
+    return _either_side(_finish(femur_surface(draw(FemurParameters, rng)), rng), rng)
+
+
+def _finish(surface: Surface, rng: np.random.Generator, faces: int = 14_000) -> Surface:
+    """Individual form and texture that no parameter describes, then a mesh of a size that files and trees like."""
+    return simplify(deformation.deform(surface, rng), faces)
+
+
+def _either_side(left: Surface, rng: np.random.Generator) -> Surface:
+    if rng.random() < 0.5:
+        return left
+    assert left.faces is not None
+    return replace(left, points=left.points * [-1.0, 1.0, 1.0], faces=left.faces[:, ::-1].copy())
+
+
+BONES: dict[str, Callable[[np.random.Generator], Surface]] = {"femur": _femur}

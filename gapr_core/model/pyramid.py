@@ -1,0 +1,184 @@
+"""From points to a `Cloud`: voxels, neighbours, ball centroids and patches, with numpy and k-d trees on the CPU.
+
+Nothing here depends on the pose of the cloud: the voxel grid lies along its principal axes, so that a moved cloud gives
+the same voxels, neighbours and patches, only moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.types import Cloud, Level, Neighborhood
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+FEWEST_POINTS = 16
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The one scale of a pair: `scale_mm` is the target's half extent, `voxel` the first voxel in these units."""
+
+    scale_mm: float
+    voxel: float
+
+
+def target_frame(target_mm: ArrayLike, config: ModelConfig) -> Frame:
+    """Scale and first voxel of a target (M, 3), mm; both clouds of a pair share them."""
+    points = _checked(target_mm)
+    centred = points - points.mean(axis=0)
+    scale_mm = float(np.linalg.norm(centred, axis=1).max())
+    return Frame(scale_mm, choose_voxel(centred / scale_mm, config))
+
+
+def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Cloud:
+    """The pyramid of one cloud (N, 3), mm, N >= 16.
+
+    Raises:
+        InvalidPointCloudError: for a wrong shape, too few or not finite points.
+    """
+    points = _checked(points_mm)
+    centre = points.mean(axis=0)
+    resolutions = pyramid((points - centre) / frame.scale_mm, frame.voxel, config)
+    trees = [cKDTree(p) for p in resolutions]
+    radii = [config.radius_voxels * frame.voxel * config.voxel_growth**s for s in range(config.stages)]
+    within = [
+        neighborhood(p, tree, config.neighbors[s], radii[s], config.small_ball)
+        for s, (p, tree) in enumerate(zip(resolutions, trees, strict=True))
+    ]
+    ups = [trees[s + 1].query(resolutions[s])[1].astype(np.int64) for s in range(config.stages - 1)]
+    inside = _inside(ups, within[-1])
+    levels = []
+    for s, p in enumerate(resolutions):
+        normals, certainty = oriented_normals(p, within[s], inside[s], radii[-1])
+        below = None
+        if s > 0:
+            below = neighborhood(p, trees[s - 1], config.neighbors[s - 1], radii[s - 1], config.small_ball)
+        up = torch.from_numpy(ups[s]) if s < config.stages - 1 else None
+        levels.append(Level(_tensor(p), _tensor(normals), _tensor(certainty), (len(p),), within[s], below, up))
+    patches, valid = group_patches(resolutions[config.fine_stage], trees[-1], config.patch_size)
+    return Cloud(
+        tuple(levels), torch.from_numpy(patches), torch.from_numpy(valid), config.fine_stage,
+        torch.from_numpy(centre[None]), torch.tensor([frame.scale_mm], dtype=torch.float64),
+    )
+
+
+def choose_voxel(points: Array, config: ModelConfig, steps: int = 12) -> float:
+    """First voxel, in units, for which the cloud keeps about the middle of `config.superpoints` at the bottleneck."""
+    wanted = 0.5 * sum(config.superpoints)
+    low, high = 1e-3, 0.5
+    for _ in range(steps):
+        middle = float(np.sqrt(low * high))
+        count = len(pyramid(points, middle, config)[-1])
+        if config.superpoints[0] <= count <= config.superpoints[1] and abs(count - wanted) < 0.1 * wanted:
+            return middle
+        low, high = (middle, high) if count > wanted else (low, middle)
+    return float(np.sqrt(low * high))
+
+
+def pyramid(points: Array, voxel: float, config: ModelConfig) -> list[Array]:
+    """The points of every stage, finest first."""
+    axes = principal_axes(points)
+    resolutions = [voxel_means(points @ axes, voxel)]
+    for _ in range(config.stages - 1):
+        voxel *= config.voxel_growth
+        resolutions.append(voxel_means(resolutions[-1], voxel))
+    return [p @ axes.T for p in resolutions]
+
+
+def principal_axes(points: Array) -> Array:
+    """(3, 3) columns: principal axes of a cloud, each pointing to its heavier tail."""
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    skewness = ((centred @ axes) ** 3).sum(axis=0)
+    return np.asarray(axes * np.where(skewness < 0, -1.0, 1.0))
+
+
+def voxel_means(points: Array, voxel: float) -> Array:
+    """Means of the points of each occupied voxel, in the order of the voxels."""
+    cells = np.floor(points / voxel).astype(np.int64)
+    cells -= cells.min(axis=0)
+    size = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(inverse, points[:, axis], len(counts)) for axis in range(3)], axis=1)
+    return np.asarray(sums / counts[:, None])
+
+
+def neighborhood(centres: Array, tree: cKDTree, cap: int, radius: float, small_ball: float) -> Neighborhood:
+    """The `cap` nearest support points within `radius` of each centre, and the centroids of both balls.
+
+    A centre without any neighbour gets its nearest point; an empty small ball has the centre as its centroid.
+    """
+    support = np.asarray(tree.data)
+    distance, index = tree.query(centres, k=min(cap, len(support)))
+    distance, index = distance.reshape(len(centres), -1), index.reshape(len(centres), -1)
+    valid = distance <= radius
+    valid[:, 0] = True
+    index = np.where(valid, index, 0)
+    near = support[index]
+    c_h = _mean(near, valid, centres)
+    c_k = _mean(near, valid & (distance <= small_ball * radius), centres)
+    return Neighborhood(
+        torch.from_numpy(index.astype(np.int64)), torch.from_numpy(valid), _tensor(c_h), _tensor(c_k),
+        torch.full((len(centres),), radius),
+    )
+
+
+def _mean(near: Array, chosen: NDArray[np.bool_], otherwise: Array) -> Array:
+    count = chosen.sum(axis=1)[:, None]
+    total = np.einsum("nkc,nk->nc", near, chosen.astype(np.float64))
+    return np.where(count > 0, total / np.maximum(count, 1), otherwise)
+
+
+def _inside(ups: list[Index], coarsest: Neighborhood) -> list[Array]:
+    """For every point of every level, the centroid of the coarsest ball around its nearest superpoint."""
+    inside = [coarsest.c_h.double().numpy()]
+    for up in reversed(ups):
+        inside.insert(0, inside[0][up])
+    return inside
+
+
+def oriented_normals(points: Array, near: Neighborhood, inside: Array, reach: float) -> tuple[Array, Array]:
+    """Plane normals turned away from `inside`, and how surely: 1 when `inside` is 0.15 `reach` or more behind."""
+    offset = points[near.index.numpy()] - near.c_h.double().numpy()[:, None]
+    offset *= near.valid.numpy()[..., None]
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
+    outward = np.einsum("ni,ni->n", normals, points - inside)
+    return normals * np.where(outward < 0, -1.0, 1.0)[:, None], np.minimum(1.0, np.abs(outward) / (0.15 * reach))
+
+
+def group_patches(fine: Array, superpoints: cKDTree, most: int) -> tuple[Index, NDArray[np.bool_]]:
+    """Point-to-node grouping: every fine point goes to its nearest superpoint; at most `most` of them, nearest first."""
+    distance, node = superpoints.query(fine)
+    order = np.lexsort((distance, node))
+    node = node[order]
+    rank = np.arange(len(node)) - np.searchsorted(node, node)
+    kept = rank < most
+    patches = np.zeros((superpoints.n, int(rank[kept].max()) + 1), dtype=np.int64)
+    valid = np.zeros(patches.shape, dtype=bool)
+    patches[node[kept], rank[kept]] = order[kept]
+    valid[node[kept], rank[kept]] = True
+    return patches, valid
+
+
+def _checked(points_mm: ArrayLike) -> Array:
+    points = np.asarray(points_mm, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST_POINTS or not np.isfinite(points).all():
+        raise InvalidPointCloudError(
+            f"at least {FEWEST_POINTS} finite points (N, 3)", f"an array of shape {points.shape}", "clean the cloud"
+        )
+    if not np.ptp(points, axis=0).any():
+        raise InvalidPointCloudError("points at different places", "one place only", "check the units")
+    return points
+
+
+def _tensor(array: Array) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

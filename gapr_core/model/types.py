@@ -1,0 +1,188 @@
+"""What flows through the network: clouds with their pyramid, and matches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    """For each of N centres, up to K points of a support cloud, nearest first.
+
+    Attributes:
+        index: (N, K) int64 rows of the support; missing ones point at row 0 of their cloud.
+        valid: (N, K) bool.
+        c_h: (N, 3) centroid of the ball (paper, section IV-A).
+        c_k: (N, 3) centroid of the smaller ball.
+        radius: (N,) radius of the ball.
+    """
+
+    index: Tensor
+    valid: Tensor
+    c_h: Tensor
+    c_k: Tensor
+    radius: Tensor
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution of a cloud, or of several clouds one after the other.
+
+    Attributes:
+        points: (N, 3) in units of the target's half extent, centred on the cloud's own mean.
+        normals: (N, 3) unit, away from the bone's inside as far as the points tell.
+        certainty: (N,) 0 to 1, how surely they point outward; near 0 on thin plates, where points alone do not tell.
+        lengths: points of each cloud.
+        within: neighbours in this level.
+        below: neighbours in the finer level; None at the finest.
+        up: (N,) nearest point of the next coarser level; None at the coarsest.
+    """
+
+    points: Tensor
+    normals: Tensor
+    certainty: Tensor
+    lengths: tuple[int, ...]
+    within: Neighborhood
+    below: Neighborhood | None
+    up: Tensor | None
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """One cloud, or a batch of them by concatenation, with everything about its geometry that the network asks for.
+
+    Attributes:
+        levels: finest first; the last holds the superpoints.
+        patches: (S, P) fine points of each superpoint, nearest first; missing ones point at row 0 of their cloud.
+        patches_valid: (S, P) bool.
+        fine_stage: which level the patches index.
+        centre_mm: (B, 3) float64 mean that was taken off each cloud.
+        scale_mm: (B,) float64 length of one unit: the target's half extent.
+    """
+
+    levels: tuple[Level, ...]
+    patches: Tensor
+    patches_valid: Tensor
+    fine_stage: int
+    centre_mm: Tensor
+    scale_mm: Tensor
+
+    @property
+    def fine(self) -> Level:
+        """The level that is matched finely."""
+        return self.levels[self.fine_stage]
+
+    @property
+    def coarse(self) -> Level:
+        """The superpoints."""
+        return self.levels[-1]
+
+    def __len__(self) -> int:
+        return len(self.coarse.lengths)
+
+    def to(self, device: torch.device | str) -> Cloud:
+        """The same on another device."""
+        return on_device(self, device)
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the backbone made of a cloud: `fine` (N, C_fine) of its fine points, `coarse` (S, C) of its superpoints."""
+
+    fine: Tensor
+    coarse: Tensor
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Fine correspondences of a batch of pairs, in the clouds' units.
+
+    Attributes:
+        source, target: (C, 3) points.
+        score: (C,) soft assignment times the patch pair's score.
+        patch: (C,) row of the patch pair.
+        pair: (C,) which pair of the batch.
+    """
+
+    source: Tensor
+    target: Tensor
+    score: Tensor
+    patch: Tensor
+    pair: Tensor
+
+
+@dataclass(frozen=True)
+class PatchPairs:
+    """Rows of source and target superpoints that are matched finely: `pair`, `source`, `target`, `score`, (P,) each."""
+
+    pair: Tensor
+    source: Tensor
+    target: Tensor
+    score: Tensor
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+def on_device(value: T, device: torch.device | str) -> T:
+    """Moves every tensor inside nested dataclasses and tuples."""
+    if isinstance(value, Tensor):
+        return value.to(device, non_blocking=True)  # type: ignore[return-value]
+    if isinstance(value, tuple):
+        return tuple(on_device(v, device) for v in value)  # type: ignore[return-value]
+    if is_dataclass(value) and not isinstance(value, type):
+        moved: dict[str, Any] = {f.name: on_device(getattr(value, f.name), device) for f in fields(value)}
+        return replace(value, **moved)
+    return value
+
+
+def collate(clouds: list[Cloud]) -> Cloud:
+    """Several clouds as one, by concatenation; indices are shifted, nothing is padded but the patches."""
+    if len(clouds) == 1:
+        return clouds[0]
+    levels = tuple(_join_levels([c.levels for c in clouds], depth) for depth in range(len(clouds[0].levels)))
+    fine = clouds[0].fine_stage
+    starts = _starts([len(c.levels[fine].points) for c in clouds])
+    size = max(c.patches.shape[1] for c in clouds)
+    patches = [_pad(c.patches, size) + start for c, start in zip(clouds, starts, strict=True)]
+    return Cloud(
+        levels, torch.cat(patches), torch.cat([_pad(c.patches_valid, size) for c in clouds]), fine,
+        torch.cat([c.centre_mm for c in clouds]), torch.cat([c.scale_mm for c in clouds]),
+    )
+
+
+def _join_levels(pyramids: list[tuple[Level, ...]], depth: int) -> Level:
+    own = [levels[depth] for levels in pyramids]
+    starts = _starts([len(level.points) for level in own])
+    below = up = None
+    if depth > 0:
+        finer = _starts([len(levels[depth - 1].points) for levels in pyramids])
+        below = _join([level.below for level in own if level.below is not None], finer)
+    if depth < len(pyramids[0]) - 1:
+        coarser = _starts([len(levels[depth + 1].points) for levels in pyramids])
+        up = torch.cat([level.up + start for level, start in zip(own, coarser, strict=True) if level.up is not None])
+    return Level(
+        *(torch.cat([getattr(level, name) for level in own]) for name in ("points", "normals", "certainty")),
+        tuple(n for level in own for n in level.lengths), _join([level.within for level in own], starts), below, up,
+    )
+
+
+def _join(parts: list[Neighborhood], starts: list[int]) -> Neighborhood:
+    return Neighborhood(
+        torch.cat([p.index + start for p, start in zip(parts, starts, strict=True)]),
+        *(torch.cat([getattr(p, name) for p in parts]) for name in ("valid", "c_h", "c_k", "radius")),
+    )
+
+
+def _starts(lengths: list[int]) -> list[int]:
+    return [sum(lengths[:i]) for i in range(len(lengths))]
+
+
+def _pad(table: Tensor, size: int) -> Tensor:
+    return torch.nn.functional.pad(table, (0, size - table.shape[1]))

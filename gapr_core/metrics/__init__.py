@@ -1,0 +1,34 @@
+"""Metrics: pure functions of float64 numpy arrays; what each means is in docs/metrics.md."""
+
+from gapr_core.metrics.bootstrap import interval
+from gapr_core.metrics.confidence import (
+    auroc,
+    expected_calibration_error,
+    false_accept_rate,
+    false_accepts,
+    reliability,
+    risk_coverage,
+)
+from gapr_core.metrics.cramer_rao import pose_bound
+from gapr_core.metrics.pose import (
+    PoseError,
+    centroid_alignment,
+    extreme_points,
+    pose_error,
+    r2_rotation,
+    r2_translation,
+    recall,
+    rmse_mm,
+    tre_mm,
+    whole_bone_rmse_mm,
+    within_paper_limit,
+)
+from gapr_core.metrics.surfaces import chamfer_mm, coarse_inlier_ratio, fine_inlier_ratio
+from gapr_core.metrics.uncertainty import error_twist, nees, predicted_rmse_mm
+
+__all__ = [
+    "PoseError", "auroc", "centroid_alignment", "chamfer_mm", "coarse_inlier_ratio", "error_twist",
+    "expected_calibration_error", "extreme_points", "false_accept_rate", "false_accepts", "fine_inlier_ratio",
+    "interval", "nees", "pose_bound", "pose_error", "predicted_rmse_mm", "r2_rotation", "r2_translation", "recall",
+    "reliability", "risk_coverage", "rmse_mm", "tre_mm", "whole_bone_rmse_mm", "within_paper_limit",
+]  # fmt: skip

@@ -1,0 +1,108 @@
+"""Errors of one pose against the truth, and recall over many. All distances in mm, angles in degrees."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from gapr_core.geometry import se3
+
+Array = NDArray[np.float64]
+
+PAPER_RMSE_LIMIT = 0.02  # of the target's half extent: "after normalisation" in the paper
+STRICT_LIMITS = ((1.0, 1.0), (2.0, 2.0), (4.0, 5.0))  # mm at the source's centroid, deg
+ACCEPT_LIMIT = STRICT_LIMITS[-1]  # beyond it an accepted pose is a false accept
+
+
+class PoseError(NamedTuple):
+    """Translation error at the source's centroid and geodesic rotation error."""
+
+    rte_mm: float
+    rre_deg: float
+
+    def within(self, limit_mm: float, limit_deg: float) -> bool:
+        """Both errors below their limits."""
+        return self.rte_mm < limit_mm and self.rre_deg < limit_deg
+
+
+def pose_error(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> PoseError:
+    """RTE at the centroid of `source` (N, 3) and RRE of T_estimate against T_true, both T_target_source (4, 4)."""
+    return PoseError(*se3.pose_error(T_estimate, T_true, source))
+
+
+def rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> float:
+    """sqrt(mean_i |T_estimate p_i - T_true p_i|^2) over the source (N, 3): the paper's RMSE of one pair."""
+    shift = se3.apply(T_estimate, source) - se3.apply(T_true, source)
+    return float(np.sqrt((shift**2).sum(axis=1).mean()))
+
+
+def whole_bone_rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, target: ArrayLike) -> float:
+    """The same over the whole target (M, 3), target frame: what the fit on the observed patch hides."""
+    return rmse_mm(error_motion(T_estimate, T_true), np.eye(4), target)
+
+
+def tre_mm(T_estimate: ArrayLike, T_true: ArrayLike, targets: dict[str, ArrayLike]) -> dict[str, float]:
+    """Target registration error at named points {name: (3,)} of the target frame, mm."""
+    motion = error_motion(T_estimate, T_true)
+    return {name: rmse_mm(motion, np.eye(4), np.reshape(point, (1, 3))) for name, point in targets.items()}
+
+
+def extreme_points(target: ArrayLike) -> dict[str, Array]:
+    """Six named targets of any bone (M, 3): its farthest points along both directions of its principal axes."""
+    points = np.asarray(target, dtype=np.float64)
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
+    axes *= np.sign(np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1))  # one sign for good
+    along = centred @ axes.T
+    ends = {f"axis{k + 1}+": points[along[:, k].argmax()] for k in range(3)}
+    return ends | {f"axis{k + 1}-": points[along[:, k].argmin()] for k in range(3)}
+
+
+def error_motion(T_estimate: ArrayLike, T_true: ArrayLike) -> Array:
+    """(4, 4) motion of the target frame from where a point is to where the estimate puts it."""
+    return np.asarray(T_estimate, dtype=np.float64) @ se3.inverse(T_true)
+
+
+def within_paper_limit(rmse: float, half_extent_mm: float) -> bool:
+    """RMSE below 0.02 of the target's half extent (largest distance to its centroid)."""
+    return rmse < PAPER_RMSE_LIMIT * half_extent_mm
+
+
+def recall(successes: ArrayLike) -> float:
+    """Share of successes, refusals and failures counted; NaN of nothing."""
+    successes = np.asarray(successes, dtype=np.float64)
+    return float(successes.mean()) if successes.size else float("nan")
+
+
+def r2_rotation(T_estimates: ArrayLike, T_trues: ArrayLike) -> float:
+    """The paper's R2(R): coefficient of determination of Euler angles (zyx, degrees), mean of the three.
+
+    Angles wrap around at 180 deg, so small errors can cost much: no measure of accuracy (1 deg errors give 0.965).
+    """
+    return r2(_euler_deg(T_estimates), _euler_deg(T_trues))
+
+
+def r2_translation(T_estimates: ArrayLike, T_trues: ArrayLike) -> float:
+    """The paper's R2(t): coefficient of determination of the translation, mean of the three components."""
+    return r2(np.asarray(T_estimates)[:, :3, 3], np.asarray(T_trues)[:, :3, 3])
+
+
+def r2(predicted: ArrayLike, true: ArrayLike) -> float:
+    """1 - residual / total sum of squares per column of (K, D), averaged; NaN for fewer than two rows."""
+    predicted, true = np.asarray(predicted, dtype=np.float64), np.asarray(true, dtype=np.float64)
+    if len(true) < 2:
+        return float("nan")
+    total = ((true - true.mean(axis=0)) ** 2).sum(axis=0)
+    return float(np.mean(1.0 - ((true - predicted) ** 2).sum(axis=0) / total))
+
+
+def centroid_alignment(source: ArrayLike, target: ArrayLike) -> Array:
+    """The pose that stands in for a refusal in errors over ALL pairs: no rotation, centroid on centroid."""
+    return se3.from_rotation_translation(np.eye(3), np.mean(target, axis=0) - np.mean(source, axis=0))
+
+
+def _euler_deg(transforms: ArrayLike) -> Array:
+    return Rotation.from_matrix(np.asarray(transforms, dtype=np.float64)[:, :3, :3]).as_euler("zyx", degrees=True)

@@ -1,0 +1,50 @@
+"""Is the covariance honest? Pose errors in the coordinates of `RegistrationResult.covariance`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from gapr_core.geometry import se3
+
+Array = NDArray[np.float64]
+
+
+def error_twist(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> Array:
+    """(6,) x y z (mm) rx ry rz (rad): how the estimate has moved the source, target frame, about its true centroid.
+
+    `se3.exp(twist, centre) @ T_true == T_estimate` with the centre at T_true x centroid.
+    """
+    centroid = np.mean(np.asarray(source, dtype=np.float64), axis=0, keepdims=True)
+    shift = se3.apply(T_estimate, centroid)[0] - se3.apply(T_true, centroid)[0]
+    rotation = np.asarray(T_estimate)[:3, :3] @ np.asarray(T_true)[:3, :3].T
+    return np.r_[shift, Rotation.from_matrix(rotation).as_rotvec()]
+
+
+def nees(twist: ArrayLike, covariance: ArrayLike) -> float:
+    """Normalised estimation error squared, e^T C^-1 e; its expectation is 6 for an honest covariance (6, 6).
+
+    Solved in coordinates of unit variance, so that mm and rad do not spoil the conditioning.
+    """
+    covariance = np.asarray(covariance, dtype=np.float64)
+    scale = np.sqrt(np.diag(covariance))
+    error = np.asarray(twist, dtype=np.float64) / scale
+    return float(error @ np.linalg.solve(covariance / np.outer(scale, scale), error))
+
+
+def motion_jacobians(points: ArrayLike, centre: ArrayLike) -> Array:
+    """(N, 3, 6) derivative of each moved point (target frame) by the twist about `centre`: [I, -[p - c]x]."""
+    x, y, z = (np.asarray(points, dtype=np.float64) - np.asarray(centre)).T
+    jacobian = np.zeros((len(x), 3, 6))
+    jacobian[:, :, :3] = np.eye(3)
+    jacobian[:, 0, 4], jacobian[:, 0, 5] = z, -y
+    jacobian[:, 1, 3], jacobian[:, 1, 5] = -z, x
+    jacobian[:, 2, 3], jacobian[:, 2, 4] = y, -x
+    return jacobian
+
+
+def predicted_rmse_mm(covariance: ArrayLike, points: ArrayLike, centre: ArrayLike) -> float:
+    """Root-mean-square error that a pose covariance (6, 6) about `centre` predicts over points (N, 3), mm."""
+    jacobian = motion_jacobians(points, centre)
+    return float(np.sqrt(np.einsum("nij,jk,nik->n", jacobian, np.asarray(covariance), jacobian).mean()))

@@ -1,0 +1,138 @@
+"""Twists, NEES and the Cramer-Rao bound against simulation."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from gapr_core.geometry import se3
+from gapr_core.metrics import cramer_rao
+from gapr_core.metrics.bootstrap import interval
+from gapr_core.metrics.uncertainty import error_twist, motion_jacobians, nees, predicted_rmse_mm
+
+
+def random_pose(rng):
+    return se3.from_rotation_translation(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-100, 100, 3))
+
+
+def random_covariance(rng):
+    root = rng.normal(size=(6, 6)) * np.array([[0.5]] * 3 + [[0.01]] * 3)
+    return root @ root.T + np.diag([0.01] * 3 + [1e-6] * 3)
+
+
+def ellipsoid(rng, count, axes=(120.0, 45.0, 25.0)):
+    unit = rng.normal(size=(count, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    normals = unit / axes
+    return unit * axes, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def test_the_error_twist_rebuilds_the_estimate_from_the_truth():
+    rng = np.random.default_rng(0)
+    source, true, estimate = rng.normal(size=(30, 3)) * 50, random_pose(rng), random_pose(rng)
+    twist = error_twist(estimate, true, source)
+    centre = se3.apply(true, source).mean(axis=0)
+    assert np.allclose(se3.exp(twist, centre) @ true, estimate)
+
+
+def test_nees_of_an_honest_covariance_is_chi_square_with_six_degrees():
+    rng = np.random.default_rng(1)
+    covariance = random_covariance(rng)
+    errors = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
+    values = np.array([nees(error, covariance) for error in errors])
+    assert values.mean() == pytest.approx(6.0, rel=0.03)
+    assert np.mean(values < chi2.ppf(0.95, 6)) == pytest.approx(0.95, abs=0.01)
+    assert np.mean([nees(2 * error, covariance) for error in errors]) == pytest.approx(24.0, rel=0.03)
+
+
+def test_motion_jacobians_are_the_derivative_of_the_motion():
+    rng = np.random.default_rng(2)
+    points, centre, step = rng.normal(size=(5, 3)) * 40, rng.normal(size=3), 1e-6
+    numeric = [(se3.apply(se3.exp(step * e, centre), points) - points) / step for e in np.eye(6)]
+    assert np.allclose(motion_jacobians(points, centre), np.stack(numeric, axis=2), atol=1e-4)
+
+
+def test_predicted_rmse_is_what_random_errors_of_that_covariance_give():
+    rng = np.random.default_rng(3)
+    points, covariance = rng.normal(size=(40, 3)) * 60, random_covariance(rng) * 0.01
+    centre = points.mean(axis=0)
+    twists = rng.multivariate_normal(np.zeros(6), covariance, size=3000)
+    shifts = np.array([se3.apply(se3.exp(t, centre), points) - points for t in twists])
+    assert predicted_rmse_mm(covariance, points, centre) == pytest.approx(
+        np.sqrt((shifts**2).sum(axis=2).mean()), rel=0.05
+    )
+
+
+def test_the_bound_is_what_least_squares_on_a_known_surface_reaches():
+    """Maximum likelihood on an ellipsoid (exact distances by linearisation) attains the bound at small noise."""
+    rng = np.random.default_rng(4)
+    sigma, clean_normals = 0.3, None
+    clean, clean_normals = ellipsoid(rng, 300)
+    true = random_pose(rng)
+    centre = clean.mean(axis=0)
+    rows = np.hstack([clean_normals, np.cross(clean - centre, clean_normals)])
+    twists = []
+    for _ in range(600):
+        noisy = clean + rng.normal(0, sigma, clean.shape)
+        twists.append(np.linalg.lstsq(rows, ((clean - noisy) * clean_normals).sum(axis=1), rcond=None)[0])
+    source = se3.apply(np.linalg.inv(true), clean)
+    bound = cramer_rao.pose_bound(source, clean, true, sigma, normals=clean_normals)
+    measured = np.cov(np.array(twists).T)
+    assert np.allclose(np.diag(measured) / np.diag(bound.covariance), 1.0, atol=0.25)
+    shifts = np.einsum("nij,kj->kni", motion_jacobians(clean, centre), np.array(twists))
+    assert bound.rmse_mm == pytest.approx(np.sqrt((shifts**2).sum(axis=2).mean()), rel=0.06)
+
+
+def test_the_bound_falls_with_the_root_of_the_points_and_rises_with_the_noise():
+    rng = np.random.default_rng(5)
+    clean, normals = ellipsoid(rng, 4000)
+    few = cramer_rao.pose_bound(clean[:1000], clean, np.eye(4), 1.0, normals).rmse_mm
+    assert cramer_rao.pose_bound(clean, clean, np.eye(4), 1.0, normals).rmse_mm == pytest.approx(few / 2, rel=0.1)
+    assert cramer_rao.pose_bound(clean[:1000], clean, np.eye(4), 2.0, normals).rmse_mm == pytest.approx(2 * few)
+
+
+def test_estimated_normals_give_nearly_the_bound_of_exact_ones():
+    rng = np.random.default_rng(6)
+    clean, normals = ellipsoid(rng, 6000)
+    source = clean[:800] + rng.normal(0, 0.5, (800, 3))
+    exact = cramer_rao.pose_bound(source, clean, np.eye(4), 0.5, normals)
+    assert cramer_rao.pose_bound(source, clean, np.eye(4), 0.5).rmse_mm == pytest.approx(exact.rmse_mm, rel=0.1)
+
+
+def test_outliers_carry_no_information():
+    rng = np.random.default_rng(7)
+    clean, normals = ellipsoid(rng, 3000)
+    off = clean.copy()
+    off[:1500] += 10.0 * normals[:1500]
+    half = cramer_rao.pose_bound(clean[1500:], clean, np.eye(4), 0.5, normals)
+    with_outliers = cramer_rao.pose_bound(off, clean, np.eye(4), 0.5, normals)
+    assert np.linalg.det(with_outliers.covariance) ** (1 / 6) == pytest.approx(
+        np.linalg.det(half.covariance) ** (1 / 6), rel=0.1
+    )
+
+
+def test_a_sphere_or_no_noise_has_no_bound():
+    rng = np.random.default_rng(8)
+    sphere, normals = ellipsoid(rng, 500, (50.0, 50.0, 50.0))
+    sphere -= sphere.mean(axis=0)
+    ball = 50.0 * normals
+    assert cramer_rao.pose_bound(ball, ball, np.eye(4), 1.0, normals) is None
+    bone, bone_normals = ellipsoid(rng, 500)
+    assert cramer_rao.pose_bound(bone, bone, np.eye(4), 0.0, bone_normals) is None
+    assert cramer_rao.pose_bound(bone[:5], bone, np.eye(4), 1.0, bone_normals) is None
+
+
+def test_bootstrap_of_a_mean_has_the_width_of_the_normal_approximation():
+    values = np.random.default_rng(9).normal(size=400)
+    low, high = interval(values)
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
+    assert low < values.mean() < high and interval(values) == (low, high)
+
+
+def test_pairs_of_one_person_do_not_count_as_independent():
+    rng = np.random.default_rng(10)
+    values = np.repeat(rng.normal(size=20), 30)
+    people = np.repeat([f"person {k}" for k in range(20)], 30)
+    alone, together = interval(values), interval(values, people)
+    assert together[1] - together[0] > 4 * (alone[1] - alone[0])
+    assert np.isnan(interval([])[0])

@@ -54,14 +54,17 @@ def bias_along_normals(
 
 
 def scatter_outliers(
-    specimen: Specimen, points: Array, rng: np.random.Generator, nearest_mm: float = 3.0, farthest_mm: float = 15.0
+    specimen: Specimen, points: Array, normals: Array, rng: np.random.Generator,
+    nearest_mm: float = 3.0, farthest_mm: float = 15.0,
 ) -> Array:
-    """Surface points (K, 3) thrown in random directions until each is 3-15 mm off the whole surface."""
+    """Surface points (K, 3) thrown U[3, 15] mm outward or inward, askew, again until 3 mm off the whole surface."""
     outliers, pending = points.copy(), np.arange(len(points))
     for _ in range(50):
         if not len(pending):
             break
         reach = rng.uniform(nearest_mm, farthest_mm, (len(pending), 1))
-        outliers[pending] = points[pending] + reach * random_directions(len(pending), rng)
+        sign = rng.choice([-1.0, 1.0], (len(pending), 1))
+        away = sign * normals[pending] + 0.7 * random_directions(len(pending), rng)
+        outliers[pending] = points[pending] + reach * away / np.linalg.norm(away, axis=1, keepdims=True)
         pending = pending[specimen.distance(outliers[pending]) < nearest_mm]
     return np.delete(outliers, pending, axis=0)

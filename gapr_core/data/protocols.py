@@ -124,7 +124,8 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
     dirty = points + rng.normal(0.0, level.noise_mm, points.shape)
     if level.bias_mm:
         dirty += degradation.bias_along_normals(points, normals, level.bias_mm, rng)
-    dirty = np.vstack([dirty[outliers:], degradation.scatter_outliers(specimen, points[:outliers], rng)])
+    scattered = degradation.scatter_outliers(specimen, points[:outliers], normals[:outliers], rng)
+    dirty = np.vstack([dirty[outliers:], scattered])
     metadata |= {"noise_mm": level.noise_mm, "bias_mm": level.bias_mm, "outlier_share": level.outlier_share}
     rotation = Rotation.random(random_state=rng).as_matrix()  # uniform on SO(3)
     return _place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)
@@ -135,8 +136,8 @@ def wrong(
 ) -> Pair:
     """A source that is not of this bone: in turn another bone type, another person's; each as L1, L2, L3 and paper."""
     turn = int(rng.integers(8)) if turn is None else turn
-    kind = ("other_bone", "other_person")[turn % 2]
-    source_of = _another(specimen, others, kind, rng)
+    source_of = _another(specimen, others, turn % 2, rng)
+    kind = "other_person" if source_of.bone == specimen.bone else "other_bone"
     degraded_as = ("L1", "L2", "L3", "paper")[turn // 2 % 4]
     stranger, own = (PROTOCOLS[degraded_as](who, rng) for who in (source_of, specimen))
     metadata = {
@@ -146,13 +147,14 @@ def wrong(
     return replace(own, source=stranger.source, T_target_source=np.full((4, 4), np.nan), metadata=metadata)
 
 
-def _another(specimen: Specimen, others: Sequence[Specimen], kind: str, rng: np.random.Generator) -> Specimen:
-    same_bone = [o for o in others if o.bone == specimen.bone and o.person != specimen.person]
+def _another(specimen: Specimen, others: Sequence[Specimen], kind: int, rng: np.random.Generator) -> Specimen:
+    """Another bone type (kind 0) or another person's (kind 1); the other of the two where there is none of the kind."""
     other_bone = [o for o in others if o.bone != specimen.bone]
-    candidates = same_bone if kind == "other_person" else other_bone
+    other_person = [o for o in others if o.bone == specimen.bone and o.person != specimen.person]
+    candidates = (other_bone or other_person, other_person or other_bone)[kind]
     if not candidates:
         raise ConfigError(
-            f"at least one {kind.replace('_', ' ')} beside {specimen.bone} of {specimen.person}",
+            f"another bone or another person beside {specimen.bone} of {specimen.person}",
             f"{len(others)} other specimens, none fitting", "name more bones or more people",
         )
     return candidates[rng.integers(len(candidates))]

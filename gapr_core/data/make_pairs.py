@@ -1,0 +1,150 @@
+"""`gapr make-pairs`: frozen lists of pairs as .npz files with a manifest, the same from the same seed."""
+
+from __future__ import annotations
+
+import json
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from gapr_core.data import anatomy, pool
+from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
+from gapr_core.data.protocols import PROTOCOLS, make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that a list of pairs depends on but the meshes themselves."""
+
+    protocols: tuple[str, ...]
+    bones: tuple[str, ...]
+    count: int
+    seed: int = 0
+    split: str = "all"
+    people: int = 20
+    origin: str = "parametric"  # or "anatomy", "meshes"
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.protocols if name not in PROTOCOLS]
+        if unknown or not self.protocols:
+            raise ConfigError(f"protocols of {', '.join(PROTOCOLS)}", ", ".join(unknown) or "none", "choose of these")
+        if self.count < 1 or self.people < 1 or self.seed < 0 or not self.bones:
+            raise ConfigError("count and people of at least 1, a seed from 0, a bone", str(self), "correct it")
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """The options of `gapr make-pairs`."""
+    parser.add_argument("--protocol", required=True, help=f"one or more, with commas: {', '.join(PROTOCOLS)}")
+    parser.add_argument("--bones", help="with commas; default: femur,tibia,pelvis,thoracic, or what --meshes holds")
+    parser.add_argument("--count", type=int, default=40, help="pairs for each bone and protocol (40)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="folder for NAME.npz and manifest.json")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--anatomy", type=Path, help="folder of corresponded meshes with splits.json")
+    where.add_argument("--meshes", type=Path, help="folder of your own meshes, one per person, or a folder per bone")
+    parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of --meshes")
+    parser.add_argument("--split", default="all", choices=(*anatomy.SPLITS, "all"), help="whose bones")
+    parser.add_argument("--people", type=int, default=20, help="parametric people for each bone (20)")
+
+
+def run(args: Namespace) -> int:
+    """Make the pairs that the arguments name; says what it made, or takes up what an earlier run left."""
+    origin = "anatomy" if args.anatomy else "meshes" if args.meshes else "parametric"
+    named = args.bones.split(",") if args.bones else pool.bones_in(args.meshes) if args.meshes else anatomy.BONES
+    recipe = Recipe(
+        tuple(args.protocol.split(",")), tuple(named), args.count, args.seed, args.split, args.people, origin
+    )
+    bones = {bone: _bones(args, bone) for bone in tqdm(recipe.bones, desc="bones", disable=None)}
+    manifest = write_pairs(recipe, bones, args.out)
+    for bone, found in bones.items():
+        cohorts = ", ".join(sorted({s.cohort for s in found}))
+        print(f"{bone}: {len(found)} people of split {recipe.split} ({cohorts})")
+    print(f"{len(manifest['pairs'])} pairs in {args.out}, hash {manifest['hash'][:16]}")
+    return 0
+
+
+def write_pairs(recipe: Recipe, bones: dict[str, list[Specimen]], out: str | Path) -> dict[str, Any]:
+    """Write every pair of the recipe that is not there yet, and the manifest.
+
+    Args:
+        recipe: which pairs.
+        bones: specimens of each bone of the recipe.
+        out: folder; made if missing.
+
+    Returns:
+        The manifest: the recipe, every pair with its sha256, and one `hash` over all.
+
+    Raises:
+        ConfigError: the folder holds pairs of another recipe, or no specimen is left for a bone.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    _check_same_recipe(recipe, out / "manifest.json")
+    plan = list(_plan(recipe, bones))
+    others = [specimen for found in bones.values() for specimen in found]
+    pairs = [_pair_entry(job, others, out) for job in tqdm(plan, desc="pairs", unit="pair", disable=None)]
+    digest = sha256("".join(f"{p['name']} {p['sha256']}\n" for p in pairs).encode()).hexdigest()
+    return _write_manifest(out / "manifest.json", recipe, pairs, digest)
+
+
+def read_manifest(folder: str | Path) -> dict[str, Any]:
+    """The manifest of a folder of pairs."""
+    return dict(json.loads((Path(folder) / "manifest.json").read_text()))
+
+
+@dataclass(frozen=True)
+class _Job:
+    name: str
+    protocol: str
+    specimen: Specimen
+    seed: int
+    turn: int
+
+
+def _bones(args: Namespace, bone: str) -> list[Specimen]:
+    return pool.specimens(bone, args.split, args.people, args.anatomy, args.meshes, args.units)
+
+
+def _plan(recipe: Recipe, bones: dict[str, list[Specimen]]) -> Iterator[_Job]:
+    """Everybody in turn; people of several cohorts stand in the list one after the other, so that all come."""
+    for protocol in recipe.protocols:
+        for bone in recipe.bones:
+            if not bones[bone]:
+                raise ConfigError(f"somebody's {bone} in split {recipe.split}", "nobody's", "choose another split")
+            for index in range(recipe.count):
+                specimen = bones[bone][index % len(bones[bone])]
+                name = f"{protocol}_{bone}_{index:04d}"
+                yield _Job(name, protocol, specimen, 1_000_000 * recipe.seed + index, index)
+
+
+def _pair_entry(job: _Job, others: list[Specimen], out: Path) -> dict[str, Any]:
+    path = out / f"{job.name}.npz"
+    if not path.is_file():
+        save_pair(path, make_pair(job.protocol, job.specimen, job.seed, others, job.turn))
+    pair = load_pair(path)
+    entry = {"name": job.name, "bone": pair.bone, "person": pair.person, "protocol": pair.protocol}
+    return {**entry, "cohort": pair.metadata.get("cohort", ""), "sha256": pair_hash(pair)}
+
+
+def _check_same_recipe(recipe: Recipe, path: Path) -> None:
+    wanted = json.loads(json.dumps(asdict(recipe)))
+    if path.is_file() and json.loads(path.read_text())["recipe"] != wanted:
+        raise ConfigError("an empty folder or one with pairs of this recipe", f"other pairs in {path.parent}",
+                          "choose another --out")
+    if not path.is_file():
+        _write_manifest(path, recipe, [], "")
+
+
+def _write_manifest(path: Path, recipe: Recipe, pairs: list[dict[str, Any]], digest: str) -> dict[str, Any]:
+    manifest = {"format": FORMAT, "recipe": asdict(recipe), "hash": digest, "pairs": pairs}
+    path.write_text(json.dumps(manifest, indent=1) + "\n")
+    return manifest

@@ -1,0 +1,54 @@
+"""Where the bones of a list of pairs come from: people in a folder, a user's own meshes, or parametric people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from gapr_core.data import anatomy
+from gapr_core.data.parametric import make_bone
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError
+
+PARAMETRIC_SPLIT = {"train": (0, 1, 2), "val": (3,), "test": (4,)}  # of the person's number modulo 5
+
+
+def parametric_people(split: str, count: int) -> list[int]:
+    """The numbers (seeds of `make_bone`) of the first `count` people of a split; no number is in two splits."""
+    if split == "all":
+        return list(range(count))
+    if split not in PARAMETRIC_SPLIT:
+        raise ConfigError(f"a split of {', '.join(PARAMETRIC_SPLIT)} or all", repr(split), "choose one of these")
+    residues = PARAMETRIC_SPLIT[split]
+    return [5 * (i // len(residues)) + residues[i % len(residues)] for i in range(count)]
+
+
+def parametric_specimen(bone: str, number: int) -> Specimen:
+    """The bone of parametric person `number`; all bones of one number are of one person."""
+    return Specimen(make_bone(bone, number), bone, f"parametric_{number}", "parametric")
+
+
+def specimens(
+    bone: str, split: str = "all", people: int = 20, anatomy_folder: str | Path | None = None,
+    meshes_folder: str | Path | None = None, units: str = "mm",
+) -> list[Specimen]:
+    """The bones of one type to make pairs from.
+
+    From `meshes_folder` or `anatomy_folder` everybody of the split; the first `people` parametric ones where neither
+    is given, and where the anatomy folder has no mesh of this bone in any split (its cohort then says "parametric").
+    """
+    if meshes_folder is not None:
+        return anatomy.meshes(meshes_folder, bone, split, units)
+    if anatomy_folder is not None and anatomy.surfaces(anatomy_folder, bone):
+        return anatomy.surfaces(anatomy_folder, bone, split)
+    return [parametric_specimen(bone, number) for number in parametric_people(split, people)]
+
+
+def bones_in(meshes_folder: str | Path) -> list[str]:
+    """The bone names that a folder of meshes holds."""
+    return sorted({s.bone for s in anatomy.meshes(meshes_folder)})
+
+
+def persons(bones: Iterable[Specimen]) -> set[str]:
+    """Who the bones are of."""
+    return {bone.person for bone in bones}

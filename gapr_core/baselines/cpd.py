@@ -48,10 +48,10 @@ def _rigid(library: Any) -> Any:
             self.t = mean_target - mean_source @ self.R
 
         def update_variance(self) -> None:
-            before = self.sigma2
+            before = float(self.sigma2)
             spread = self.Pt1 @ (self.X_hat**2).sum(axis=1)
-            self.sigma2 = (spread - 2.0 * np.trace(self.A @ self.R) + self.YPY) / (self.Np * self.D)
-            self.sigma2 = max(self.sigma2, self.tolerance / 10.0)
+            variance = (spread - 2.0 * np.trace(self.A @ self.R) + self.YPY) / (self.Np * self.D)
+            self.sigma2: float = max(float(variance), self.tolerance / 10.0)
             self.diff = abs(self.sigma2 - before)
 
     return Rigid

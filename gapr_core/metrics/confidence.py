@@ -17,7 +17,7 @@ class Reliability(NamedTuple):
 
     confidence: Array
     accuracy: Array
-    count: NDArray[np.int64]
+    pairs: NDArray[np.int64]
 
 
 def auroc(confidence: ArrayLike, correct: ArrayLike) -> float:
@@ -43,8 +43,8 @@ def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> Re
 def expected_calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> float:
     """ECE (Guo et al. 2017): |confidence - accuracy| of the bins, weighted by how full they are; NaN of nothing."""
     rows = reliability(confidence, correct, bins)
-    total = rows.count.sum()
-    return float((rows.count * np.abs(rows.confidence - rows.accuracy)).sum() / total) if total else float("nan")
+    total = rows.pairs.sum()
+    return float((rows.pairs * np.abs(rows.confidence - rows.accuracy)).sum() / total) if total else float("nan")
 
 
 def risk_coverage(confidence: ArrayLike, correct: ArrayLike, total: int | None = None) -> tuple[Array, Array]:

@@ -101,7 +101,7 @@ def r2(predicted: ArrayLike, true: ArrayLike) -> float:
 
 def centroid_alignment(source: ArrayLike, target: ArrayLike) -> Array:
     """The pose that stands in for a refusal in errors over ALL pairs: no rotation, centroid on centroid."""
-    return se3.from_rotation_translation(np.eye(3), np.mean(target, axis=0) - np.mean(source, axis=0))
+    return se3.from_rotation_translation(np.eye(3), np.asarray(target).mean(axis=0) - np.asarray(source).mean(axis=0))
 
 
 def _euler_deg(transforms: ArrayLike) -> Array:

@@ -32,7 +32,7 @@ def test_a_calibrated_score_has_no_calibration_error_and_an_overconfident_one_ha
 
 def test_reliability_bins_keep_everything_and_include_full_confidence():
     rows = c.reliability([0.0, 0.05, 0.999, 1.0], [0, 1, 1, 1])
-    assert rows.count.tolist() == [2, 2]
+    assert rows.pairs.tolist() == [2, 2]
     assert rows.accuracy.tolist() == [0.5, 1.0]
     assert rows.confidence == pytest.approx([0.025, 0.9995])
 

@@ -1,0 +1,89 @@
+"""tf2, imported only when it is needed and there: it is part of a ROS installation, not of the Python wheels."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_ros.refusal import Reason, RefusedError
+from msg_adapters import InvalidMessageError, transform_to_matrix
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import TransformStamped
+    from rclpy.node import Node
+    from rclpy.time import Time
+
+Array = NDArray[np.float64]
+MISSING = "tf2_ros is not installed (it comes with a ROS installation, not with the wheels)"
+POLL_S = 0.005
+
+
+class Frames:
+    """Looks transforms up and sends them; without tf2_ros it says so once and refuses look-ups."""
+
+    def __init__(self, node: Node, publish: bool, listen: bool) -> None:
+        self._node = node
+        self._sent_ns = -1
+        self._tf2 = _import_tf2() if publish or listen else None
+        if self._tf2 is None and (publish or listen):
+            node.get_logger().warning(f"{MISSING}: nothing goes to /tf and no other frame can be used")
+        self._broadcaster = self._tf2.TransformBroadcaster(node) if self._tf2 and publish else None
+        self._buffer: Any = None
+        self._listener: Any = None
+        if listen:
+            self.listen()
+
+    def listen(self) -> None:
+        """Start filling the buffer, if tf2 is there and it has not been started; call it from the executor."""
+        if self._tf2 is not None and self._buffer is None:
+            self._buffer = self._tf2.Buffer(node=self._node)
+            self._listener = self._tf2.TransformListener(self._buffer, self._node)
+
+    def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float) -> Array:
+        """T_parent_child (4, 4), metres, at a time. Waits in the caller's thread, by the wall clock.
+
+        Raises:
+            RefusedError: tf_missing, never the identity.
+        """
+        if parent == child:
+            return np.eye(4)
+        if self._tf2 is None or self._buffer is None:
+            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {MISSING}")
+        deadline = time.monotonic() + timeout_s  # tf2's own wait never ends while simulated time stands still
+        while not self._buffer.can_transform(parent, child, stamp) and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        try:
+            return transform_to_matrix(self._buffer.lookup_transform(parent, child, stamp))
+        except (self._tf2.TransformException, InvalidMessageError) as error:
+            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {error}") from error
+
+    def send(self, transform: TransformStamped, stamp_ns: int) -> bool:
+        """To /tf, if its stamp is newer than that of the last one (tf2 warns about repeated data) and it has frames."""
+        if self._broadcaster is None or stamp_ns <= self._sent_ns or not transform.header.frame_id:
+            return False
+        self._broadcaster.sendTransform(transform)
+        self._sent_ns = stamp_ns
+        return True
+
+    def forget(self) -> None:
+        """Time went back: older stamps are news again."""
+        self._sent_ns = -1
+
+    def close(self) -> None:
+        """Give back what was subscribed and advertised."""
+        if self._listener is not None:
+            self._listener.unregister()
+        if self._broadcaster is not None:
+            self._node.destroy_publisher(self._broadcaster.pub_tf)
+        self._listener = self._buffer = self._broadcaster = None
+
+
+def _import_tf2() -> Any | None:
+    try:
+        import tf2_ros
+    except ImportError:
+        return None
+    return tf2_ros

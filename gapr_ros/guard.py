@@ -1,0 +1,64 @@
+"""What keeps the node alive: exceptions that rclpy would swallow or die of are logged instead."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.lifecycle import TransitionCallbackReturn
+
+THROTTLE_S = 5.0
+
+
+def guarded(callback: Callable[..., Any]) -> Callable[..., Any]:
+    """For subscription, timer and event callbacks of a node: an exception is logged (throttled), never raised."""
+
+    @functools.wraps(callback)
+    def wrapper(self: Any, *args: Any) -> Any:
+        try:
+            return callback(self, *args)
+        except Exception as error:
+            text = f"{callback.__name__} failed: {describe(error)}"
+            self.get_logger().error(text, throttle_duration_sec=THROTTLE_S)
+            return None
+
+    return wrapper
+
+
+def transition(callback: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
+    """For lifecycle callbacks: an exception makes the transition fail and leaves its reason in log and diagnostics."""
+
+    @functools.wraps(callback)
+    def wrapper(self: Any, state: Any) -> TransitionCallbackReturn:
+        try:
+            return callback(self, state)
+        except Exception as error:
+            self.report_failure(f"{callback.__name__.removeprefix('on_')} failed: {describe(error)}")
+            return TransitionCallbackReturn.FAILURE
+
+    return wrapper
+
+
+def describe(error: BaseException) -> str:
+    """The sentence of an error that names its cure; anything else with the place where it happened."""
+    if isinstance(error, ValueError) and str(error).startswith("expected "):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1:]
+    where = f" ({place[0].filename.rsplit('/', 1)[-1]}:{place[0].lineno})" if place else ""
+    return f"{type(error).__name__}: {error}{where}"
+
+
+class RosLogHandler(logging.Handler):
+    """Sends warnings of the library to the node's log."""
+
+    def __init__(self, logger: Any) -> None:
+        super().__init__(logging.WARNING)
+        self._logger = logger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """One record, at its own level."""
+        write = self._logger.error if record.levelno >= logging.ERROR else self._logger.warning
+        write(record.getMessage())

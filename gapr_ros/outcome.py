@@ -1,0 +1,73 @@
+"""What became of one cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from std_msgs.msg import Header
+
+from gapr_ros.refusal import Reason
+from gapr_ros.worker import Job
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Outcome:
+    """Filled step by step while a cloud is processed; a pose only when there is no reason against it.
+
+    Attributes:
+        job: where the cloud came from and who waits for it.
+        cloud_frame: frame of the cloud.
+        header: frame of the pose (`output_frame` or that of the cloud) and stamp of the cloud.
+        reason: why there is no pose, or None.
+        text: the reason in full, for people.
+        pose: (4, 4) T_frame_model, metres; None when refused.
+        covariance: (6, 6) of that pose, metres and radians, fixed axes of the frame.
+        confidence: of the registration, 0 to 1, whatever was decided later.
+        points_in, points_used: of the message; given to registration.
+        age_s: of the cloud when it was taken in hand; None while the clock does not run.
+        tre_mm, inlier_ratio, exec_ms: of the registration; wall time of the whole way.
+    """
+
+    job: Job
+    cloud_frame: str = ""
+    header: Header = field(default_factory=Header)
+    reason: Reason | None = None
+    text: str = ""
+    pose: Array | None = None
+    covariance: Array | None = None
+    confidence: float = 0.0
+    points_in: int = 0
+    points_used: int = 0
+    age_s: float | None = None
+    tre_mm: float | None = None
+    inlier_ratio: float = 0.0
+    exec_ms: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        """True when the pose goes out."""
+        return self.reason is None and self.pose is not None
+
+    @property
+    def confidence_out(self) -> float:
+        """What ~/confidence says: 0 when refused."""
+        return self.confidence if self.ok else 0.0
+
+    def refuse(self, reason: Reason, text: str) -> None:
+        """Take the pose away."""
+        self.reason, self.text, self.pose, self.covariance = reason, text, None, None
+
+    def tell(self) -> None:
+        """Give it to those who wait for it."""
+        for waiter in self.job.waiters:
+            waiter.set_result(self)
+
+    def __str__(self) -> str:
+        if self.ok:
+            tre = "" if self.tre_mm is None else f"  TRE {self.tre_mm:.1f} mm"
+            return f"OK  confidence {self.confidence:.2f}{tre}  inliers {self.inlier_ratio:.2f}  {self.exec_ms:.0f} ms"
+        return f"refused: {self.reason}" + (f": {self.text}" if self.text else "")

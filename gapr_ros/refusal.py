@@ -1,0 +1,45 @@
+"""Why a cloud gets no pose."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from gapr_core.results import RegistrationStatus
+
+
+class Reason(str, Enum):
+    """The words that logs, diagnostics and service answers use."""
+
+    EMPTY_CLOUD = "empty_cloud"
+    TOO_FEW_POINTS = "too_few_points"
+    BAD_FIELDS = "bad_fields"
+    NON_FINITE = "non_finite"
+    UNIT_MISMATCH = "unit_mismatch"
+    STALE = "stale"
+    TF_MISSING = "tf_missing"
+    TIMEOUT = "timeout"
+    NOT_CONVERGED = "not_converged"
+    AMBIGUOUS = "ambiguous"
+    DEGENERATE = "degenerate"
+    LOW_CONFIDENCE = "low_confidence"
+    JUMP = "jump"
+    SUPERSEDED_BY_RESET = "superseded_by_reset"
+
+    def __str__(self) -> str:
+        return self.value
+
+
+OF_STATUS = {
+    RegistrationStatus.AMBIGUOUS: Reason.AMBIGUOUS,
+    RegistrationStatus.DEGENERATE: Reason.DEGENERATE,
+    RegistrationStatus.LOW_CONFIDENCE: Reason.LOW_CONFIDENCE,
+    RegistrationStatus.TOO_FEW_POINTS: Reason.TOO_FEW_POINTS,
+}
+
+
+class RefusedError(Exception):
+    """Raised inside the node to end the way of one cloud; never leaves it."""
+
+    def __init__(self, reason: Reason, text: str = "") -> None:
+        super().__init__(f"{reason}: {text}" if text else str(reason))
+        self.reason, self.text = reason, text

@@ -1,0 +1,141 @@
+"""The way of one cloud through the worker's thread: read, look up, register, convert, or refuse."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.time import Time
+from sensor_msgs.msg import PointCloud2
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult
+from gapr_ros import intake, wire
+from gapr_ros.frames import Frames
+from gapr_ros.guard import describe
+from gapr_ros.model import Model
+from gapr_ros.outcome import Outcome
+from gapr_ros.parameters import NodeParameters
+from gapr_ros.refusal import OF_STATUS, Reason, RefusedError
+from gapr_ros.worker import Job
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A pose that somebody gave: T_frame_model (4, 4), metres, in `frame` (empty: that of the cloud)."""
+
+    T_frame_model: Array
+    frame: str
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What holds at the moment when a cloud is taken in hand."""
+
+    model: Model
+    parameters: NodeParameters
+    epoch: int
+    seed: Seed | None
+    now_ns: int
+
+
+class Registration:
+    """Turns jobs into outcomes with one registration method.
+
+    Args:
+        method: satisfies `RegistrationMethod`; `register` takes `initial` when a seed is given.
+        frames: look-up of transforms.
+        situation: asked at the start of each job.
+    """
+
+    def __init__(self, method: Any, frames: Frames, situation: Callable[[], Situation]) -> None:
+        self.method, self._frames, self._situation = method, frames, situation
+
+    def process(self, job: Job) -> Outcome:
+        """The outcome of one cloud; never raises."""
+        outcome, start = Outcome(job), time.monotonic()
+        try:
+            self._run(outcome, self._situation(), start)
+        except RefusedError as refusal:
+            outcome.refuse(refusal.reason, refusal.text)
+        except InvalidPointCloudError as error:  # sizes and values that the method itself rejects
+            outcome.refuse(Reason.UNIT_MISMATCH, str(error))
+        except Exception as error:
+            outcome.refuse(Reason.NOT_CONVERGED, f"the registration failed: {describe(error)}")
+        outcome.exec_ms = (time.monotonic() - start) * 1000.0
+        return outcome
+
+    def _run(self, outcome: Outcome, now: Situation, start: float) -> None:
+        if outcome.job.epoch != now.epoch:
+            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset")
+        cloud = intake.read_message(outcome.job.cloud)
+        _note_header(outcome, cloud, now)
+        intake.check_age(cloud.header, now.now_ns, now.parameters.max_cloud_age)
+        T_output_cloud = self._lookup(outcome.header.frame_id, outcome, now)
+        taken = intake.take_in(cloud, now.model.extent_mm, now.parameters)
+        outcome.points_used = len(taken.points_mm)
+        result = self._register(taken.points_mm, outcome, now)
+        _check(result, time.monotonic() - start, now.parameters)
+        _note_pose(outcome, result, taken.points_mm, T_output_cloud, now.parameters)
+
+    def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
+        seed = self._initial(outcome, now)
+        options = {} if seed is None else {"initial": seed}
+        result = self.method.register(points_mm, now.model.target, **options)
+        outcome.confidence, outcome.inlier_ratio = float(result.confidence), float(result.inlier_ratio)
+        outcome.tre_mm = result.tre_mm
+        return result
+
+    def _initial(self, outcome: Outcome, now: Situation) -> Array | None:
+        if now.seed is None:
+            return None
+        T_cloud_seed = se3.inverse(self._lookup(now.seed.frame, outcome, now))
+        return wire.core_pose(T_cloud_seed @ now.seed.T_frame_model)
+
+    def _lookup(self, frame: str, outcome: Outcome, now: Situation) -> Array:
+        """T_frame_cloud at the cloud's stamp."""
+        if not frame:
+            return np.eye(4)
+        stamp = Time.from_msg(outcome.header.stamp)
+        return self._frames.lookup(frame, outcome.cloud_frame, stamp, now.parameters.tf_timeout)
+
+
+def _note_header(outcome: Outcome, cloud: PointCloud2, now: Situation) -> None:
+    """Frame and stamp of the answer; a cloud without a stamp gets the time at which it arrived."""
+    stamp_ns = intake.stamp_ns(cloud.header)
+    outcome.points_in = cloud.width * cloud.height
+    outcome.cloud_frame = cloud.header.frame_id
+    outcome.header.frame_id = now.parameters.output_frame or cloud.header.frame_id
+    outcome.header.stamp = Time(nanoseconds=stamp_ns or outcome.job.received_ns).to_msg()
+    outcome.age_s = (now.now_ns - stamp_ns) * 1e-9 if stamp_ns and now.now_ns else None
+
+
+def _check(result: RegistrationResult, seconds: float, parameters: NodeParameters) -> None:
+    """Refuse what the method refused, what took too long and what is not sure enough."""
+    if seconds > parameters.timeout:
+        raise RefusedError(Reason.TIMEOUT, f"took {seconds:.3g} s, timeout is {parameters.timeout:g} s")
+    if not result.ok:
+        raise RefusedError(OF_STATUS[result.status], result.reason)
+    if not result.confidence >= parameters.min_confidence:
+        text = f"confidence {result.confidence:.2f}, min_confidence is {parameters.min_confidence:g}"
+        raise RefusedError(Reason.LOW_CONFIDENCE, text)
+    for name, value in (("pose", result.T_target_source), ("covariance", result.covariance)):
+        if value is None or not np.isfinite(value).all():
+            raise RefusedError(Reason.NOT_CONVERGED, f"{result.method} gave no finite {name}")
+
+
+def _note_pose(
+    outcome: Outcome, result: RegistrationResult, points_mm: Array, T_output_cloud: Array, parameters: NodeParameters
+) -> None:
+    assert result.T_target_source is not None and result.covariance is not None
+    floors = (parameters.covariance_floor_translation, parameters.covariance_floor_rotation)
+    covariance = wire.wire_covariance(result.covariance, result.T_target_source, points_mm.mean(axis=0), floors)
+    outcome.pose = T_output_cloud @ wire.wire_pose(result.T_target_source)
+    outcome.covariance = wire.rotate_covariance(covariance, T_output_cloud[:3, :3])

@@ -1,0 +1,171 @@
+"""Everything that lives from configure to cleanup: one bone, one method, one worker, one track."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
+from gapr_ros import intake, track
+from gapr_ros.diagnostics import RefusalLog
+from gapr_ros.frames import Frames
+from gapr_ros.model import Model, load_model, warm_up
+from gapr_ros.outcome import Outcome
+from gapr_ros.publishers import Publishers
+from gapr_ros.refusal import Reason, RefusedError
+from gapr_ros.registration import Registration, Seed, Situation
+from gapr_ros.track import Track
+from gapr_ros.worker import Job, Worker
+from msg_adapters import InvalidMessageError, pose_to_matrix
+
+if TYPE_CHECKING:
+    from gapr_ros.register_node import RegisterNode
+
+STOP_TIMEOUT_S = 10.0
+BACKWARD_NS = 1_000_000_000  # a stamp this much older than the last one: time went back (a bag in a loop)
+
+
+class Session:
+    """Takes clouds in, has them registered, decides on the outcomes and sends them.
+
+    All methods belong to the executor's thread, except `_work`, `_situation` and `read_model`, which the worker calls.
+
+    Raises:
+        GaprError: a bone that cannot be read or prepared.
+    """
+
+    def __init__(self, node: RegisterNode, method: Any) -> None:
+        self._node, self._method = node, method
+        self.enabled = True
+        self.last_outcome: Outcome | None = None
+        self._track, self._epoch, self._seed, self._last_stamp_ns = Track(), 0, None, 0
+        self._log_refusal = RefusalLog(node.get_logger().warning)
+        self.model = self.read_model()
+        warm_up(method, self.model)
+        self._frames = Frames(node, node.parameters.publish_tf, listen=bool(node.parameters.output_frame))
+        self._publishers = Publishers(node, self._frames, node.parameters.model_frame)
+        self._registration = Registration(method, self._frames, self._situation)
+        self.worker = Worker(self._work, self._held, self._period_s)
+
+    def close(self) -> None:
+        """End the worker and give the topics back."""
+        self.stop_waiting("the node stopped")
+        if not self.worker.stop(STOP_TIMEOUT_S):
+            self._node.get_logger().error(f"the registration has not ended after {STOP_TIMEOUT_S:g} s: left alone")
+        self._publishers.close()
+        self._frames.close()
+
+    # --- in: the executor's thread ---
+
+    def take_cloud(self, data: bytes) -> None:
+        """A serialised cloud arrived: into the mailbox, nothing more."""
+        counters = self._node.counters
+        counters.receive()
+        if not self.enabled:
+            counters.dropped += 1
+            return
+        counters.dropped += self.worker.put(Job(data, self._epoch, self._node.now_ns()))
+
+    def take_seed(self, message: PoseWithCovarianceStamped) -> None:
+        """A pose from outside, where the next registrations start until one is accepted."""
+        try:
+            T_frame_model = pose_to_matrix(message)
+        except InvalidMessageError as error:
+            self._node.get_logger().warning(f"initialpose is ignored: {error}")
+            return
+        self.reset()
+        self._seed = Seed(T_frame_model, message.header.frame_id)
+        if message.header.frame_id:
+            self._frames.listen()
+
+    def register_newest(self, waiter: Any) -> bool:
+        """Register the newest cloud now; its outcome becomes the waiter's result. False when none has come."""
+        return self.worker.ask(waiter, self._epoch)
+
+    # --- the worker's thread ---
+
+    def read_model(self) -> Model:
+        """The bone that the parameters name now, prepared."""
+        return load_model(self._method, self._node.parameters)
+
+    def _work(self, job: Job) -> None:
+        self._node.call_soon(partial(self._settle, self._registration.process(job)))
+
+    def _situation(self) -> Situation:
+        return Situation(self.model, self._node.parameters, self._epoch, self._seed, self._node.now_ns())
+
+    def _held(self) -> bool:
+        return not self._node.parameters.continuous
+
+    def _period_s(self) -> float:
+        max_rate = self._node.parameters.max_rate
+        return 1.0 / max_rate if max_rate > 0.0 else 0.0
+
+    # --- out: the executor's thread again ---
+
+    def _settle(self, outcome: Outcome) -> None:
+        """Decide on an outcome, count it, send it, and tell who waits for it."""
+        self._decide(outcome)
+        self.last_outcome = outcome
+        self._node.counters.settle(outcome)
+        if not outcome.ok:
+            self._log_refusal(outcome)
+        self._publishers.send(outcome, self.model)
+        outcome.tell()
+        self._node.reporter.send()
+
+    def _decide(self, outcome: Outcome) -> None:
+        if outcome.job.epoch != self._epoch:
+            outcome.refuse(Reason.SUPERSEDED_BY_RESET, "a reset came while the cloud was on its way")
+            return
+        self._watch_stamps(outcome)
+        if not outcome.ok:
+            self._track.miss()
+            return
+        try:
+            centre_m = track.centre_of(self.model.points_mm)
+            self._track.judge(outcome.pose, outcome.header.frame_id, centre_m, self._node.parameters)
+            self._seed = None
+        except RefusedError as refusal:
+            outcome.refuse(refusal.reason, refusal.text)
+
+    def _watch_stamps(self, outcome: Outcome) -> None:
+        """A bag that starts over without simulated time shows in its stamps only."""
+        stamp_ns = intake.stamp_ns(outcome.header)
+        if 0 < stamp_ns < self._last_stamp_ns - BACKWARD_NS:
+            self._node.get_logger().warning("stamps went back: the track is cleared")
+            self._forget()
+        self._last_stamp_ns = stamp_ns or self._last_stamp_ns
+
+    # --- state ---
+
+    def reset(self) -> None:
+        """Forget track and seed; clouds on their way will be refused."""
+        self._epoch += 1
+        self._forget()
+
+    def replace_model(self, model: Model) -> None:
+        """Swap the bone, between two clouds."""
+        self.model = model
+        self.reset()
+        self.send_model()
+
+    def send_model(self) -> None:
+        """Show the bone."""
+        self._publishers.send_model(self.model)
+
+    def stop_waiting(self, why: str) -> None:
+        """Drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way."""
+        self.reset()
+        waiting = self.worker.clear()
+        if waiting is not None:
+            self._node.counters.dropped += 1
+            outcome = Outcome(waiting)
+            outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
+            outcome.tell()
+
+    def _forget(self) -> None:
+        self._track.clear()
+        self._seed, self._last_stamp_ns = None, 0
+        self._frames.forget()

@@ -1,0 +1,83 @@
+"""What the node remembers from cloud to cloud: the last pose, how many good ones in a row, the seed from outside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.geometry import se3
+from gapr_ros import wire
+from gapr_ros.parameters import NodeParameters
+from gapr_ros.refusal import Reason, RefusedError
+
+Array = NDArray[np.float64]
+
+
+class Track:
+    """The poses of one bone over time, in one frame. Used by one thread only."""
+
+    def __init__(self) -> None:
+        self._frame = ""
+        self._candidate: Array | None = None
+        self._accepted: Array | None = None
+        self._streak = 0
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.__init__()  # type: ignore[misc]
+
+    def judge(self, T_frame_model: Array, frame: str, centre_m: Array, parameters: NodeParameters) -> None:
+        """Let a good pose pass, or refuse it.
+
+        Args:
+            T_frame_model: (4, 4), metres.
+            frame: its parent; another one than before starts a new track.
+            centre_m: (3,) of the bone, in its own frame, where a jump is measured.
+            parameters: `max_jump_*` and `require_consecutive`.
+
+        Raises:
+            RefusedError: jump, or low_confidence while there are too few good poses in a row.
+        """
+        if frame != self._frame:
+            self.clear()
+            self._frame = frame
+        self._check_jump(T_frame_model, centre_m, parameters)
+        self._count(T_frame_model, centre_m, parameters)
+        if self._streak < parameters.require_consecutive:
+            text = f"{self._streak} of {parameters.require_consecutive} good poses in a row (require_consecutive)"
+            raise RefusedError(Reason.LOW_CONFIDENCE, text)
+        self._accepted = T_frame_model
+
+    def miss(self) -> None:
+        """A cloud was refused: the row of good poses ends."""
+        self._streak, self._candidate = 0, None
+
+    def _check_jump(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
+        if self._accepted is None:
+            return
+        why = jump(self._accepted, T_frame_model, centre_m, parameters)
+        if why:
+            raise RefusedError(Reason.JUMP, f"{why}; call ~/reset if the bone really moved")
+
+    def _count(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
+        if self._candidate is not None and jump(self._candidate, T_frame_model, centre_m, parameters):
+            self._streak = 0
+        self._candidate = T_frame_model
+        self._streak += 1
+
+
+def jump(T_before: Array, T_now: Array, centre_m: Array, parameters: NodeParameters) -> str:
+    """How two poses are farther apart than `max_jump_*` allow; empty when they are not."""
+    step = se3.apply(T_now, centre_m[None]) - se3.apply(T_before, centre_m[None])
+    distance_m = float(np.linalg.norm(step))
+    angle = float(np.radians(se3.rotation_angle_deg(se3.inverse(T_before) @ T_now)))
+    if 0.0 < parameters.max_jump_translation < distance_m:
+        return f"moved {distance_m:.3g} m, max_jump_translation is {parameters.max_jump_translation:g} m"
+    if 0.0 < parameters.max_jump_rotation < angle:
+        return f"turned {angle:.3g} rad, max_jump_rotation is {parameters.max_jump_rotation:g} rad"
+    return ""
+
+
+def centre_of(points_mm: Array) -> Array:
+    """(3,) mean of the bone's points, m."""
+    return wire.to_metres(points_mm.mean(axis=0))

@@ -1,0 +1,99 @@
+"""Between the core (mm, T_target_source) and the wire (metres, T_cloud_model): the only place that converts.
+
+The target is the model (pre-operative bone), the source is the cloud: T_cloud_model is the inverse of T_target_source.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.geometry import se3
+
+Array = NDArray[np.float64]
+MM_PER_M = 1000.0
+MM_PER_UNIT = {"m": MM_PER_M, "mm": 1.0}
+
+
+def to_mm(points: Array, unit: str) -> Array:
+    """Points in `unit` ("m" or "mm") as mm."""
+    return points * MM_PER_UNIT[unit]
+
+
+def to_metres(points_mm: Array) -> Array:
+    """Points in mm as metres."""
+    return points_mm / MM_PER_M
+
+
+def metres_from_mm(length_mm: float) -> float:
+    """A length in mm as metres."""
+    return length_mm / MM_PER_M
+
+
+def wire_pose(T_target_source: Array) -> Array:
+    """The core's answer (4, 4), mm, as T_cloud_model in metres."""
+    T = se3.inverse(se3.nearest_rigid(T_target_source))
+    T[:3, 3] /= MM_PER_M
+    return T
+
+
+def core_pose(T_cloud_model: Array) -> Array:
+    """A pose from the wire (4, 4), metres, as T_target_source in mm."""
+    T = se3.inverse(T_cloud_model)
+    T[:3, 3] *= MM_PER_M
+    return T
+
+
+def wire_covariance(
+    covariance: Array, T_target_source: Array, centroid_mm: Array, floors: tuple[float, float]
+) -> Array:
+    """The core's covariance as that of T_cloud_model in the cloud's frame.
+
+    The core's error xi = (v, w) is a twist in the target's frame that acts on the left of T_target_source about the
+    transformed centroid c. To first order exp(xi)^-1 p = p - w x (p - c) - v, so that the model's origin p = 0 and its
+    axes, seen from the cloud, with R = R_cloud_target, move by
+        dt = -R (v + [c]x w),   dr = -R w.
+    Both signs cancel in J C J^T.
+
+    Args:
+        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed axes of the target frame, about the transformed centroid.
+        T_target_source: (4, 4), mm.
+        centroid_mm: (3,) of the source, in the cloud's frame.
+        floors: smallest standard deviation of a translation (m) and of a rotation (rad), applied at the centroid,
+            where the two are least correlated.
+
+    Returns:
+        (6, 6) symmetric positive definite, x y z (m) rx ry rz (rad), fixed axes of the cloud's frame, of the model's
+        origin: what PoseWithCovariance means.
+    """
+    metres = np.diag([1.0 / MM_PER_M] * 3 + [1.0] * 3)
+    floored = floor_covariance(metres @ covariance @ metres, *floors)
+    centre = se3.apply(T_target_source, centroid_mm[None])[0] / MM_PER_M
+    R = T_target_source[:3, :3].T
+    J = np.block([[R, R @ skew(centre)], [np.zeros((3, 3)), R]])
+    return symmetric(J @ floored @ J.T)
+
+
+def rotate_covariance(covariance: Array, R: Array) -> Array:
+    """The covariance of a pose whose parent frame is turned by R (3, 3)."""
+    J = np.kron(np.eye(2), R)
+    return symmetric(J @ covariance @ J.T)
+
+
+def floor_covariance(covariance: Array, translation: float, rotation: float) -> Array:
+    """The covariance with no direction surer than the floors (standard deviations): eigenvalues in their unit >= 1."""
+    scale = np.diag([translation] * 3 + [rotation] * 3)
+    inverse = np.diag(1.0 / scale.diagonal())
+    values, vectors = np.linalg.eigh(symmetric(inverse @ covariance @ inverse))
+    return symmetric(scale @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ scale)
+
+
+def skew(v: Array) -> Array:
+    """(3, 3) matrix of the cross product with v."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def symmetric(matrix: Array) -> Array:
+    """The matrix without the asymmetry of rounding."""
+    return 0.5 * (matrix + matrix.T)

@@ -1,0 +1,257 @@
+"""What the ROS tests share: a client that talks to a node over DDS, nodes as processes or in threads, synthetic bones.
+
+Every test process has a domain of its own and stays on this machine, so that runs side by side do not meet.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float64, Header
+from std_srvs.srv import SetBool, Trigger
+
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.register_node import RegisterNode
+from msg_adapters import xyz_to_cloud
+
+DOMAIN = 1 + os.getpid() % 101
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NODE = "/register_node"
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "") -> Any:
+    """The first true value of the condition; fails when there is none in time."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"waited {timeout_s} s in vain for {what or condition}")
+
+
+def context() -> Context:
+    """An rclpy context in this process's domain."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    made = Context()
+    made.init(args=[], domain_id=DOMAIN)
+    return made
+
+
+class Spinner:
+    """Runs nodes in a thread, in a context of their own."""
+
+    def __init__(self, in_context: Context) -> None:
+        self.context = in_context
+        self.executor = SingleThreadedExecutor(context=in_context)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+
+    def start(self, node: Node) -> None:
+        self.executor.add_node(node)
+        self._thread.start()
+
+    def close(self) -> None:
+        self.context.try_shutdown()
+        self._thread.join(5.0)
+        self.executor.shutdown(timeout_sec=0.0)
+
+    def _spin(self) -> None:
+        try:
+            self.executor.spin()
+        except ExternalShutdownException:
+            pass
+
+
+class Client:
+    """Publishes clouds and remembers everything that the node says, with the order of arrival."""
+
+    def __init__(self, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> None:
+        self._spinner = Spinner(context())
+        self.node = Node("client", context=self._spinner.context)
+        self.poses: list[PoseWithCovarianceStamped] = []
+        self.transforms: list[TransformStamped] = []
+        self.confidences: list[float] = []
+        self.models: list[PointCloud2] = []
+        self.diagnostics: list[DiagnosticArray] = []
+        listen = self.node.create_subscription
+        listen(PoseWithCovarianceStamped, f"{NODE}/pose", self.poses.append, LATCHED)
+        listen(TransformStamped, f"{NODE}/transform", self.transforms.append, 10)
+        listen(Float64, f"{NODE}/confidence", lambda m: self.confidences.append(m.data), 1000)
+        listen(PointCloud2, f"{NODE}/model", self.models.append, LATCHED)
+        listen(DiagnosticArray, "/diagnostics", self.diagnostics.append, 100)
+        self.points = self.node.create_publisher(PointCloud2, "points", QoSProfile(depth=10, reliability=reliability))
+        self.seeds = self.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 1)
+        self.clock = self.node.create_publisher(Clock, "/clock", 10)
+        self._spinner.start(self.node)
+
+    def close(self) -> None:
+        self._spinner.close()
+
+    def values(self, status: str = "registration") -> dict[str, str]:
+        """Key and value of the newest diagnostics, with `level` and `message`; empty before the first."""
+        for array in reversed(self.diagnostics):
+            for entry in array.status:
+                if entry.name.endswith(f": {status}"):
+                    own = {"level": ord(entry.level), "message": entry.message}
+                    return {pair.key: pair.value for pair in entry.values} | own
+        return {}
+
+    def wait_for_state(self, state: str, timeout_s: float = 20.0) -> None:
+        wait_until(lambda: self.values().get("state") == state, timeout_s, f"state {state}")
+        if state == "active":
+            wait_until(lambda: self.points.get_subscription_count(), 10.0, "the subscription")
+            wait_until(lambda: self.node.count_publishers(f"{NODE}/confidence"), 10.0, "the publishers")
+
+    def send(self, cloud: PointCloud2 | np.ndarray, frame: str = "probe", stamp_s: float | None = None) -> None:
+        """Publish a cloud, or (N, 3) points in metres."""
+        if not isinstance(cloud, PointCloud2):
+            stamp_s = time.time() if stamp_s is None else stamp_s
+            stamp = Time(nanoseconds=int(stamp_s * 1e9)).to_msg()
+            cloud = xyz_to_cloud(np.asarray(cloud, dtype=np.float32), Header(frame_id=frame, stamp=stamp))
+        self.points.publish(cloud)
+
+    def ask(self, cloud: PointCloud2 | np.ndarray, timeout_s: float = 20.0, **kwargs: Any) -> dict[str, str]:
+        """Publish one cloud and wait for its answer: the diagnostics after it was settled."""
+        before = _answered(self.values())
+        self.send(cloud, **kwargs)
+        wait_until(lambda: _answered(self.values()) == before + 1, timeout_s, f"an answer; last: {self.values()}")
+        return self.values()
+
+    def call(self, name: str, request: Any = None, timeout_s: float = 20.0) -> Any:
+        """The response of one of the node's services."""
+        request = request or Trigger.Request()
+        kind = SetBool if isinstance(request, SetBool.Request) else Trigger
+        client = self.node.create_client(kind, f"{NODE}/{name}")
+        wait_until(client.service_is_ready, 10.0, f"service {name}")
+        future = client.call_async(request)
+        wait_until(future.done, timeout_s, f"the answer of {name}")
+        self.node.destroy_client(client)
+        return future.result()
+
+
+def _answered(values: dict[str, str]) -> int:
+    return int(values.get("frames_accepted", 0)) + int(values.get("frames_refused", 0))
+
+
+@contextmanager
+def node_in_thread(method: Any, model_path: Path, **parameters: Any) -> Iterator[RegisterNode]:
+    """A register_node in this process with a registration method of the test's own."""
+    spinner = Spinner(context())
+    values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False} | parameters
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    node = RegisterNode(lambda _: method, context=spinner.context, parameter_overrides=overrides)
+    spinner.start(node)
+    try:
+        yield node
+    finally:
+        spinner.close()
+        node.close()
+
+
+class NodeProcess:
+    """`python -m gapr_ros.register_node` as a process of its own."""
+
+    def __init__(self, folder: Path, *arguments: str, module: str = "gapr_ros.register_node", **parameters: Any) -> None:
+        self.log_path = folder / f"{module}-{time.monotonic_ns()}.log"
+        self._log = self.log_path.open("wb")
+        given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={yaml_value(value)}")]
+        ros = ["--ros-args", *given] if given else []
+        command = [sys.executable, "-m", module, *arguments, *ros]
+        self.process = subprocess.Popen(
+            command, stdout=self._log, stderr=subprocess.STDOUT, env=environment(folder), cwd=REPOSITORY
+        )
+
+    @property
+    def log(self) -> str:
+        return self.log_path.read_text()
+
+    def rss_mb(self) -> float:
+        return psutil.Process(self.process.pid).memory_info().rss / 2**20
+
+    def stop(self, number: int = signal.SIGINT, timeout_s: float = 20.0) -> int:
+        """Send a signal and return the exit code."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.wait(timeout_s)
+
+    def wait(self, timeout_s: float = 20.0) -> int:
+        try:
+            return self.process.wait(timeout_s)
+        finally:
+            self.process.kill()
+            self._log.close()
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """For child processes: this domain, this machine only, messages checked."""
+    return os.environ | {
+        "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1",
+        "ROS_LOG_DIR": str(folder), "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2"),
+    }  # fmt: skip
+
+
+def yaml_value(value: Any) -> str:
+    """A parameter's value as `-p name:=value` wants it."""
+    return str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
+
+
+class StandIn:
+    """A registration method whose answers a test decides."""
+
+    name = "stand-in"
+
+    def __init__(self) -> None:
+        self.answer = accepted()
+        self.error: Exception | None = None
+        self.calls: list[dict[str, Any]] = []
+        self.gate = threading.Event()
+        self.gate.set()
+        self.prepared = 0
+
+    def prepare(self, target: Any, units: str = "mm") -> Any:
+        self.prepared += 1
+        return target
+
+    def register(self, source: np.ndarray, target: Any, initial: np.ndarray | None = None) -> RegistrationResult:
+        self.calls.append({"source": source, "initial": initial, "target": target})
+        assert self.gate.wait(20.0)
+        if self.error is not None:
+            raise self.error
+        return self.answer
+
+
+def accepted(T: np.ndarray | None = None, confidence: float = 0.9, **kwargs: Any) -> RegistrationResult:
+    """An OK result."""
+    covariance = np.diag([0.01, 0.02, 0.03, 1e-6, 2e-6, 3e-6])
+    options = {"covariance": covariance, "tre_mm": 0.7, "inlier_ratio": 0.8} | kwargs
+    return RegistrationResult(RegistrationStatus.OK, np.eye(4) if T is None else T, confidence=confidence, **options)
+
+
+def pose_mm(rotation_vector: Any, translation_mm: Any) -> np.ndarray:
+    """A rigid (4, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    return se3.from_rotation_translation(Rotation.from_rotvec(rotation_vector).as_matrix(), translation_mm)

@@ -59,7 +59,8 @@ def test_the_code_is_free_of(what):
     pattern, exempt = FORBIDDEN[what]
     found = [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
-        for path in FILES if str(path.relative_to(ROOT)) not in exempt
+        for path in FILES
+        if str(path.relative_to(ROOT)) not in exempt
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
         if re.search(pattern, line)
     ]

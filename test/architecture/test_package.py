@@ -29,8 +29,12 @@ def test_the_changelog_has_an_entry_for_the_version_or_for_the_one_to_come():
 
 
 def test_every_entry_point_leads_to_something_that_can_be_called():
-    ours = [e for group in ("console_scripts", "gapr.commands") for e in entry_points(group=group)
-            if e.dist.name.replace("-", "_") == "gapr_ros"]
+    ours = [
+        e
+        for group in ("console_scripts", "gapr.commands")
+        for e in entry_points(group=group)
+        if e.dist.name.replace("-", "_") == "gapr_ros"
+    ]
     assert {"gapr", "register_node", "bag_replay", "demo"} <= {e.name for e in ours}
     for entry in ours:
         loaded = entry.load()
@@ -64,7 +68,10 @@ def test_the_node_that_colcon_built_starts_and_uses_the_installed_code(workspace
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     run = subprocess.run(
         ["bash", "-c", f"{command} && timeout -s INT 5 {node} --ros-args -p model_path:=/no/such/file.stl"],
-        cwd=workspace, env={**os.environ, "PATH": path}, capture_output=True, text=True,
+        cwd=workspace,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
     )
     assert str(workspace / "install") in run.stdout, run.stdout + run.stderr
     assert "file.stl" in run.stdout + run.stderr

@@ -1,0 +1,1 @@
+"""Judging methods on pairs, and pages that show what came out."""

@@ -1,0 +1,129 @@
+"""Poses from correspondences: per-patch consensus (local to global) and RANSAC, both with several answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Point pairs that may belong together.
+
+    Attributes:
+        source, target: (C, 3) mm.
+        score: (C,) positive weights.
+        patch: (C,) int, correspondences of one patch pair share a number.
+    """
+
+    source: Array
+    target: Array
+    score: Array
+    patch: NDArray[np.int64]
+
+
+def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -> tuple[Array, Array]:
+    """One weighted SVD per patch pair, scored on all correspondences, refined on its inliers (GeoTransformer's LGR).
+
+    Args:
+        found: the correspondences.
+        radius_mm: within it a correspondence agrees with a pose.
+        count: most poses returned.
+
+    Returns:
+        (K, 4, 4) distinct T_target_source, best first, and (K,) the summed score of what agrees with each.
+    """
+    patches = np.unique(found.patch, return_counts=True)
+    large = patches[0][patches[1] >= 3]
+    members = (found.patch[None] == large[:, None]) * found.score
+    return _settle(_batched_kabsch(found, members), found, radius_mm, count)
+
+
+def ransac(
+    found: Correspondences, radius_mm: float, rng: np.random.Generator, draws: int = 2000, count: int = 32
+) -> tuple[Array, Array]:
+    """Poses of random triples of correspondences (Fischler and Bolles 1981), drawn by score, with equal sides.
+
+    Args and returns: as `local_to_global`; `draws` triples are tried.
+    """
+    if len(found.score) < 3:
+        return np.empty((0, 4, 4)), np.empty(0)
+    triples = rng.choice(len(found.score), (draws, 3), p=found.score / found.score.sum())
+    p, q = found.source[triples], found.target[triples]
+    sides_p, sides_q = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
+    rigid = (np.abs(sides_p - sides_q) < 2.0 * radius_mm).all(axis=1) & (sides_p > 2.0 * radius_mm).all(axis=1)
+    weights = np.ones((int(rigid.sum()), 3))
+    return _settle(_kabsch(p[rigid], q[rigid], weights), found, radius_mm, count)
+
+
+def _settle(poses: Array, found: Correspondences, radius_mm: float, count: int, rounds: int = 4) -> tuple[Array, Array]:
+    """The best poses, each refitted to the correspondences it explains, near-copies dropped."""
+    if len(poses) == 0:
+        return np.empty((0, 4, 4)), np.empty(0)
+    centroid = found.source.mean(axis=0)
+    scores = _support(poses, found, radius_mm).sum(axis=1)
+    poses = poses[distinct(poses, scores, centroid, 2 * count)]
+    for _ in range(rounds):
+        weights = _support(poses, found, radius_mm)
+        enough = (weights > 0).sum(axis=1) >= 3
+        refitted = _batched_kabsch(found, weights)
+        poses = np.where(enough[:, None, None], refitted, poses)
+    scores = _support(poses, found, radius_mm).sum(axis=1)
+    kept = distinct(poses, scores, centroid, count)
+    return poses[kept], scores[kept]
+
+
+def distinct(
+    poses: Array, scores: Array, centroid: Array, count: int, apart_mm: float = 8.0, apart_deg: float = 8.0
+) -> NDArray[np.int64]:
+    """Rows of up to `count` poses, best first, none within both limits of a better one (at the source's centroid)."""
+    order = np.argsort(-scores, kind="stable")
+    places = poses[order, :3, :3] @ centroid + poses[order, :3, 3]
+    trace_limit = 1.0 + 2.0 * np.cos(np.radians(apart_deg))
+    kept: list[int] = []
+    for i in range(len(order)):
+        shift = np.linalg.norm(places[kept] - places[i], axis=1)
+        trace = np.einsum("kij,ij->k", poses[order[kept], :3, :3], poses[order[i], :3, :3])
+        if not ((shift < apart_mm) & (trace > trace_limit)).any():
+            kept.append(i)
+        if len(kept) == count:
+            break
+    return order[kept]
+
+
+def _support(poses: Array, found: Correspondences, radius_mm: float) -> Array:
+    """(K, C) the score of every correspondence that agrees with a pose, else 0."""
+    moved = found.source @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    squared = ((moved - found.target) ** 2).sum(axis=2)
+    return np.where(squared < radius_mm**2, found.score, 0.0)
+
+
+def _batched_kabsch(found: Correspondences, weights: Array) -> Array:
+    """Weighted SVD of all correspondences under each row of weights (K, C)."""
+    total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
+    p_mean, q_mean = weights @ found.source / total, weights @ found.target / total
+    products = (found.source[:, :, None] * found.target[:, None, :]).reshape(-1, 9)
+    covariance = (weights @ products / total).reshape(-1, 3, 3) - p_mean[:, :, None] * q_mean[:, None]
+    return _poses(covariance, p_mean, q_mean)
+
+
+def _kabsch(p: Array, q: Array, weights: Array) -> Array:
+    """Weighted SVD (Arun 1987) of K small sets: p, q (K, n, 3), weights (K, n)."""
+    w = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    p_mean, q_mean = (w * p).sum(axis=1), (w * q).sum(axis=1)
+    return _poses((w * (p - p_mean[:, None])).transpose(0, 2, 1) @ (q - q_mean[:, None]), p_mean, q_mean)
+
+
+def _poses(covariance: Array, p_mean: Array, q_mean: Array) -> Array:
+    u, _, vt = np.linalg.svd(covariance)
+    v = vt.transpose(0, 2, 1).copy()
+    v[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    poses = np.tile(np.eye(4), (len(covariance), 1, 1))
+    poses[:, :3, :3] = v @ u.transpose(0, 2, 1)
+    poses[:, :3, 3] = q_mean - np.einsum("kij,kj->ki", poses[:, :3, :3], p_mean)
+    return poses
+

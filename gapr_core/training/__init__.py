@@ -1,0 +1,1 @@
+"""Where the truth meets the network: targets, losses and the trainer."""

@@ -1,0 +1,134 @@
+"""What the network should have said: overlaps of patches and matches of fine points under the true motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import pad as pad_tensor
+
+from gapr_core.geometry import se3
+from gapr_core.model.pyramid import Frame
+from gapr_core.model.repositioning import move
+from gapr_core.model.types import Cloud, PatchPairs, collate, on_device
+
+Array = NDArray[np.float64]
+MOST_RADIUS_MM = 5.0
+POSITIVE_OVERLAP = 0.1
+
+
+@dataclass(frozen=True)
+class TrainingPair:
+    """One pair, or a batch of them, as the trainer sees it.
+
+    Attributes:
+        source, target: the clouds.
+        T: (B, 3, 4) true T_target_source in the clouds' units.
+        overlaps: (B, n, m) mean share of two patches' points that have a match in the other.
+        radius: (B,) matching radius in units.
+    """
+
+    source: Cloud
+    target: Cloud
+    T: Tensor
+    overlaps: Tensor
+    radius: Tensor
+
+    def to(self, device: torch.device | str) -> TrainingPair:
+        """The same on another device."""
+        return on_device(self, device)
+
+
+def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: Frame) -> TrainingPair:
+    """Joins two clouds of one frame with the truth (4, 4), mm."""
+    T = to_units(T_target_source, source, target)
+    radius = min(2.0 * frame.voxel, MOST_RADIUS_MM / frame.scale_mm)
+    overlaps = patch_overlaps(source, target, T, radius)
+    return TrainingPair(
+        source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius])
+    )
+
+
+def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:
+    """(4, 4) motion between the clouds' own unit coordinates from one in mm."""
+    scale = float(source.scale_mm[0])
+    T = np.array(T_target_source, dtype=np.float64)
+    T[:3, 3] = (se3.apply(T, source.centre_mm.numpy())[0] - target.centre_mm.numpy()[0]) / scale
+    return T
+
+
+def patch_overlaps(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[np.float32]:
+    """(n, m): for every two patches, the share of points with a match in the other, averaged over both sides."""
+    p = se3.apply(T, source.fine.points.numpy())
+    q = target.fine.points.double().numpy()
+    node_p, node_q = _nodes(source), _nodes(target)
+    matches = cKDTree(p).sparse_distance_matrix(cKDTree(q), radius, output_type="ndarray")
+    i, j = matches["i"], matches["j"]
+    kept = (node_p[i] >= 0) & (node_q[j] >= 0)
+    i, j = i[kept], j[kept]
+    shape = len(source.patches), len(target.patches)
+    hits_p = _hits(i, node_p[i], node_q[j], shape)
+    hits_q = _hits(j, node_q[j], node_p[i], shape[::-1]).T
+    size_p, size_q = (c.patches_valid.sum(1).clamp(min=1).numpy() for c in (source, target))
+    return (0.5 * (hits_p / size_p[:, None] + hits_q / size_q)).astype(np.float32)
+
+
+def _nodes(cloud: Cloud) -> NDArray[np.int64]:
+    """The patch of every fine point, -1 for those that no patch has room for."""
+    node = np.full(len(cloud.fine.points), -1, dtype=np.int64)
+    row, column = np.nonzero(cloud.patches_valid.numpy())
+    node[cloud.patches.numpy()[row, column]] = row
+    return node
+
+
+def _hits(point: NDArray[np.int64], own: NDArray[np.int64], other: NDArray[np.int64], shape: tuple[int, int]) -> Array:
+    """How many different points of each own patch have a match in each other patch."""
+    keys = np.unique(np.stack([point, own, other]), axis=1)
+    return np.bincount(keys[1] * shape[1] + keys[2], minlength=shape[0] * shape[1]).reshape(shape).astype(np.float64)
+
+
+def join(pairs: list[TrainingPair]) -> TrainingPair:
+    """A batch; overlaps are padded with zeros."""
+    n, m = (max(p.overlaps.shape[axis] for p in pairs) for axis in (1, 2))
+    overlaps = [pad_tensor(p.overlaps, (0, m - p.overlaps.shape[2], 0, n - p.overlaps.shape[1])) for p in pairs]
+    return TrainingPair(
+        collate([p.source for p in pairs]), collate([p.target for p in pairs]),
+        torch.cat([p.T for p in pairs]), torch.cat(overlaps), torch.cat([p.radius for p in pairs]),
+    )
+
+
+def true_patch_pairs(pair: TrainingPair, count: int, generator: torch.Generator) -> PatchPairs:
+    """Up to `count` patch pairs per pair of clouds, drawn from those that overlap by 10 % or more: the set C*."""
+    parts = []
+    start_p = start_q = 0
+    for b, (n, m) in enumerate(zip(pair.source.coarse.lengths, pair.target.coarse.lengths, strict=True)):
+        rows, columns = (pair.overlaps[b, :n, :m] > POSITIVE_OVERLAP).nonzero(as_tuple=True)
+        drawn = torch.randperm(len(rows), generator=generator)[:count].to(rows.device)
+        rows, columns = rows[drawn], columns[drawn]
+        score = pair.overlaps[b, rows, columns]
+        parts.append((torch.full_like(rows, b), rows + start_p, columns + start_q, score))
+        start_p, start_q = start_p + n, start_q + m
+    return PatchPairs(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+
+
+def fine_labels(
+    pair: TrainingPair, index_p: Tensor, index_q: Tensor, valid_p: Tensor, valid_q: Tensor, which: Tensor
+) -> Tensor:
+    """(P, a + 1, b + 1) bool: true matches of patch pairs, and the dustbin for existing points without any.
+
+    Args:
+        index_p, index_q: (P, a), (P, b) fine points of the patches. valid_*: which exist.
+        which: (P,) the pair of clouds that a patch pair belongs to.
+    """
+    p = move(pair.T[which], pair.source.fine.points[index_p])
+    q = pair.target.fine.points[index_q]
+    near = torch.cdist(p, q, compute_mode="donot_use_mm_for_euclid_dist") < pair.radius[which, None, None]
+    near &= valid_p[:, :, None] & valid_q[:, None]
+    labels = pad_tensor(near, (0, 1, 0, 1))
+    labels[:, :-1, -1] = ~near.any(2) & valid_p
+    labels[:, -1, :-1] = ~near.any(1) & valid_q
+    return labels

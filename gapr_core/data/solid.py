@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
@@ -167,6 +168,13 @@ def loft(z_low: float, z_high: float, reach: float, radius: Callable[[Grid, Grid
         return np.maximum(wall, np.maximum(z_low - z, z - z_high))
 
     return Shape(np.array([-reach, -reach, z_low]), np.array([reach, reach, z_high]), distance)
+
+
+def profile(stations: ArrayLike, values: ArrayLike) -> Callable[[Grid], Grid]:
+    """A smooth curve through `values` at increasing `stations`, without overshoot (PCHIP), constant beyond the ends."""
+    at = np.asarray(stations, dtype=np.float64)
+    curve = PchipInterpolator(at, np.asarray(values, dtype=np.float64))
+    return lambda z: np.asarray(curve(np.clip(z, at[0], at[-1])), dtype=np.float32)
 
 
 def half_space(point: ArrayLike, outward: ArrayLike, reach: float) -> Shape:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gapr_core.clouds import Surface
 from gapr_core.data.parameters import length, trait
-from gapr_core.data.solid import Grid, Solid, ball, ellipsoid, loft, tube, wheel
+from gapr_core.data.solid import Grid, Solid, ball, ellipsoid, loft, profile, tube, wheel
 
 Array = NDArray[np.float64]
 
@@ -56,12 +56,12 @@ def _shaft(solid: Solid, p: FemurParameters) -> None:
     half_width = np.array([33.0 * wide, 31.0 * wide, 26.5 * wide, 21.5 * wide, 1.22 * width, 1.04 * width, width,
                            1.03 * width, 1.2 * width, 1.42 * width, 1.3 * width])
     half_depth = p.shaft_roundness * width * np.array([1.5, 1.4, 1.25, 1.12, 1.04, 1.02, 1.0, 0.97, 1.0, 1.08, 1.0])
-    ridge = np.interp(stations, p.length_mm * np.array([0.2, 0.32, 0.66, 0.80]), [0.0, 1.0, 1.0, 0.0])
+    ridge = profile(p.length_mm * np.array([0.2, 0.32, 0.66, 0.80]), [0.0, p.linea_aspera_mm, p.linea_aspera_mm, 0.0])
+    a, b = profile(stations, half_width), profile(stations, half_depth)
 
     def radius(angle: Grid, z: Grid) -> Grid:
-        a, b, height = (np.interp(z, stations, v).astype(np.float32) for v in (half_width, half_depth, ridge))
-        oval = 1.0 / np.sqrt((np.cos(angle) / a) ** 2 + (np.sin(angle) / b) ** 2)
-        return oval + p.linea_aspera_mm * height * np.exp(-(((angle - np.pi / 2.0) / 0.28) ** 2))
+        oval = 1.0 / np.sqrt((np.cos(angle) / a(z)) ** 2 + (np.sin(angle) / b(z)) ** 2)
+        return oval + ridge(z) * np.exp(-(((angle - np.pi / 2.0) / 0.28) ** 2))
 
     solid.add(loft(stations[0], stations[-1], float(half_width.max()) + 3.0, radius), 0.0)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from gapr_ros import intake
 from gapr_ros.model import Model
 from gapr_ros.outcome import Outcome
 from gapr_ros.refusal import Reason
@@ -19,7 +18,10 @@ THROTTLE_S = 5.0
 
 @dataclass
 class Counters:
-    """Every cloud that was received is accepted, refused, dropped, or still on its way (two at most)."""
+    """Every cloud that was received is accepted, refused, dropped, or still on its way (two at most).
+
+    `lost` are those that a publisher sent and that never arrived.
+    """
 
     received: int = 0
     dropped: int = 0

@@ -174,7 +174,9 @@ def node_in_thread(method: Any, model_path: Path, **parameters: Any) -> Iterator
 class NodeProcess:
     """`python -m gapr_ros.register_node` as a process of its own."""
 
-    def __init__(self, folder: Path, *arguments: str, module: str = "gapr_ros.register_node", **parameters: Any) -> None:
+    def __init__(
+        self, folder: Path, *arguments: str, module: str = "gapr_ros.register_node", **parameters: Any
+    ) -> None:
         self.log_path = folder / f"{module}-{time.monotonic_ns()}.log"
         self._log = self.log_path.open("wb")
         given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={yaml_value(value)}")]

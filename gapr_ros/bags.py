@@ -1,0 +1,117 @@
+"""Opens rosbag2 bags (mcap or sqlite3) for replay: what is in them, what can be played, how it was offered."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosReliability
+from rosbags.rosbag2 import Reader
+
+
+class BagError(ValueError):
+    """A bag that cannot be played; the text says why."""
+
+
+@dataclass
+class Bag:
+    """An open bag: what it holds, as far as this machine knows the types.
+
+    Attributes:
+        connections: playable ones.
+        skipped: topic and reason of the others.
+        duration_s: from the first to the last message.
+        count: messages on the playable connections.
+    """
+
+    reader: Reader
+    connections: list[Connection]
+    types: dict[str, Any]
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last message."""
+        return max(0, self.reader.end_time - self.reader.start_time) * 1e-9
+
+    @property
+    def count(self) -> int:
+        """Messages on the playable connections."""
+        return sum(connection.msgcount for connection in self.connections)
+
+    def messages(self) -> Iterator[tuple[int, Connection, bytes]]:
+        """Time (ns), connection and CDR bytes, in the order of time.
+
+        Raises:
+            BagError: the rest of the bag cannot be read.
+        """
+        try:
+            for connection, stamp_ns, data in self.reader.messages(self.connections):
+                yield stamp_ns, connection, bytes(data)
+        except Exception as error:  # the storages raise errors of their own
+            raise BagError(f"{self.reader.path}: damaged: {error}") from error
+
+
+def open_bag(path: str | Path, topics: Sequence[str] = ()) -> Bag:
+    """Open a bag for replay; close its `reader` afterwards.
+
+    Raises:
+        BagError: no bag, a damaged one, a topic it does not have, or nothing in it that can be played.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f"{path}: no such file or folder")
+    try:
+        reader = Reader(path)
+        reader.open()
+    except Exception as error:  # rosbags lets errors of YAML, sqlite and zstd through
+        raise BagError(f"{path}: not a readable rosbag2: {error}") from error
+    bag = Bag(reader, [], {})
+    try:
+        _choose(bag, topics)
+    except BagError:
+        reader.close()
+        raise
+    return bag
+
+
+def _choose(bag: Bag, topics: Sequence[str]) -> None:
+    there = {connection.topic for connection in bag.reader.connections}
+    missing = sorted(set(topics) - there)
+    if missing:
+        raise BagError(f"{bag.reader.path}: no topic {', '.join(missing)}; it has {', '.join(sorted(there)) or 'none'}")
+    for connection in bag.reader.connections:
+        if topics and connection.topic not in topics:
+            continue
+        try:
+            bag.types[connection.msgtype] = import_type(connection.msgtype)
+            bag.connections.append(connection)
+        except (ImportError, AttributeError, ValueError) as error:
+            bag.skipped[connection.topic] = f"{connection.msgtype} cannot be imported ({error})"
+    if not bag.count:
+        raise BagError(
+            f"{bag.reader.path}: no messages to play" + "".join(f"; {t}: {w}" for t, w in bag.skipped.items())
+        )
+
+
+def import_type(name: str) -> Any:
+    """The message class of `package/msg/Name`."""
+    package, kind, message = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), message)
+
+
+def recorded_qos(profiles: Sequence[Qos]) -> QoSProfile:
+    """The QoS to publish with: what every recorded publisher offered; reliable, volatile, keep last 10 when unknown."""
+    reliable = all(p.reliability is not QosReliability.BEST_EFFORT for p in profiles)
+    latched = bool(profiles) and all(p.durability is QosDurability.TRANSIENT_LOCAL for p in profiles)
+    keep_all = any(p.history is QosHistory.KEEP_ALL for p in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
+        depth=max([p.depth for p in profiles if p.depth] or [10]),
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,171 @@
+"""Real bags, written and replayed over DDS."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from harness import DOMAIN, NodeProcess, Spinner, context, wait_until
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+from gapr_ros import bag_replay
+from gapr_ros.bag_replay import Replay, ReplayOptions
+from gapr_ros.bag_writing import BagWriter, offered
+from gapr_ros.bags import BagError, open_bag
+from msg_adapters import cloud_to_xyz
+
+START_NS = 1_700_000_000_250_000_000
+
+
+@pytest.fixture(scope="module", params=["mcap", "sqlite3"])
+def bag_path(request, tmp_path_factory):
+    """Ten clouds in 0.45 s, the i-th with i + 1 points, and two transforms."""
+    path = tmp_path_factory.mktemp("bags") / request.param
+    with BagWriter(path, request.param) as bag:
+        for i in range(10):
+            bag.write_cloud("/points", np.full((i + 1, 3), 0.1 * i), "probe", START_NS + 50_000_000 * i)
+            if i % 5 == 0:
+                bag.write("/pose_of_tool", TransformStamped(child_frame_id=f"tool{i}"), START_NS + 50_000_000 * i)
+    return path
+
+
+@pytest.fixture
+def listener():
+    spinner = Spinner(context())
+    node = Node("listener", context=spinner.context)
+    node.heard = {"clouds": [], "transforms": [], "clocks": [], "times": []}
+
+    def on_cloud(message):
+        node.heard["clouds"].append(message)
+        node.heard["times"].append(time.monotonic())
+
+    node.create_subscription(PointCloud2, "/points", on_cloud, 100)
+    node.create_subscription(TransformStamped, "/pose_of_tool", node.heard["transforms"].append, 100)
+    node.create_subscription(Clock, "/clock", lambda m: node.heard["clocks"].append(m.clock), 1000)
+    spinner.start(node)
+    yield node
+    spinner.close()
+
+
+def play(path, on_message=None, topics=(), **options):
+    ros = context()
+    node = Node("player", context=ros)
+    bag = open_bag(path, topics)
+    replay = Replay(node, bag, ReplayOptions(progress=False, wait_s=5.0, topics=topics, **options), on_message)
+    try:
+        return replay.run()
+    finally:
+        bag.reader.close()
+        ros.try_shutdown()
+
+
+def test_a_replayed_bag_arrives_whole_in_order_and_at_its_pace(bag_path, listener):
+    assert play(bag_path) == 12
+    heard = listener.heard
+    wait_until(lambda: len(heard["clouds"]) == 10 and len(heard["transforms"]) == 2)
+    assert [m.width for m in heard["clouds"]] == list(range(1, 11))
+    np.testing.assert_allclose(cloud_to_xyz(heard["clouds"][3]), np.full((4, 3), 0.3), atol=1e-7)
+    assert heard["clouds"][0].header.stamp.sec == 1_700_000_000
+    assert heard["clouds"][0].header.stamp.nanosec == 250_000_000
+    assert [m.child_frame_id for m in heard["transforms"]] == ["tool0", "tool5"]
+    assert heard["times"][-1] - heard["times"][0] == pytest.approx(0.45, abs=0.1)
+
+
+def test_rate_topics_and_clock_are_obeyed(bag_path, listener):
+    sent = []
+    start = time.monotonic()
+    assert (
+        play(bag_path, on_message=lambda *event: sent.append(event), topics=["/points"], rate=2.0, clock_hz=100.0) == 10
+    )
+    assert time.monotonic() - start < 3.0
+    wait_until(lambda: len(listener.heard["clouds"]) == 10 and len(listener.heard["clocks"]) >= 20)
+    assert not listener.heard["transforms"]
+    assert listener.heard["times"][-1] - listener.heard["times"][0] == pytest.approx(0.225, abs=0.08)
+    clocks = [m.sec + m.nanosec * 1e-9 for m in listener.heard["clocks"]]
+    assert clocks == sorted(clocks)
+    assert clocks[0] == pytest.approx(START_NS / 1e9, abs=0.1)
+    assert [topic for topic, _ in sent] == ["/points"] * 10
+
+
+def test_a_looped_bag_starts_over_until_it_is_interrupted(bag_path, listener, tmp_path):
+    player = NodeProcess(tmp_path, str(bag_path), "--loop", "--rate", "4", "--clock", module="gapr_ros.bag_replay")
+    wait_until(lambda: len(listener.heard["clouds"]) > 25, 20.0, player.log)
+    assert player.stop() == 0, player.log
+    clocks = [m.sec + m.nanosec * 1e-9 for m in listener.heard["clocks"]]
+    assert min(np.diff(clocks)) < -0.3, "time goes back when the bag starts over"
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_the_recorded_qos_is_offered(reliable, tmp_path, listener):
+    with BagWriter(tmp_path / "bag", qos=offered(reliable=reliable, latched=True, depth=3)) as bag:
+        bag.write_cloud("/qos", np.ones((1, 3)), "probe", START_NS)
+    ros = context()
+    node = Node("player", context=ros)
+    opened = open_bag(tmp_path / "bag")
+    Replay(node, opened, ReplayOptions())
+    info = wait_until(lambda: listener.get_publishers_info_by_topic("/qos"))[0].qos_profile
+    assert info.reliability is (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
+    assert info.durability is DurabilityPolicy.TRANSIENT_LOCAL
+    opened.reader.close()
+    ros.try_shutdown()
+
+
+def test_a_type_that_is_not_installed_is_left_out_and_said(bag_path, tmp_path, capfd):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_cloud("/points", np.ones((1, 3)), "probe", START_NS)
+        kind = "tf2_msgs/msg/TFMessage"
+        bag.write_raw("/tf", kind, b"\x00\x01\x00\x00\x00\x00\x00\x00", START_NS)
+    opened = open_bag(tmp_path / "bag")
+    try:
+        import tf2_msgs  # noqa: F401
+    except ImportError:
+        assert "tf2_msgs/msg/TFMessage" in opened.skipped["/tf"]
+        assert [c.topic for c in opened.connections] == ["/points"]
+    else:
+        assert not opened.skipped
+    opened.reader.close()
+
+
+def test_a_bag_that_cannot_be_played_is_one_clear_line(tmp_path, bag_path, capsys):
+    (tmp_path / "text.mcap").write_text("this is no bag")
+    (tmp_path / "text.db3").write_text("this is no bag either")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "yaml").mkdir()
+    (tmp_path / "yaml" / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 5}")
+    with BagWriter(tmp_path / "nothing"):
+        pass
+    bad = [["absent"], ["text.mcap"], ["text.db3"], ["empty"], ["yaml"], ["nothing"]]
+    for name, *arguments in [*bad, [str(bag_path), "--topics", "/other"]]:
+        assert bag_replay.main([str(tmp_path / name), *arguments]) == 1
+        error = capsys.readouterr().err
+        assert error.startswith("bag_replay: ") and error.count("\n") == 1 and "Traceback" not in error, error
+    assert "/points" in error, "an unknown topic is answered with the known ones"
+
+
+def test_a_bag_that_is_cut_off_plays_what_can_be_read(tmp_path, listener):
+    with BagWriter(tmp_path / "bag") as bag:
+        for i in range(20):
+            bag.write_cloud("/points", np.random.default_rng(i).random((2000, 3)), "probe", START_NS + 10_000_000 * i)
+    file = next((tmp_path / "bag").glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(BagError, match="damaged|not a readable"):
+        play(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "nan", "inf"])
+def test_a_rate_that_is_not_positive_is_refused(rate, bag_path):
+    with pytest.raises(SystemExit):
+        bag_replay.parse_arguments([str(bag_path), "--rate", rate])
+
+
+def test_an_existing_folder_is_not_overwritten_and_storages_are_named(tmp_path):
+    with pytest.raises(Exception, match="exists"), BagWriter(tmp_path):
+        pass
+    with pytest.raises(ValueError, match="mcap, sqlite3"):
+        BagWriter(tmp_path / "bag", "bag")
+    assert QoSProfile(depth=1) and 1 <= DOMAIN <= 101

@@ -1,1 +1,1 @@
-"""Judging methods on pairs, and pages that show what came out."""
+"""Judging methods: pairs x methods, tables, pictures, reports."""

@@ -45,7 +45,8 @@ def save_poster(
     figure = Figure(figsize=(11.0, 6.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13)
-    bone, below = np.ravel(figure.subfigures(2, 1, height_ratios=[1.15, 1.0]))
+    rows: Any = figure.subfigures(2, 1, height_ratios=[1.15, 1.0])
+    bone, below = rows
     _draw_bone(bone, target, points, distances_mm)
     all_axes = np.ravel(below.subplots(1, len(charts)))
     for axes, (name, (values, limit)) in zip(all_axes, charts.items(), strict=True):

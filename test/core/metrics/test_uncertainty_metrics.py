@@ -127,6 +127,9 @@ def test_bootstrap_of_a_mean_has_the_width_of_the_normal_approximation():
     low, high = interval(values)
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
     assert low < values.mean() < high and interval(values) == (low, high)
+    people = np.arange(400) // 4
+    assert interval(values, people, np.mean) == pytest.approx(interval(values, people))
+    assert interval(values, statistic=np.median) != (low, high)
 
 
 def test_pairs_of_one_person_do_not_count_as_independent():

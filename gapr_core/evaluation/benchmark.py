@@ -1,0 +1,198 @@
+"""`gapr benchmark`: pairs x methods to one table, plots and a report; resumable, parallel, sharded.
+
+    gapr benchmark --pairs DIR --methods gapr,kiss4,icp --out OUT [--shard 1/4] [--jobs 2]
+    gapr benchmark merge OUT_1 OUT_2 ... --out OUT
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from gapr_core.data.pair_files import load_pair, pair_hash
+from gapr_core.errors import ConfigError
+from gapr_core.evaluation import benchmark_report, records, runner, table, writers
+from gapr_core.evaluation.methods import OURS
+from gapr_core.evaluation.table import Row
+
+Record = dict[str, Any]
+Plan = dict[str, Any]
+DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """The options of `gapr benchmark`."""
+    parser.add_argument("merge", nargs="*", help="`merge DIR...`: join the outputs of several shards into --out")
+    parser.add_argument("--pairs", type=Path, help="folder of NAME.npz with source, target, transform, mm (gapr make-pairs)")
+    parser.add_argument("--methods", default=DEFAULT_METHODS, help=f"names with commas; {DEFAULT_METHODS}")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the table, the plots and the report")
+    parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")
+    parser.add_argument("--jobs", type=int, default=1, help="worker processes (1)")
+    parser.add_argument("--threads", type=int, default=1, help="cores for each worker (1)")
+    parser.add_argument("--ours", help="the method that the others are compared with (gapr, or the first one)")
+
+
+def run(args: Namespace) -> int:
+    """Run or merge as the arguments say, and say where the report is."""
+    if args.merge:
+        folders = [Path(name) for name in args.merge[1:]]
+        if args.merge[0] != "merge" or not folders:
+            raise ConfigError("merge DIR...", " ".join(args.merge), "name the folders to merge after the word merge")
+        rows = merge(folders, args.out)
+    else:
+        if args.pairs is None:
+            raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
+        methods = [name.strip() for name in args.methods.split(",") if name.strip()]
+        rows = benchmark(args.pairs, methods, args.out, _shard(args.shard), args.jobs, args.threads, args.ours)
+    print(f"{len(rows)} rows in {args.out / 'table.md'}; for people: {args.out / 'report.html'}")
+    return 0
+
+
+def benchmark(
+    pairs: Path, methods: Sequence[str], out: Path, shard: tuple[int, int] = (1, 1), jobs: int = 1, threads: int = 1,
+    ours: str | None = None,
+) -> list[Row]:
+    """Run what is not yet in `out`, then write table, plots and report there.
+
+    Args:
+        pairs: folder of NAME.npz (see `gapr_core.data.pair_files`).
+        methods: names that `methods.make` knows.
+        out: folder of the results; an interrupted run there is taken up again.
+        shard: (i, n): every n-th pair, beginning with the i-th, 1 to n.
+        jobs: worker processes.
+        threads: cores for each of them.
+        ours: the method the others are compared with.
+
+    Returns:
+        The rows of the table.
+
+    Raises:
+        ConfigError: no pairs, an unknown method, or results of other pairs in `out`.
+        MethodUnavailableError: a method whose library is not installed.
+    """
+    paths = sorted(path for path in pairs.glob("*.npz") if not path.name.startswith("."))
+    if not paths or not methods:
+        raise ConfigError("pairs NAME.npz and methods", f"{len(paths)} pairs in {pairs}, {len(methods)} methods",
+                          "make pairs with gapr make-pairs, name methods with --methods")  # fmt: skip
+    out.mkdir(parents=True, exist_ok=True)
+    plan = _plan(pairs, paths, methods, out, threads, ours)
+    known = records.read(out / records.FILE)
+    done = records.done(known, plan["pairs"])
+    records.write_plan(out, plan)
+    tasks = [runner.Task(path, method) for path in paths[shard[0] - 1 :: shard[1]] for method in methods]
+    open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
+    with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
+        for record in runner.run(open_tasks, jobs, threads):
+            records.append(out / records.FILE, {**record, "commit": plan["commit"]})
+            bar.set_postfix_str(f"{record['method']} {record['pair']}", refresh=False)
+            bar.update()
+    return write(out, plan)
+
+
+def merge(folders: Sequence[Path], out: Path) -> list[Row]:
+    """Join the results of shards of one run.
+
+    Raises:
+        ConfigError: a folder that is no output of a benchmark, or shards of different pairs.
+    """
+    plans = [records.read_plan(folder) for folder in folders]
+    pairs: dict[str, str] = {}
+    for folder, plan in zip(folders, plans, strict=True):
+        if any(pairs.setdefault(name, digest) != digest for name, digest in plan["pairs"].items()):
+            raise ConfigError("shards of the same pairs", f"other clouds in {folder}", "merge runs over one folder")
+    out.mkdir(parents=True, exist_ok=True)
+    methods = list(dict.fromkeys(name for plan in plans for name in plan["methods"]))
+    records.write_plan(out, {**plans[0], "pairs": pairs, "methods": methods, "command": _command()})
+    (out / records.FILE).unlink(missing_ok=True)
+    for record in records.sort([r for folder in folders for r in records.read(folder / records.FILE)], methods):
+        records.append(out / records.FILE, record)
+    return write(out, records.read_plan(out))
+
+
+def write(out: Path, plan: Plan) -> list[Row]:
+    """Table, plots and report of the records in `out`."""
+    found = records.sort(records.read(out / records.FILE), plan["methods"])
+    if not found:
+        raise ConfigError("results", f"none in {out}", "this shard has no pairs: use fewer shards")
+    rows, notes = table.rows(found, plan["methods"]), _notes(found, plan)
+    writers.write_json(out / "table.json", rows, plan)
+    writers.write_csv(out / "table.csv", rows)
+    writers.write_markdown(out / "table.md", rows, plan, notes)
+    benchmark_report.write(out, found, rows, plan, notes)
+    return rows
+
+
+def _plan(
+    pairs: Path, paths: Sequence[Path], methods: Sequence[str], out: Path, threads: int, ours: str | None
+) -> Plan:
+    hashes = {path.stem: pair_hash(load_pair(path)) for path in tqdm(paths, desc="reading pairs", disable=None)}
+    earlier = records.read_plan(out)["methods"] if (out / records.PLAN).is_file() else []
+    all_methods = list(dict.fromkeys([*earlier, *methods]))
+    return {
+        "command": _command(), "commit": _commit(), "machine": _machine(), "threads": threads,
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "ours": ours or (OURS if OURS in all_methods else all_methods[0]),
+        "methods": all_methods, "folder": str(pairs.resolve()), "pairs": hashes,
+    }  # fmt: skip
+
+
+def _notes(found: Sequence[Record], plan: Plan) -> list[str]:
+    """What a reader must know before the figures."""
+    notes = []
+    wanted, there = len(plan["pairs"]) * len(plan["methods"]), len(found)
+    if there < wanted:
+        notes.append(f"{wanted - there} of {wanted} results are missing: one shard, or an interrupted run.")
+    commits = sorted({r["commit"] for r in found})
+    if len(commits) > 1:
+        notes.append(f"Results of different commits: {', '.join(commits)}.")
+    failed = {f"{r['method']} on {r['pair']} ({r['reason']})" for r in found if r["status"] == "ERROR"}
+    return [*notes, *(f"Failed: {line}." for line in sorted(failed))]
+
+
+def _shard(text: str) -> tuple[int, int]:
+    try:
+        index, count = (int(part) for part in text.split("/"))
+    except ValueError:
+        index, count = 0, 0
+    if not 1 <= index <= count:
+        raise ConfigError("--shard i/n with 1 <= i <= n", repr(text), "for example --shard 2/4")
+    return index, count
+
+
+def _command() -> str:
+    return " ".join(["gapr", *sys.argv[1:]])
+
+
+def _commit() -> str:
+    """Commit of the source tree that runs, or the version of the installed package."""
+    here = Path(__file__).resolve().parent
+    asked = subprocess.run(
+        ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True
+    ) if _in_repository(here) else None  # fmt: skip
+    if asked and asked.returncode == 0:
+        return asked.stdout.strip()
+    try:
+        return f"version {version('gapr_ros')}"
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _in_repository(here: Path) -> bool:
+    return (here.parents[1] / ".git").exists()
+
+
+def _machine() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
+    return f"{model or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"

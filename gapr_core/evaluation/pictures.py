@@ -1,0 +1,79 @@
+"""The worst cases of one method as pictures: the bone, the source where the method put it, and where it belongs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from gapr_core.data.pair_files import load_pair
+from gapr_core.data.protocols import Pair
+from gapr_core.geometry import se3
+
+Array = NDArray[np.float64]
+Record = dict[str, Any]
+MOST_TARGET_POINTS, MOST_SOURCE_POINTS = 5000, 1500
+
+
+def worst(records: Sequence[Record], method: str, count: int = 10) -> list[Record]:
+    """False accepts first, the most confident of them first; then refused pairs that have a pose; then by RMSE."""
+    own = [r for r in records if r["method"] == method and (r["has_truth"] or r["accepted"])]
+    return sorted(own, key=_badness, reverse=True)[:count]
+
+
+def _badness(record: Record) -> tuple[float, float, float]:
+    kind = 2.0 if record["false_accept"] else 1.0 if not record["accepted"] else 0.0
+    return kind, record["confidence"] if kind == 2.0 else 0.0, record.get("rmse_mm") or 0.0
+
+
+def caption(record: Record) -> str:
+    """One line on what went wrong."""
+    head = f"{record['pair']} ({record['protocol']}, {record['bone']}): "
+    if not record["accepted"]:
+        return f"{head}refused, {record['status']}, confidence {record['confidence']:.2f}. {record['reason']}"
+    if not record["has_truth"]:
+        return f"{head}FALSE ACCEPT of a wrong pair, confidence {record['confidence']:.2f}"
+    kind = "FALSE ACCEPT" if record["false_accept"] else "right"
+    errors = f"{record['rte_mm']:.2f} mm, {record['rre_deg']:.2f}°, whole bone {record['whole_bone_mm']:.2f} mm"
+    return f"{head}{kind}, {errors}, confidence {record['confidence']:.2f}"
+
+
+def picture(record: Record, folder: Path) -> Figure:
+    """Two views along the bone's two shorter principal axes."""
+    pair = load_pair(folder / f"{record['file']}")
+    centre = pair.target.mean(axis=0)
+    axes = np.linalg.eigh((pair.target - centre).T @ (pair.target - centre))[1][:, ::-1].T
+    clouds = [((points - centre) @ axes.T, colour, size, name) for points, colour, size, name in _clouds(record, pair)]
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    for view, (across, up) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
+        _draw(view, clouds, across, up)
+    handles, labels = view.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False, markerscale=4)
+    return figure
+
+
+def _clouds(record: Record, pair: Pair) -> list[tuple[Array, str, float, str]]:
+    source = _thin(pair.source, MOST_SOURCE_POINTS)
+    clouds = [(_thin(pair.target, MOST_TARGET_POINTS), "#b9bec4", 1.0, "target")]
+    if pair.has_truth:
+        clouds.append((se3.apply(pair.T_target_source, source), "#0b5fa5", 2.0, "source, true pose"))
+    if record["transform"]:
+        clouds.append((se3.apply(record["transform"], source), "#d1495b", 2.0, "source, answer"))
+    return clouds
+
+
+def _draw(view: Axes, clouds: Sequence[tuple[Array, str, float, str]], across: int, up: int) -> None:
+    for points, colour, size, name in clouds:
+        view.scatter(points[:, across], points[:, up], s=size, c=colour, linewidths=0, label=name)
+    view.set(aspect="equal", xlabel=f"axis {across + 1}, mm", ylabel=f"axis {up + 1}, mm")
+    view.tick_params(labelsize=7)
+    view.spines[["top", "right"]].set_visible(False)
+
+
+def _thin(points: Array, most: int) -> Array:
+    return points[:: max(1, -(-len(points) // most))]

@@ -1,0 +1,139 @@
+"""Runs pairs x methods in worker processes and hands back one record each, whatever happens to a worker."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gapr_core.baselines import RegistrationMethod
+from gapr_core.data.pair_files import load_pair, pair_hash
+from gapr_core.data.protocols import Pair
+from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
+from gapr_core.evaluation import methods
+from gapr_core.evaluation.judge import failure_facts, answer_facts, judge, jsonable, pair_facts
+
+log = logging.getLogger(__name__)
+
+Record = dict[str, Any]
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_methods: dict[str, RegistrationMethod] = {}  # of this worker process, made at their first use
+
+
+class Task(NamedTuple):
+    """One pair for one method."""
+
+    path: Path
+    method: str
+
+
+def run(tasks: Sequence[Task], jobs: int = 1, threads: int = 1) -> Iterator[Record]:
+    """Records in the order in which they finish.
+
+    Each worker is a fresh process bound to `threads` cores, so that times can be compared and random numbers repeat.
+    When one dies (a crash inside a library), what was under way is tried again, each task alone; one that dies then
+    as well is recorded as a failure.
+    """
+    waiting = list(tasks)
+    while waiting:
+        lost: list[Task] = []
+        yield from _run_pool(waiting, jobs, threads, lost)
+        for task in lost:
+            deadly: list[Task] = []
+            yield from _run_pool([task], 1, threads, deadly)
+            if deadly:
+                yield _failure(task, load_pair(task.path), "the process died")
+
+
+def _run_pool(waiting: list[Task], jobs: int, threads: int, lost: list[Task]) -> Iterator[Record]:
+    """Take tasks off `waiting` until it is empty or the pool breaks; what was under way then goes to `lost`."""
+    context = multiprocessing.get_context("spawn")
+    under_way: dict[Future[Record], Task] = {}
+    with _environment(threads), ProcessPoolExecutor(jobs, context, _start, (context.Value("i", 0), threads)) as pool:
+        try:
+            while waiting or under_way:
+                while waiting and len(under_way) < jobs:
+                    task = waiting.pop(0)
+                    under_way[pool.submit(run_task, task)] = task
+                for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    yield future.result()
+                    del under_way[future]
+        except BrokenProcessPool:
+            names = (f"{task.method} on {task.path.stem}" for task in under_way.values())
+            log.warning("a worker process died during %s", " or ".join(names))
+            lost.extend(under_way.values())
+
+
+def run_task(task: Task) -> Record:
+    """Prepare, register and judge one pair; the first one of a method in this process is run twice to warm up."""
+    pair = load_pair(task.path)
+    check_truth(pair)
+    try:
+        if task.method not in _methods:
+            _methods[task.method] = methods.make(task.method)
+            _timed(_methods[task.method], pair)
+        result, times = _timed(_methods[task.method], pair)
+    except (ConfigError, MethodUnavailableError, WeightsError):
+        raise
+    except Exception as error:
+        log.warning("%s failed on %s", task.method, pair.name, exc_info=True)
+        return _failure(task, pair, f"{type(error).__name__}: {error}")
+    return _record(task, pair, {**answer_facts(result), **judge(pair, result), **times})
+
+
+def check_truth(pair: Pair) -> None:
+    """Raise `ConfigError` for a pair that cannot be judged."""
+    if not pair.has_truth and pair.protocol != "wrong":
+        raise ConfigError(
+            "a true `transform` (4, 4) in every pair", f"none in {pair.name}",
+            "add it, or protocol='wrong' where no pose is right; gapr evaluate runs pairs without truth",
+        )  # fmt: skip
+
+
+def _timed(method: RegistrationMethod, pair: Pair) -> tuple[Any, Record]:
+    start = time.perf_counter()
+    target = method.prepare(pair.target, "mm")
+    prepared = time.perf_counter()
+    result = method.register(pair.source, target)
+    return result, {"seconds": time.perf_counter() - prepared, "prepare_seconds": prepared - start}
+
+
+def _failure(task: Task, pair: Pair, reason: str) -> Record:
+    return _record(task, pair, {**failure_facts(reason), **judge(pair, None), "seconds": None, "prepare_seconds": None})
+
+
+def _record(task: Task, pair: Pair, facts: Record) -> Record:
+    head = {"pair": task.path.stem, "file": task.path.name, "method": task.method, "sha256": pair_hash(pair)}
+    return jsonable({**pair_facts(pair), **head, **facts})
+
+
+def _start(counter: Any, threads: int) -> None:
+    """Bind this worker to its own cores, as far as there are enough."""
+    with counter.get_lock():
+        number = counter.value
+        counter.value += 1
+    if hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        first = number * threads % len(cores)
+        os.sched_setaffinity(0, {cores[(first + k) % len(cores)] for k in range(threads)})
+
+
+class _environment:
+    """Thread counts that libraries read when a worker imports them; put back afterwards."""
+
+    def __init__(self, threads: int) -> None:
+        self.wanted = dict.fromkeys(THREAD_VARIABLES, str(threads))
+
+    def __enter__(self) -> None:
+        self.before = {name: os.environ.get(name) for name in self.wanted}
+        os.environ.update(self.wanted)
+
+    def __exit__(self, *_: object) -> None:
+        for name, value in self.before.items():
+            os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)

@@ -1,0 +1,126 @@
+"""Records to rows: one per protocol, bone and method, with `all` for the sum over bones and over protocols."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gapr_core import metrics
+from gapr_core.metrics.confidence import SURE
+
+Record = dict[str, Any]
+Row = dict[str, Any]
+ALL = "all"
+KEYS = ("protocol", "bone", "method")
+TIMES = ("seconds", "seconds_p90", "prepare_seconds")  # what may differ between two runs of one command
+RECALLS = {"rr_paper": "within_paper", "rr_1_1": "within_1_1", "rr_2_2": "within_2_2", "rr_4_5": "within_4_5"}
+
+
+def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
+    """The table, grouped by protocol, then bone (`all` last), then the methods in the order given."""
+    protocols = sorted({r["protocol"] for r in records})
+    table = []
+    for protocol in [*protocols, ALL] if len(protocols) > 1 else protocols:
+        of_protocol = [r for r in records if protocol in (ALL, r["protocol"])]
+        for bone in _bones(of_protocol):
+            of_bone = [r for r in of_protocol if bone in (ALL, r["bone"])]
+            for method in methods:
+                chosen = [r for r in of_bone if r["method"] == method]
+                if chosen:
+                    table.append({"protocol": protocol, "bone": bone, "method": method, **summary(chosen)})
+    return table
+
+
+def summary(records: Sequence[Record]) -> Row:
+    """Every figure of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
+    row: Row = {"pairs": len(records), "persons": len({r["person"] for r in records})}
+    row |= _answers(records) | _accuracy([r for r in records if r["has_truth"]])
+    row |= _calibration(records) | _uncertainty([r for r in records if r.get("right")]) | _times(records)
+    return {key: _rounded(value) for key, value in row.items()}
+
+
+def people(records: Sequence[Record]) -> list[str] | None:
+    """Who each pair is of, for the bootstrap; None unless that is known of all."""
+    named = [r["person"] for r in records]
+    return named if all(named) else None
+
+
+def _bones(records: Sequence[Record]) -> list[str]:
+    bones = sorted({r["bone"] for r in records})
+    return [*bones, ALL] if len(bones) > 1 else bones
+
+
+def _answers(records: Sequence[Record]) -> Row:
+    accepted, wrong = [r["accepted"] for r in records], [r["false_accept"] for r in records]
+    sure = [r["false_accept"] and r["confidence"] >= SURE for r in records]
+    low, high = metrics.interval(wrong, people(records))
+    return {
+        "accepted": sum(accepted), "refused": len(records) - sum(accepted),
+        "errors": sum(r["status"] == "ERROR" for r in records), "false_accepts": sum(wrong),
+        "false_accepts_sure": sum(sure), "false_accept_rate": np.mean(wrong), "false_accept_rate_low": low,
+        "false_accept_rate_high": high,
+    }  # fmt: skip
+
+
+def _accuracy(records: Sequence[Record]) -> Row:
+    """Over ALL pairs that have a truth: refusals are no success, and count with their stand-in pose in the errors."""
+    row: Row = {"pairs_with_truth": len(records)}
+    for name, key in RECALLS.items():
+        row[name] = metrics.recall([r[key] for r in records])
+        row[f"{name}_low"], row[f"{name}_high"] = metrics.interval([r[key] for r in records], people(records))
+    rmse = _values(records, "rmse_mm")
+    judged, true = [r["judged"] for r in records], [r["true"] for r in records]
+    return row | {
+        "rmse_mm": _of(np.mean, rmse), "rmse_median_mm": _of(np.median, rmse),
+        "chamfer_mm": _of(np.mean, _values(records, "chamfer_mm")),
+        "r2_rotation": metrics.r2_rotation(judged, true) if records else None,
+        "r2_translation": metrics.r2_translation(judged, true) if records else None,
+        "rte_median_mm": _of(np.median, _values(records, "rte_mm")),
+        "rre_median_deg": _of(np.median, _values(records, "rre_deg")),
+        "whole_bone_median_mm": _of(np.median, _values(records, "whole_bone_mm")),
+        "tre_worst_median_mm": _of(np.median, [max(r["tre_mm"].values()) for r in records]),
+    }  # fmt: skip
+
+
+def _calibration(records: Sequence[Record]) -> Row:
+    known = [r for r in records if r["best_right"] is not None]
+    confidence, right = _values(known, "confidence"), [r["best_right"] for r in known]
+    return {
+        "auroc": metrics.auroc(confidence, right) if known else None,
+        "ece": metrics.expected_calibration_error(confidence, right) if known else None,
+    }  # fmt: skip
+
+
+def _uncertainty(right: Sequence[Record]) -> Row:
+    """Of the right answers alone: a wrong basin has no meaningful covariance and no distance to the bound."""
+    nees, ratio = _values(right, "nees"), _values(right, "bound_ratio")
+    return {
+        "nees_6": _of(np.mean, nees / 6.0), "nees_6_median": _of(np.median, nees / 6.0),
+        "bound_rmse_mm": _of(np.median, _values(right, "bound_rmse_mm")),
+        "bound_ratio": _of(lambda r: np.sqrt(np.mean(r**2)), ratio), "bound_ratio_median": _of(np.median, ratio),
+    }  # fmt: skip
+
+
+def _times(records: Sequence[Record]) -> Row:
+    seconds = _values(records, "seconds")
+    return {
+        "seconds": _of(np.median, seconds), "seconds_p90": _of(lambda s: np.percentile(s, 90), seconds),
+        "prepare_seconds": _of(np.median, _values(records, "prepare_seconds")),
+    }  # fmt: skip
+
+
+def _values(records: Sequence[Record], key: str) -> np.ndarray:
+    return np.array([r[key] for r in records if r.get(key) is not None], dtype=np.float64)
+
+
+def _of(statistic: Callable[[Any], Any], values: Any) -> float | None:
+    return float(statistic(values)) if len(values) else None
+
+
+def _rounded(value: Any) -> Any:
+    """Six significant digits, so that summation order cannot show; None for NaN."""
+    if isinstance(value, float | np.floating):
+        return None if not np.isfinite(value) else float(f"{value:.6g}")
+    return value

@@ -28,6 +28,7 @@ class ModelConfig:
         fine_scores: `dot` (eq. 9) or `cosine` with a learnable temperature.
         norm: `group` (statistics over each cloud) or `layer` (each point by itself).
         mlp_projections: a hidden layer before W^Q, W^K and W^V, as the paper's "separate MLP projections".
+        pair_width: channels of the hidden layer between a pair's geometry and r_ij; 0 for as many as the features have.
         stages: encoder stages, the bottleneck included.
         width: channels of the first stage; doubled at each further one.
         global_width: channels of the global aggregation.
@@ -61,20 +62,21 @@ class ModelConfig:
     fine_scores: str = "cosine"
     norm: str = "group"
     mlp_projections: bool = False
+    pair_width: int = 32
     stages: int = 4
     width: int = 32
     global_width: int = 128
     heads: int = 4
     global_layers: int = 3
-    superpoints: tuple[int, int] = (90, 140)
+    superpoints: tuple[int, int] = (75, 110)
     voxel_growth: float = 1.6
-    neighbors: tuple[int, ...] = (20, 20, 20, 20)
+    neighbors: tuple[int, ...] = (16, 16, 16, 16)
     radius_voxels: float = 2.5
     sigma_voxels: float = 2.0
     small_ball: float = 0.5
     fine_stage: int = 0
     patch_size: int = 32
-    train_pairs: int = 64
+    train_pairs: int = 32
     test_pairs: int = 128
     sinkhorn_iterations: int = 20
     mutual_k: int = 3

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 T = TypeVar("T")
@@ -29,6 +31,10 @@ class Neighborhood:
     c_k: Tensor
     radius: Tensor
 
+    def turned(self, R: Tensor) -> Neighborhood:
+        """The same neighbours after a turn by R (3, 3)."""
+        return replace(self, c_h=self.c_h @ R.T, c_k=self.c_k @ R.T)
+
 
 @dataclass(frozen=True)
 class Level:
@@ -51,6 +57,13 @@ class Level:
     within: Neighborhood
     below: Neighborhood | None
     up: Tensor | None
+
+    def turned(self, R: Tensor) -> Level:
+        """The same level turned by R (3, 3)."""
+        below = self.below.turned(R) if self.below is not None else None
+        return replace(
+            self, points=self.points @ R.T, normals=self.normals @ R.T, within=self.within.turned(R), below=below
+        )
 
 
 @dataclass(frozen=True)
@@ -89,6 +102,12 @@ class Cloud:
     def to(self, device: torch.device | str) -> Cloud:
         """The same on another device."""
         return on_device(self, device)
+
+    def turned(self, T: NDArray[np.float64]) -> Cloud:
+        """One cloud after a rigid motion (4, 4), mm; nothing is searched again."""
+        R = torch.from_numpy(T[:3, :3]).float()
+        centre = self.centre_mm @ torch.from_numpy(T[:3, :3]).T + torch.from_numpy(T[:3, 3])
+        return replace(self, levels=tuple(level.turned(R) for level in self.levels), centre_mm=centre)
 
 
 @dataclass(frozen=True)
@@ -174,9 +193,11 @@ def _join_levels(pyramids: list[tuple[Level, ...]], depth: int) -> Level:
 
 
 def _join(parts: list[Neighborhood], starts: list[int]) -> Neighborhood:
+    width = max(p.index.shape[1] for p in parts)
     return Neighborhood(
-        torch.cat([p.index + start for p, start in zip(parts, starts, strict=True)]),
-        *(torch.cat([getattr(p, name) for p in parts]) for name in ("valid", "c_h", "c_k", "radius")),
+        torch.cat([_pad(p.index, width) + start for p, start in zip(parts, starts, strict=True)]),
+        torch.cat([_pad(p.valid, width) for p in parts]),
+        *(torch.cat([getattr(p, name) for p in parts]) for name in ("c_h", "c_k", "radius")),
     )
 
 

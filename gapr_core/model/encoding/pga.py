@@ -14,10 +14,10 @@ from gapr_core.model.pgf import EMBEDDED
 class PGAEncoder(nn.Module):
     """l_ij -> MLP -> r_ij; local, global and cross alike, since `Pairs` brings the right ball centroids."""
 
-    def __init__(self, dim: int, in_values: bool) -> None:
+    def __init__(self, dim: int, hidden: int, in_values: bool) -> None:
         super().__init__()
-        self.first = nn.Sequential(nn.Linear(EMBEDDED, dim), nn.ReLU())
-        self.relative = RelativeEncoder(dim, dim, in_values)
+        self.first = nn.Sequential(nn.Linear(EMBEDDED, hidden), nn.ReLU())
+        self.relative = RelativeEncoder(hidden, dim, in_values)
 
     def forward(self, pairs: Pairs) -> PairEncoding:
         return self.relative(self.first(pairs.pgf))
@@ -25,4 +25,5 @@ class PGAEncoder(nn.Module):
 
 def layer(dim: int, config: ModelConfig) -> nn.Module:
     """self-PGA, or cross-PGA when the pairs are across clouds."""
-    return TransformerLayer(dim, config.heads, PGAEncoder(dim, config.values_encoded), config.mlp_projections)
+    encoder = PGAEncoder(dim, config.pair_width or dim, config.values_encoded)
+    return TransformerLayer(dim, config.heads, encoder, config.mlp_projections)

@@ -30,10 +30,10 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 class PPFEncoder(nn.Module):
     """PPF of every pair through an MLP, added to keys and values."""
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
-        self.first = nn.Sequential(nn.Linear(4, dim), nn.ReLU())
-        self.relative = RelativeEncoder(dim, dim, in_values=True)
+        self.first = nn.Sequential(nn.Linear(4, hidden), nn.ReLU())
+        self.relative = RelativeEncoder(hidden, dim, in_values=True)
 
     def forward(self, pairs: Pairs) -> PairEncoding:
         return self.relative(self.first(point_pair_features(pairs)))
@@ -41,4 +41,4 @@ class PPFEncoder(nn.Module):
 
 def layer(dim: int, config: ModelConfig) -> nn.Module:
     """RoITr's PPF attention."""
-    return TransformerLayer(dim, config.heads, PPFEncoder(dim), config.mlp_projections)
+    return TransformerLayer(dim, config.heads, PPFEncoder(dim, config.pair_width or dim), config.mlp_projections)

@@ -1,0 +1,77 @@
+"""Weights as safetensors: configuration, data card and checksum in the header; strict, and no pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gapr_core.errors import ConfigError, WeightsError
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
+
+FORMAT = "gapr-net/1"
+
+
+def save(
+    network: GAPRNet, path: str | Path, card: dict[str, Any] | None = None, dtype: torch.dtype = torch.float32
+) -> str:
+    """Write a network; returns the sha256 of its tensors.
+
+    Args:
+        network: what to write.
+        path: `*.safetensors`.
+        card: what it was trained on, licences, splits, figures: anything that JSON takes.
+        dtype: float32, or float16 for half the size.
+    """
+    tensors = {name: t.detach().to("cpu", dtype).contiguous() for name, t in network.state_dict().items()}
+    digest = checksum(tensors)
+    header = {
+        "format": FORMAT, "config": json.dumps(network.config.to_dict()), "card": json.dumps(card or {}),
+        "sha256": digest,
+    }
+    save_file(tensors, str(path), metadata=header)
+    return digest
+
+
+def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet, dict[str, Any]]:
+    """The network that a file describes, in evaluation mode, and its card.
+
+    Raises:
+        WeightsError: the file is missing, damaged, of another format, or does not fit its own configuration.
+    """
+    header, tensors = _read(path)
+    if header.get("format") != FORMAT:
+        raise WeightsError(f"weights of format {FORMAT}", f"{header.get('format')} in {path}", "export them again")
+    if checksum(tensors) != header.get("sha256"):
+        raise WeightsError("tensors with the checksum of the header", f"others in {path}", "fetch the file again")
+    try:
+        network = GAPRNet(ModelConfig.from_dict(json.loads(header["config"])))
+        network.load_state_dict({name: t.float() for name, t in tensors.items()}, strict=True)
+    except (ConfigError, RuntimeError, KeyError, TypeError) as error:
+        raise WeightsError("weights that fit their configuration", f"{path}: {error}", "export them again") from error
+    return network.to(device).eval(), json.loads(header.get("card", "{}"))
+
+
+def checksum(tensors: dict[str, Tensor]) -> str:
+    """sha256 over names and bytes, in the order of the names."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        digest.update(name.encode())
+        digest.update(tensors[name].contiguous().view(torch.uint8).numpy().tobytes() if tensors[name].dim()
+                      else tensors[name].numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: str | Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}
+    except (OSError, SafetensorError) as error:
+        raise WeightsError("a readable safetensors file", f"{path}: {error}", "check the path") from error

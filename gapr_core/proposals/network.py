@@ -1,0 +1,97 @@
+"""Proposals of GAPR-Net: correspondences, then consensus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.model.network import GAPRNet
+from gapr_core.model.pyramid import Frame, build_cloud, target_frame
+from gapr_core.model.types import Cloud, Features, Matches
+from gapr_core.proposals.base import Proposals
+from gapr_core.proposals.consensus import Correspondences, local_to_global, ransac
+from gapr_core.source import PreparedSource
+from gapr_core.target import PreparedTarget
+
+Array = NDArray[np.float64]
+METHODS = ("local_to_global", "ransac")
+
+
+class NetworkProposer:
+    """Poses from the correspondences of a trained network.
+
+    Args:
+        network: in evaluation mode, on any device.
+        method: `local_to_global`, or `ransac` as the paper says.
+        count: most poses for one pair.
+        weights_name: what the target's share of the work is kept under, beside the configuration's name.
+    """
+
+    def __init__(
+        self, network: GAPRNet, method: str = "local_to_global", count: int = 32, weights_name: str = ""
+    ) -> None:
+        if method not in METHODS:
+            raise ConfigError(f"method one of {', '.join(METHODS)}", repr(method), "choose one of these")
+        self.network, self.method, self.count = network.eval(), method, count
+        self.name = "network"
+        self._key = f"network {weights_name or id(network)}"
+
+    @classmethod
+    def from_weights(cls, path: str | Path, device: str = "cpu", **options: Any) -> NetworkProposer:
+        """The network in a safetensors file.
+
+        Raises:
+            WeightsError: the file is missing, damaged or of another format.
+        """
+        from gapr_core.model import weights
+
+        return cls(weights.load(path, device)[0], weights_name=str(path), **options)
+
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+        """Distinct poses, best first; none where the source is too small or too large for the network."""
+        frame, cloud, features = self.prepare(target)
+        try:
+            moving = build_cloud(source.points, frame, self.network.config)
+        except InvalidPointCloudError:
+            return Proposals(np.empty((0, 4, 4)), np.empty(0))
+        found = self.match(moving, cloud, features)
+        radius_mm = 2.0 * min(2.0 * frame.voxel * frame.scale_mm, 5.0)
+        if self.method == "ransac":
+            return Proposals(*ransac(found, radius_mm, rng, count=self.count))
+        return Proposals(*local_to_global(found, radius_mm, count=self.count))
+
+    def prepare(self, target: PreparedTarget) -> tuple[Frame, Cloud, Features]:
+        """The target's share: its pyramid and its features, computed once and kept with it."""
+        import torch
+
+        if self._key not in target.cache:
+            frame = target_frame(target.points, self.network.config)
+            cloud = build_cloud(target.points, frame, self.network.config)
+            with torch.inference_mode():
+                features = self.network.backbone(cloud.to(self._device))
+            target.cache[self._key] = frame, cloud, features
+        return target.cache[self._key]
+
+    def match(self, source: Cloud, target: Cloud, features: Features) -> Correspondences:
+        """Correspondences in mm, from clouds on the CPU."""
+        import torch
+
+        with torch.inference_mode():
+            output = self.network(source.to(self._device), target.to(self._device), features)
+        return correspondences_mm(output.matches, source, target)
+
+    @property
+    def _device(self) -> Any:
+        return next(self.network.parameters()).device
+
+
+def correspondences_mm(matches: Matches, source: Cloud, target: Cloud) -> Correspondences:
+    """Matches of a single pair, from the clouds' units to mm."""
+    scale = float(source.scale_mm[0])
+    p = matches.source.double().cpu().numpy() * scale + source.centre_mm.cpu().numpy()
+    q = matches.target.double().cpu().numpy() * scale + target.centre_mm.cpu().numpy()
+    return Correspondences(p, q, matches.score.double().cpu().numpy(), matches.patch.cpu().numpy())

@@ -1,0 +1,58 @@
+"""The state of a run as one safetensors file: nothing in it can execute."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gapr_core.errors import WeightsError
+from gapr_core.model.network import GAPRNet
+
+
+def save_checkpoint(
+    path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer, state: dict[str, Any]
+) -> None:
+    """Write weights, averaged weights, moments of AdamW and `state`; the old file stays until the new one is whole."""
+    tensors = {f"network.{name}": t for name, t in network.state_dict().items()}
+    tensors |= {f"ema.{name}": t for name, t in ema.state_dict().items()}
+    for index, moments in optimizer.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": t for name, t in moments.items()}
+    new = path.with_suffix(".new")
+    contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+    save_file(contiguous, str(new), metadata={"state": json.dumps(state)})
+    os.replace(new, path)
+
+
+def load_checkpoint(
+    path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer
+) -> dict[str, Any]:
+    """Fill network, averaged network and optimiser; returns the state.
+
+    Raises:
+        WeightsError: the checkpoint is of another configuration.
+    """
+    with safe_open(str(path), framework="pt") as file:
+        state = json.loads(file.metadata()["state"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
+    try:
+        network.load_state_dict(_under(tensors, "network."))
+        ema.load_state_dict(_under(tensors, "ema."))
+    except RuntimeError as error:
+        raise WeightsError("a checkpoint of this configuration", f"{path}: {error}", "choose another folder") from error
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in _under(tensors, "adam.").items():
+        index, key = name.split(".")
+        moments.setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+    return state
+
+
+def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}

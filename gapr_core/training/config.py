@@ -1,0 +1,91 @@
+"""Settings of a training run; `config/train.yaml` holds only what differs from these defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gapr_core.errors import ConfigError
+
+
+def _default_mix() -> dict[str, float]:
+    return {"L1": 0.2, "L2": 0.3, "L3": 0.25, "paper": 0.15, "incomplete": 0.1}
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run; two runs with the same entries on one CPU thread are equal bit by bit.
+
+    Attributes:
+        model: path of a yaml in `config/model`; empty for the defaults (`best`).
+        bones: bone types.
+        mix: protocols and how often each is drawn.
+        pairs: length of the schedule, in pairs.
+        batch: pairs per optimiser step, over all processes.
+        micro_batch: pairs per forward pass, by concatenation; gradients accumulate up to `batch`.
+        learning_rate, weight_decay, clip: AdamW, and the limit on the gradient's norm.
+        warmup: share of the schedule with a rising learning rate; a cosine falls from there to `final_rate` of it.
+        ema: decay of the averaged weights, which are what is validated and exported.
+        pool: how many bones are in use at once; each serves `reuse` pairs before the next person comes in.
+        synthetic: share of bones that are drawn from the shape model instead of being a person of the split.
+        seed: of weights, bones, pairs and patches.
+        workers: processes that make pairs; 0 makes them in the training process.
+        precision: `float32` or `bfloat16` (autocast).
+        device: `auto`, `cpu` or `cuda`.
+        checkpoint_minutes, validate_minutes: how often.
+        validation_pairs: per protocol of the mix.
+    """
+
+    model: str = ""
+    bones: tuple[str, ...] = ("femur", "tibia", "pelvis", "thoracic")
+    mix: dict[str, float] = field(default_factory=_default_mix)
+    pairs: int = 24_000
+    batch: int = 8
+    micro_batch: int = 4
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    warmup: float = 0.03
+    final_rate: float = 0.01
+    ema: float = 0.995
+    pool: int = 128
+    reuse: int = 16
+    synthetic: float = 0.7
+    seed: int = 0
+    workers: int = 0
+    precision: str = "float32"
+    device: str = "auto"
+    checkpoint_minutes: float = 3.0
+    validate_minutes: float = 10.0
+    validation_pairs: int = 8
+
+    def __post_init__(self) -> None:
+        if self.batch % self.micro_batch:
+            raise ConfigError("a batch of whole micro-batches", f"{self.batch} and {self.micro_batch}", "make them fit")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ConfigError("precision float32 or bfloat16", self.precision, "choose one")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
+        """The defaults with `values` over them.
+
+        Raises:
+            ConfigError: for a key that does not exist.
+        """
+        unknown = sorted(set(values) - {f.name for f in fields(cls)})
+        if unknown:
+            raise ConfigError("keys of TrainConfig", ", ".join(unknown), "mend the names")
+        return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> TrainConfig:
+        """The defaults with a yaml's entries over them."""
+        return cls.from_dict(yaml.safe_load(Path(path).read_text()) or {})
+
+    def to_dict(self) -> dict[str, Any]:
+        """All entries, as `from_dict` takes them."""
+        return asdict(self)

@@ -1,0 +1,184 @@
+"""Train the network: the whole run on one screen.
+
+One process on a CPU or a GPU, several under `torchrun`: the same call. Stop it at any time and call it again.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from gapr_core.errors import ConfigError
+from gapr_core.model import weights
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
+from gapr_core.training import distributed
+from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
+from gapr_core.training.config import TrainConfig
+from gapr_core.training.dataset import TrainingPairs, one_thread
+from gapr_core.training.losses import Losses, compute_losses
+from gapr_core.training.targets import TrainingPair
+from gapr_core.training.validation import validate, validation_set
+
+
+def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: float = math.inf, card: Any = None) -> Path:
+    """Run until the schedule ends or `minutes` are over, from where the last call in `folder` stopped.
+
+    Args:
+        config: the run; must be the one that `folder` was begun with.
+        folder: gets config.json, checkpoint.safetensors, log.csv, validation.csv and weights.safetensors.
+        anatomy: real bones for training and validation; None for parametric ones.
+        minutes: budget of this call.
+        card: goes into the header of the weights.
+
+    Returns:
+        The averaged weights, ready for `NetworkProposer`.
+    """
+    rank, world, device = distributed.start(config.device)
+    model = ModelConfig.from_yaml(config.model) if config.model else ModelConfig()
+    settle(folder, config, model, rank)
+    torch.manual_seed(config.seed)
+    network, ema = GAPRNet(model).to(device), GAPRNet(model).to(device)
+    ema.load_state_dict(network.state_dict())
+    optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    state = {"step": 0, "seconds": 0.0}
+    if (folder / "checkpoint.safetensors").exists():
+        state = load_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer)
+    steps = config.pairs // config.batch
+    per_step = config.batch // config.micro_batch // world
+    batches = micro_batches(config, model, anatomy, state["step"] * config.batch // config.micro_batch, rank, world)
+    held_out = validation_set(config, model, anatomy) if rank == 0 else []
+    begun, saved, validated = time.monotonic(), time.monotonic(), time.monotonic()
+    earlier = state["seconds"]
+
+    progress = tqdm(range(state["step"], steps), initial=state["step"], total=steps, disable=rank > 0 or None, unit="step")
+    for step in progress:
+        rate = learning_rate(config, step / steps)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        parts = []
+        for part in range(per_step):
+            generator = torch.Generator().manual_seed(config.seed + 7919 * (step * per_step + part) + rank)
+            losses = forward(network, next(batches).to(device), generator, config.precision)
+            (losses.total / (per_step * world)).backward()
+            parts.append(losses)
+        distributed.sum_gradients(network, world)
+        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip)
+        if torch.isfinite(norm):
+            optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        average(ema, network, min(config.ema, (1 + step) / (10 + step)))
+
+        state = {"step": step + 1, "seconds": earlier + time.monotonic() - begun}
+        row = log_row(state, config, rate, float(norm), parts)
+        progress.set_postfix(loss=row["loss"], coarse=row["coarse"], fine=row["fine"])
+        last = step + 1 == steps or time.monotonic() - begun > 60.0 * minutes
+        if rank == 0:
+            append(folder / "log.csv", row)
+            if last or time.monotonic() - validated > 60.0 * config.validate_minutes:
+                validated = time.monotonic()
+                report(folder, ema, held_out, state, config, device)
+            if last or time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
+                saved = time.monotonic()
+                save_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer, state)
+                weights.save(ema, folder / "weights.safetensors", {**(card or {}), "run": config.to_dict(), **state})
+        if distributed.agree(last, world):
+            break
+    distributed.stop(world)
+    return folder / "weights.safetensors"
+
+
+def forward(network: GAPRNet, pair: TrainingPair, generator: torch.Generator, precision: str) -> Losses:
+    """The losses of one micro-batch, in bfloat16 where asked for."""
+    device = pair.T.device.type
+    with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
+        return compute_losses(network, pair, generator)[0]
+
+
+def micro_batches(
+    config: TrainConfig, model: ModelConfig, anatomy: Path | None, first: int, rank: int, world: int
+) -> Iterator[TrainingPair]:
+    """This process's share of the micro-batches, in order, from number `first` on."""
+    dataset = TrainingPairs(config, model, anatomy)
+    numbers = range(first + rank, config.pairs // config.micro_batch, world)
+    loader = DataLoader(
+        dataset, batch_size=None, sampler=list(numbers), num_workers=config.workers, worker_init_fn=one_thread,
+        prefetch_factor=4 if config.workers else None, multiprocessing_context="fork" if config.workers else None,
+    )
+    return iter(loader)
+
+
+def learning_rate(config: TrainConfig, progress: float) -> float:
+    """Linear warm-up, then a cosine; `progress` from 0 to 1."""
+    if progress < config.warmup:
+        return config.learning_rate * (progress + 1e-3) / config.warmup
+    fallen = 0.5 * (1.0 + math.cos(math.pi * (progress - config.warmup) / (1.0 - config.warmup)))
+    return config.learning_rate * (config.final_rate + (1.0 - config.final_rate) * fallen)
+
+
+@torch.no_grad()
+def average(ema: GAPRNet, network: GAPRNet, decay: float) -> None:
+    """Exponential moving average of the weights."""
+    for kept, new in zip(ema.parameters(), network.parameters(), strict=True):
+        kept.lerp_(new, 1.0 - decay)
+
+
+def settle(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> None:
+    """Write the run's settings, or check that they are those the folder was begun with.
+
+    Raises:
+        ConfigError: the folder holds another run.
+    """
+    settings = json.loads(json.dumps({"train": config.to_dict(), "model": model.to_dict()}))
+    path = folder / "config.json"
+    if path.exists():
+        if json.loads(path.read_text()) != settings:
+            raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
+    elif rank == 0:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(settings, indent=1) + "\n")
+
+
+def log_row(state: dict[str, Any], config: TrainConfig, rate: float, norm: float, parts: list[Losses]) -> dict[str, Any]:
+    """One line of log.csv."""
+    means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in ("coarse", "fine", "early")}
+    row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
+    total = means["coarse"] + means["fine"] + 0.5 * means["early"]
+    figures = {"rate": rate, "norm": norm, "loss": total, **means}
+    return row | {name: float(f"{value:.5g}") for name, value in figures.items()}
+
+
+def report(
+    folder: Path, ema: GAPRNet, held_out: Any, state: dict[str, Any], config: TrainConfig, device: torch.device
+) -> None:
+    """Validate the averaged weights: lines of validation.csv, and one on the terminal."""
+    scores = validate(ema, held_out, device)
+    for protocol, score in scores.items():
+        figures = {name: round(value, 4) for name, value in asdict(score).items()}
+        row = {"pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1), "protocol": protocol}
+        append(folder / "validation.csv", row | figures)
+    total = scores["all"]
+    tqdm.write(
+        f"{state['step'] * config.batch} pairs  {state['seconds'] / 60:.0f} min  coarse inliers {total.coarse_inliers:.2f}  "
+        f"fine inliers {total.fine_inliers:.2f}  recall 4 mm/5 deg {total.first:.2f}  among the proposals {total.among:.2f}"
+    )
+
+
+def append(path: Path, row: dict[str, Any]) -> None:
+    """One line at the end of a CSV file, with a head if it is new."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)

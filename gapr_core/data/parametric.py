@@ -14,6 +14,7 @@ import numpy as np
 from gapr_core.clouds import Surface
 from gapr_core.data import deformation
 from gapr_core.data.bones.femur import FemurParameters, femur_surface
+from gapr_core.data.bones.pelvis import PelvisParameters, pelvis_surface
 from gapr_core.data.bones.tibia import TibiaParameters, tibia_surface
 from gapr_core.data.parameters import draw
 from gapr_core.data.solid import simplify
@@ -48,6 +49,10 @@ def _tibia(rng: np.random.Generator) -> Surface:
     return _either_side(_finish(tibia_surface(draw(TibiaParameters, rng)), rng), rng)
 
 
+def _pelvis(rng: np.random.Generator) -> Surface:
+    return _finish(pelvis_surface(draw(PelvisParameters, rng), rng), rng, faces=24_000)
+
+
 def _finish(surface: Surface, rng: np.random.Generator, faces: int = 14_000) -> Surface:
     """Individual form and texture that no parameter describes, then a mesh of a size that files and trees like."""
     return simplify(deformation.deform(surface, rng), faces)
@@ -60,4 +65,4 @@ def _either_side(left: Surface, rng: np.random.Generator) -> Surface:
     return replace(left, points=left.points * [-1.0, 1.0, 1.0], faces=left.faces[:, ::-1].copy())
 
 
-BONES: dict[str, Callable[[np.random.Generator], Surface]] = {"femur": _femur, "tibia": _tibia}
+BONES: dict[str, Callable[[np.random.Generator], Surface]] = {"femur": _femur, "tibia": _tibia, "pelvis": _pelvis}

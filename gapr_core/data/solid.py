@@ -184,7 +184,30 @@ def half_space(point: ArrayLike, outward: ArrayLike, reach: float) -> Shape:
     return Shape(c - reach, c + reach, lambda x, y, z: -_along(x, y, z, c, n))
 
 
-def skeleton(points: ArrayLike, radii: ArrayLike, neighbours: int = 3) -> Shape:
+def clipped(shape: Shape, point: ArrayLike, outward: ArrayLike) -> Shape:
+    """The shape without what lies beyond the plane through `point`, on the side that `outward` looks to."""
+    c, n = np.asarray(point, dtype=np.float64), np.asarray(outward, dtype=np.float64)
+    n = n / np.linalg.norm(n)
+
+    def distance(x: Grid, y: Grid, z: Grid) -> Grid:
+        return np.maximum(shape.distance(x, y, z), _along(x, y, z, c, n))
+
+    return Shape(shape.low, shape.high, distance)
+
+
+def sheet(rows: Sequence[tuple[ArrayLike, ArrayLike]], step_mm: float = 2.5) -> Shape:
+    """A bent plate through rows of control points (K, 3), each with radii (K,): smooth along and across the rows."""
+    points, radii = (np.stack([np.asarray(row[i], dtype=np.float64) for row in rows]) for i in (0, 1))
+    across = int(np.ceil(np.linalg.norm(np.diff(points, axis=0), axis=2).sum(axis=0).max() / step_mm)) + 1
+    along = int(np.ceil(np.linalg.norm(np.diff(points, axis=1), axis=2).sum(axis=1).max() / step_mm)) + 1
+    surface = np.concatenate([points, radii[..., None]], axis=2)
+    for axis, count in ((0, across), (1, along)):
+        knots = np.linspace(0.0, 1.0, surface.shape[axis])
+        surface = PchipInterpolator(knots, surface, axis=axis)(np.linspace(0.0, 1.0, count))
+    return skeleton(surface[..., :3].reshape(-1, 3), surface[..., 3].ravel())
+
+
+def skeleton(points: ArrayLike, radii: ArrayLike, neighbours: int = 2) -> Shape:
     """A solid from samples of its medial sheet or line: `points` (K, 3) dense against `radii` (K,)."""
     centres, radius = np.asarray(points, dtype=np.float64), np.asarray(radii, dtype=np.float64)
     tree = cKDTree(centres)
@@ -192,7 +215,7 @@ def skeleton(points: ArrayLike, radii: ArrayLike, neighbours: int = 3) -> Shape:
     def distance(x: Grid, y: Grid, z: Grid) -> Grid:
         grids = np.broadcast_arrays(x, y, z)
         queries = np.stack([g.ravel() for g in grids], axis=1)
-        limit = float(radius.max()) + 12.0
+        limit = float(radius.max()) + 8.0
         apart, nearest = tree.query(queries, k=neighbours, distance_upper_bound=limit)
         inside = np.where(np.isfinite(apart), apart - np.append(radius, 0.0)[nearest], limit).min(axis=1)
         return inside.reshape(grids[0].shape).astype(np.float32)

@@ -74,8 +74,8 @@ def _plateau(solid: Solid, p: TibiaParameters) -> None:
         solid.add(ellipsoid(centre, [across * w, along * d, 24.0]), 14.0)
     solid.add(ellipsoid([0.0, -1.0, top - 14.0], [28.0 * w, 22.0 * d, 22.0]), 14.0)
     solid.add(ellipsoid([30.0 * w, 17.0 * d, top - 19.0], [8.0, 8.0, 8.0]), 8.0)  # facet of the fibula
-    tuberosity = [[3.0, -14.0, top - 24.0], [3.0, -17.0, top - 38.0], [2.0, -15.0, top - 56.0], [1.0, -12.0, top - 80.0]]
-    solid.add(tube(tuberosity, p.tuberosity_size * np.array([8.0, 9.0, 8.0, 5.0])), 14.0)
+    tuberosity = np.array([[3.0, -14.0, -24.0], [3.0, -17.0, -38.0], [2.0, -15.0, -56.0], [1.0, -12.0, -80.0]])
+    solid.add(tube(tuberosity + [0.0, 0.0, top], p.tuberosity_size * np.array([8.0, 9.0, 8.0, 5.0])), 14.0)
     slope = np.radians(p.posterior_slope_deg)
     up = np.array([0.0, np.sin(slope), np.cos(slope)])
     solid.cut(half_space([0.0, 0.0, top], up, 60.0), 6.0)

@@ -29,6 +29,7 @@ from gapr_ros.bags import Bag, BagError, open_bag, recorded_qos
 CLOCK_HZ = 40.0
 DISCOVERY_S = 1.0
 SETTLE_S = 0.2  # a listener that we know of knows us a little later
+MUTUAL_S = 1.0  # a listener that we have discovered may not have discovered us yet
 DRAIN_S = 5.0
 LARGEST_STEP_S = 0.1  # of one sleep, so that Ctrl-C is heard
 
@@ -43,6 +44,7 @@ class ReplayOptions:
         loop: start over at the end, time goes back.
         clock_hz: how often /clock says the bag's time; 0: never.
         wait_s: longest wait, at the start, for somebody to listen to every topic.
+        listeners: how many listeners each topic is to have before that wait ends.
         progress: show a bar.
     """
 
@@ -51,6 +53,7 @@ class ReplayOptions:
     loop: bool = False
     clock_hz: float = 0.0
     wait_s: float = DISCOVERY_S
+    listeners: int = 1
     progress: bool = True
 
 
@@ -101,6 +104,9 @@ class Replay:
             time.sleep(0.02)
         time.sleep(SETTLE_S)
 
+    def _has_listeners(self) -> bool:
+        return all(p.get_subscription_count() >= self._options.listeners for p in self._publishers.values())
+
     def _play_once(self) -> int:
         origin, sent = time.monotonic(), 0
         hide = None if self._options.progress else True  # None: no bar when this is no terminal
@@ -150,9 +156,13 @@ def parse_arguments(args: Sequence[str]) -> tuple[Path, ReplayOptions]:
     parser.add_argument("--clock", type=_positive, nargs="?", const=CLOCK_HZ, default=0.0, metavar="HZ",
                         help=f"publish /clock, {CLOCK_HZ:g} times a second unless told")  # fmt: skip
     parser.add_argument("--wait", type=float, default=DISCOVERY_S, metavar="S", help="longest wait for listeners")
+    parser.add_argument("--listeners", type=int, default=1, metavar="N", help="listeners per topic to wait for")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     given = parser.parse_args(args)
-    return given.bag, ReplayOptions(given.rate, given.topics, given.loop, given.clock, given.wait, not given.quiet)
+    waiting = {"wait_s": given.wait, "listeners": given.listeners}
+    return given.bag, ReplayOptions(
+        given.rate, given.topics, given.loop, given.clock, **waiting, progress=not given.quiet
+    )
 
 
 def _positive(text: str) -> float:

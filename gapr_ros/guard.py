@@ -34,7 +34,9 @@ def transition(callback: Callable[..., TransitionCallbackReturn]) -> Callable[..
     @functools.wraps(callback)
     def wrapper(self: Any, state: Any) -> TransitionCallbackReturn:
         try:
-            return callback(self, state)
+            result = callback(self, state)
+            self.call_soon(self.reporter.send)  # after the state has changed
+            return result
         except Exception as error:
             self.report_failure(f"{callback.__name__.removeprefix('on_')} failed: {describe(error)}")
             return TransitionCallbackReturn.FAILURE

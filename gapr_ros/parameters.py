@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")  # declared by rclpy itself
 LARGE = 1e9
+ROS_TYPES = {float: "double", int: "integer", str: "string", bool: "bool"}
 
 
 def setting(default: Any, text: str, *, low: float | None = None, high: float = LARGE, choices: Iterable[str] = (),
@@ -115,7 +116,8 @@ def problem(setting_field: Field, value: Any) -> str:
     """What is wrong with a value, and what to write instead; empty when nothing is."""
     name, default, metadata = setting_field.name, setting_field.default, setting_field.metadata
     if type(value) is not type(default):
-        return f"parameter '{name}' must be a {type(default).__name__}, got {value!r}: write {_example(default, value)}"
+        kind = ROS_TYPES[type(default)]
+        return f"parameter '{name}' must be of type {kind}, got {value!r}: write {_example(default, value)}"
     if metadata["choices"] and value not in metadata["choices"]:
         return f"parameter '{name}' must be one of {', '.join(metadata['choices'])}, got '{value}'"
     if metadata["low"] is not None and not metadata["low"] <= value <= metadata["high"]:

@@ -78,7 +78,7 @@ class RegisterNode(LifecycleNode):
         """A transition failed: keep its reason for log and diagnostics."""
         self.failure = text
         self.get_logger().error(text)
-        self.reporter.send()
+        self.call_soon(self.reporter.send)
 
     def close(self) -> None:
         """End the worker and destroy the node."""

@@ -21,7 +21,7 @@ import psutil
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -67,21 +67,25 @@ class Spinner:
     def __init__(self, in_context: Context) -> None:
         self.context = in_context
         self.executor = SingleThreadedExecutor(context=in_context)
+        self._nodes: list[Node] = []
         self._thread = threading.Thread(target=self._spin, daemon=True)
 
     def start(self, node: Node) -> None:
+        self._nodes.append(node)
         self.executor.add_node(node)
         self._thread.start()
 
     def close(self) -> None:
-        self.context.try_shutdown()
+        self.executor.shutdown(timeout_sec=5.0)
         self._thread.join(5.0)
-        self.executor.shutdown(timeout_sec=0.0)
+        for node in self._nodes:
+            node.destroy_node()
+        self.context.try_shutdown()
 
     def _spin(self) -> None:
         try:
             self.executor.spin()
-        except ExternalShutdownException:
+        except (ExternalShutdownException, ShutdownException):
             pass
 
 
@@ -125,9 +129,9 @@ class Client:
             wait_until(lambda: self.points.get_subscription_count(), 10.0, "the subscription")
             wait_until(lambda: self.node.count_publishers(f"{NODE}/confidence"), 10.0, "the publishers")
 
-    def send(self, cloud: PointCloud2 | np.ndarray, frame: str = "probe", stamp_s: float | None = None) -> None:
-        """Publish a cloud, or (N, 3) points in metres."""
-        if not isinstance(cloud, PointCloud2):
+    def send(self, cloud: PointCloud2 | np.ndarray | bytes, frame: str = "probe", stamp_s: float | None = None) -> None:
+        """Publish a cloud, (N, 3) points in metres, or the bytes of a message."""
+        if not isinstance(cloud, PointCloud2 | bytes):
             stamp_s = time.time() if stamp_s is None else stamp_s
             stamp = Time(nanoseconds=int(stamp_s * 1e9)).to_msg()
             cloud = xyz_to_cloud(np.asarray(cloud, dtype=np.float32), Header(frame_id=frame, stamp=stamp))
@@ -160,15 +164,16 @@ def _answered(values: dict[str, str]) -> int:
 def node_in_thread(method: Any, model_path: Path, **parameters: Any) -> Iterator[RegisterNode]:
     """A register_node in this process with a registration method of the test's own."""
     spinner = Spinner(context())
-    values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False} | parameters
+    values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False, "diagnostics_period": 0.1} | parameters
     overrides = [Parameter(name, value=value) for name, value in values.items()]
     node = RegisterNode(lambda _: method, context=spinner.context, parameter_overrides=overrides)
     spinner.start(node)
     try:
         yield node
     finally:
-        spinner.close()
+        spinner.executor.shutdown(timeout_sec=5.0)
         node.close()
+        spinner.close()
 
 
 class NodeProcess:

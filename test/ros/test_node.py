@@ -1,0 +1,417 @@
+"""The node with a registration method of the tests' own: topics, services, lifecycle, QoS, time."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time as TimeMessage
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from harness import Client, accepted, node_in_thread, pose_mm, wait_until
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool
+
+from gapr_core.geometry import se3
+from gapr_ros import frames
+from gapr_ros.refusal import Reason, RefusedError
+from msg_adapters import cloud_to_xyz, list_to_covariance, pose_to_matrix, transform_to_matrix, xyz_to_cloud
+
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+T_TARGET_SOURCE = pose_mm([0.3, -1.1, 0.7], [120.0, -40.0, 300.0])
+REGISTRATION_KEYS = set(
+    "state model_path model_points cloud_stamp cloud_frame points_in points_used cloud_age_s confidence tre_mm"
+    " inlier_ratio exec_ms frames_received frames_dropped frames_refused consecutive_refusals last_refusal cloud_qos"
+    " publishers_on_points".split()
+)
+
+
+@pytest.fixture
+def live(blob_path, client, method):
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        yield node, client, method
+
+
+def test_an_accepted_cloud_gives_the_inverse_pose_in_metres_with_its_stamp_and_frame(live):
+    node, client, method = live
+    method.answer = accepted(T_TARGET_SOURCE)
+    client.send(GOOD, frame="probe", stamp_s=1234.5)
+    wait_until(lambda: client.poses and client.transforms and client.confidences)
+    pose, transform = client.poses[0], client.transforms[0]
+    expected = se3.inverse(T_TARGET_SOURCE)
+    expected[:3, 3] /= 1000.0
+    np.testing.assert_allclose(pose_to_matrix(pose), expected, atol=1e-12)
+    np.testing.assert_allclose(transform_to_matrix(transform), expected, atol=1e-12)
+    assert pose.header == transform.header == Header(frame_id="probe", stamp=TimeMessage(sec=1234, nanosec=500_000_000))
+    assert transform.child_frame_id == "bone_preop"
+    assert client.confidences == [0.9]
+    covariance = list_to_covariance(pose.pose.covariance)
+    np.linalg.cholesky(covariance)
+    assert 1e-4 < np.sqrt(covariance[0, 0]) < 1e-2
+    np.testing.assert_allclose(method.calls[-1]["source"], GOOD * 1000.0, atol=1e-3)
+
+
+def test_the_model_is_latched_in_metres_and_the_aligned_bone_is_sent_when_somebody_listens(live):
+    node, client, method = live
+    wait_until(lambda: client.models)
+    model = client.models[0]
+    assert model.header.frame_id == "bone_preop"
+    bone_mm = method.calls[0]["target"].points
+    np.testing.assert_allclose(cloud_to_xyz(model) * 1000.0, bone_mm, atol=1e-4)
+
+    aligned = []
+    client.node.create_subscription(PointCloud2, "/register_node/aligned", aligned.append, 1)
+    wait_until(lambda: client.node.count_publishers("/register_node/aligned"))
+    time.sleep(0.2)
+    method.answer = accepted(T_TARGET_SOURCE)
+    client.ask(GOOD)
+    wait_until(lambda: aligned)
+    assert aligned[0].header.frame_id == "probe"
+    np.testing.assert_allclose(
+        cloud_to_xyz(aligned[0]) * 1000.0, se3.apply(se3.inverse(T_TARGET_SOURCE), bone_mm), atol=1e-3
+    )
+
+
+def test_a_late_listener_gets_the_last_pose(live):
+    node, client, method = live
+    client.ask(GOOD)
+    late = Client()
+    wait_until(lambda: late.poses and late.models)
+    late.close()
+
+
+def test_diagnostics_have_every_key_and_come_when_idle(live):
+    node, client, method = live
+    client.ask(GOOD)
+    assert REGISTRATION_KEYS <= set(client.values())
+    count = len(client.diagnostics)
+    wait_until(lambda: len(client.diagnostics) >= count + 2, 4.0)
+    wait_until(lambda: client.values("input")["level"] == 1, 5.0)
+    assert client.values("input")["message"].startswith("no cloud for")
+
+
+def test_the_newest_cloud_wins_and_every_other_is_counted(live):
+    node, client, method = live
+    client.ask(GOOD)
+    method.gate.clear()
+    for i in range(10):
+        client.send(np.full((300, 3), 0.01) + GOOD[:300] * (i + 1))
+        wait_until(lambda i=i: node.counters.received == i + 2)
+    method.gate.set()
+    wait_until(lambda: int(client.values()["frames_accepted"]) == 3)
+    values = client.values()
+    assert (values["frames_received"], values["frames_dropped"], values["frames_lost"]) == ("11", "8", "0")
+    np.testing.assert_allclose(method.calls[-1]["source"], (0.01 + GOOD[:300] * 10) * 1000.0, atol=1e-3)
+
+
+def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
+    node, client, method = live
+    client.ask(GOOD)
+    node.call_soon(lambda: time.sleep(0.6))
+    time.sleep(0.1)
+    for _ in range(5):
+        client.send(GOOD)
+        time.sleep(0.02)
+    wait_until(lambda: int(client.values()["frames_lost"]) + int(client.values()["frames_received"]) == 6, 2.0, client.values())
+    assert int(client.values()["frames_lost"]) >= 1
+
+
+def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(blob_path, client, method):
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        nothing = client.call("register")
+        assert not nothing.success and nothing.message == "no cloud has come yet"
+        for i in range(3):
+            client.send(GOOD)
+            wait_until(lambda i=i: node.counters.received == i + 1)
+        time.sleep(0.1)
+        calls = len(method.calls)
+        answer = client.call("register")
+        assert answer.success and answer.message.startswith("OK  confidence 0.90  TRE 0.7 mm")
+        assert len(method.calls) == calls + 1, "continuous is off: one cloud, on request"
+        client.send(np.empty((0, 3)))
+        wait_until(lambda: node.counters.received == 4)
+        answer = client.call("register")
+        assert not answer.success and answer.message.startswith("refused: empty_cloud")
+        assert node.counters.dropped == 2
+
+
+def test_reload_keeps_the_old_bone_until_the_new_one_is_ready(live, tmp_path, blob_path):
+    node, client, method = live
+    node.set_parameters([Parameter("model_path", value=str(tmp_path / "absent.stl"))])
+    answer = client.call("reload_model")
+    assert not answer.success and answer.message.startswith("the old bone stays: expected a file that exists")
+    assert client.ask(GOOD)["model_path"] == str(blob_path)
+
+    np.save(tmp_path / "new.npy", np.random.default_rng(5).normal(size=(700, 3)) * 40.0)
+    node.set_parameters([Parameter("model_path", value=str(tmp_path / "new.npy"))])
+    answer = client.call("reload_model")
+    assert answer.success and "700 points" in answer.message
+    values = client.ask(GOOD)
+    assert values["level"] == 0 and values["model_points"] == "700"
+    wait_until(lambda: client.models[-1].width == 700)
+
+
+def test_a_disabled_node_counts_clouds_and_answers_none(live):
+    node, client, method = live
+    assert client.call("set_enabled", SetBool.Request(data=False)).success
+    client.send(GOOD)
+    wait_until(lambda: int(client.values()["frames_dropped"]) == 1)
+    assert not client.call("register").success
+    assert not client.confidences
+    assert client.call("set_enabled", SetBool.Request(data=True)).success
+    assert client.ask(GOOD)["level"] == 0
+
+
+def test_a_seed_reaches_the_method_until_a_pose_is_accepted(live):
+    node, client, method = live
+    seed = PoseWithCovarianceStamped(header=Header(frame_id="probe"))
+    seed.pose.pose.position.x = 0.1
+    wait_until(client.seeds.get_subscription_count)
+    epoch = node.session._epoch
+    client.seeds.publish(seed)
+    wait_until(lambda: node.session._epoch > epoch)
+    client.ask(np.empty((0, 3)))
+    client.ask(GOOD)
+    client.ask(GOOD)
+    first, second = method.calls[-2]["initial"], method.calls[-1]["initial"]
+    np.testing.assert_allclose(first, se3.from_rotation_translation(np.eye(3), [-100.0, 0.0, 0.0]), atol=1e-9)
+    assert second is None
+
+    bad = PoseWithCovarianceStamped(header=Header(frame_id="probe"))
+    bad.pose.pose.orientation.w = 0.0
+    client.seeds.publish(bad)
+    time.sleep(0.2)
+    client.ask(GOOD)
+    assert method.calls[-1]["initial"] is None
+
+
+@pytest.mark.parametrize("chosen", ["auto", "best_effort"])
+def test_best_effort_publishers_are_heard(blob_path, method, chosen):
+    client = Client(ReliabilityPolicy.BEST_EFFORT)
+    with node_in_thread(method, blob_path, cloud_reliability=chosen):
+        client.wait_for_state("active")
+        wait_until(lambda: client.values()["cloud_qos"] == "best_effort")
+        time.sleep(0.3)
+        assert client.ask(GOOD)["level"] == 0
+        assert client.values("input")["level"] == 0
+    client.close()
+
+
+def test_a_qos_mismatch_that_was_asked_for_is_an_error_in_the_diagnostics(blob_path, method):
+    client = Client(ReliabilityPolicy.BEST_EFFORT)
+    with node_in_thread(method, blob_path, cloud_reliability="reliable"):
+        wait_until(lambda: client.values("input").get("level") == 2)
+        assert "incompatible RELIABILITY" in client.values("input")["message"]
+    client.close()
+
+
+def test_time_that_goes_back_clears_the_track(blob_path, client, method):
+    with node_in_thread(method, blob_path, use_sim_time=True, require_consecutive=2) as node:
+        client.wait_for_state("active")
+        set_clock(client, node, 1000)
+        assert "1 of 2" in client.ask(GOOD, stamp_s=1000.0)["last_refusal"]
+        assert client.ask(GOOD, stamp_s=1000.1)["level"] == 0
+        set_clock(client, node, 990)
+        assert "1 of 2" in client.ask(GOOD, stamp_s=1000.2)["last_refusal"], "the track begins anew"
+
+
+def set_clock(client, node, seconds):
+    wait_until(client.clock.get_subscription_count)
+
+    def arrived():
+        client.clock.publish(Clock(clock=TimeMessage(sec=seconds)))
+        time.sleep(0.02)
+        return abs(node.now_ns() - seconds * 1e9) < 1e6
+
+    wait_until(arrived)
+
+
+def test_stamps_that_go_back_clear_the_track_without_simulated_time(blob_path, client, method):
+    with node_in_thread(method, blob_path, max_jump_translation=0.01):
+        client.wait_for_state("active")
+        client.ask(GOOD, stamp_s=1000.0)
+        method.answer = accepted(pose_mm([0, 0, 0], [50.0, 0, 0]))
+        assert "jump" in client.ask(GOOD, stamp_s=1000.5)["last_refusal"]
+        assert client.ask(GOOD, stamp_s=990.0)["level"] == 0
+
+
+def test_before_the_clock_runs_clouds_have_no_age_and_are_not_stale(blob_path, client, method):
+    with node_in_thread(method, blob_path, use_sim_time=True, max_cloud_age=0.5):
+        client.wait_for_state("active")
+        values = client.ask(GOOD, stamp_s=1000.0)
+        assert values["level"] == 0 and values["cloud_age_s"] == ""
+
+
+def test_a_cloud_without_a_stamp_gets_the_time_of_its_arrival(live):
+    node, client, method = live
+    client.ask(xyz_to_cloud(GOOD, Header(frame_id="probe")))
+    wait_until(lambda: client.poses)
+    assert abs(client.poses[0].header.stamp.sec - time.time()) < 5.0
+
+
+def test_a_cloud_without_a_frame_is_answered_in_no_frame(live):
+    node, client, method = live
+    assert client.ask(GOOD, frame="")["level"] == 0
+    wait_until(lambda: client.poses)
+    assert client.poses[0].header.frame_id == ""
+
+
+@pytest.mark.parametrize("path", ["", "/absent/bone.stl", "text.ply", "empty.stl", "metres.npy", "bone.docx"])
+def test_a_model_that_cannot_be_used_fails_configure_with_its_reason_and_the_node_lives(
+    path, tmp_path, blob_path, client, method
+):
+    (tmp_path / "text.ply").write_text("this is not a mesh")
+    (tmp_path / "empty.stl").write_bytes(b"")
+    np.save(tmp_path / "metres.npy", np.random.default_rng(0).normal(size=(100, 3)) * 0.05)
+    given = str(tmp_path / path) if path and not path.startswith("/") else path
+    with node_in_thread(method, given) as node:
+        wait_until(lambda: client.values().get("level") == 2)
+        values = client.values()
+        assert values["state"] == "unconfigured" and values["message"].startswith("configure failed: expected")
+        node.set_parameters([Parameter("model_path", value=str(blob_path))])
+        assert change_state(client, Transition.TRANSITION_CONFIGURE)
+        assert change_state(client, Transition.TRANSITION_ACTIVATE)
+        client.wait_for_state("active")
+        assert client.ask(GOOD)["level"] == 0
+
+
+def change_state(client, transition):
+    service = client.node.create_client(ChangeState, "/register_node/change_state")
+    wait_until(service.service_is_ready)
+    future = service.call_async(ChangeState.Request(transition=Transition(id=transition)))
+    wait_until(future.done)
+    client.node.destroy_client(service)
+    return future.result().success
+
+
+def test_the_lifecycle_goes_round_and_the_node_works_after_it(live):
+    node, client, method = live
+    client.ask(GOOD)
+    assert change_state(client, Transition.TRANSITION_DEACTIVATE)
+    assert not client.call("register").success
+    assert change_state(client, Transition.TRANSITION_CLEANUP)
+    answer = client.call("reload_model")
+    assert not answer.success and "unconfigured" in answer.message
+    assert change_state(client, Transition.TRANSITION_CONFIGURE)
+    assert change_state(client, Transition.TRANSITION_ACTIVATE)
+    client.wait_for_state("active")
+    assert client.ask(GOOD)["level"] == 0
+    assert change_state(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert node.state == "finalized"
+
+
+def test_deactivating_tells_those_who_wait_and_sends_nothing_more(live):
+    node, client, method = live
+    client.ask(GOOD)
+    method.gate.clear()
+    client.send(GOOD)
+    calls = len(method.calls)
+    wait_until(lambda: len(method.calls) == calls + 1 or len(method.calls) > calls)
+    poses = len(client.poses)
+    assert change_state(client, Transition.TRANSITION_DEACTIVATE)
+    method.gate.set()
+    wait_until(lambda: client.values()["last_refusal"].startswith("superseded_by_reset"))
+    assert len(client.poses) == poses
+
+
+def test_without_autostart_the_node_waits(blob_path, client, method):
+    with node_in_thread(method, blob_path, autostart=False):
+        wait_until(lambda: client.values().get("state") == "unconfigured")
+        assert client.values()["level"] == 1 and not method.prepared
+
+
+def test_without_tf_another_output_frame_is_refused_and_never_taken_as_identity(blob_path, client, method, monkeypatch):
+    monkeypatch.setattr(frames, "_import_tf2", lambda: None)
+    with node_in_thread(method, blob_path, output_frame="tracker"):
+        client.wait_for_state("active")
+        values = client.ask(GOOD, frame="probe")
+        assert values["last_refusal"].startswith("tf_missing: tracker <- probe: tf2_ros is not installed")
+        assert client.ask(GOOD, frame="tracker")["level"] == 0, "the cloud is in the output frame already"
+
+
+class FakeTf2:
+    """What the node uses of tf2_ros: one known transform, and what was sent."""
+
+    class TransformException(Exception):
+        pass
+
+    def __init__(self, T_tracker_probe):
+        self.sent, self.T_tracker_probe = [], T_tracker_probe
+        self.delay = itertools.count()
+
+    def TransformBroadcaster(self, node):
+        fake = self
+
+        class Broadcaster:
+            pub_tf = node.create_publisher(TransformStamped, "unused", 1)
+
+            def sendTransform(self, transform):
+                fake.sent.append(transform)
+
+        return Broadcaster()
+
+    def TransformListener(self, buffer, node):
+        class Listener:
+            def unregister(self):
+                pass
+
+        return Listener()
+
+    def Buffer(self, node):
+        fake = self
+
+        class Buffer:
+            def can_transform(self, parent, child, stamp):
+                return child == "probe" and next(fake.delay) > 3
+
+            def lookup_transform(self, parent, child, stamp):
+                if child != "probe":
+                    raise fake.TransformException(f"{child} does not exist")
+                from msg_adapters import matrix_to_transform
+
+                T = fake.T_tracker_probe if parent == "tracker" else se3.inverse(fake.T_tracker_probe)
+                return TransformStamped(transform=matrix_to_transform(T))
+
+        return Buffer()
+
+
+def test_with_tf_poses_go_to_the_output_frame_and_to_tf_once_for_each_newer_stamp(
+    blob_path, client, method, monkeypatch
+):
+    T_tracker_probe = pose_mm([0.0, 0.0, 1.2], [0.5, 0.1, 0.2])  # metres
+    tf2 = FakeTf2(T_tracker_probe)
+    monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
+    method.answer = accepted(T_TARGET_SOURCE)
+    with node_in_thread(method, blob_path, output_frame="tracker", publish_tf=True):
+        client.wait_for_state("active")
+        for stamp_s in (10.0, 10.0, 9.5, 11.0):
+            assert client.ask(GOOD, frame="probe", stamp_s=stamp_s)["level"] == 0
+        wait_until(lambda: len(client.transforms) == 4)
+        T_cloud_model = se3.inverse(T_TARGET_SOURCE)
+        T_cloud_model[:3, 3] /= 1000.0
+        T_tracker_model = T_tracker_probe @ T_cloud_model
+        np.testing.assert_allclose(transform_to_matrix(client.transforms[0]), T_tracker_model, atol=1e-12)
+        assert [t.header.stamp.sec for t in tf2.sent] == [10, 11]
+        assert tf2.sent[0].header.frame_id == "tracker" and tf2.sent[0].child_frame_id == "bone_preop"
+        refused = client.ask(GOOD, frame="unknown", stamp_s=12.0)
+        assert refused["last_refusal"] == "tf_missing: tracker <- unknown: unknown does not exist"
+
+
+def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands_still(monkeypatch):
+    tf2 = FakeTf2(np.eye(4))
+    monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
+    looked_up = frames.Frames(None, publish=False, listen=True)
+    start = time.monotonic()
+    with pytest.raises(RefusedError) as caught:
+        looked_up.lookup("tracker", "unknown", None, 0.1)
+    assert caught.value.reason is Reason.TF_MISSING
+    assert 0.1 <= time.monotonic() - start < 1.0

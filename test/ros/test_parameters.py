@@ -1,0 +1,108 @@
+"""The dataclass is the one source; wrong values are answered with what to write instead."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+from harness import NodeProcess, StandIn, context, node_in_thread
+from rclpy.parameter import Parameter
+
+from gapr_ros import parameters
+from gapr_ros.parameters import FIELDS, NodeParameters
+from gapr_ros.register_node import RegisterNode
+
+FILE = Path(__file__).parents[2] / "config" / "register_node.yaml"
+
+
+def test_the_parameter_file_is_the_dataclass():
+    assert FILE.read_text() == parameters.as_yaml(), "run: python -m gapr_ros.parameters > config/register_node.yaml"
+
+
+def test_yaml_reads_the_defaults_back_with_their_types():
+    values = yaml.safe_load(parameters.as_yaml())["/**"]["ros__parameters"]
+    assert values == dataclasses.asdict(NodeParameters())
+    assert {name: type(value) for name, value in values.items()} == {n: type(f.default) for n, f in FIELDS.items()}
+
+
+def test_every_default_is_within_its_own_range_and_choices():
+    assert [parameters.problem(f, f.default) for f in FIELDS.values()] == [""] * len(FIELDS)
+
+
+@pytest.fixture
+def ros():
+    made = context()
+    yield made
+    made.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "hint"),
+    [
+        ("min_confidence", 1, "'min_confidence' must be of type double, got 1: write 1.0"),
+        ("max_rate", 10, "write 10.0"),
+        ("min_points", 3.5, "must be of type integer, got 3.5"),
+        ("model_path", 5, 'write "5"'),
+        ("continuous", "yes", "write true"),
+        ("min_confidence", 1.5, "within 0 to 1"),
+        ("timeout", float("nan"), "must be within"),
+        ("cloud_unit", "cm", "one of m, mm, got 'cm'"),
+        ("seed", -1, "within 0 to"),
+    ],
+)
+def test_a_wrong_value_is_refused_with_what_to_write(ros, name, value, hint):
+    with pytest.raises(ValueError, match="parameter") as caught:
+        RegisterNode(lambda _: StandIn(), context=ros, parameter_overrides=[Parameter(name, value=value)])
+    assert hint in str(caught.value)
+
+
+def test_the_process_ends_with_one_line_that_says_write_1_0(tmp_path):
+    node = NodeProcess(tmp_path, "--ros-args", "-p", "min_confidence:=1")
+    assert node.wait() == 1
+    assert "write 1.0" in node.log and "Traceback" not in node.log
+
+
+def test_a_parameter_file_with_an_unknown_name_is_warned_about(tmp_path):
+    path = tmp_path / "typo.yaml"
+    path.write_text("/**:\n  ros__parameters:\n    min_confidnce: 0.9\n    use_sim_time: false\n    autostart: false\n")
+    node = NodeProcess(tmp_path, "--ros-args", "--params-file", str(path))
+    from harness import wait_until
+
+    wait_until(lambda: "unknown parameter 'min_confidnce' is ignored; did you mean 'min_confidence'?" in node.log)
+    assert "use_sim_time" not in node.log
+    assert node.stop() == 0, node.log
+
+
+def test_the_shipped_file_starts_the_node_without_a_warning(tmp_path):
+    node = NodeProcess(tmp_path, "--ros-args", "--params-file", str(FILE), "-p", "autostart:=false")
+    import time
+
+    time.sleep(2.0)
+    assert node.stop() == 0, node.log
+    assert "WARN" not in node.log and "unknown" not in node.log
+
+
+def test_descriptions_ranges_and_choices_can_be_asked_for(ros):
+    node = RegisterNode(lambda _: StandIn(), context=ros, parameter_overrides=[Parameter("autostart", value=False)])
+    described = {name: node.describe_parameter(name) for name in FIELDS}
+    assert all(d.description for d in described.values())
+    assert described["min_confidence"].floating_point_range[0].to_value == 1.0
+    assert described["min_points"].integer_range[0].from_value == 3
+    assert described["cloud_unit"].additional_constraints == "one of: m, mm"
+    node.close()
+
+
+def test_live_parameters_change_while_running_and_the_others_say_how(blob_path, client, method):
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        ask = node.set_parameters_atomically
+        assert ask([Parameter("min_confidence", value=0.7)]).successful
+        assert node.parameters.min_confidence == 0.7
+        refused = ask([Parameter("seed", value=3)])
+        assert not refused.successful and "deactivate" in refused.reason
+        refused = ask([Parameter("cloud_unit", value="inch")])
+        assert not refused.successful and "one of m, mm" in refused.reason
+        assert not ask([Parameter("max_rate", value=5)]).successful
+        assert node.parameters.seed == 0 and node.parameters.cloud_unit == "m"

@@ -1,0 +1,253 @@
+"""Every reason to refuse, on a live node: confidence 0, no pose, the reason in the diagnostics, the next is fine."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from harness import StandIn, accepted, node_in_thread, pose_mm, wait_until
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2, PointField
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.parameters import NodeParameters
+from gapr_ros.refusal import Reason
+from msg_adapters import xyz_to_cloud
+
+CHANGED = ("max_cloud_age", "timeout", "min_confidence", "cloud_unit", "max_jump_translation", "max_jump_rotation",
+           "require_consecutive", "range_min", "range_max")  # fmt: skip
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+
+
+@pytest.fixture(scope="module")
+def live(blob_path_module):
+    """One node and one client for all tests of this file; every test puts back what it changed."""
+    from harness import Client
+
+    method, client = StandIn(), Client()
+    with node_in_thread(method, blob_path_module, max_cloud_age=0.0) as node:
+        client.wait_for_state("active")
+        yield node, client, method
+        client.close()
+
+
+@pytest.fixture(scope="module")
+def blob_path_module(blob_path):
+    return blob_path
+
+
+@pytest.fixture(autouse=True)
+def restored(live):
+    node, client, method = live
+    client.call("reset")
+    client.poses.clear()
+    client.confidences.clear()
+    yield
+    method.answer, method.error = accepted(), None
+    method.gate.set()
+    defaults = NodeParameters()
+    for name in CHANGED:
+        assert node.set_parameters_atomically([Parameter(name, value=getattr(defaults, name))]).successful
+
+
+def expect_refusal(live, cloud, reason, text="", **kwargs):
+    """The cloud is refused for this reason, and the node accepts a good one right after."""
+    node, client, method = live
+    values = client.ask(cloud, **kwargs)
+    assert values["last_refusal"].split(":")[0] == str(reason), values["last_refusal"]
+    assert text in values["last_refusal"]
+    assert values["level"] == 1 and values["confidence"] == "0"
+    wait_until(lambda: client.confidences)
+    assert client.confidences == [0.0] and not client.poses
+
+
+def expect_good(live):
+    node, client, method = live
+    values = client.ask(GOOD)
+    assert values["level"] == 0, values
+    wait_until(lambda: client.poses)
+
+
+def damaged(change) -> PointCloud2:
+    cloud = xyz_to_cloud(GOOD.astype(np.float32))
+    change(cloud)
+    return cloud
+
+
+INTEGERS = damaged(lambda c: [setattr(field, "datatype", PointField.INT32) for field in c.fields])
+BAD_INPUT = {
+    "an empty cloud": (np.empty((0, 3)), Reason.EMPTY_CLOUD),
+    "a message of nothing": (PointCloud2(), Reason.EMPTY_CLOUD),
+    "five points": (GOOD[:5], Reason.TOO_FEW_POINTS),
+    "all NaN": (np.full((500, 3), np.nan), Reason.NON_FINITE),
+    "all infinite": (np.full((500, 3), np.inf), Reason.NON_FINITE),
+    "all at the sensor's origin": (np.zeros((500, 3)), Reason.NON_FINITE),
+    "NaN but for 100 points": (np.vstack([np.full((500, 3), np.nan), GOOD[:100]]), Reason.TOO_FEW_POINTS),
+    "millimetres given as metres": (GOOD * 1000.0, Reason.UNIT_MISMATCH),
+    "far too large in any unit": (GOOD * 1e9, Reason.UNIT_MISMATCH),
+    "wrong field types": (INTEGERS, Reason.BAD_FIELDS),
+    "no fields": (damaged(lambda c: c.fields.clear()), Reason.BAD_FIELDS),
+    "truncated data": (damaged(lambda c: setattr(c, "data", c.data[:-7])), Reason.BAD_FIELDS),
+    "data for fewer points than it says": (damaged(lambda c: setattr(c, "width", 2_000_000_000)), Reason.BAD_FIELDS),
+}
+
+
+@pytest.mark.parametrize("name", BAD_INPUT)
+def test_bad_input_is_refused_with_its_reason_and_survived(live, name):
+    cloud, reason = BAD_INPUT[name]
+    expect_refusal(live, cloud, reason)
+    expect_good(live)
+
+
+def test_millimetres_are_named(live):
+    expect_refusal(live, GOOD * 1000.0, Reason.UNIT_MISMATCH, "looks like millimetres")
+
+
+def test_metres_given_as_millimetres_are_named(live):
+    live[0].set_parameters_atomically([Parameter("cloud_unit", value="mm")])
+    expect_refusal(live, GOOD, Reason.UNIT_MISMATCH, "looks like metres")
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00\x01\x00\x00", b"\x00\x01\x00\x00garbage that is no cloud", b"\xff" * 4000]
+)
+def test_bytes_that_are_no_message_are_refused_and_survived(live, data):
+    expect_refusal(live, data, Reason.BAD_FIELDS)
+    assert live[1].values("input")["level"] == 2
+    expect_good(live)
+    assert live[1].values("input")["level"] == 0
+
+
+def test_a_cloud_cut_off_on_the_wire_is_refused(live):
+    from rclpy.serialization import serialize_message
+
+    whole = serialize_message(xyz_to_cloud(GOOD.astype(np.float32)))
+    expect_refusal(live, whole[: len(whole) // 2], Reason.BAD_FIELDS)
+    expect_good(live)
+
+
+def test_five_million_points_are_thinned_and_answered(live):
+    cloud = np.random.default_rng(0).normal(size=(5_000_000, 3)).astype(np.float32) * 0.02
+    node, client, method = live
+    values = client.ask(cloud, timeout_s=60.0)
+    assert values["level"] == 0, values
+    assert (values["points_in"], values["points_used"]) == ("5000000", "200000")
+
+
+def test_an_old_cloud_is_stale(live):
+    live[0].set_parameters_atomically([Parameter("max_cloud_age", value=0.5)])
+    expect_refusal(live, GOOD, Reason.STALE, "max_cloud_age is 0.5", stamp_s=time.time() - 10.0)
+    expect_good(live)
+
+
+def test_a_slow_registration_times_out(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("timeout", value=0.05)])
+    method.gate.clear()
+    client.send(GOOD)
+    wait_until(lambda: method.gate is not None and client.values()["frames_received"] != "0")
+    time.sleep(0.2)
+    method.gate.set()
+    wait_until(lambda: client.values()["last_refusal"].startswith("timeout: took 0."))
+    assert not client.poses
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason", "text"),
+    [
+        (RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two poses fit"), Reason.AMBIGUOUS, "two poses fit"),
+        (RegistrationResult(RegistrationStatus.DEGENERATE, reason="spin"), Reason.DEGENERATE, "spin"),
+        (RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, confidence=0.4), Reason.LOW_CONFIDENCE, ""),
+        (RegistrationResult(RegistrationStatus.TOO_FEW_POINTS), Reason.TOO_FEW_POINTS, ""),
+        (accepted(confidence=0.49), Reason.LOW_CONFIDENCE, "min_confidence is 0.5"),
+        (accepted(confidence=float("nan")), Reason.LOW_CONFIDENCE, ""),
+        (accepted(np.full((4, 4), np.nan)), Reason.NOT_CONVERGED, "no finite pose"),
+        (accepted(covariance=None), Reason.NOT_CONVERGED, "no finite covariance"),
+        (accepted(covariance=np.full((6, 6), np.inf)), Reason.NOT_CONVERGED, "no finite covariance"),
+    ],
+)
+def test_what_the_method_refuses_or_cannot_stand_for_has_no_pose(live, answer, reason, text):
+    live[2].answer = answer
+    expect_refusal(live, GOOD, reason, text)
+    live[2].answer = accepted()
+    expect_good(live)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason", "text"),
+    [
+        (RuntimeError("singular"), Reason.NOT_CONVERGED, "RuntimeError: singular"),
+        (InvalidPointCloudError("a bone", "3 m", "check the unit"), Reason.UNIT_MISMATCH, "got 3 m"),
+        (MemoryError(), Reason.NOT_CONVERGED, "MemoryError"),
+    ],
+)
+def test_an_exception_of_the_method_is_a_refusal(live, error, reason, text):
+    live[2].error = error
+    expect_refusal(live, GOOD, reason, text)
+    live[2].error = None
+    expect_good(live)
+
+
+def test_a_jump_beyond_the_limit_is_refused_until_a_reset(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("max_jump_translation", value=0.01)])
+    expect_good(live)
+    client.poses.clear()
+    client.confidences.clear()
+    method.answer = accepted(pose_mm([0, 0, 0], [30.0, 0, 0]))
+    expect_refusal(live, GOOD, Reason.JUMP, "moved 0.03 m, max_jump_translation is 0.01 m; call ~/reset")
+    client.call("reset")
+    expect_good(live)
+
+
+def test_a_turn_beyond_the_limit_is_refused(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("max_jump_rotation", value=0.1)])
+    expect_good(live)
+    client.poses.clear()
+    client.confidences.clear()
+    method.answer = accepted(pose_mm([0, 0, 0.3], [0, 0, 0]))
+    expect_refusal(live, GOOD, Reason.JUMP, "turned 0.3 rad")
+
+
+def test_a_pose_goes_out_after_enough_good_ones_in_a_row(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("require_consecutive", value=3)])
+    assert "1 of 3" in client.ask(GOOD)["last_refusal"]
+    assert "2 of 3" in client.ask(GOOD)["last_refusal"]
+    assert "empty_cloud" in client.ask(np.empty((0, 3)))["last_refusal"]
+    assert "1 of 3" in client.ask(GOOD)["last_refusal"]
+    assert "2 of 3" in client.ask(GOOD)["last_refusal"]
+    assert client.ask(GOOD)["level"] == 0
+    wait_until(lambda: client.confidences == [0.0] * 5 + [0.9] and len(client.poses) == 1)
+
+
+def test_a_reset_refuses_the_cloud_on_its_way(live):
+    node, client, method = live
+    before = len(method.calls)
+    method.gate.clear()
+    client.send(GOOD)
+    wait_until(lambda: len(method.calls) > before)
+    client.send(GOOD)
+    received = int(client.values()["frames_received"])
+    wait_until(lambda: node.counters.received >= received + 1)
+    client.call("reset")
+    method.gate.set()
+    wait_until(lambda: client.confidences == [0.0, 0.0])
+    assert client.values()["last_refusal"].startswith("superseded_by_reset")
+    assert len(method.calls) == before + 1, "the waiting cloud is not even registered"
+    expect_good(live)
+
+
+def test_the_range_is_limited_on_both_sides(live):
+    node, client, method = live
+    near, middle, far = (direction(radius) for radius in (0.05, 0.2, 0.6))
+    node.set_parameters_atomically([Parameter("range_min", value=0.1), Parameter("range_max", value=0.5)])
+    assert client.ask(np.vstack([near, middle, far]))["points_used"] == "300"
+
+
+def direction(radius: float) -> np.ndarray:
+    vectors = np.random.default_rng(3).normal(size=(300, 3))
+    return radius * vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

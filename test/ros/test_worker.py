@@ -1,0 +1,117 @@
+"""One thread, one slot: newest wins, nothing is lost without being counted."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from harness import wait_until
+
+from gapr_ros.worker import Job, Worker
+
+
+class Bench:
+    """A worker whose process waits for a gate."""
+
+    def __init__(self, held=False, period_s=0.0):
+        self.done, self.gate, self.held, self.period_s = [], threading.Event(), held, period_s
+        self.worker = Worker(self._process, lambda: self.held, lambda: self.period_s)
+
+    def _process(self, job):
+        self.gate.wait(10.0)
+        self.done.append((job, time.monotonic()))
+
+    def names(self):
+        return [job.cloud for job, _ in self.done]
+
+
+def job(name: bytes) -> Job:
+    return Job(name, epoch=0, received_ns=0)
+
+
+def test_the_newest_cloud_wins_and_the_others_are_counted():
+    bench = Bench()
+    bench.worker.put(job(b"0"))
+    wait_until(lambda: bench.worker._slot is None)
+    dropped = sum(bench.worker.put(job(b"%d" % i)) for i in range(1, 11))
+    bench.gate.set()
+    wait_until(lambda: len(bench.done) == 2)
+    assert bench.names() == [b"0", b"10"]
+    assert dropped == 9
+    assert bench.worker.stop(5.0)
+
+
+def test_those_who_wait_for_a_cloud_wait_for_the_newer_one():
+    bench = Bench()
+    bench.worker.put(job(b"busy"))
+    wait_until(lambda: bench.worker._slot is None)
+    bench.worker.put(job(b"old"))
+    assert bench.worker.ask("waiter", epoch=0)
+    bench.worker.put(job(b"new"))
+    bench.gate.set()
+    wait_until(lambda: len(bench.done) == 2)
+    assert bench.names() == [b"busy", b"new"] and bench.done[1][0].waiters == ["waiter"]
+    bench.worker.stop(5.0)
+
+
+def test_a_held_cloud_waits_until_it_is_asked_for():
+    bench = Bench(held=True)
+    bench.gate.set()
+    bench.worker.put(job(b"1"))
+    assert bench.worker.put(job(b"2")) == 1
+    time.sleep(0.05)
+    assert not bench.done
+    assert bench.worker.ask("waiter", epoch=0)
+    wait_until(lambda: bench.names() == [b"2"])
+    assert bench.worker.ask("again", epoch=7)
+    wait_until(lambda: bench.names() == [b"2", b"2"])
+    assert bench.done[1][0].epoch == 7
+    bench.held = False
+    bench.worker.wake()
+    bench.worker.put(job(b"3"))
+    wait_until(lambda: bench.names()[-1] == b"3")
+    bench.worker.stop(5.0)
+
+
+def test_without_a_cloud_there_is_nothing_to_ask_for():
+    bench = Bench()
+    assert not bench.worker.ask("waiter", epoch=0)
+    assert bench.worker.clear() is None
+    bench.worker.stop(5.0)
+
+
+def test_the_rate_is_limited_and_the_newest_cloud_is_taken_when_the_time_has_come():
+    bench = Bench(period_s=0.2)
+    bench.gate.set()
+    start = time.monotonic()
+    for i in range(12):
+        bench.worker.put(job(b"%d" % i))
+        time.sleep(0.05)
+    bench.worker.stop(5.0)
+    starts = [moment - start for _, moment in bench.done]
+    assert 3 <= len(starts) <= 4
+    assert all(b - a > 0.19 for a, b in zip(starts, starts[1:], strict=False))
+
+
+def test_tasks_go_before_clouds_and_an_exception_ends_nothing(caplog):
+    bench = Bench()
+    order = []
+    bench.worker.put(job(b"busy"))
+    wait_until(lambda: bench.worker._slot is None)
+    bench.worker.put(job(b"1"))
+    bench.worker.run(lambda: 1 / 0)
+    bench.worker.run(lambda: order.append(list(bench.names())))
+    bench.gate.set()
+    wait_until(lambda: len(bench.done) == 2)
+    assert order == [[b"busy"]]
+    assert "ZeroDivisionError" in caplog.text
+    bench.worker.stop(5.0)
+
+
+def test_stop_says_when_the_work_does_not_end():
+    bench = Bench()
+    bench.worker.put(job(b"long"))
+    wait_until(lambda: bench.worker._slot is None)
+    assert not bench.worker.stop(0.05)
+    bench.gate.set()
+    assert bench.worker.stop(5.0)

@@ -1,7 +1,7 @@
 """`gapr benchmark`: pairs x methods to one table, plots and a report; resumable, parallel, sharded.
 
-    gapr benchmark --pairs DIR --methods gapr,kiss4,icp --out OUT [--shard 1/4] [--jobs 2]
-    gapr benchmark merge OUT_1 OUT_2 ... --out OUT
+gapr benchmark --pairs DIR --methods gapr,kiss4,icp --out OUT [--shard 1/4] [--jobs 2]
+gapr benchmark merge OUT_1 OUT_2 ... --out OUT
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr benchmark`."""
     parser.add_argument("merge", nargs="*", help="`merge DIR...`: join the outputs of several shards into --out")
-    parser.add_argument("--pairs", type=Path, help="folder of NAME.npz with source, target, transform, mm (gapr make-pairs)")
+    parser.add_argument("--pairs", type=Path, help="folder of NAME.npz, as gapr make-pairs writes it")
     parser.add_argument("--methods", default=DEFAULT_METHODS, help=f"names with commas; {DEFAULT_METHODS}")
     parser.add_argument("--out", type=Path, required=True, help="folder for the table, the plots and the report")
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")

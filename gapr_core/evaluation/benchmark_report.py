@@ -12,21 +12,25 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from gapr_core.evaluation import pictures, plots
+from gapr_core.evaluation.sections import LEGEND, Section, sections, where_beaten
 from gapr_core.evaluation.table import Row
-from gapr_core.evaluation.writers import LEGEND, Plan, Section, sections, where_beaten
 
 Record = dict[str, Any]
+Plan = dict[str, Any]
 
 STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; margin: 0 auto; max-width: 1280px; padding: 1.5rem; }
-h1 { margin: 0 0 .3rem } h2 { margin: 2.2rem 0 .6rem; border-bottom: 2px solid #0b5fa5 } h3 { margin: 1.2rem 0 .4rem }
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; margin: 0 auto; max-width: 1440px; padding: 1.5rem; }
+h1 { margin: 0 0 .3rem } h2 { margin: 2.2rem 0 .6rem; border-bottom: 2px solid #0b5fa5 }
+h3 { margin: 1.2rem 0 .4rem }
 .wide { overflow-x: auto } table { border-collapse: collapse; font-size: 13px; white-space: nowrap }
-th { background: #eef3f8; white-space: normal; vertical-align: bottom; max-width: 8rem } tr.paper td { color: #6a7480; font-style: italic }
-th, td { padding: .25rem .55rem; border-bottom: 1px solid #dde3ea; text-align: right }
+th { background: #eef3f8; white-space: normal; vertical-align: bottom; max-width: 8rem }
+tr.paper td { color: #6a7480; font-style: italic }
+th, td { padding: .25rem .45rem; border-bottom: 1px solid #dde3ea; text-align: right }
 td:nth-child(1), td:nth-child(2), th:nth-child(1), th:nth-child(2) { text-align: left }
 tr.first td { border-top: 2px solid #aab7c4 } .note { background: #fff4d6; padding: .4rem .8rem; margin: .3rem 0 }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(520px, 1fr)); gap: 1rem }
-figure { margin: 0 } figure img { width: 100% } figcaption { font-size: 13px } .wrong { color: #b3202f; font-weight: 600 }
+figure { margin: 0 } figure img { width: 100% } figcaption { font-size: 13px }
+.wrong { color: #b3202f; font-weight: 600 }
 footer { margin-top: 2rem; font-size: 13px; color: #556070 }
 """
 
@@ -38,7 +42,8 @@ def write(out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan,
     cases = [(record, _case(out, number, record, plan)) for number, record in enumerate(_worst(records, plan), 1)]
     body = [
         _head(plan, notes), _beaten(rows, plan), "<h2>Tables</h2>", *(_table(section) for section in sections(rows)),
-        f"<p>{html.escape(LEGEND)}</p>", "<h2>Plots</h2>", f"<div class='plots'>{''.join(map(_image, drawn.items()))}</div>",
+        f"<p>{html.escape(LEGEND)}</p>", "<h2>Plots</h2>",
+        f"<div class='plots'>{''.join(map(_image, drawn.items()))}</div>",
         f"<h2>The worst {len(cases)} cases of {html.escape(plan['ours'])}</h2>",
         f"<div class='plots'>{''.join(_worst_case(*case) for case in cases)}</div>", _footer(plan),
     ]  # fmt: skip
@@ -54,7 +59,7 @@ def _plots(records: Sequence[Record], plan: Plan) -> list[tuple[str, Figure]]:
         "recall_noise": plots.recall_against(records, methods, "noise_mm", "noise, mm"),
         "reliability": plots.reliability_diagram(records, methods),
         "risk_coverage": plots.risk_coverage(records, methods),
-        "error_ellipsoids": plots.error_ellipsoids(records, methods),
+        "error_ellipsoids": plots.error_ellipsoids(records, plan["ours"]),
     }
     return [(name, figure) for name, figure in figures.items() if figure is not None]
 

@@ -83,7 +83,7 @@ def pose_facts(pair: Pair, T: Array, accepted: bool) -> Record:
 
 
 def best_right(pair: Pair, result: RegistrationResult | None) -> bool | None:
-    """Is the pose that the confidence speaks of right? The answer, or the best pose behind a refusal; None without one."""
+    """Is the pose that the confidence speaks of right: the answer, or the best one behind a refusal; None without."""
     if result is None or not (result.ok or result.alternatives):
         return None
     T = result.alternatives[0] if result.T_target_source is None else result.T_target_source

@@ -1,4 +1,4 @@
-"""The paper's own figures (arXiv 2606.13488, tables I to III), on its data: printed beside ours, never mixed with them."""
+"""The paper's figures (arXiv 2606.13488, tables I to III), on its data: printed beside ours, never mixed with them."""
 
 from __future__ import annotations
 

@@ -49,8 +49,11 @@ def picture(record: Record, folder: Path) -> Figure:
     centre = pair.target.mean(axis=0)
     axes = np.linalg.eigh((pair.target - centre).T @ (pair.target - centre))[1][:, ::-1].T
     clouds = [((points - centre) @ axes.T, colour, size, name) for points, colour, size, name in _clouds(record, pair)]
-    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    for view, (across, up) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
+    length, *widths = np.ptp(clouds[0][0], axis=0)
+    long = max(widths) < 0.45 * length  # views of a long bone one below the other
+    figure = Figure(figsize=(9.0, 1.6 + 8.0 * sum(widths) / length if long else 4.6), layout="constrained")
+    views = figure.subplots(2, 1, height_ratios=widths) if long else figure.subplots(1, 2)
+    for view, (across, up) in zip(views, ((0, 1), (0, 2)), strict=True):
         _draw(view, clouds, across, up)
     handles, labels = view.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False, markerscale=4)

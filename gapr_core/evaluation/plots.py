@@ -16,7 +16,9 @@ from gapr_core import metrics
 Array = NDArray[np.float64]
 Record = dict[str, Any]
 
-COLOURS = ("#0b5fa5", "#d1495b", "#2e9e6b", "#e0992b", "#7b5ea7", "#3aa6b9", "#8c6d46", "#c06c9c", "#6b7a2f", "#555555")
+COLOURS = (
+    "#0b5fa5", "#d1495b", "#2e9e6b", "#e0992b", "#7b5ea7", "#3aa6b9", "#8c6d46", "#c06c9c", "#6b7a2f", "#555555"
+)  # fmt: skip
 DASHES = ("-", "--", ":", "-.")
 CHI2_95_2D = 5.991  # 95 % quantile with two degrees of freedom
 DEG_PER_MM = 1.25  # 4 mm goes with 5 deg
@@ -62,13 +64,14 @@ def reliability_diagram(records: Sequence[Record], methods: Sequence[str]) -> Fi
             continue
         rows = metrics.reliability([r["confidence"] for r in own], [r["best_right"] for r in own])
         axes.plot(rows.confidence, rows.accuracy, label=method, **_style(k))
-        axes.scatter(rows.confidence, rows.accuracy, s=8 + 200 * rows.pairs / len(own), color=_style(k)["color"], alpha=0.6)
+        sizes = 8 + 200 * rows.pairs / len(own)
+        axes.scatter(rows.confidence, rows.accuracy, s=sizes, color=_style(k)["color"], alpha=0.6)
     return _finish(figure, axes)
 
 
 def risk_coverage(records: Sequence[Record], methods: Sequence[str]) -> Figure:
     """Share of wrong answers among the most confident ones; the curve ends where the method refuses the rest."""
-    figure, axes = _figure("Risk against coverage", "share of all pairs answered", "share of the answers that are wrong")
+    figure, axes = _figure("Risk against coverage", "share of all pairs answered", "share of wrong answers")
     for k, (method, own) in enumerate(_by_method(records, methods)):
         given = [r for r in own if r["accepted"]]
         curve = metrics.risk_coverage([r["confidence"] for r in given], [r["right"] for r in given], len(own))
@@ -78,16 +81,19 @@ def risk_coverage(records: Sequence[Record], methods: Sequence[str]) -> Figure:
     return _finish(figure, axes)
 
 
-def error_ellipsoids(records: Sequence[Record], methods: Sequence[str], most: int = 3) -> Figure | None:
-    """Translation errors of right answers along the bone's principal axes, with 95 % ellipses: found, predicted, bound."""
-    groups = [(m, [r for r in own if r.get("twist") and r["right"]]) for m, own in _by_method(records, methods)]
-    groups = sorted([g for g in groups if len(g[1]) > 2], key=lambda g: -len(g[1]))[:most]
+def error_ellipsoids(records: Sequence[Record], method: str) -> Figure | None:
+    """Translation errors of a method's right answers along the bone's principal axes, one line per protocol.
+
+    95 % ellipses of the errors found, of the covariance predicted (mean) and of the Cramer-Rao bound (mean).
+    """
+    right = [r for r in records if r["method"] == method and r["right"]]
+    protocols = sorted({r["protocol"] for r in right})
+    groups = [(p, own) for p in protocols if len(own := [r for r in right if r["protocol"] == p]) > 2]
     if not groups:
         return None
-    groups.sort(key=lambda g: list(methods).index(g[0]))
     figure = Figure(figsize=(10.5, 3.4 * len(groups)), layout="constrained")
     all_axes = figure.subplots(len(groups), 3, squeeze=False)
-    for line, (method, own) in zip(all_axes, groups, strict=True):
+    for line, (protocol, own) in zip(all_axes, groups, strict=True):
         errors = np.array([np.array(r["axes"]) @ r["twist"][:3] for r in own])
         span = 1.1 * np.abs(errors).max()
         for axes, (i, j) in zip(line, ((0, 1), (0, 2), (1, 2)), strict=True):
@@ -96,16 +102,18 @@ def error_ellipsoids(records: Sequence[Record], methods: Sequence[str], most: in
                 _draw_ellipse(axes, covariance[np.ix_([i, j], [i, j])], colour, dash, name)
             axes.set(xlim=(-span, span), ylim=(-span, span), aspect="equal")
             axes.set(xlabel=f"axis {i + 1}, mm", ylabel=f"axis {j + 1}, mm")
-        line[0].set_title(f"{method}, {len(own)} right answers", fontsize=10, loc="left")
+        line[0].set_title(f"{protocol}, {len(own)} right answers", fontsize=10, loc="left")
         line[2].legend(fontsize=8, frameon=False)
-    figure.suptitle("Translation error at the source's centroid, bone axes (1 is the longest); 95 % ellipses", fontsize=11)
+    title = f"{method}: translation error at the source's centroid, bone axes (1 is the longest); 95 % ellipses"
+    figure.suptitle(title, fontsize=11)
     return figure
 
 
 def _ellipses(own: Sequence[Record], errors: Array) -> list[tuple[Array, str, str, str]]:
     found = [(errors.T @ errors / len(errors), "#0b5fa5", "-", "errors found")]
     for key, colour, dash, name in (
-        ("covariance", "#d1495b", "--", "mean predicted"), ("bound_covariance", "#222222", ":", "mean Cramer-Rao bound"),
+        ("covariance", "#d1495b", "--", "mean predicted"),
+        ("bound_covariance", "#222222", ":", "mean Cramer-Rao bound"),
     ):  # fmt: skip
         turned = [np.array(r["axes"]) @ np.array(r[key])[:3, :3] @ np.transpose(r["axes"]) for r in own if r.get(key)]
         if turned:
@@ -136,7 +144,8 @@ def _bins(values: Array) -> Array:
 
 
 def _style(k: int) -> dict[str, Any]:
-    return {"color": COLOURS[k % len(COLOURS)], "ls": DASHES[k // len(COLOURS) % len(DASHES)], "lw": 2.6 if k == 0 else 1.6}
+    dash = DASHES[k // len(COLOURS) % len(DASHES)]
+    return {"color": COLOURS[k % len(COLOURS)], "ls": dash, "lw": 2.6 if k == 0 else 1.6}
 
 
 def _figure(title: str, x: str, y: str) -> tuple[Figure, Axes]:

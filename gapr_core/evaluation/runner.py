@@ -17,7 +17,7 @@ from gapr_core.data.pair_files import load_pair, pair_hash
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.evaluation import methods
-from gapr_core.evaluation.judge import failure_facts, answer_facts, judge, jsonable, pair_facts
+from gapr_core.evaluation.judge import answer_facts, failure_facts, jsonable, judge, pair_facts
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ def _run_pool(waiting: list[Task], jobs: int, threads: int, lost: list[Task]) ->
     """Take tasks off `waiting` until it is empty or the pool breaks; what was under way then goes to `lost`."""
     context = multiprocessing.get_context("spawn")
     under_way: dict[Future[Record], Task] = {}
-    with _environment(threads), ProcessPoolExecutor(jobs, context, _start, (context.Value("i", 0), threads)) as pool:
+    with _Environment(threads), ProcessPoolExecutor(jobs, context, _start, (context.Value("i", 0), threads)) as pool:
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < jobs:
@@ -124,7 +124,7 @@ def _start(counter: Any, threads: int) -> None:
         os.sched_setaffinity(0, {cores[(first + k) % len(cores)] for k in range(threads)})
 
 
-class _environment:
+class _Environment:
     """Thread counts that libraries read when a worker imports them; put back afterwards."""
 
     def __init__(self, threads: int) -> None:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
 
 Array = NDArray[np.float64]
 SURE = 0.9  # an accepted wrong pose at this confidence is the worst bug there is
@@ -26,7 +25,8 @@ def auroc(confidence: ArrayLike, correct: ArrayLike) -> float:
     right, wrong = int(correct.sum()), int((~correct).sum())
     if right == 0 or wrong == 0:
         return float("nan")
-    ranks = rankdata(np.asarray(confidence, dtype=np.float64))
+    _, place, ties = np.unique(np.asarray(confidence, dtype=np.float64), return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(ties) - (ties - 1) / 2)[place]  # equal scores share their mean rank
     return float((ranks[correct].sum() - right * (right + 1) / 2) / (right * wrong))
 
 

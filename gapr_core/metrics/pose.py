@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +45,7 @@ def whole_bone_rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, target: ArrayLi
     return rmse_mm(error_motion(T_estimate, T_true), np.eye(4), target)
 
 
-def tre_mm(T_estimate: ArrayLike, T_true: ArrayLike, targets: dict[str, ArrayLike]) -> dict[str, float]:
+def tre_mm(T_estimate: ArrayLike, T_true: ArrayLike, targets: Mapping[str, ArrayLike]) -> dict[str, float]:
     """Target registration error at named points {name: (3,)} of the target frame, mm."""
     motion = error_motion(T_estimate, T_true)
     return {name: rmse_mm(motion, np.eye(4), np.reshape(point, (1, 3))) for name, point in targets.items()}

@@ -1,0 +1,179 @@
+"""The printed tables: columns, headings, the paper's figures below ours, and where another method is better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from gapr_core.evaluation import paper_figures
+from gapr_core.evaluation.table import ALL, Row
+
+
+class Column(NamedTuple):
+    """One column of a printed table."""
+
+    title: str
+    text: Callable[[Row], str]
+    key: str = ""
+    better: int = 0  # 1: higher is better, -1: lower, 0: no ranking
+
+
+class Section(NamedTuple):
+    """A heading with a table; `best` marks the cells to print bold."""
+
+    title: str
+    header: list[str]
+    cells: list[list[str]]
+    best: set[tuple[int, int]]
+
+
+def number(key: str, digits: int) -> Callable[[Row], str]:
+    """Prints a figure; a dash where there is none."""
+    return lambda row: "–" if row.get(key) is None else f"{row[key]:.{digits}f}"
+
+
+def percent(key: str, interval: bool = False) -> Callable[[Row], str]:
+    """Prints a share in percent, with its 95 % bootstrap interval on request."""
+
+    def text(row: Row) -> str:
+        if row.get(key) is None:
+            return "–"
+        ends = f" [{100 * row[f'{key}_low']:.0f}–{100 * row[f'{key}_high']:.0f}]" if interval else ""
+        return f"{100 * row[key]:.1f}{ends}"
+
+    return text
+
+
+def count(key: str) -> Callable[[Row], str]:
+    """Prints a count."""
+    return lambda row: "–" if row.get(key) is None else str(row[key])
+
+
+SURE_TITLE = "false accepts with confidence ≥ 0.9"
+ACCURACY = [
+    Column("pairs", count("pairs_with_truth")),
+    Column("RR % (RMSE < 0.02 half extent)", percent("rr_paper", True), "rr_paper", 1),
+    Column("RR % 1 mm/1°", percent("rr_1_1"), "rr_1_1", 1),
+    Column("RR % 2 mm/2°", percent("rr_2_2"), "rr_2_2", 1),
+    Column("RR % 4 mm/5°", percent("rr_4_5", True), "rr_4_5", 1),
+    Column("RMSE mm", number("rmse_mm", 3), "rmse_mm", -1),
+    Column("median RMSE mm", number("rmse_median_mm", 3), "rmse_median_mm", -1),
+    Column("CD mm", number("chamfer_mm", 3), "chamfer_mm", -1),
+    Column("R²(R)", number("r2_rotation", 3)),
+    Column("R²(t)", number("r2_translation", 3)),
+    Column("RTE mm", number("rte_median_mm", 2), "rte_median_mm", -1),
+    Column("RRE °", number("rre_median_deg", 2), "rre_median_deg", -1),
+    Column("whole bone mm", number("whole_bone_median_mm", 2), "whole_bone_median_mm", -1),
+    Column("worst TRE mm", number("tre_worst_median_mm", 2), "tre_worst_median_mm", -1),
+]
+SAFETY = [
+    Column("pairs", count("pairs")),
+    Column("accepted", count("accepted")),
+    Column("refused", count("refused")),
+    Column("of these errors", count("errors")),
+    Column("false accepts", count("false_accepts"), "false_accepts", -1),
+    Column(SURE_TITLE, count("false_accepts_sure"), "false_accepts_sure", -1),
+    Column("false accept rate %", percent("false_accept_rate", True), "false_accept_rate", -1),
+    Column("AUROC", number("auroc", 3), "auroc", 1),
+    Column("ECE", number("ece", 3), "ece", -1),
+    Column("NEES/6", number("nees_6", 2)),
+    Column("× bound", number("bound_ratio", 2), "bound_ratio", -1),
+    Column("s", number("seconds", 3)),
+    Column("s, 90 %", number("seconds_p90", 3)),
+    Column("prepare s", number("prepare_seconds", 3)),
+]
+SUMMARY = [
+    Column("pairs", count("pairs")),
+    *(column for column in ACCURACY if column.key.startswith("rr_")),
+    Column("median RMSE mm", number("rmse_median_mm", 3), "rmse_median_mm", -1),
+    Column("whole bone mm", number("whole_bone_median_mm", 2), "whole_bone_median_mm", -1),
+    *(column for column in SAFETY if column.title in ("refused", "false accepts", SURE_TITLE)),
+    Column("s", number("seconds", 3)),
+]
+LEGEND = (
+    "RR: registration recall, all pairs with a truth counted, refusals are no success; in brackets 95 % bootstrap "
+    "intervals by person. RMSE, CD, R², RTE, RRE, whole bone and TRE count a refusal with centroid on centroid without "
+    "rotation. RTE (at the source's centroid), RRE, whole bone (RMSE over the target) and worst TRE (of the named "
+    "targets) are medians. False accept: an accepted pose beyond 4 mm or 5°, or any accepted pose on a wrong pair. "
+    "AUROC and ECE judge the confidence of every pose given, also of the best one behind a refusal. NEES/6 (about 1 is "
+    "honest) and × bound (RMSE over the Cramer-Rao bound, root-mean-square) are of the right answers. s: median "
+    "register time without reading files and without preparing the target, which is apart. The confidence of a "
+    "baseline is its share of source points within 5 mm, not calibrated. R²(R) is no measure of accuracy: Euler "
+    "angles wrap around. Definitions: docs/metrics.md."
+)
+
+
+def sections(rows: Sequence[Row]) -> list[Section]:
+    """A summary over all bones; per protocol how accurate (the paper's figures below ours), and how safe and fast."""
+    protocols = dict.fromkeys(row["protocol"] for row in rows)
+    last_bone = {row["protocol"]: row["bone"] for row in rows}  # `all`, or the only one
+    over_bones = [row for row in rows if row["bone"] == last_bone[row["protocol"]]]
+    found = [_section("Summary, all bones", over_bones, SUMMARY, first="protocol")]
+    for protocol in protocols:
+        chosen = [row for row in rows if row["protocol"] == protocol]
+        name = "All protocols" if protocol == ALL else f"Protocol {protocol}"
+        if any(row["pairs_with_truth"] for row in chosen):
+            with_truth = [row for row in chosen if row["pairs_with_truth"]]
+            found.append(_section(f"{name}: accuracy", with_truth, ACCURACY, paper=protocol))
+        found.append(_section(f"{name}: safety, uncertainty, time", chosen, SAFETY))
+    return found
+
+
+def where_beaten(rows: Sequence[Row], ours: str) -> list[str]:
+    """One line for each protocol and figure in which another method is better than ours, over all its bones."""
+    lines = []
+    for protocol in dict.fromkeys(row["protocol"] for row in rows):
+        of_protocol = [row for row in rows if row["protocol"] == protocol]
+        bone = of_protocol[-1]["bone"]  # `all` comes last; the only bone where there is one
+        by_method = {row["method"]: row for row in of_protocol if row["bone"] == bone}
+        if ours in by_method:
+            own = by_method.pop(ours)
+            found = [_beaten(own, list(by_method.values()), c) for c in ACCURACY + SAFETY if c.better]
+            lines += [f"{protocol}, {line}; {ours} {own_text}" for line, own_text in found if line]
+    return lines or ["nowhere in these pairs"]
+
+
+def _beaten(own: Row, others: Sequence[Row], column: Column) -> tuple[str, str]:
+    """The methods that are better in one figure (empty if none), and what ours has."""
+    if own[column.key] is None:
+        return "", ""
+    there = [row for row in others if row[column.key] is not None]
+    better = [row for row in there if column.better * (row[column.key] - own[column.key]) > 0]
+    listed = ", ".join(f"{row['method']} {column.text(row)}" for row in better)
+    return f"{column.title}: {listed}" if better else "", column.text(own)
+
+
+def _section(
+    title: str, rows: Sequence[Row], columns: Sequence[Column], first: str = "bone", paper: str = ""
+) -> Section:
+    columns = [c for c in columns if any(c.text(row) != "–" for row in rows)]
+    cells: list[list[str]] = []
+    best: set[tuple[int, int]] = set()
+    for name in dict.fromkeys(row[first] for row in rows):
+        group = [row for row in rows if row[first] == name]
+        best |= {(len(cells) + i, j + 2) for i, j in _best(group, columns)}
+        cells += [[name, row["method"], *(c.text(row) for c in columns)] for row in group]
+        cells += _paper_cells(paper, name, columns)
+    return Section(title, [first, "method", *(c.title for c in columns)], cells, best)
+
+
+def _best(group: Sequence[Row], columns: Sequence[Column]) -> set[tuple[int, int]]:
+    """The best cells of each ranked column, unless all are equal."""
+    marked = set()
+    for j, column in enumerate(columns):
+        ranked = [(i, row[column.key]) for i, row in enumerate(group) if column.better]
+        values = {i: column.better * value for i, value in ranked if value is not None}
+        if len(set(values.values())) > 1:
+            marked |= {(i, j) for i, v in values.items() if v == max(values.values())}
+    return marked
+
+
+def _paper_cells(protocol: str, bone: str, columns: Sequence[Column]) -> list[list[str]]:
+    lines = []
+    for method, f in paper_figures.of(protocol, bone).items():
+        cd = "–" if f.chamfer_mm is None else f"{f.chamfer_mm:.3f}"
+        figures = {"rr_paper": f"{f.rr_percent:.1f}", "rmse_mm": f"{f.rmse_mm:.3f}", "chamfer_mm": cd}
+        named = {"R²(R)": f"{f.r2_rotation:.3f}", "R²(t)": f"{f.r2_translation:.3f}"}
+        own = [figures.get(c.key) or named.get(c.title, "") for c in columns]
+        lines.append([bone, f"{method} (the paper's figure, on the paper's data)", *own])
+    return lines

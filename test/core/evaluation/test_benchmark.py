@@ -1,0 +1,151 @@
+"""A run is repeatable, resumable and can be split; failures and false accepts are counted, never dropped."""
+
+import argparse
+import json
+import shutil
+
+import numpy as np
+import pytest
+from benchmark_cases import make_pair
+
+from gapr_core.data.pair_files import save_pair
+from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.evaluation import benchmark, records, runner
+from gapr_core.evaluation.table import TIMES
+
+
+def timeless(rows):
+    return [{key: value for key, value in row.items() if key not in TIMES} for row in rows]
+
+
+def row_of(rows, protocol, method, bone="all"):
+    return next(r for r in rows if (r["protocol"], r["bone"], r["method"]) == (protocol, bone, f"fakes:{method}"))
+
+
+def test_two_shards_merged_equal_one_run_and_the_same_run_again(pairs, fakes, tmp_path, in_process):
+    methods = fakes("good", "turned")
+    whole = benchmark.benchmark(pairs, methods, tmp_path / "whole")
+    for k in (1, 2):
+        benchmark.benchmark(pairs, methods, tmp_path / f"shard{k}", shard=(k, 2))
+    merged = benchmark.merge([tmp_path / "shard2", tmp_path / "shard1"], tmp_path / "merged")
+    assert timeless(merged) == timeless(whole)
+    assert len(records.read(tmp_path / "shard1" / records.FILE)) == 8  # four of seven pairs, two methods
+    assert timeless(benchmark.benchmark(pairs, methods, tmp_path / "again")) == timeless(whole)
+    assert "results are missing" in (tmp_path / "shard1" / "table.md").read_text()
+    assert "results are missing" not in (tmp_path / "merged" / "table.md").read_text()
+
+
+def test_worker_processes_give_the_same_table_in_any_number(pairs, fakes, tmp_path, no_report, request):
+    pytest.importorskip("small_gicp")
+    methods = [*fakes("good"), "point_to_plane"]
+    two = benchmark.benchmark(pairs, methods, tmp_path / "two", jobs=2, threads=1)
+    request.getfixturevalue("in_process")
+    assert timeless(benchmark.benchmark(pairs, methods, tmp_path / "one")) == timeless(two)
+
+
+def test_an_interrupted_run_is_taken_up_where_it_was_killed(pairs, fakes, tmp_path, in_process, monkeypatch):
+    methods = fakes("good", "shy")
+    whole = benchmark.benchmark(pairs, methods, tmp_path / "out")
+    file = tmp_path / "out" / records.FILE
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(lines[:5]) + lines[5][:40])  # killed while it wrote the sixth record
+    asked = []
+    run = runner.run_task
+    monkeypatch.setattr(runner, "run_task", lambda task: asked.append(task) or run(task))
+    assert timeless(benchmark.benchmark(pairs, methods, tmp_path / "out")) == timeless(whole)
+    assert len(asked) == len(lines) - 5
+    assert len(file.read_text().splitlines()) == len(lines)
+
+
+def test_every_way_to_answer_ends_in_its_own_column(pairs, fakes, tmp_path, in_process):
+    rows = benchmark.benchmark(pairs, fakes("good", "turned", "shy", "raising"), tmp_path / "out")
+    good, turned, shy, raising = (row_of(rows, "all", m) for m in ("good", "turned", "shy", "raising"))
+    assert (good["rr_1_1"], good["rr_4_5"], good["rr_paper"]) == (1.0, 1.0, 1.0)
+    assert (good["accepted"], good["false_accepts"], good["false_accepts_sure"]) == (7, 2, 2)  # the two wrong pairs
+    assert (turned["rr_4_5"], turned["false_accepts"], turned["false_accepts_sure"]) == (0.0, 7, 7)
+    assert (shy["refused"], shy["false_accepts"], shy["rr_4_5"], shy["errors"]) == (7, 0, 0.0, 0)
+    assert (raising["refused"], raising["errors"], raising["rr_paper"]) == (7, 7, 0.0)
+    assert shy["rmse_mm"] == raising["rmse_mm"] > 10.0  # centroid on centroid stands in
+    assert row_of(rows, "wrong", "good")["false_accept_rate"] == 1.0
+    assert row_of(rows, "wrong", "good")["rr_4_5"] is None
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "Failed: fakes:raising on L1_tibia_0000 (RuntimeError: no luck)" in text
+
+
+def test_a_process_that_dies_costs_its_own_pair_only(pairs, fakes, tmp_path, no_report):
+    rows = benchmark.benchmark(pairs, fakes("deadly", "good"), tmp_path / "out", jobs=2)
+    deadly = row_of(rows, "L1", "deadly")
+    assert (deadly["pairs"], deadly["errors"], deadly["rr_4_5"]) == (4, 1, 0.75)
+    assert row_of(rows, "L1", "good")["rr_4_5"] == 1.0
+
+
+def test_a_missing_library_stops_the_run_with_its_install_line(pairs, fakes, tmp_path, in_process):
+    with pytest.raises(MethodUnavailableError, match="pip install nope"):
+        benchmark.benchmark(pairs, fakes("missing"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["fakes:nobody", "no_such_module:good", "fakes:nothing", "ipc"])
+def test_a_method_that_does_not_exist_stops_the_run(name, pairs, fakes, tmp_path, in_process):
+    with pytest.raises(ConfigError):
+        benchmark.benchmark(pairs, [name], tmp_path / "out")
+
+
+def test_results_of_other_pairs_of_the_same_name_are_refused(pairs, fakes, tmp_path, in_process):
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    other = make_pair(9)
+    save_pair(pairs / "L1_femur_0001.npz", other)
+    with pytest.raises(ConfigError, match="L1_femur_0001"):
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    shutil.copytree(tmp_path / "out", tmp_path / "old")
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "new")
+    with pytest.raises(ConfigError, match="other clouds"):
+        benchmark.merge([tmp_path / "old", tmp_path / "new"], tmp_path / "merged")
+
+
+def test_a_pair_without_truth_cannot_be_judged(tmp_path, fakes, in_process):
+    folder = tmp_path / "bare"
+    folder.mkdir()
+    pair = make_pair(0)
+    np.savez(folder / "a.npz", source=pair.source, target=pair.target)
+    with pytest.raises(ConfigError, match="gapr evaluate"):
+        benchmark.benchmark(folder, fakes("good"), tmp_path / "out")
+
+
+def test_methods_can_be_added_to_a_finished_run(pairs, fakes, tmp_path, in_process):
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    rows = benchmark.benchmark(pairs, fakes("shy"), tmp_path / "out")
+    assert {row["method"] for row in rows} == {"fakes:good", "fakes:shy"}
+    assert all(row["pairs"] == 7 for row in rows if row["protocol"] == "all" and row["bone"] == "all")
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "2", "a/b", "1/0"])
+def test_a_shard_is_one_of_n(text):
+    with pytest.raises(ConfigError, match="shard"):
+        benchmark._shard(text)
+
+
+def test_the_command_line_runs_merges_and_says_where_the_report_is(pairs, fakes, tmp_path, in_process, capsys):
+    parser = argparse.ArgumentParser()
+    benchmark.add_arguments(parser)
+    out = [str(tmp_path / name) for name in ("a", "b", "c")]
+    methods = ",".join(fakes("good"))
+    for k in (1, 2):
+        arguments = ["--pairs", str(pairs), "--methods", methods, "--out", out[k - 1], "--shard", f"{k}/2"]
+        assert benchmark.run(parser.parse_args(arguments)) == 0
+    assert benchmark.run(parser.parse_args(["merge", *out[:2], "--out", out[2]])) == 0
+    assert "report.html" in capsys.readouterr().out
+    table = json.loads((tmp_path / "c" / "table.json").read_text())
+    assert len(table["run"]["pairs"]) == 7 and table["rows"][-1]["pairs"] == 7
+    assert len((tmp_path / "c" / "table.csv").read_text().splitlines()) == len(table["rows"]) + 1
+    with pytest.raises(ConfigError, match="merge"):
+        benchmark.run(parser.parse_args(["join", out[0], "--out", out[2]]))
+    with pytest.raises(ConfigError, match="make-pairs"):
+        benchmark.run(parser.parse_args(["--out", out[2]]))
+    with pytest.raises(ConfigError, match="plan.json"):
+        benchmark.merge([tmp_path], tmp_path / "d")
+
+
+def test_a_damaged_line_in_the_middle_is_no_silent_loss(tmp_path):
+    (tmp_path / records.FILE).write_text('{"a": 1}\n{"a": \n{"a": 3}\n')
+    with pytest.raises(ConfigError, match="damaged"):
+        records.read(tmp_path / records.FILE)

@@ -1,0 +1,118 @@
+"""Records and rows from hand-made answers."""
+
+import json
+
+import numpy as np
+import pytest
+from benchmark_cases import make_pair, ok, record, shifted, some_records
+
+from gapr_core.evaluation import sections, table
+from gapr_core.evaluation.judge import judge, pair_facts
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+
+def test_a_shift_is_measured_in_every_error_and_limit():
+    pair = make_pair(0)
+    facts = judge(pair, ok(shifted(pair, 3.0)))
+    for key in ("rte_mm", "rmse_mm", "whole_bone_mm"):
+        assert facts[key] == pytest.approx(3.0)
+    assert all(value == pytest.approx(3.0) for value in facts["tre_mm"].values())
+    assert (facts["within_1_1"], facts["within_2_2"], facts["within_4_5"]) == (False, False, True)
+    assert facts["right"] and not facts["false_accept"] and not facts["stand_in"]
+    assert facts["within_paper"] == (3.0 < 0.02 * pair_facts(pair)["half_extent_mm"])
+    assert judge(pair, ok(shifted(pair, 4.1)))["false_accept"]
+
+
+def test_a_refusal_is_never_within_a_limit_even_where_its_stand_in_would_be():
+    pair = make_pair(0)
+    on_centroid = pair.source - pair.source.mean(axis=0) + pair.target.mean(axis=0)
+    aligned = type(pair)(on_centroid, pair.target, np.eye(4), "a", "femur", "p", "L1")
+    facts = judge(aligned, RegistrationResult(RegistrationStatus.LOW_CONFIDENCE))
+    assert facts["rmse_mm"] == pytest.approx(0.0, abs=1e-9) and facts["stand_in"]
+    assert not any(facts[key] for key in ("within_paper", "within_4_5", "right", "false_accept"))
+    assert facts["best_right"] is None
+
+
+def test_the_pose_behind_a_refusal_is_judged_for_calibration():
+    pair = make_pair(0)
+    for T, right in ((shifted(pair, 1.0), True), (shifted(pair, 50.0), False)):
+        refusal = RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.4, alternatives=(T,))
+        assert judge(pair, refusal)["best_right"] is right
+
+
+def test_any_pose_for_a_wrong_pair_is_a_false_accept_and_a_refusal_is_not():
+    pair = make_pair(0, "wrong")
+    assert judge(pair, ok(np.eye(4))) == {"right": False, "false_accept": True, "best_right": False}
+    refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE)
+    assert judge(pair, refusal) == {"right": False, "false_accept": False, "best_right": None}
+
+
+def test_nees_and_the_ratio_to_the_bound_come_with_a_covariance_and_a_noise():
+    pair = make_pair(0)
+    covariance = np.diag([1.0] * 3 + [1e-4] * 3)
+    facts = judge(pair, ok(shifted(pair, 2.0), covariance=covariance))
+    assert facts["nees"] == pytest.approx(4.0)
+    assert facts["bound_ratio"] == pytest.approx(2.0 / facts["bound_rmse_mm"])
+    assert "nees" not in judge(pair, ok(shifted(pair, 2.0)))
+
+
+def test_targets_named_in_the_pair_take_the_place_of_the_extreme_points():
+    pair = make_pair(0)
+    assert set(judge(pair, ok(shifted(pair, 1.0)))["tre_mm"]) == {f"axis{k}{s}" for k in (1, 2, 3) for s in "+-"}
+    pair.metadata["landmark_hip_centre"] = np.array([1.0, 2.0, 3.0])
+    assert set(judge(pair, ok(shifted(pair, 1.0)))["tre_mm"]) == {"hip_centre"}
+
+
+def test_records_are_plain_json_without_nan():
+    pair = make_pair(0)
+    pair.metadata["overlap"] = np.float64("nan")
+    text = json.dumps(record(pair, ok(shifted(pair, 1.0), covariance=np.eye(6))), allow_nan=False)
+    assert json.loads(text)["overlap"] is None
+
+
+def test_a_row_counts_what_happened():
+    rows = {(r["protocol"], r["method"]): r for r in table.rows(some_records(), ["a", "b"])}
+    a, b = rows["L1", "a"], rows["L1", "b"]
+    assert a["rr_4_5"] == pytest.approx(1 / 3, rel=1e-5) and b["rr_4_5"] == 1.0
+    assert (a["rr_1_1"] > 0, b["rr_1_1"], b["rr_2_2"]) == (True, 0.0, 1.0)
+    assert (a["accepted"], a["refused"], a["false_accepts"], a["false_accepts_sure"]) == (2, 1, 1, 1)
+    assert a["auroc"] == 0.0 and b["auroc"] is None  # the wrong one had the higher confidence
+    assert b["rmse_mm"] == pytest.approx(1.5) and a["rmse_median_mm"] == pytest.approx(30.0)
+    assert rows["wrong", "b"]["false_accepts"] == 1 and rows["wrong", "a"]["false_accepts"] == 0
+    assert rows["all", "a"]["pairs"] == 4 and rows["all", "a"]["pairs_with_truth"] == 3
+    assert rows["all", "b"]["seconds"] == 0.5
+
+
+def test_rows_do_not_depend_on_the_order_of_the_pairs_within_a_group():
+    found = some_records()
+    assert table.rows(found, ["a", "b"]) == table.rows(sorted(found, key=lambda r: r["pair"]), ["a", "b"])
+
+
+def test_the_table_says_where_another_method_is_better_and_only_there():
+    lines = sections.where_beaten(table.rows(some_records(), ["a", "b"]), "a")
+    assert any(line.startswith("L1, RR % 4 mm/5°: b 100.0") and line.endswith("a 33.3 [0–100]") for line in lines)
+    assert any(line.startswith("L1, false accepts: b 0; a 1") for line in lines)
+    assert not any("RR % 1 mm" in line for line in lines)
+    assert not any(line.startswith("wrong") for line in lines)
+    assert sections.where_beaten(table.rows(some_records()[:3], ["a"]), "a") == ["nowhere in these pairs"]
+
+
+def test_the_figures_of_the_paper_stand_below_ours_and_are_marked():
+    pair = make_pair(0, "paper")
+    found = sections.sections(table.rows([record(pair, ok(shifted(pair, 1.0)), "a")], ["a"]))
+    accuracy = next(s for s in found if s.title == "Protocol paper: accuracy")
+    marked = {line[1]: line for line in accuracy.cells if "the paper's figure, on the paper's data" in line[1]}
+    assert len(marked) == 6
+    recall = accuracy.header.index("RR % (RMSE < 0.02 half extent)")
+    name = "GAPR-Net (the paper's figure, on the paper's data)"
+    assert marked[name][recall] == "95.6" and accuracy.cells[0][recall].startswith("100.0")
+
+
+def test_the_best_cell_of_a_column_is_marked_unless_all_are_equal():
+    rows = table.rows(some_records(), ["a", "b"])
+    accuracy = next(s for s in sections.sections(rows) if s.title == "Protocol L1: accuracy")
+    column = accuracy.header.index("RR % 4 mm/5°")
+    assert (1, column) in accuracy.best and (0, column) not in accuracy.best
+    same = [{**row, "rr_4_5": 0.5} for row in rows if row["protocol"] == "L1"]
+    accuracy = next(s for s in sections.sections(same) if s.title == "Protocol L1: accuracy")
+    assert not {(0, column), (1, column)} & accuracy.best

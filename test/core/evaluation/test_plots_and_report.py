@@ -1,0 +1,104 @@
+"""Plots show the figures of the records; the report is one file that a browser shows without a network."""
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from benchmark_cases import make_pair, ok, record, shifted, some_records
+
+from gapr_core.data.pair_files import save_pair
+from gapr_core.evaluation import benchmark_report, pictures, plots, table
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+
+def curve(figure, label):
+    return next(line.get_data() for line in figure.axes[0].lines if line.get_label() == label)
+
+
+def test_recall_against_threshold_steps_at_the_errors_and_never_counts_a_refusal():
+    x, y = curve(plots.recall_against_threshold(some_records(), ["a", "b"]), "a")
+    assert y[x < 0.49].max() == 0.0
+    assert y[(x > 0.51) & (x < 29)] == pytest.approx(1 / 3)
+    assert y[-1] == pytest.approx(1 / 3)  # the third is exactly 30 mm off, the second was refused
+    assert curve(plots.recall_against_threshold(some_records(), ["a", "b"]), "b")[1][-1] == 1.0
+
+
+def test_recall_against_overlap_has_one_dot_per_value_and_none_without_variation():
+    x, y = curve(plots.recall_against(some_records(), ["a", "b"], "overlap", "overlap"), "a")
+    assert x == pytest.approx([0.1, 0.15, 0.2]) and y.tolist() == [1.0, 0.0, 0.0]
+    assert plots.recall_against(some_records(), ["a", "b"], "noise_mm", "noise") is None
+
+
+def test_many_values_are_put_in_at_most_six_bins():
+    found = [record(pair, ok(shifted(pair, 1.0))) for pair in map(make_pair, range(40))]
+    x, y = curve(plots.recall_against(found, ["m"], "overlap", "overlap"), "m")
+    assert 3 <= len(x) <= 6 and np.all(y == 1.0)
+
+
+def test_the_risk_curve_ends_at_the_share_of_pairs_that_were_answered():
+    coverage, risk = curve(plots.risk_coverage(some_records(), ["a"]), "a")
+    assert coverage[-1] == 0.5 and risk[-1] == 0.5
+    assert risk[0] == 1.0  # the most confident answer was wrong
+
+
+def test_the_ellipse_found_is_that_of_the_errors():
+    found = []
+    for k in range(12):
+        pair = make_pair(k)
+        found.append(record(pair, ok(shifted(pair, (-1) ** k * 1.0), covariance=np.eye(6) * 0.25)))
+    figure = plots.error_ellipsoids(found, "m")
+    labels = {patch.get_label() for patch in figure.axes[0].patches}
+    assert labels == {"errors found", "mean predicted", "mean Cramer-Rao bound"}
+    assert figure.axes[0].collections[0].get_offsets().shape == (12, 2)
+    predicted = next(p for p in figure.axes[0].patches if p.get_label() == "mean predicted")
+    assert predicted.get_width() == pytest.approx(2 * np.sqrt(5.991 * 0.25))
+    assert plots.error_ellipsoids(found[:2], "m") is None
+
+
+def test_the_worst_cases_begin_with_the_most_confident_false_accept():
+    worst = pictures.worst(some_records(), "a")
+    assert [r["accepted"] for r in worst] == [True, False, True]
+    assert worst[0]["false_accept"] and worst[0]["confidence"] == 0.95
+    assert "FALSE ACCEPT" in pictures.caption(worst[0]) and "refused" in pictures.caption(worst[1])
+    assert pictures.worst(some_records(), "b")[0]["protocol"] == "wrong"
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    pairs = [*map(make_pair, range(3)), make_pair(7, "wrong")]
+    for pair in pairs[:3]:
+        save_pair(folder / f"{pair.name}.npz", pair)
+    plan = {
+        "ours": "a", "methods": ["a", "b"], "folder": str(folder), "pairs": {p.name: "0" for p in pairs},
+        "command": "gapr benchmark <&>", "commit": "c0ffee", "machine": "m", "threads": 1, "started": "now",
+    }  # fmt: skip
+    found = some_records()
+    refused = record(pairs[3], RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="<b>two</b> poses"), "a")
+    found = [*found[:-2], refused, found[-1]]
+    benchmark_report.write(folder, found, table.rows(found, ["a", "b"]), plan, ["One <note>."])
+    return folder
+
+
+def test_the_report_needs_nothing_but_itself(report):
+    page = (report / "report.html").read_text()
+    sources = re.findall(r"(?:src|href)=[\"']([^\"']{0,40})", page)
+    assert sources and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "http" not in re.sub(r"base64,[^']*", "", page) and "<script" not in page
+    assert "One &lt;note&gt;." in page and "gapr benchmark &lt;&amp;&gt;" in page
+    assert "c0ffee" in page and "worst 3 cases of a" in page
+    assert (report / "plots" / "worst_01.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_a_browser_lays_the_report_out(report, tmp_path):
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+             "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}"]  # fmt: skip
+    script = f"file://{report / 'report.html'}"
+    dom = subprocess.run(["chromium", *flags, "--dump-dom", script], capture_output=True, text=True, timeout=120).stdout
+    assert dom.count("<table>") == 6 and dom.count("<figure>") >= 8
+    subprocess.run(["chromium", *flags, f"--screenshot={tmp_path / 'page.png'}", script], timeout=120, check=True)
+    assert (tmp_path / "page.png").stat().st_size > 20_000

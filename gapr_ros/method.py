@@ -8,9 +8,10 @@ from gapr_ros.parameters import NodeParameters
 
 
 def default_method(parameters: NodeParameters) -> Any:
-    """GAPR's Registrar; `min_confidence` is judged by the node, where it can be changed while running."""
-    from gapr_core import Registrar
-    from gapr_core.config import RegistrarConfig
+    """GAPR's Registrar as it ships."""
+    from gapr_core import Registrar, RegistrarConfig
 
-    config = RegistrarConfig(min_confidence=0.0, num_threads=parameters.num_threads, seed=parameters.seed)
-    return Registrar(config=config)
+    config = RegistrarConfig(
+        min_confidence=parameters.min_confidence, num_threads=parameters.num_threads, seed=parameters.seed
+    )
+    return Registrar.from_pretrained(config)

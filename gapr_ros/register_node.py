@@ -93,7 +93,7 @@ class RegisterNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the bone, prepare the method, advertise."""
         self.failure, self.parameters = "", parameters.read(self)
-        self.session = Session(self, self._method_factory(self.parameters))
+        self.session = Session(self, self._method_factory)
         model = self.session.model
         self.get_logger().info(f"{model.path}: {len(model.target.points)} points, {model.extent_mm:.0f} mm across")
         return super().on_configure(state)
@@ -172,7 +172,7 @@ class RegisterNode(LifecycleNode):
     def _on_changed(self, changes: list[Parameter]) -> None:
         self.parameters = parameters.read(self)
         if self.session is not None:
-            self.session.worker.wake()
+            self.session.parameters_changed()
 
     @guarded
     def _on_jump(self, jump: Any) -> None:

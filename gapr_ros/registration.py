@@ -39,6 +39,7 @@ class Seed:
 class Situation:
     """What holds at the moment when a cloud is taken in hand."""
 
+    method: Any
     model: Model
     parameters: NodeParameters
     epoch: int
@@ -47,16 +48,16 @@ class Situation:
 
 
 class Registration:
-    """Turns jobs into outcomes with one registration method.
+    """Turns jobs into outcomes.
 
     Args:
-        method: satisfies `RegistrationMethod`; `register` takes `initial` when a seed is given.
         frames: look-up of transforms.
-        situation: asked at the start of each job.
+        situation: asked at the start of each job; its method satisfies `RegistrationMethod`, and `register` takes
+            `initial` when there is a seed.
     """
 
-    def __init__(self, method: Any, frames: Frames, situation: Callable[[], Situation]) -> None:
-        self.method, self._frames, self._situation = method, frames, situation
+    def __init__(self, frames: Frames, situation: Callable[[], Situation]) -> None:
+        self._frames, self._situation = frames, situation
 
     def process(self, job: Job) -> Outcome:
         """The outcome of one cloud; never raises."""
@@ -88,7 +89,7 @@ class Registration:
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
         seed = self._initial(outcome, now)
         options = {} if seed is None else {"initial": seed}
-        result = self.method.register(points_mm, now.model.target, **options)
+        result = now.method.register(points_mm, now.model.target, **options)
         outcome.confidence, outcome.inlier_ratio = float(result.confidence), float(result.inlier_ratio)
         outcome.tre_mm = result.tre_mm
         return result

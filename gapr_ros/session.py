@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from gapr_ros.diagnostics import RefusalLog
 from gapr_ros.frames import Frames
 from gapr_ros.model import Model, load_model, warm_up
 from gapr_ros.outcome import Outcome
+from gapr_ros.parameters import NodeParameters
 from gapr_ros.publishers import Publishers
 from gapr_ros.refusal import Reason, RefusedError
 from gapr_ros.registration import Registration, Seed, Situation
@@ -35,17 +37,19 @@ class Session:
         GaprError: a bone that cannot be read or prepared.
     """
 
-    def __init__(self, node: RegisterNode, method: Any) -> None:
-        self._node, self._method = node, method
+    def __init__(self, node: RegisterNode, method_factory: Callable[[NodeParameters], Any]) -> None:
+        self._node, self._method_factory = node, method_factory
+        self._method = method_factory(node.parameters)
+        self._min_confidence = node.parameters.min_confidence
         self.enabled = True
         self.last_outcome: Outcome | None = None
         self._track, self._epoch, self._seed, self._last_stamp_ns = Track(), 0, None, 0
         self._log_refusal = RefusalLog(node.get_logger().warning)
         self.model = self.read_model()
-        warm_up(method, self.model)
+        warm_up(self._method, self.model)
         self._frames = Frames(node, node.parameters.publish_tf, listen=bool(node.parameters.output_frame))
         self._publishers = Publishers(node, self._frames, node.parameters.model_frame)
-        self._registration = Registration(method, self._frames, self._situation)
+        self._registration = Registration(self._frames, self._situation)
         self.worker = Worker(self._work, self._held, self._period_s)
 
     def close(self) -> None:
@@ -93,7 +97,11 @@ class Session:
         self._node.call_soon(partial(self._settle, self._registration.process(job)))
 
     def _situation(self) -> Situation:
-        return Situation(self.model, self._node.parameters, self._epoch, self._seed, self._node.now_ns())
+        node = self._node
+        return Situation(self._method, self.model, node.parameters, self._epoch, self._seed, node.now_ns())
+
+    def _renew_method(self) -> None:
+        self._method = self._method_factory(self._node.parameters)
 
     def _held(self) -> bool:
         return not self._node.parameters.continuous
@@ -144,6 +152,13 @@ class Session:
         """Forget track and seed; clouds on their way will be refused."""
         self._epoch += 1
         self._forget()
+
+    def parameters_changed(self) -> None:
+        """Take up what may change while running; the method's own limit means a new method for the same bone."""
+        if self._min_confidence != self._node.parameters.min_confidence:
+            self._min_confidence = self._node.parameters.min_confidence
+            self.worker.run(self._renew_method)
+        self.worker.wake()
 
     def replace_model(self, model: Model) -> None:
         """Swap the bone, between two clouds."""

@@ -85,8 +85,9 @@ def benchmark(
         raise ConfigError("pairs NAME.npz and methods", f"{len(paths)} pairs in {pairs}, {len(methods)} methods",
                           "make pairs with gapr make-pairs, name methods with --methods")  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
-    plan = _plan(pairs, paths, methods, out, threads, ours)
     known = records.read(out / records.FILE)
+    all_methods = list(dict.fromkeys([*(record["method"] for record in records.sort(known, methods)), *methods]))
+    plan = _plan(pairs, paths, all_methods, threads, ours)
     done = records.done(known, plan["pairs"])
     records.write_plan(out, plan)
     tasks = [runner.Task(path, method) for path in paths[shard[0] - 1 :: shard[1]] for method in methods]
@@ -132,17 +133,13 @@ def write(out: Path, plan: Plan) -> list[Row]:
     return rows
 
 
-def _plan(
-    pairs: Path, paths: Sequence[Path], methods: Sequence[str], out: Path, threads: int, ours: str | None
-) -> Plan:
+def _plan(pairs: Path, paths: Sequence[Path], methods: Sequence[str], threads: int, ours: str | None) -> Plan:
     hashes = {path.stem: pair_hash(load_pair(path)) for path in tqdm(paths, desc="reading pairs", disable=None)}
-    earlier = records.read_plan(out)["methods"] if (out / records.PLAN).is_file() else []
-    all_methods = list(dict.fromkeys([*earlier, *methods]))
     return {
         "command": _command(), "commit": _commit(), "machine": _machine(), "threads": threads,
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "ours": ours or (OURS if OURS in all_methods else all_methods[0]),
-        "methods": all_methods, "folder": str(pairs.resolve()), "pairs": hashes,
+        "ours": ours or (OURS if OURS in methods else methods[0]), "methods": list(methods),
+        "folder": str(pairs.resolve()), "pairs": hashes,
     }  # fmt: skip
 
 

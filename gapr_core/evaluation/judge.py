@@ -83,10 +83,10 @@ def pose_facts(pair: Pair, T: Array, accepted: bool) -> Record:
 
 
 def best_right(pair: Pair, result: RegistrationResult | None) -> bool | None:
-    """Is the pose that the confidence speaks of right: the answer, or the best one behind a refusal; None without."""
-    if result is None or not (result.ok or result.alternatives):
+    """Is the pose that the confidence speaks of right: the answer, or details["best_pose"] of a refusal?"""
+    T = None if result is None else result.details.get("best_pose", result.T_target_source)
+    if T is None:
         return None
-    T = result.alternatives[0] if result.T_target_source is None else result.T_target_source
     return pair.has_truth and metrics.pose_error(T, pair.T_target_source, pair.source).within(*ACCEPT_LIMIT)
 
 

@@ -52,7 +52,7 @@ def picture(record: Record, folder: Path) -> Figure:
     length, *widths = np.ptp(clouds[0][0], axis=0)
     long = max(widths) < 0.45 * length  # views of a long bone one below the other
     figure = Figure(figsize=(9.0, 1.6 + 8.0 * sum(widths) / length if long else 4.6), layout="constrained")
-    views = figure.subplots(2, 1, height_ratios=widths) if long else figure.subplots(1, 2)
+    views = figure.subplots(2, 1, height_ratios=widths, sharex=True) if long else figure.subplots(1, 2)
     for view, (across, up) in zip(views, ((0, 1), (0, 2)), strict=True):
         _draw(view, clouds, across, up)
     handles, labels = view.get_legend_handles_labels()
@@ -62,7 +62,7 @@ def picture(record: Record, folder: Path) -> Figure:
 
 def _clouds(record: Record, pair: Pair) -> list[tuple[Array, str, float, str]]:
     source = _thin(pair.source, MOST_SOURCE_POINTS)
-    clouds = [(_thin(pair.target, MOST_TARGET_POINTS), "#b9bec4", 1.0, "target")]
+    clouds = [(_thin(pair.target, MOST_TARGET_POINTS), "#9aa2ab", 1.2, "target")]
     if pair.has_truth:
         clouds.append((se3.apply(pair.T_target_source, source), "#0b5fa5", 2.0, "source, true pose"))
     if record["transform"]:

@@ -95,17 +95,21 @@ def error_ellipsoids(records: Sequence[Record], method: str) -> Figure | None:
     all_axes = figure.subplots(len(groups), 3, squeeze=False)
     for line, (protocol, own) in zip(all_axes, groups, strict=True):
         errors = np.array([np.array(r["axes"]) @ r["twist"][:3] for r in own])
-        span = 1.1 * np.abs(errors).max()
+        ellipses = _ellipses(own, errors)
+        widest = max(np.linalg.eigvalsh(covariance)[-1] for covariance, *_ in ellipses)
+        span = 1.1 * max(np.abs(errors).max(), np.sqrt(CHI2_95_2D * widest))
         for axes, (i, j) in zip(line, ((0, 1), (0, 2), (1, 2)), strict=True):
             axes.scatter(errors[:, i], errors[:, j], s=9, color="#0b5fa5", alpha=0.55, linewidths=0)
-            for covariance, colour, dash, name in _ellipses(own, errors):
+            for covariance, colour, dash, name in ellipses:
                 _draw_ellipse(axes, covariance[np.ix_([i, j], [i, j])], colour, dash, name)
             axes.set(xlim=(-span, span), ylim=(-span, span), aspect="equal")
             axes.set(xlabel=f"axis {i + 1}, mm", ylabel=f"axis {j + 1}, mm")
+            axes.locator_params(nbins=5)
         line[0].set_title(f"{protocol}, {len(own)} right answers", fontsize=10, loc="left")
-        line[2].legend(fontsize=8, frameon=False)
     title = f"{method}: translation error at the source's centroid, bone axes (1 is the longest); 95 % ellipses"
     figure.suptitle(title, fontsize=11)
+    handles, labels = all_axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
 

@@ -39,7 +39,9 @@ class Shy(Fake):
     """Refuses, with the right pose up its sleeve."""
 
     def answer(self, source, target, T):
-        return RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.4, alternatives=(T,), reason="two poses")
+        return RegistrationResult(
+            RegistrationStatus.AMBIGUOUS, confidence=0.4, reason="two poses", details={"best_pose": T}
+        )
 
 class Raising(Fake):
     def answer(self, source, target, T):

@@ -113,7 +113,10 @@ def test_a_pair_without_truth_cannot_be_judged(tmp_path, fakes, in_process):
 
 def test_methods_can_be_added_to_a_finished_run(pairs, fakes, tmp_path, in_process):
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    with pytest.raises(ConfigError):
+        benchmark.benchmark(pairs, fakes("nobody"), tmp_path / "out")  # leaves nothing behind
     rows = benchmark.benchmark(pairs, fakes("shy"), tmp_path / "out")
+    assert "missing" not in (tmp_path / "out" / "table.md").read_text()
     assert {row["method"] for row in rows} == {"fakes:good", "fakes:shy"}
     assert all(row["pairs"] == 7 for row in rows if row["protocol"] == "all" and row["bone"] == "all")
 

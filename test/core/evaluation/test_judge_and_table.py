@@ -36,7 +36,7 @@ def test_a_refusal_is_never_within_a_limit_even_where_its_stand_in_would_be():
 def test_the_pose_behind_a_refusal_is_judged_for_calibration():
     pair = make_pair(0)
     for T, right in ((shifted(pair, 1.0), True), (shifted(pair, 50.0), False)):
-        refusal = RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.4, alternatives=(T,))
+        refusal = RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.4, details={"best_pose": T})
         assert judge(pair, refusal)["best_right"] is right
 
 

@@ -99,6 +99,6 @@ def test_a_browser_lays_the_report_out(report, tmp_path):
              "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}"]  # fmt: skip
     script = f"file://{report / 'report.html'}"
     dom = subprocess.run(["chromium", *flags, "--dump-dom", script], capture_output=True, text=True, timeout=120).stdout
-    assert dom.count("<table>") == 6 and dom.count("<figure>") >= 8
+    assert dom.count("<table>") == 6 and dom.count("<figure>") == 7
     subprocess.run(["chromium", *flags, f"--screenshot={tmp_path / 'page.png'}", script], timeout=120, check=True)
     assert (tmp_path / "page.png").stat().st_size > 20_000

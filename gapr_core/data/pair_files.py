@@ -25,7 +25,8 @@ def save_pair(path: str | Path, pair: Pair) -> None:
     extra = {key: np.asarray(value) for key, value in pair.metadata.items()}
     names = {key: np.asarray(getattr(pair, key)) for key in NAMES}
     partial = path.with_name(f".{path.stem}.{os.getpid()}.npz")
-    np.savez_compressed(partial, **_content(pair), has_truth=np.asarray(pair.has_truth), **names, **extra)
+    arrays: dict[str, Any] = {**_content(pair), "has_truth": np.asarray(pair.has_truth), **names, **extra}
+    np.savez_compressed(partial, **arrays)
     partial.replace(path)
 
 

@@ -15,6 +15,7 @@ from gapr_core.clouds import Surface
 from gapr_core.data import deformation
 from gapr_core.data.bones.femur import FemurParameters, femur_surface
 from gapr_core.data.bones.pelvis import PelvisParameters, pelvis_surface
+from gapr_core.data.bones.thoracic import ThoracicParameters, thoracic_surface
 from gapr_core.data.bones.tibia import TibiaParameters, tibia_surface
 from gapr_core.data.parameters import draw
 from gapr_core.data.solid import simplify
@@ -37,8 +38,23 @@ def make_bone(name: str, seed: int) -> Surface:
 
 
 def femur(seed: int) -> Surface:
-    """`make_bone("femur", seed)`."""
+    """A whole femur of person `seed`, left or right."""
     return make_bone("femur", seed)
+
+
+def tibia(seed: int) -> Surface:
+    """A whole tibia of person `seed`, left or right."""
+    return make_bone("tibia", seed)
+
+
+def pelvis(seed: int) -> Surface:
+    """Both hip bones and the sacrum of person `seed`, joints fused."""
+    return make_bone("pelvis", seed)
+
+
+def thoracic(seed: int) -> Surface:
+    """Sternum and costal cartilages 1-10 of person `seed`."""
+    return make_bone("thoracic", seed)
 
 
 def _femur(rng: np.random.Generator) -> Surface:
@@ -53,6 +69,10 @@ def _pelvis(rng: np.random.Generator) -> Surface:
     return _finish(pelvis_surface(draw(PelvisParameters, rng), rng), rng, faces=24_000)
 
 
+def _thoracic(rng: np.random.Generator) -> Surface:
+    return _finish(thoracic_surface(draw(ThoracicParameters, rng), rng), rng, faces=20_000)
+
+
 def _finish(surface: Surface, rng: np.random.Generator, faces: int = 14_000) -> Surface:
     """Individual form and texture that no parameter describes, then a mesh of a size that files and trees like."""
     return simplify(deformation.deform(surface, rng), faces)
@@ -65,4 +85,9 @@ def _either_side(left: Surface, rng: np.random.Generator) -> Surface:
     return replace(left, points=left.points * [-1.0, 1.0, 1.0], faces=left.faces[:, ::-1].copy())
 
 
-BONES: dict[str, Callable[[np.random.Generator], Surface]] = {"femur": _femur, "tibia": _tibia, "pelvis": _pelvis}
+BONES: dict[str, Callable[[np.random.Generator], Surface]] = {
+    "femur": _femur,
+    "tibia": _tibia,
+    "pelvis": _pelvis,
+    "thoracic": _thoracic,
+}

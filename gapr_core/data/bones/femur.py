@@ -74,7 +74,7 @@ def _proximal_end(solid: Solid, p: FemurParameters) -> None:
     root = head - p.offset_mm * (medial + [0.0, 0.0, np.tan(rise)])
     along = (head - root) / np.linalg.norm(head - root)
     across = np.cross(along, [0.0, 0.0, 1.0])
-    stations = [root + f * (head - root) for f in (-0.05, 0.25, 0.55, 0.8, 1.0)]
+    stations = root + np.array([-0.05, 0.25, 0.55, 0.8, 1.0])[:, None] * (head - root)
     solid.add(tube(stations, neck * np.array([1.35, 1.18, 1.0, 1.02, 1.1]), across / np.linalg.norm(across), 0.82), 8.0)
     solid.add(ball(head, head_radius), 4.0)
     fovea = along * 0.93 + np.array([0.0, 0.30, -0.15])
@@ -85,7 +85,8 @@ def _proximal_end(solid: Solid, p: FemurParameters) -> None:
 def _trochanters(solid: Solid, p: FemurParameters, root: Array, head: Array) -> None:
     k = p.trochanter_size
     tip = np.array([14.0, 8.0, head[2] + p.trochanter_height_mm - 13.0 * k])
-    front = [root + [1.0, 0.0, -62.0], root + [9.0, -2.0, -26.0], root + [16.0, -4.0, -2.0], [15.0, -1.0, tip[2] - 6.0]]
+    top = np.array([15.0, -1.0, tip[2] - 6.0])
+    front = [root + [1.0, 0.0, -62.0], root + [9.0, -2.0, -26.0], root + [16.0, -4.0, -2.0], top]
     back = [root + [4.0, 2.0, -44.0], root + [14.0, 6.0, -8.0], tip, tip + [-5.0, 7.0, 3.0]]
     solid.add(tube(front, k * np.array([10.0, 14.0, 13.0, 9.5])), 12.0)
     solid.add(tube(back, k * np.array([11.0, 14.5, 11.5, 7.5])), 9.0)

@@ -72,16 +72,16 @@ def pelvis_surface(p: PelvisParameters, rng: np.random.Generator, spacing_mm: fl
     symphysis = _spread(np.array([[0.0, -68.0, -80.0]]), p)[0]
     slanted = np.array([[1.0, 0.0, 0.0], [0.0, 0.77, 0.64], [0.0, -0.64, 0.77]])  # its long axis runs down and back
     solid.add(ellipsoid(symphysis, [9.0, 7.0, 17.0], slanted), 4.0)
-    add_sacrum(solid, p.sacrum_width_mm, p.sacrum_length_mm, p.sacral_curvature, p.sacral_tilt_deg, p.depth_mm / 155.0)
+    add_sacrum(solid, p.sacrum_width_mm, p.sacrum_length_mm, p.sacral_curvature, p.sacral_tilt_deg, p.depth_mm / 162.0)
     return solid.surface(smoothing_mm=1.3)
 
 
 def _spread(points: ArrayLike, p: PelvisParameters) -> Array:
     """Landmarks of the average pelvis moved to the person's widths, height and depth."""
     x, y, z = np.asarray(points, dtype=np.float64).T
-    widths = [p.tuberosity_distance_mm / 112.0, p.hip_distance_mm / 168.0, p.intercristal_mm / 270.0]
+    widths = [p.tuberosity_distance_mm / 112.0, p.hip_distance_mm / 168.0, p.intercristal_mm / 278.0]
     wide = np.interp(z, [-112.0, -56.0, 50.0], widths)
-    return np.stack([x * wide, y * p.depth_mm / 155.0, z * p.height_mm / 207.0], axis=1)
+    return np.stack([x * wide, y * p.depth_mm / 162.0, z * p.height_mm / 209.0], axis=1)
 
 
 class _Hip:

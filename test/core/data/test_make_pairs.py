@@ -130,6 +130,19 @@ def test_no_parametric_person_is_in_two_splits():
     assert not (people[0] & people[1] or people[0] & people[2] or people[1] & people[2])
 
 
+def test_a_bone_that_the_anatomy_lacks_is_a_parametric_one_and_says_so(tmp_path):
+    specimen = ball_specimen(person="a", bone="femur")
+    arrays = {"points": specimen.surface.points[None], "faces": specimen.surface.faces, "person": np.array(["a"])}
+    np.savez(tmp_path / "femur_made.npz", **arrays)
+    (tmp_path / "splits.json").write_text(json.dumps({"train": [], "val": [], "test": ["a"]}))
+    (found,) = pool.specimens("femur", "test", anatomy_folder=tmp_path)
+    assert (found.person, found.cohort) == ("a", "made")
+    (lacking,) = pool.specimens("tibia", "test", people=1, anatomy_folder=tmp_path)
+    assert (lacking.person, lacking.cohort) == ("parametric_4", "parametric")
+    with pytest.raises(ConfigError, match="train, val, test"):
+        pool.specimens("tibia", "exam", anatomy_folder=tmp_path)
+
+
 GOLDEN_POINTS = {
     "paper": [[-24.43, -36.54, -14.86], [-88.1, -87.92, -31.14], [-87.74, -81.03, -5.26]],
     "L2": [[-131.6, 168.63, 180.85], [-104.15, 151.86, 120.97], [-135.11, 175.19, 169.36]],

@@ -48,7 +48,7 @@ class ModelConfig:
         match_confidence: matches below it are dropped.
         coarse_temperature: divides the squared feature distance of eq. (6); 1 is the paper's.
         reposition_temperature, reposition_top, reposition_condition: soft matches of the weighted SVD, how many of
-            them, and the condition number of their covariance from which on nothing is moved.
+            them, and how much longer than wide they may be before nothing is moved.
     """
 
     name: str = "best"

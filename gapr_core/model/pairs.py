@@ -25,6 +25,7 @@ class Pairs:
         radius: (B, n, 1) of the larger ball.
         reach: (B, n, 1) of a neighbourhood at this resolution.
         valid: (B, 1, m) bool, keys that exist.
+        same: queries and keys are the same points.
     """
 
     p_i: Tensor
@@ -36,6 +37,7 @@ class Pairs:
     radius: Tensor
     reach: Tensor
     valid: Tensor
+    same: bool = False
 
     @cached_property
     def pgf(self) -> Tensor:
@@ -95,8 +97,15 @@ class LocalPairs(Pairs):
         return x[:, 0]
 
     def at_centres(self, x: Tensor) -> Tensor:
-        """Features (M, C) of the support, at the centres: their nearest support point."""
-        return x if self.same else x.index_select(0, self.hood.index[:, 0])
+        """Features (M, C) of the support, at the centres: the mean over the points that are nearest to each centre.
+
+        Taking the nearest point instead would toss a coin wherever a voxel held two points.
+        """
+        if self.same or self.support.up is None:
+            return x
+        zeros = x.new_zeros(len(self.centres.points), x.shape[1])
+        count = zeros[:, :1].index_add(0, self.support.up, torch.ones_like(x[:, :1]))
+        return zeros.index_add(0, self.support.up, x) / count.clamp(min=1.0)
 
     def regroup(self, index: Tensor) -> LocalPairs:
         """The same centres looking at other support points, (N, K)."""
@@ -140,7 +149,9 @@ def gather(x: Tensor, index: Tensor) -> Tensor:
 
 def self_pairs(points: Tensor, normals: Tensor, valid: Tensor, c_k: Tensor, reach: Tensor) -> DensePairs:
     """Global self-attention: the larger ball is the whole cloud, so c_h is its centroid (paper, section IV-C)."""
-    return DensePairs(points, normals, points, normals, valid, _centroid(points, valid), c_k, reach)
+    pairs = DensePairs(points, normals, points, normals, valid, _centroid(points, valid), c_k, reach)
+    pairs.same = True
+    return pairs
 
 
 def cross_pairs(

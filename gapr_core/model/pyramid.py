@@ -47,6 +47,11 @@ def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Clou
     points = _checked(points_mm)
     centre = points.mean(axis=0)
     resolutions = pyramid((points - centre) / frame.scale_mm, frame.voxel, config)
+    if len(resolutions[-1]) > 4 * config.superpoints[1]:
+        raise InvalidPointCloudError(
+            f"at most {4 * config.superpoints[1]} superpoints", f"{len(resolutions[-1])}: a cloud far larger than its target",
+            "check the units of both clouds",
+        )
     trees = [cKDTree(p) for p in resolutions]
     radii = [config.radius_voxels * frame.voxel * config.voxel_growth**s for s in range(config.stages)]
     within = [
@@ -156,7 +161,7 @@ def oriented_normals(points: Array, near: Neighborhood, inside: Array, reach: fl
 
 
 def group_patches(fine: Array, superpoints: cKDTree, most: int) -> tuple[Index, NDArray[np.bool_]]:
-    """Point-to-node grouping: every fine point goes to its nearest superpoint; at most `most` of them, nearest first."""
+    """Point-to-node grouping: every fine point goes to its nearest superpoint, which keeps the nearest `most`."""
     distance, node = superpoints.query(fine)
     order = np.lexsort((distance, node))
     node = node[order]

@@ -60,8 +60,8 @@ def weighted_svd(p: Tensor, q: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         p, q: (B, k, 3). weight: (B, k), not negative.
 
     Returns:
-        (B, 3, 4) motions, and (B,) ratio of the first to the second singular value of the covariance: infinite for
-        points in a line, which leave the turn about it open.
+        (B, 3, 4) motions, and (B,) how much longer than wide the matched points are (root of the ratio of the first two
+        singular values of the covariance): infinite for points in a line, which leave the turn about it open.
     """
     p, q, weight = p.float(), q.float(), weight.float()
     w = (weight / weight.sum(1, keepdim=True).clamp(min=1e-9))[..., None]
@@ -72,7 +72,7 @@ def weighted_svd(p: Tensor, q: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     flip[:, 2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vt))
     rotation = vt.transpose(1, 2) @ (flip[..., None] * u.transpose(1, 2))
     translation = q_mean.transpose(1, 2) - rotation @ p_mean.transpose(1, 2)
-    return torch.cat([rotation, translation], dim=2), s[:, 0] / s[:, 1].clamp(min=1e-12)
+    return torch.cat([rotation, translation], dim=2), torch.sqrt(s[:, 0] / s[:, 1].clamp(min=1e-12))
 
 
 def _rows(x: Tensor, index: Tensor) -> Tensor:

@@ -57,7 +57,7 @@ def _mean_circle(pull: Tensor, push: Tensor, positive: Tensor, negative: Tensor,
     """Mean of log(1 + sum e^pull x sum e^push) over the patches that have both kinds of partners (the set A)."""
     chosen = positive.any(axis) & negative.any(axis)
     if not bool(chosen.any()):
-        return pull.new_zeros(())
+        return 0.0 * pull.masked_fill(pull.isneginf(), 0.0).sum()  # nothing to learn, and still a gradient: zero
     pull, push = pull.movedim(axis, -1)[chosen], push.movedim(axis, -1)[chosen]
     return softplus(pull.logsumexp(-1) + push.logsumexp(-1)).mean() / LOG_SCALE  # eq. (13)
 

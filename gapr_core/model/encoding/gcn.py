@@ -44,7 +44,7 @@ class GraphLayer(nn.Module):
 
     def forward(self, x_q: Tensor, x_s: Tensor, pairs: Pairs) -> Tensor:
         first = self.first(x_q, x_s, pairs)
-        support = first if x_s is x_q else x_s
+        support = first if pairs.same else x_s
         return self.out(torch.cat([x_q, first, self.second(first, support, pairs)], dim=-1))
 
 

@@ -95,8 +95,7 @@ class SerializedLayer(nn.Module):
     def forward(self, x_q: Tensor, x_s: Tensor, pairs: Pairs) -> Tensor:
         x = self.position(x_q, x_s, pairs)
         if isinstance(pairs, LocalPairs):
-            same = pairs.same and x_s is x_q
-            return self.transformer(x, x if same else x_s, pairs.regroup(local_patches(pairs)))
+            return self.transformer(x, x if pairs.same else x_s, pairs.regroup(local_patches(pairs)))
         return self.transformer(x, x, pairs)
 
 

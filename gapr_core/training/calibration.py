@@ -1,0 +1,154 @@
+"""Fit the confidence model: register many pairs of known truth, learn when the answer is right.
+
+    python -m gapr_core.training.calibration --anatomy ../shared/anatomy --count 150 --records runs/calibration.jsonl
+
+Pairs come from the train people only, over all protocols and `wrong`. Finished pairs are kept in the records file, so
+a stopped run goes on where it was. The model is a ridge logistic regression, weighted so that pairs with and without
+a right answer count as the protocols deliver them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from tqdm import tqdm
+
+from gapr_core.confidence import FEATURES, Calibration
+from gapr_core.config import RegistrarConfig
+from gapr_core.data import anatomy, protocols
+from gapr_core.data.specimen import Specimen
+from gapr_core.geometry import se3
+
+Array = NDArray[np.float64]
+BONES = ("femur", "tibia", "pelvis")
+PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "wrong")
+RIGHT_MM, RIGHT_DEG = 4.0, 5.0
+Task = tuple[str, str, str, int]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Collect, fit and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
+    parser.add_argument("--split", default="train", help="people to learn from")
+    parser.add_argument("--count", type=int, default=150, help="pairs per bone and protocol")
+    parser.add_argument("--seed", type=int, default=10_000)
+    parser.add_argument("--records", type=Path, default=Path("runs/calibration.jsonl"))
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="where the model goes; without it only the records are made")
+    args = parser.parse_args(arguments)
+    records = collect(args.anatomy, args.split, args.count, args.seed, args.records, args.jobs)
+    if args.out:
+        args.out.write_text(as_json(fit(records), {"people": f"{args.split} people of {args.anatomy.name}"}))
+    return 0
+
+
+def collect(folder: Path, split: str, count: int, seed: int, path: Path, jobs: int) -> list[dict[str, Any]]:
+    """Register every pair that the records file does not hold yet; returns all records."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done = {record["name"]: record for record in _read(path)}
+    tasks = [(str(folder), split, protocol, bone, seed + i)
+             for i in range(count) for protocol in PROTOCOLS for bone in BONES]  # fmt: skip
+    tasks = [task for task in tasks if "-".join(map(str, task[2:])) not in done]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, path.open("a") as file:
+        for record in tqdm(pool.map(_record, tasks), total=len(tasks), unit="pair"):
+            file.write(json.dumps(record) + "\n")
+            file.flush()
+            done[record["name"]] = record
+    return list(done.values())
+
+
+def fit(records: list[dict[str, Any]], ridge: float = 1.0) -> Calibration:
+    """Penalised maximum likelihood over all records whose figures were measured."""
+    x = np.array([[r["features"][name] for name in FEATURES] for r in records])
+    y = np.array([r["right"] for r in records], dtype=np.float64)
+    scales = np.maximum(x.std(axis=0), 1e-9)
+    model = Calibration(FEATURES, x.mean(axis=0), scales, np.zeros(0), {})
+    terms = model.design(x)
+    penalty = np.concatenate([[0.0], np.full(len(FEATURES), 0.3), np.ones(terms.shape[1] - 1 - len(FEATURES))])
+
+    def loss(w: Array) -> tuple[float, Array]:
+        logit = terms @ w
+        value = np.logaddexp(0.0, logit).sum() - y @ logit + 0.5 * ridge * (penalty * w**2).sum()
+        return float(value), terms.T @ (1.0 / (1.0 + np.exp(-logit)) - y) + ridge * penalty * w
+
+    best = minimize(loss, np.zeros(terms.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 2000})
+    return Calibration(FEATURES, model.means, scales, best.x, {"pairs": len(records), "right": float(y.mean())})
+
+
+def as_json(model: Calibration, card: dict[str, Any]) -> str:
+    """The model as the file that `Calibration.load` reads."""
+    data = {"names": model.names, "card": card | model.card}
+    arrays = {key: np.round(getattr(model, key), 6).tolist() for key in ("means", "scales", "weights")}
+    return json.dumps(data | arrays, indent=1) + "\n"
+
+
+def _read(path: Path) -> Iterator[dict[str, Any]]:
+    if path.is_file():
+        yield from (json.loads(line) for line in path.read_text().splitlines() if line.endswith("}"))
+
+
+@cache
+def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
+    return {bone: anatomy.surfaces(folder, bone, split) for bone in BONES}
+
+
+@cache
+def _registrar() -> Any:
+    from gapr_core.registrar import Registrar
+
+    untrained = Calibration(FEATURES, np.zeros(len(FEATURES)), np.ones(len(FEATURES)), _undecided(), {})
+    return Registrar(RegistrarConfig(num_threads=1, min_confidence=0.0), calibration=untrained)
+
+
+def _undecided() -> Array:
+    return np.zeros(1 + len(FEATURES) + len(FEATURES) * (len(FEATURES) + 1) // 2)
+
+
+def _record(task: tuple[str, str, str, str, int]) -> dict[str, Any]:
+    """One pair registered, judged, and its figures kept."""
+    folder, split, protocol, bone, seed = task
+    bones = _bones(folder, split)
+    specimen = bones[bone][seed % len(bones[bone])]
+    others = [s for group in bones.values() for s in group]
+    pair = protocols.make_pair(protocol, specimen, seed, others)
+    registrar = _registrar()
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    return {"name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone, "person": pair.person,
+            "features": {name: result.details[name] for name in FEATURES}} | _judge(result, pair)  # fmt: skip
+
+
+def _judge(result: Any, pair: protocols.Pair) -> dict[str, Any]:
+    if not pair.has_truth:
+        return {"right": False}
+    T, truth = result.T_target_source, pair.T_target_source
+    rte_mm, rre_deg = se3.pose_error(T, truth, pair.source)
+    error = se3.inverse(truth) @ T  # source frame; the covariance speaks of the target frame
+    turn = truth[:3, :3] @ _log(error[:3, :3])
+    centre = pair.source.mean(axis=0, keepdims=True)
+    shift = (se3.apply(T, centre) - se3.apply(truth, centre))[0]
+    twist = np.concatenate([shift, turn])
+    nees = float(twist @ np.linalg.solve(result.covariance, twist))
+    rmse_mm = float(np.sqrt(((se3.apply(T, pair.source) - se3.apply(truth, pair.source)) ** 2).sum(axis=1).mean()))
+    return {"right": bool(rte_mm <= RIGHT_MM and rre_deg <= RIGHT_DEG), "rte_mm": rte_mm, "rre_deg": rre_deg,
+            "nees": nees, "rmse_mm": rmse_mm, "ms": result.stage_ms}  # fmt: skip
+
+
+def _log(rotation: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

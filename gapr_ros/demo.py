@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from gapr_core.errors import GaprError
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from gapr_ros.observer import Observer
 
 FIRST_STAMP_S = 1_700_000_000.0
-WAIT_FOR_BOTH = ("--wait", "10", "--listeners", "2")  # the node and the observer
 START_LIMIT_S, SILENCE_LIMIT_S = 60.0, 15.0
 
 
@@ -164,27 +164,46 @@ def observing() -> Iterator[Observer]:
 
 
 def replay(scene: Scene, observer: Observer, folder: Path, console: Any) -> None:
-    """Node and player as processes of their own; returns when every cloud is answered or nothing more comes.
+    """Plays the bag to a node in a process of its own; returns when every cloud is answered or nothing more comes.
 
     Raises:
-        DemoError: the node or the player did not start, or ended too early.
+        DemoError: the node did not start, or ended too early.
     """
     from gapr_ros.children import child
 
-    node_log, replay_log = folder / "register_node.log", folder / "bag_replay.log"
+    log = folder / "register_node.log"
     parameters = {"model_path": scene.path.resolve(), "model_unit": "mm", "diagnostics_period": 0.2}
     settings = [text for name, value in parameters.items() for text in ("-p", f"{name}:={value}")]
-    with child("gapr_ros.register_node", ["--ros-args", *settings], node_log) as node:
-        _wait_until_active(observer, node, node_log)
-        with child("gapr_ros.bag_replay", [str(folder / "bag"), "--quiet", *WAIT_FOR_BOTH], replay_log) as player:
-            _collect(scene, observer, [(node, node_log), (player, replay_log)], console)
+    with child("gapr_ros.register_node", ["--ros-args", *settings], log) as node:
+        with _player(observer, folder / "bag") as play:
+            _wait_until_ready(observer, node, log)
+            play()
+            _collect(len(scene.sweep.clouds), observer, node, log, console)
 
 
-def _wait_until_active(observer: Observer, node: Any, log: Path) -> None:
+@contextmanager
+def _player(observer: Observer, bag_path: Path) -> Iterator[Callable[[], None]]:
+    """Advertises the topics of the bag at once; call what it yields to play, in a thread of its own."""
+    from gapr_ros.bag_replay import Replay, ReplayOptions, open_bag
+
+    bag = open_bag(bag_path)
+    player = Replay(observer, bag, ReplayOptions(progress=False), observer.note_sent)
+    thread = Thread(target=player.run, daemon=True)
+    try:
+        yield thread.start
+    finally:
+        observer.context.try_shutdown()  # ends the player wherever it is
+        if thread.ident is not None:
+            thread.join()
+        bag.reader.close()
+
+
+def _wait_until_ready(observer: Observer, node: Any, log: Path) -> None:
+    """Until the node is active and has found the player: what is sent earlier would be lost."""
     import rclpy
 
     deadline = time.monotonic() + START_LIMIT_S
-    while observer.node_state != "active":
+    while observer.node_state != "active" or not observer.player_found:
         _check_running(node, log)
         if observer.node_failure or time.monotonic() > deadline:
             why = observer.node_failure or f"{observer.node_state or 'silent'} after {START_LIMIT_S:.0f} s; see {log}"
@@ -192,27 +211,24 @@ def _wait_until_active(observer: Observer, node: Any, log: Path) -> None:
         rclpy.spin_once(observer, timeout_sec=0.1)
 
 
-def _collect(scene: Scene, observer: Observer, children: list[tuple[Any, Path]], console: Any) -> None:
+def _collect(count: int, observer: Observer, node: Any, log: Path, console: Any) -> None:
     import rclpy
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    count, heard = len(scene.sweep.clouds), time.monotonic()
     columns = (
-        TextColumn("clouds answered"),
         BarColumn(),
         MofNCompleteColumn(),
+        TextColumn("answers"),
         TimeElapsedColumn(),
         TextColumn("{task.description}"),
     )
     with Progress(*columns, console=console) as progress:
-        task, before = progress.add_task("", total=count), -1
-        while len(observer.answers) < count and time.monotonic() < heard + SILENCE_LIMIT_S:
+        task, before, heard = progress.add_task("", total=count), -1, time.monotonic()
+        while len(observer.answers) + observer.dropped < count and time.monotonic() < heard + SILENCE_LIMIT_S:
+            _check_running(node, log)
             rclpy.spin_once(observer, timeout_sec=0.1)
-            for process, log in children:
-                _check_running(process, log)
-            state = len(observer.answers) + observer.clouds_seen()
-            if state != before:
-                heard, before = time.monotonic(), state
+            if len(observer.answers) + observer.sent != before:
+                before, heard = len(observer.answers) + observer.sent, time.monotonic()
                 progress.update(task, completed=len(observer.answers), description=_last_answer(observer))
     for _ in range(10):  # a pose may be a moment behind its diagnostics
         rclpy.spin_once(observer, timeout_sec=0.05)

@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
-from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 
 from gapr_ros import intake, wire
@@ -28,7 +27,7 @@ class Answer:
         confidence, tre_mm: as the node says.
         exec_ms: what the node says that it took.
         heard_s: when the answer arrived here, on the monotonic clock.
-        seen_s: when the cloud did.
+        sent_s: when the cloud was sent.
     """
 
     T_target_source: NDArray[np.float64] | None = None
@@ -37,12 +36,12 @@ class Answer:
     tre_mm: float | None = None
     exec_ms: float = 0.0
     heard_s: float = float("nan")
-    seen_s: float = float("nan")
+    sent_s: float = float("nan")
 
     @property
     def latency_ms(self) -> float:
-        """From the cloud's arrival to the answer's; never negative, not finite when the cloud was not seen here."""
-        return float(np.maximum(0.0, 1000.0 * (self.heard_s - self.seen_s)))
+        """From sending the cloud to hearing the answer."""
+        return 1000.0 * (self.heard_s - self.sent_s)
 
 
 class Observer(Node):
@@ -57,30 +56,29 @@ class Observer(Node):
         super().__init__("gapr_observer", **kwargs)
         self.answers: dict[int, Answer] = {}
         self.confidences = 0
-        self.node_state, self.node_failure, self.dropped = "", "", 0
+        self.node_state, self.node_failure = "", ""
+        self.player_found, self.dropped = False, 0
         self._status_name = f"{node_name}: registration"
-        self._seen: dict[int, float] = {}
+        self._sent: dict[int, float] = {}
         self._poses: dict[int, NDArray[np.float64]] = {}
-        self.create_subscription(PointCloud2, "points", self._on_cloud, 50)
         self.create_subscription(PoseWithCovarianceStamped, f"{node_name}/pose", self._on_pose, 50)
         self.create_subscription(Float64, f"{node_name}/confidence", self._on_confidence, 50)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
-    def clouds_seen(self) -> int:
-        """How many clouds have been published."""
-        return len(self._seen)
+    @property
+    def sent(self) -> int:
+        """How many clouds have been sent."""
+        return len(self._sent)
 
-    def _on_cloud(self, message: PointCloud2) -> None:
-        stamp, now = _stamp_ms(message), time.monotonic()
-        self._seen.setdefault(stamp, now)
-        if stamp in self.answers:
-            self.answers[stamp].seen_s = now
+    def note_sent(self, topic: str, stamp_ns: int) -> None:
+        """A cloud with this stamp has just been sent."""
+        self._sent[_ms(stamp_ns)] = time.monotonic()
 
     def _on_confidence(self, message: Float64) -> None:
         self.confidences += 1
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        stamp = _stamp_ms(message)
+        stamp = _ms(intake.stamp_ns(message.header))
         self._poses[stamp] = wire.core_pose(pose_to_matrix(message))
         if stamp in self.answers:
             self.answers[stamp].T_target_source = self._poses[stamp]
@@ -91,7 +89,8 @@ class Observer(Node):
                 self._on_registration(status, {pair.key: pair.value for pair in status.values})
 
     def _on_registration(self, status: DiagnosticStatus, values: dict[str, str]) -> None:
-        self.node_state, self.dropped = values["state"], int(values["frames_dropped"])
+        self.node_state = values["state"]
+        self.player_found, self.dropped = int(values["publishers_on_points"]) > 0, int(values["frames_dropped"])
         self.node_failure = status.message if status.level == DiagnosticStatus.ERROR else ""
         stamp = _milliseconds(values["cloud_stamp"])
         if stamp is None or stamp in self.answers:
@@ -104,12 +103,12 @@ class Observer(Node):
             tre_mm=float(values["tre_mm"]) if values["tre_mm"] else None,
             exec_ms=float(values["exec_ms"] or 0.0),
             heard_s=time.monotonic(),
-            seen_s=self._seen.get(stamp, float("nan")),
+            sent_s=self._sent.get(stamp, float("nan")),
         )
 
 
-def _stamp_ms(message: Any) -> int:
-    return round(intake.stamp_ns(message.header) * 1e-6)
+def _ms(stamp_ns: int) -> int:
+    return round(stamp_ns * 1e-6)
 
 
 def _milliseconds(stamp_s: str) -> int | None:

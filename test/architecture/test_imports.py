@@ -60,7 +60,7 @@ def test_message_adapters_import_numpy_and_messages_only():
 
 
 def is_message_package(name):
-    return name.endswith("_msgs") or name.endswith("_interfaces")
+    return name.endswith(("_msgs", "_srvs", "_interfaces"))
 
 
 DISTRIBUTIONS = {"yaml": "pyyaml", "vtkmodules": "vtk", "small_gicp": "small_gicp", "kiss_matcher": "kiss-matcher"}

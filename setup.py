@@ -53,7 +53,7 @@ setup(
         "network": NETWORK,
         "bags": BAGS,
         "ros": [*ROS_WHEELS, *BAGS],
-        "baselines": ["kiss-matcher"],
+        "baselines": ["kiss-matcher", "pycpd", "small_gicp"],
         "test": TEST,
         "dev": [*TEST, "mypy", "pre-commit", "types-PyYAML"],
     },
@@ -65,6 +65,7 @@ setup(
             "bag_replay = gapr_ros.bag_replay:main",
         ],
         "gapr.commands": [
+            "benchmark = gapr_core.evaluation.benchmark",
             "demo = gapr_ros.demo",
         ],
     },

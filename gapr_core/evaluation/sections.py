@@ -77,7 +77,7 @@ SAFETY = [
     Column("AUROC", number("auroc", 3), "auroc", 1),
     Column("ECE", number("ece", 3), "ece", -1),
     Column("NEES/6", number("nees_6", 2)),
-    Column("× bound", number("bound_ratio", 2), "bound_ratio", -1),
+    Column("× bound", number("bound_ratio", 2)),
     Column("s", number("seconds", 3)),
     Column("s, 90 %", number("seconds_p90", 3)),
     Column("prepare s", number("prepare_seconds", 3)),

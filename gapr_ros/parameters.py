@@ -28,6 +28,10 @@ def setting(default: Any, text: str, *, low: float | None = None, high: float = 
                                             "live": live})  # fmt: skip
 
 
+class ParameterError(ValueError):
+    """A parameter of the wrong type or out of range; the text says what to write instead."""
+
+
 @dataclass(frozen=True)
 class NodeParameters:
     """Everything register_node can be told. Lengths in metres, times in seconds, angles in radians."""
@@ -73,7 +77,7 @@ def declare(node: Node) -> NodeParameters:
     """Declare everything on the node and read what it was given.
 
     Raises:
-        ValueError: for a value of the wrong type or out of range; the text says what to write instead.
+        ParameterError: for a value of the wrong type or out of range; the text says what to write instead.
     """
     given = node._parameter_overrides  # rclpy has no public accessor for what came from files and the command line
     for name, setting_field in FIELDS.items():
@@ -152,7 +156,7 @@ def as_yaml() -> str:
 def _check_override(setting_field: Field, given: Parameter | None) -> None:
     why = "" if given is None else problem(setting_field, given.value)
     if why:
-        raise ValueError(why)
+        raise ParameterError(why)
 
 
 def _example(default: Any, value: Any) -> str:

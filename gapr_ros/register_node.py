@@ -23,7 +23,7 @@ from gapr_ros import parameters
 from gapr_ros.diagnostics import Counters
 from gapr_ros.guard import RosLogHandler, describe, guarded, transition
 from gapr_ros.method import default_method
-from gapr_ros.parameters import NodeParameters
+from gapr_ros.parameters import NodeParameters, ParameterError
 from gapr_ros.reporter import Reporter
 from gapr_ros.services import Services
 from gapr_ros.session import Session
@@ -40,7 +40,7 @@ class RegisterNode(LifecycleNode):
         kwargs: of rclpy's Node (context, parameter_overrides, ...).
 
     Raises:
-        ValueError: a parameter of the wrong type or out of range; the text says what to write.
+        ParameterError: a parameter of the wrong type or out of range; the text says what to write.
     """
 
     def __init__(self, method_factory: Callable[[NodeParameters], Any] = default_method, **kwargs: Any) -> None:
@@ -216,7 +216,8 @@ def main(args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     except Exception as error:
-        sys.stderr.write(f"register_node: {describe(error)}\n")
+        text = str(error) if isinstance(error, ParameterError) else describe(error)
+        sys.stderr.write(f"register_node: {text}\n")
         rclpy.try_shutdown()
         return 1
     try:

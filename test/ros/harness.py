@@ -164,8 +164,8 @@ def _answered(values: dict[str, str]) -> int:
 def node_in_thread(method: Any, model_path: Path, **parameters: Any) -> Iterator[RegisterNode]:
     """A register_node in this process with a registration method of the test's own."""
     spinner = Spinner(context())
-    values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False, "diagnostics_period": 0.1} | parameters
-    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False, "diagnostics_period": 0.1}
+    overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
     node = RegisterNode(lambda _: method, context=spinner.context, parameter_overrides=overrides)
     spinner.start(node)
     try:

@@ -120,8 +120,9 @@ def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
     for _ in range(5):
         client.send(GOOD)
         time.sleep(0.02)
-    wait_until(lambda: int(client.values()["frames_lost"]) + int(client.values()["frames_received"]) == 6, 2.0, client.values())
-    assert int(client.values()["frames_lost"]) >= 1
+    wait_until(lambda: node.counters.lost + node.counters.received == 6, 5.0, node.counters)
+    assert node.counters.lost >= 1
+    assert client.ask(GOOD)["frames_lost"] == str(node.counters.lost)
 
 
 def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(blob_path, client, method):

@@ -1,0 +1,136 @@
+"""The node as users start it: its own process, the real registration, DDS, bags, signals."""
+
+from __future__ import annotations
+
+import bones
+import numpy as np
+import pytest
+from harness import Client, NodeProcess, context, pose_mm, wait_until
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+
+from gapr_core.geometry import se3
+from gapr_ros import wire
+from gapr_ros.bag_replay import Replay, ReplayOptions
+from gapr_ros.bag_writing import BagWriter
+from gapr_ros.bags import open_bag
+from msg_adapters import list_to_covariance, pose_to_matrix
+
+REFUSALS_OF_SHAPE = {"too_few_points", "ambiguous", "degenerate", "low_confidence", "not_converged", "unit_mismatch"}
+
+
+@pytest.fixture(scope="module")
+def bone():
+    return bones.bone()
+
+
+@pytest.fixture(scope="module")
+def live(bone, tmp_path_factory):
+    """One node process and one client for the whole file."""
+    folder = tmp_path_factory.mktemp("node")
+    model = bones.save(bone, folder / "bone.npz")
+    client = Client()
+    node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, seed=3)
+    client.wait_for_state("active", 60.0)
+    yield node, client
+    client.close()
+    assert node.stop() == 0, node.log
+    assert "Traceback" not in node.log and "failed" not in node.log, node.log
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_partial_cloud_gives_the_true_pose(live, bone, seed):
+    node, client = live
+    client.poses.clear()
+    rng = np.random.default_rng(seed)
+    T = se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-150.0, 150.0, 3))
+    cloud = bones.partial(bone, T, seed)
+    values = client.ask(cloud, timeout_s=60.0)
+    assert values["level"] == 0, values
+    wait_until(lambda: client.poses)
+    estimate = wire.core_pose(pose_to_matrix(client.poses[0]))
+    translation_mm, rotation_deg = se3.pose_error(estimate, T, cloud * 1000.0)
+    assert translation_mm < 1.0 and rotation_deg < 1.0
+    assert float(values["confidence"]) >= 0.5
+    covariance = list_to_covariance(client.poses[0].pose.covariance)
+    np.linalg.cholesky(covariance)
+    assert (np.sqrt(covariance.diagonal()[:3]) < 0.02).all() and (np.sqrt(covariance.diagonal()[3:]) < 0.1).all()
+
+
+def plane(rng):
+    return np.column_stack([rng.uniform(-0.1, 0.1, (2000, 2)), rng.normal(scale=1e-4, size=2000)])
+
+
+def line(rng):
+    return np.outer(rng.uniform(-0.1, 0.1, 2000), [0.6, 0.0, 0.8])
+
+
+BAD_INPUT = {
+    "an empty cloud": (lambda rng: np.empty((0, 3)), {"empty_cloud"}),
+    "five points": (lambda rng: rng.normal(size=(5, 3)), {"too_few_points"}),
+    "all NaN": (lambda rng: np.full((1000, 3), np.nan), {"non_finite"}),
+    "one repeated point": (lambda rng: np.full((1000, 3), 0.1), REFUSALS_OF_SHAPE),
+    "a plane": (plane, REFUSALS_OF_SHAPE),
+    "a line": (line, REFUSALS_OF_SHAPE),
+    "a sphere": (lambda rng: 0.05 * se3_unit(rng.normal(size=(2000, 3))), REFUSALS_OF_SHAPE),
+    "noise": (lambda rng: rng.uniform(-0.1, 0.1, (2000, 3)), REFUSALS_OF_SHAPE),
+    "millimetres": (lambda rng: rng.normal(size=(1000, 3)) * 50.0, {"unit_mismatch"}),
+}
+
+
+def se3_unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", BAD_INPUT)
+def test_bad_input_is_refused_by_the_real_registration(live, name):
+    node, client = live
+    make, reasons = BAD_INPUT[name]
+    client.poses.clear()
+    client.confidences.clear()
+    values = client.ask(make(np.random.default_rng(0)), timeout_s=60.0)
+    assert values["last_refusal"].split(":")[0] in reasons, values
+    wait_until(lambda: client.confidences)
+    assert client.confidences == [0.0] and not client.poses
+    assert node.process.poll() is None
+
+
+def test_every_cloud_of_a_replayed_bag_is_answered_or_counted(live, bone, tmp_path):
+    node, client = live
+    T = pose_mm([0.4, -0.9, 1.3], [80.0, 10.0, -60.0])
+    with BagWriter(tmp_path / "bag") as bag:
+        for i in range(12):
+            bag.write_cloud("/points", bones.partial(bone, T, i), "probe", (2_000_000_000 + i * 150_000_000))
+    before = client.values()
+    client.call("reset")
+    play(tmp_path / "bag")
+
+    def gone():
+        return {key: int(client.values()[f"frames_{key}"]) - int(before[f"frames_{key}"]) for key in KINDS}
+
+    wait_until(lambda: sum(gone()[k] for k in ("accepted", "refused", "dropped", "lost")) == 12, 60.0, gone())
+    assert gone()["refused"] == 0 and gone()["accepted"] >= 1
+    assert gone()["received"] + gone()["lost"] == 12
+
+
+KINDS = ("received", "accepted", "refused", "dropped", "lost")
+
+
+def play(path):
+    ros = context()
+    node, bag = Node("player", context=ros), open_bag(path)
+    Replay(node, bag, ReplayOptions(progress=False, wait_s=5.0)).run()
+    bag.reader.close()
+    node.destroy_node()
+    ros.try_shutdown()
+
+
+def test_services_work_on_the_real_node(live, bone):
+    node, client = live
+    assert client.call("set_enabled", SetBool.Request(data=False)).success
+    assert client.call("set_enabled", SetBool.Request(data=True)).success
+    client.ask(bones.partial(bone, np.eye(4)), timeout_s=60.0)
+    answer = client.call("register", timeout_s=60.0)
+    assert answer.success and answer.message.startswith("OK"), answer
+    answer = client.call("reload_model", timeout_s=60.0)
+    assert answer.success and "points" in answer.message

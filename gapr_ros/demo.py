@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bone", default="femur", help="femur, pelvis, ...: a parametric bone (default: femur)")
     parser.add_argument("--seed", type=int, default=1, help="which person, which sweep, where the patient lies")
     parser.add_argument("--frames", type=int, default=24, help="clouds in the bag (default: 24)")
-    parser.add_argument("--period", type=float, default=1.0, metavar="S", help="time between two clouds (default: 1 s)")
+    parser.add_argument("--period", type=float, default=1.5, metavar="S", help="time between two clouds (default: 1.5 s)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag")
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder (default: demo_output)")
 
@@ -79,8 +79,8 @@ def _run(args: argparse.Namespace, console: Any) -> int:
     scene = make_scene(args.bone, args.seed, args.frames, args.period, args.out)
     say(f"Writing {args.frames} clouds to the bag {args.out / 'bag'}")
     write_bag(scene, args.out / "bag", args.storage)
-    with ros_graph(args.out / "log") as domain, observing() as observer:
-        say(f"Starting register_node (ROS_DOMAIN_ID={domain}) and replaying the bag over DDS")
+    with observing(args.out / "log") as observer:
+        say(f"Starting register_node (ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']}) and playing the bag over DDS")
         replay(scene, observer, args.out, console)
         rows = demo_report.judge(scene, observer.answers)
     console.print(demo_report.rich_table(rows))
@@ -134,8 +134,8 @@ def write_bag(scene: Scene, path: Path, storage: str) -> None:
 
 
 @contextmanager
-def ros_graph(log_folder: Path) -> Iterator[str]:
-    """A ROS graph of our own on this machine, for this process and its children; yields its domain.
+def observing(log_folder: Path) -> Iterator[Observer]:
+    """An observer in a ROS graph of its own on this machine, which the children of this process share.
 
     ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE are respected where they are set.
     """
@@ -144,23 +144,16 @@ def ros_graph(log_folder: Path) -> Iterator[str]:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
     os.environ["ROS_LOG_DIR"] = str(log_folder.resolve())
-    rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)  # Ctrl-C stays a KeyboardInterrupt
-    try:
-        yield os.environ["ROS_DOMAIN_ID"]
-    finally:
-        rclpy.try_shutdown()
-
-
-@contextmanager
-def observing() -> Iterator[Observer]:
-    """An observer, given back at the end."""
     from gapr_ros.observer import Observer
 
-    observer = Observer()
+    context = rclpy.Context()  # without handlers of its own: Ctrl-C stays a KeyboardInterrupt
+    context.init(args=[])
+    observer = Observer(context=context)
     try:
         yield observer
     finally:
         observer.destroy_node()
+        context.try_shutdown()
 
 
 def replay(scene: Scene, observer: Observer, folder: Path, console: Any) -> None:
@@ -200,19 +193,16 @@ def _player(observer: Observer, bag_path: Path) -> Iterator[Callable[[], None]]:
 
 def _wait_until_ready(observer: Observer, node: Any, log: Path) -> None:
     """Until the node is active and has found the player: what is sent earlier would be lost."""
-    import rclpy
-
     deadline = time.monotonic() + START_LIMIT_S
     while observer.node_state != "active" or not observer.player_found:
         _check_running(node, log)
         if observer.node_failure or time.monotonic() > deadline:
             why = observer.node_failure or f"{observer.node_state or 'silent'} after {START_LIMIT_S:.0f} s; see {log}"
             raise DemoError(f"register_node did not start: {why}")
-        rclpy.spin_once(observer, timeout_sec=0.1)
+        observer.listen(0.1)
 
 
 def _collect(count: int, observer: Observer, node: Any, log: Path, console: Any) -> None:
-    import rclpy
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
@@ -226,12 +216,12 @@ def _collect(count: int, observer: Observer, node: Any, log: Path, console: Any)
         task, before, heard = progress.add_task("", total=count), -1, time.monotonic()
         while len(observer.answers) + observer.dropped < count and time.monotonic() < heard + SILENCE_LIMIT_S:
             _check_running(node, log)
-            rclpy.spin_once(observer, timeout_sec=0.1)
+            observer.listen(0.1)
             if len(observer.answers) + observer.sent != before:
                 before, heard = len(observer.answers) + observer.sent, time.monotonic()
                 progress.update(task, completed=len(observer.answers), description=_last_answer(observer))
     for _ in range(10):  # a pose may be a moment behind its diagnostics
-        rclpy.spin_once(observer, timeout_sec=0.05)
+        observer.listen(0.05)
 
 
 def _last_answer(observer: Observer) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
@@ -58,12 +59,18 @@ class Observer(Node):
         self.confidences = 0
         self.node_state, self.node_failure = "", ""
         self.player_found, self.dropped = False, 0
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self)
         self._status_name = f"{node_name}: registration"
         self._sent: dict[int, float] = {}
         self._poses: dict[int, NDArray[np.float64]] = {}
         self.create_subscription(PoseWithCovarianceStamped, f"{node_name}/pose", self._on_pose, 50)
         self.create_subscription(Float64, f"{node_name}/confidence", self._on_confidence, 50)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+
+    def listen(self, seconds: float) -> None:
+        """Take in what comes, one message or nothing, waiting at most that long."""
+        self._executor.spin_once(timeout_sec=seconds)
 
     @property
     def sent(self) -> int:

@@ -68,7 +68,7 @@ class ModelConfig:
     global_width: int = 128
     heads: int = 4
     global_layers: int = 3
-    superpoints: tuple[int, int] = (75, 110)
+    superpoints: tuple[int, int] = (70, 100)
     voxel_growth: float = 1.6
     neighbors: tuple[int, ...] = (16, 16, 16, 16)
     radius_voxels: float = 2.5
@@ -78,7 +78,7 @@ class ModelConfig:
     patch_size: int = 32
     train_pairs: int = 32
     test_pairs: int = 128
-    sinkhorn_iterations: int = 20
+    sinkhorn_iterations: int = 15
     mutual_k: int = 3
     match_confidence: float = 0.05
     coarse_temperature: float = 0.1

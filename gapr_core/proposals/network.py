@@ -59,7 +59,7 @@ class NetworkProposer:
         except InvalidPointCloudError:
             return Proposals(np.empty((0, 4, 4)), np.empty(0))
         found = self.match(moving, cloud, features)
-        radius_mm = 2.0 * min(2.0 * frame.voxel * frame.scale_mm, 5.0)
+        radius_mm = 1.5 * max(5.0, frame.voxel * frame.scale_mm)
         if self.method == "ransac":
             return Proposals(*ransac(found, radius_mm, rng, count=self.count))
         return Proposals(*local_to_global(found, radius_mm, count=self.count))

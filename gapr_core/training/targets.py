@@ -17,7 +17,7 @@ from gapr_core.model.repositioning import move
 from gapr_core.model.types import Cloud, PatchPairs, collate, on_device
 
 Array = NDArray[np.float64]
-MOST_RADIUS_MM = 5.0
+MOST_RADIUS_MM = 5.0  # but never less than the first voxel: two samplings of a surface lie that far apart
 POSITIVE_OVERLAP = 0.1
 
 
@@ -46,11 +46,16 @@ class TrainingPair:
 def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: Frame) -> TrainingPair:
     """Joins two clouds of one frame with the truth (4, 4), mm."""
     T = to_units(T_target_source, source, target)
-    radius = min(2.0 * frame.voxel, MOST_RADIUS_MM / frame.scale_mm)
+    radius = matching_radius(frame)
     overlaps = patch_overlaps(source, target, T, radius)
     return TrainingPair(
         source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius])
     )
+
+
+def matching_radius(frame: Frame) -> float:
+    """Two first voxels, at most 5 mm, at least one voxel; in units."""
+    return min(2.0 * frame.voxel, max(MOST_RADIUS_MM / frame.scale_mm, frame.voxel))
 
 
 def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:

@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gapr_core.geometry import se3
+from gapr_core.proposals.consensus import Correspondences, distinct, local_to_global, ransac
+
+
+def scene(share_right: float, second_share: float = 0.0, seed: int = 0):
+    """Patches of eight correspondences: some under one motion, some under another, the rest at random."""
+    rng = np.random.default_rng(seed)
+    T, other = (se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-100, 100, 3)) for _ in range(2))
+    source = rng.uniform(-60, 60, (60, 1, 3)) + rng.uniform(-8, 8, (60, 8, 3))
+    target = rng.uniform(-60, 60, (60, 1, 3)) + rng.uniform(-8, 8, (60, 8, 3))
+    right, second = int(60 * share_right), int(60 * (share_right + second_share))
+    target[:right] = se3.apply(T, source[:right].reshape(-1, 3)).reshape(-1, 8, 3)
+    target[right:second] = se3.apply(other, source[right:second].reshape(-1, 3)).reshape(-1, 8, 3)
+    target += rng.normal(0, 0.5, target.shape)
+    found = Correspondences(source.reshape(-1, 3), target.reshape(-1, 3), rng.uniform(0.2, 1, 480), np.repeat(np.arange(60), 8))
+    return found, T, other
+
+
+@pytest.mark.parametrize("method", ["local_to_global", "ransac"])
+def test_the_true_motion_is_the_first_pose_although_most_patches_are_wrong(method):
+    found, T, _ = scene(0.25)
+    rng = np.random.default_rng(1)
+    poses, scores = local_to_global(found, 4.0) if method == "local_to_global" else ransac(found, 4.0, rng, draws=4000)
+    mm, deg = se3.pose_error(poses[0], T, found.source)
+    assert mm < 0.5 and deg < 1.0 and (np.diff(scores) <= 0).all()
+
+
+def test_two_motions_that_both_have_support_are_both_proposed():
+    found, T, other = scene(0.3, 0.2)
+    poses, _ = local_to_global(found, 4.0)
+    for truth, pose in ((T, poses[0]), (other, poses[1])):
+        assert se3.pose_error(pose, truth, found.source)[0] < 0.5
+
+
+def test_proposed_poses_are_rigid_and_distinct():
+    found, _, _ = scene(0.2)
+    poses, _ = local_to_global(found, 4.0, count=10)
+    np.testing.assert_allclose(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-9)
+    assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0) and 1 < len(poses) <= 10
+    again = distinct(poses, np.arange(len(poses), 0, -1.0), found.source.mean(0), 10)
+    assert len(again) == len(poses)
+
+
+def test_without_correspondences_there_are_no_poses():
+    none = Correspondences(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, dtype=int))
+    for poses, scores in (local_to_global(none, 4.0), ransac(none, 4.0, np.random.default_rng(0))):
+        assert poses.shape == (0, 4, 4) and len(scores) == 0
+
+
+def test_two_correspondences_make_no_pose():
+    found, _, _ = scene(0.5)
+    two = Correspondences(found.source[:2], found.target[:2], found.score[:2], found.patch[:2])
+    assert len(local_to_global(two, 4.0)[0]) == 0

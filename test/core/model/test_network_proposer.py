@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gapr_core import source as sources
+from gapr_core import target as targets
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+from gapr_core.model import weights
+from gapr_core.model.network import GAPRNet
+from gapr_core.proposals.network import NetworkProposer
+
+
+@pytest.fixture(scope="module")
+def pair(toy):
+    rng = np.random.default_rng(0)
+    moved = se3.apply(toy.motion(3), toy.view(toy.bone(3000, 1))) + rng.normal(0, 0.3, (1500, 3))
+    return sources.prepare(moved), targets.prepare(toy.bone(3000))
+
+
+def proposer(toy, **options):
+    torch.manual_seed(0)
+    return NetworkProposer(GAPRNet(toy.small_config()), **options)
+
+
+@pytest.mark.parametrize("method", ["local_to_global", "ransac"])
+def test_proposals_are_rigid_poses_best_first(method, toy, pair):
+    found = proposer(toy, method=method).propose(*pair, np.random.default_rng(0))
+    assert found.poses.shape == (len(found.scores), 4, 4) and len(found.scores) > 1
+    assert (np.diff(found.scores) <= 0).all() and np.allclose(np.linalg.det(found.poses[:, :3, :3]), 1.0)
+
+
+def test_the_share_of_the_target_is_computed_once(toy, pair, monkeypatch):
+    target = targets.prepare(toy.bone(3000))
+    one = proposer(toy)
+    first = one.propose(pair[0], target, np.random.default_rng(0))
+    assert len([k for k in target.cache if k.startswith("network")]) == 1
+    calls = []
+    forward = type(one.network.backbone).forward
+    monkeypatch.setattr(type(one.network.backbone), "forward", lambda self, c: calls.append(len(c.fine.points)) or forward(self, c))
+    second = one.propose(pair[0], target, np.random.default_rng(0))
+    assert len(calls) == 1 and np.array_equal(first.poses, second.poses)
+
+
+def test_moving_the_source_moves_every_proposal(toy, pair):
+    T = toy.motion(9)
+    moved = sources.prepare(se3.apply(T, pair[0].points))
+    one = proposer(toy)
+    still, after = (one.propose(s, pair[1], np.random.default_rng(0)) for s in (pair[0], moved))
+    shift, turn = se3.pose_error(after.poses[0] @ T, still.poses[0], pair[0].points)
+    assert shift < 0.05 and turn < 0.05
+
+
+def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
+    one = proposer(toy)
+    weights.save(one.network, tmp_path / "w.safetensors")
+    first, second = (p.propose(*pair, np.random.default_rng(0)) for p in (one, NetworkProposer.from_weights(tmp_path / "w.safetensors")))
+    assert np.array_equal(first.poses, second.poses)
+
+
+def test_an_unknown_method_is_refused(toy):
+    with pytest.raises(ConfigError):
+        proposer(toy, method="guess")

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from gapr_core.clouds import Surface
+from gapr_core.errors import ConfigError
+from gapr_core.model import weights
+from gapr_core.training import trainer
+from gapr_core.training.config import TrainConfig
+from gapr_core.training.dataset import TrainingPairs
+from gapr_core.training.shapes import ShapeModel, vary
+
+
+@pytest.fixture(scope="module")
+def anatomy(tmp_path_factory, toy):
+    """Nine people with one made-up bone in vertex correspondence, in the layout of the anatomy folder."""
+    from scipy.spatial import ConvexHull
+
+    folder = tmp_path_factory.mktemp("anatomy")
+    points = toy.bone(400)
+    faces = ConvexHull(points).simplices
+    rng = np.random.default_rng(0)
+    people = np.stack([points * rng.uniform(0.8, 1.2, 3) for _ in range(9)]).astype(np.float32)
+    names = [f"p{i}" for i in range(9)]
+    np.savez(folder / "femur_toy.npz", points=people, faces=faces, person=np.array(names))
+    (folder / "splits.json").write_text(
+        '{"train": ["p0", "p1", "p2", "p3", "p4"], "val": ["p5", "p6"], "test": ["p7", "p8"]}'
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def settings(toy, tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "toy.yaml"
+    small = toy.small_config(superpoints=(10, 20), width=8, global_width=16, train_pairs=6)
+    path.write_text(yaml.safe_dump({k: list(v) if isinstance(v, tuple) else v for k, v in small.to_dict().items()}))
+    return TrainConfig(
+        model=str(path), bones=("femur",), mix={"L1": 1.0, "paper": 1.0}, pairs=12, batch=4, micro_batch=2, pool=3,
+        validation_pairs=1, warmup=0.2, checkpoint_minutes=0.0, validate_minutes=1e9,
+    )
+
+
+def test_a_pair_is_a_function_of_its_number(settings, anatomy, toy):
+    model = trainer.ModelConfig.from_yaml(settings.model)
+    first, second = TrainingPairs(settings, model, anatomy), TrainingPairs(settings, model, anatomy)
+    second.pair(0)  # another history
+    a, b = first.pair(7), second.pair(7)
+    assert torch.equal(a.source.fine.points, b.source.fine.points) and torch.equal(a.overlaps, b.overlaps)
+    assert not torch.equal(a.T, first.pair(8).T)
+
+
+def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
+    """Under the true motion nearly every source point of the clean protocol lies on the target."""
+    from gapr_core.model.repositioning import move
+
+    pairs = TrainingPairs(replace(settings, mix={"L1": 1.0}), trainer.ModelConfig.from_yaml(settings.model), anatomy)
+    for number in range(3):
+        pair = pairs.pair(number)
+        moved = move(pair.T, pair.source.fine.points[None])[0]
+        gap = torch.cdist(moved, pair.target.fine.points).amin(1)
+        assert gap.median() < 0.1 and pair.overlaps.max() > 0.3
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(settings, anatomy, tmp_path):
+    whole = trainer.train(settings, tmp_path / "whole", anatomy)
+    for _ in range(3):
+        parts = trainer.train(settings, tmp_path / "parts", anatomy, minutes=0.0)  # one step per call
+    first, second = weights.load(whole)[0], weights.load(parts)[0]
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    logs = [list(csv.DictReader((tmp_path / name / "log.csv").open())) for name in ("whole", "parts")]
+    assert [r["loss"] for r in logs[0]] == [r["loss"] for r in logs[1]] and len(logs[0]) == 3
+    assert {r["protocol"] for r in csv.DictReader((tmp_path / "whole" / "validation.csv").open())} == {"L1", "paper", "all"}
+    with pytest.raises(ConfigError, match="begun"):
+        trainer.train(replace(settings, seed=1), tmp_path / "whole", anatomy)
+
+
+def test_workers_make_the_same_pairs_in_the_same_order(settings, anatomy):
+    model = trainer.ModelConfig.from_yaml(settings.model)
+    alone, helped = (
+        list(trainer.micro_batches(replace(settings, workers=w, pairs=8), model, anatomy, 1, 0, 1)) for w in (0, 1)
+    )
+    assert len(alone) == len(helped) == 3
+    assert all(torch.equal(a.overlaps, b.overlaps) for a, b in zip(alone, helped, strict=True))
+
+
+def test_processes_share_the_micro_batches_without_repeating_any(settings, anatomy):
+    dataset = settings.pairs // settings.micro_batch
+    shares = [set(range(0 + rank, dataset, 2)) for rank in range(2)]
+    assert shares[0] | shares[1] == set(range(dataset)) and not shares[0] & shares[1]
+
+
+def test_the_learning_rate_rises_then_falls_to_its_final_share():
+    config = TrainConfig(learning_rate=1.0, warmup=0.1, final_rate=0.05)
+    rates = [trainer.learning_rate(config, s / 100) for s in range(101)]
+    assert rates[0] < 0.02 and max(rates) == pytest.approx(1.0) and rates[100] == pytest.approx(0.05)
+    assert rates[:10] == sorted(rates[:10]) and rates[10:] == sorted(rates[10:], reverse=True)
+
+
+def test_a_drawn_person_lies_in_the_span_of_the_people():
+    rng = np.random.default_rng(0)
+    mean, mode = rng.normal(size=(40, 3)) * 50, rng.normal(size=(40, 3))
+    model = ShapeModel(mean, np.array([-1.0, 0.0, 1.0])[:, None, None] * mode, np.zeros((1, 3), dtype=int))
+    drawn = model.draw(rng).points - mean
+    assert np.linalg.matrix_rank(np.stack([drawn.ravel(), mode.ravel()]), tol=1e-6) == 1
+
+
+def test_a_varied_bone_keeps_its_faces_outward(toy):
+    from scipy.spatial import ConvexHull
+
+    from gapr_core.data.solid import volume_mm3
+
+    points = toy.bone(300)
+    faces = ConvexHull(points).simplices
+    corners = points[faces]
+    inward = np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(1)) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    for seed in range(4):
+        assert volume_mm3(vary(Surface(points, faces, None), np.random.default_rng(seed))) > 0
+
+
+def test_unknown_keys_of_a_run_are_named():
+    with pytest.raises(ConfigError, match="lerning_rate"):
+        TrainConfig.from_dict({"lerning_rate": 1})

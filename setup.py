@@ -9,10 +9,12 @@ PACKAGE = "gapr_ros"
 
 CORE = ["matplotlib", "numba", "numpy", "open3d>=0.18", "plotly>=5.20", "rich", "scipy>=1.10", "tqdm", "vtk"]
 NETWORK = ["safetensors", "torch>=2.4,<2.14"]
+BASELINES = ["kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
 BAGS = ["rosbags>=0.10"]
 ROS_WHEELS = ["ros-jazzy-rclpy", "ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-common-interfaces"]
 TEST = [
     "colcon-common-extensions",
+    "hypothesis",
     "import-linter",
     "pytest>=7.4",
     "pytest-timeout",
@@ -66,7 +68,10 @@ setup(
         ],
         "gapr.commands": [
             "benchmark = gapr_core.evaluation.benchmark",
+            "benchmark = gapr_core.evaluation.benchmark",
             "demo = gapr_ros.demo",
+            "make-pairs = gapr_core.data.make_pairs",
+            "train = gapr_core.training.cli",
         ],
     },
 )

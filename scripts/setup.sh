@@ -62,7 +62,7 @@ create_environment() {
   fi
 }
 
-pip_install() { .venv/bin/python -m pip install --quiet --disable-pip-version-check "$@"; }
+pip_install() { .venv/bin/python -m pip install -qq --disable-pip-version-check "$@"; }
 
 # On Linux the usual index has torch with CUDA, some gigabytes; nothing here needs a GPU.
 install_torch() {
@@ -85,10 +85,10 @@ PY
 install_project() {
   if [ -n "${ROS_DISTRO:-}" ]; then
     say "installing GAPR and its libraries; ROS is the sourced $ROS_DISTRO"
-    pip_install --editable '.[bags,network,test]'
+    pip_install --editable '.[bags,network,baselines,test]'
   else
     say "installing GAPR and its libraries; ROS 2 (rclpy, Fast DDS) from wheels, as no ROS is sourced (some minutes)"
-    pip_install --editable '.[ros,network,test]'
+    pip_install --editable '.[ros,network,baselines,test]'
   fi
 }
 

@@ -69,7 +69,7 @@ FROM_ROS = {"rclpy", "tf2_ros", "ament_index_python", "rpyutils"}
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_library_that_is_imported_is_declared_in_setup_py(package):
-    declared = set(re.findall(r'"([A-Za-z0-9_-]+)(?:[<>=~!][^"]*)?"', (ROOT / "setup.py").read_text()))
+    declared = set(re.findall(r'"([A-Za-z0-9_-]+)(?:[<>=~!;][^"]*)?"', (ROOT / "setup.py").read_text()))
     imported = {name for name in third_party(package) if name not in FROM_ROS and not is_message_package(name)}
     assert {DISTRIBUTIONS.get(name, name) for name in imported} <= declared
 

@@ -68,7 +68,6 @@ setup(
         ],
         "gapr.commands": [
             "benchmark = gapr_core.evaluation.benchmark",
-            "benchmark = gapr_core.evaluation.benchmark",
             "demo = gapr_ros.demo",
             "make-pairs = gapr_core.data.make_pairs",
             "train = gapr_core.training.cli",

@@ -1,0 +1,41 @@
+"""GAPR: partial-to-full rigid registration of bones, with a confidence and with refusals.
+
+Heavy parts load when first used: `import gapr_core` takes neither torch, open3d nor numba along.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gapr_core.clouds import Surface, load
+    from gapr_core.config import RegistrarConfig
+    from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
+    from gapr_core.registrar import Registrar
+    from gapr_core.results import RegistrationResult, RegistrationStatus
+    from gapr_core.target import PreparedTarget
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Registrar": "registrar",
+    "RegistrarConfig": "config",
+    "PreparedTarget": "target",
+    "RegistrationResult": "results",
+    "RegistrationStatus": "results",
+    "Surface": "clouds",
+    "load": "clouds",
+    "GaprError": "errors",
+    "InvalidPointCloudError": "errors",
+    "ConfigError": "errors",
+    "WeightsError": "errors",
+    "MethodUnavailableError": "errors",
+}
+__all__ = [*_HOMES, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'gapr_core' has no attribute {name!r}")
+    return getattr(import_module(f"gapr_core.{_HOMES[name]}"), name)

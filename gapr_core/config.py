@@ -1,0 +1,137 @@
+"""Every setting of the library, in one place: frozen dataclasses whose defaults are the defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any, TypeVar
+
+from gapr_core.errors import ConfigError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TargetConfig:
+    """How the target is prepared."""
+
+    most_points: int = 10_000
+    fewest_points: int = 200
+    normal_neighbours: int = 12
+    quadric_neighbours: int = 16
+    view_directions: int = 96
+    anchors: int = 1200
+    field_reach_mm: float = 12.0
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """How a source is cleaned and thinned."""
+
+    fewest_points: int = 30
+    most_points: int = 6000
+    normal_neighbours: int = 30
+    smallest_extent_mm: float = 10.0
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """The weight-free search: reference points x anchors x spins, scored on the distance field."""
+
+    references: int = 14
+    spins: int = 36
+    probes: int = 32
+    first_probes: int = 8
+    first_limit_mm: float = 7.0
+    keep: int = 3000
+
+
+@dataclass(frozen=True)
+class VerificationConfig:
+    """Which proposals are refined further, and when two poses are the same."""
+
+    coarse_points: int = 64
+    coarse_limits_mm: tuple[float, float, int] = (10.0, 5.0, 8)  # from, to, iterations
+    middle_points: int = 300
+    middle_poses: int = 120
+    middle_limits_mm: tuple[float, float, int] = (6.0, 4.0, 10)
+    final_poses: int = 8
+    final_limits_mm: tuple[float, float, int] = (5.0, 4.0, 8)
+    same_pose_mm: float = 4.0
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """The last, robust point-to-surface refinement."""
+
+    rounds: int = 12
+    iterations: int = 3
+    tukey_scale: float = 3.5
+    rest_mm: float = 1e-3
+    smallest_sigma_mm: float = 0.15
+    largest_sigma_mm: float = 3.0
+
+
+@dataclass(frozen=True)
+class CovarianceConfig:
+    """The smooth bias that the covariance reckons with."""
+
+    bias_floor_mm: float = 0.05
+    bias_gain: float = 1.0
+    correlation_mm: float = 25.0
+    correlation_points: int = 400
+    smooth_neighbours: int = 30
+
+
+@dataclass(frozen=True)
+class RegistrarConfig:
+    """Everything a `Registrar` can be told."""
+
+    target: TargetConfig = field(default_factory=TargetConfig)
+    source: SourceConfig = field(default_factory=SourceConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
+    min_confidence: float = 0.5
+    num_threads: int = 0  # 0: all cores
+    seed: int = 0
+
+
+def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
+    """A dataclass from nested mappings; what is absent keeps its default.
+
+    Raises:
+        ConfigError: for a name that the dataclass does not have or a value of another kind.
+    """
+    known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
+    for name in values:
+        if name not in known:
+            raise ConfigError(f"one of {', '.join(known)}", repr(name), f"correct the name in {cls.__name__}")
+    defaults = cls()
+    return cls(**{name: _convert(getattr(defaults, name), value, name) for name, value in values.items()})
+
+
+def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
+    """The settings of a nested dataclass as one mapping with dotted names (for ROS parameters)."""
+    flat: dict[str, Any] = {}
+    for name, value in vars(config).items():
+        flat |= flatten(value, f"{prefix}{name}.") if is_dataclass(value) else {f"{prefix}{name}": value}
+    return flat
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """A nested dataclass as nested dictionaries; `from_dict` reads it back."""
+    return asdict(config)
+
+
+def _convert(default: Any, value: Any, name: str) -> Any:
+    if is_dataclass(default):
+        return from_dict(type(default), value)
+    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(default, tuple) and isinstance(value, list):
+        value = tuple(value)
+    if default is not None and type(value) is not type(default):
+        raise ConfigError(f"{name} of type {type(default).__name__}", repr(value), "correct the value")
+    return value

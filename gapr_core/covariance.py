@@ -1,0 +1,98 @@
+"""How uncertain a refined pose is, under noise and under the smooth bias that probes and segmentations have.
+
+The weighted least-squares pose reacts to residuals e by H^-1 J^T W e. With independent noise of variance s^2 and a
+smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), its covariance is the sandwich
+H^-1 J^T W (s^2 I + b^2 K) W J H^-1 (White 1980; Censi 2007 for the noise alone). A Hessian alone is over-confident.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.config import CovarianceConfig
+from gapr_core.refinement import Fit
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseUncertainty:
+    """Covariance of a pose, and what follows from it.
+
+    Attributes:
+        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed axes of the target frame, about the moved source's centroid.
+        bias_mm: standard deviation of the smooth misfit that the residuals show.
+        weakest_turn: (3,) unit axis, target frame, about which the rotation is least certain.
+        weakest_shift: (3,) unit direction, target frame, along which the position is least certain.
+    """
+
+    covariance: Array
+    bias_mm: float
+    weakest_turn: Array
+    weakest_shift: Array
+
+    @property
+    def largest_shift_mm(self) -> float:
+        """Standard deviation along the least certain direction, mm."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def largest_turn_deg(self) -> float:
+        """Standard deviation about the least certain axis, deg."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
+
+    def tre_mm(self, points: Array, centroid: Array) -> float:
+        """Predicted root-mean-square error over (M, 3) target points: the trace of J Sigma J^T (Fitzpatrick 1998)."""
+        arm = points - centroid
+        J = np.zeros((len(points), 3, 6))
+        J[:, :, :3] = np.eye(3)
+        J[:, 0, 4], J[:, 0, 5] = arm[:, 2], -arm[:, 1]
+        J[:, 1, 3], J[:, 1, 5] = -arm[:, 2], arm[:, 0]
+        J[:, 2, 3], J[:, 2, 4] = arm[:, 1], -arm[:, 0]
+        return float(np.sqrt(np.einsum("nia,ab,nib->n", J, self.covariance, J).mean()))
+
+
+def estimate(fit: Fit, config: CovarianceConfig) -> PoseUncertainty:
+    """Covariance of a fit from its residuals; always symmetric and positive definite."""
+    J, w = fit.jacobian, fit.weights
+    H = (J * w[:, None]).T @ J + np.diag([1e-6] * 3 + [1e-3] * 3)
+    noise = fit.sigma_mm**2 * (J * (w**2)[:, None]).T @ J
+    bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_misfit_mm(fit, config.smooth_neighbours))
+    H_inverse = np.linalg.inv(H)
+    covariance = H_inverse @ (noise + bias_mm**2 * _correlated(fit, config)) @ H_inverse
+    covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
+    return PoseUncertainty(
+        covariance, float(bias_mm), _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
+    )
+
+
+def smooth_misfit_mm(fit: Fit, neighbours: int) -> float:
+    """Root mean square of the locally averaged residuals of the inliers, less what noise leaves in an average."""
+    inlier = fit.weights > 0.0
+    if inlier.sum() <= neighbours:
+        return fit.sigma_mm
+    points, signed = fit.moved[inlier], fit.signed_mm[inlier]
+    averages = signed[cKDTree(points).query(points, k=neighbours)[1]].mean(axis=1)
+    return float(np.sqrt(max((averages**2).mean() - signed.var() / neighbours, 0.0)))
+
+
+def _correlated(fit: Fit, config: CovarianceConfig) -> Array:
+    """J^T W K W J of a smooth field, from a regular subset of the inliers scaled to all of them."""
+    inlier = np.flatnonzero(fit.weights > 0.0)
+    if not len(inlier):
+        return np.zeros((6, 6))
+    some = inlier[:: max(1, len(inlier) // config.correlation_points)]
+    weighted = fit.jacobian[some] * fit.weights[some, None] * (len(inlier) / len(some))
+    points = fit.moved[some]
+    squares = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    return np.asarray(weighted.T @ np.exp(-0.5 * squares / config.correlation_mm**2) @ weighted)
+
+
+def _largest_axis(block: Array) -> Array:
+    return np.asarray(np.linalg.eigh(block)[1][:, -1])

@@ -1,0 +1,37 @@
+"""What every source of pose hypotheses offers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.source import PreparedSource
+from gapr_core.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """Pose hypotheses, best first.
+
+    Attributes:
+        poses: (K, 4, 4) float64 T_target_source, mm.
+        scores: (K,) the proposer's own measure, larger is better; comparable within one proposer only.
+    """
+
+    poses: Array
+    scores: Array
+
+
+class Proposer(Protocol):
+    """Suggests poses; verification decides. A right one among many wrong ones is a success."""
+
+    name: str
+
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+        """Hypotheses for one pair; may be empty."""
+        ...

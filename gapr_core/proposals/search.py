@@ -1,0 +1,141 @@
+"""The weight-free proposer: every way to lay a source normal on a target normal.
+
+A reference point of the source is put on an anchor of the target, normal on normal, and turned about the normal in
+steps. Each pose is scored by the distances of a few probe points of the source in the target's distance field. The
+sign of a source normal is unknown (one-sided clouds look alike from both sides), so both are tried.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import repeat
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import SearchConfig
+from gapr_core.geometry import quadrics, sampling
+from gapr_core.geometry.distance_field import DistanceField
+from gapr_core.parallel import thread_count
+from gapr_core.proposals.base import Proposals
+from gapr_core.source import PreparedSource
+from gapr_core.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NormalAlignedSearch:
+    """Exhaustive search over normal-aligned poses; deterministic, no training."""
+
+    config: SearchConfig = SearchConfig()
+    num_threads: int = 0
+    name: str = "search"
+
+    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
+        """The best spin of every (reference, sign, anchor), best `keep` of them all."""
+        references = _references(source, self.config.references)
+        anchor_axes = _anchor_axes(target)
+        local = np.stack([_probes_in_frame(source, i, sign, self.config) for i in references for sign in (1.0, -1.0)])
+        anchors = target.points[target.anchors].astype(np.float32)
+        score, spin = self._score(local, anchors, anchor_axes.astype(np.float32), target.field)
+        best = np.argsort(score, axis=None, kind="stable")[: self.config.keep]
+        view, anchor = np.unravel_index(best, score.shape)
+        angles = 2.0 * np.pi * spin[view, anchor] / self.config.spins
+        poses = _poses(source, references[view // 2], np.where(view % 2, -1.0, 1.0), angles, target, anchor_axes, anchor)
+        return Proposals(poses, -score[view, anchor].astype(np.float64))
+
+    def _score(
+        self, local: NDArray[np.float32], anchors: NDArray[np.float32], axes: NDArray[np.float32], field: DistanceField
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        limit = self.config.first_limit_mm * 255.0 / field.reach_mm
+        with ThreadPoolExecutor(thread_count(self.num_threads)) as pool:
+            rows = pool.map(
+                _best_spins,
+                local,
+                repeat(anchors),
+                repeat(axes),
+                repeat(field.distance),
+                repeat(field.origin.astype(np.float32)),
+                repeat(np.float32(1.0 / field.cell_mm)),
+                repeat(self.config.first_probes),
+                repeat(np.float32(limit)),
+            )
+            scores, spins = zip(*rows, strict=True)
+        return np.stack(scores), np.stack(spins)
+
+
+def _references(source: PreparedSource, count: int) -> NDArray[np.int64]:
+    """Points far apart, each the one with the flattest surroundings among its neighbours in the spread order."""
+    candidates = source.order[: 8 * count]
+    flat = candidates[np.argsort(source.flatness_mm[candidates], kind="stable")[: max(count, len(candidates) // 2)]]
+    return flat[sampling.farthest_points(source.points[flat], count)]
+
+
+def _anchor_axes(target: PreparedTarget) -> Array:
+    """(A, 3, 3): rows are two tangents and the outward normal of every anchor."""
+    normals = target.normals[target.anchors]
+    return np.concatenate([quadrics.tangent_basis(normals), normals[:, None]], axis=1)
+
+
+def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config: SearchConfig) -> NDArray[np.float32]:
+    """(spins, probes, 3) probe points in the frame of one reference, turned about its normal."""
+    probes = (source.subset(config.probes) - source.points[reference]) @ _signed_axes(source, reference, sign).T
+    angle = 2.0 * np.pi * np.arange(config.spins)[:, None] / config.spins
+    x, y, z = probes.T
+    turned = [np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, np.broadcast_to(z, (len(angle), len(z)))]
+    return np.stack(turned, axis=-1).astype(np.float32)
+
+
+def _signed_axes(source: PreparedSource, reference: int, sign: float) -> Array:
+    return source.axes[reference] * np.array([1.0, sign, sign])[:, None]
+
+
+def _poses(
+    source: PreparedSource, references: NDArray[np.int64], signs: Array, angles: Array, target: PreparedTarget,
+    anchor_axes: Array, anchors: NDArray[np.intp],
+) -> Array:
+    """(K, 4, 4): R = axes_anchor^T Rz(angle) axes_reference, the reference point on the anchor."""
+    c, s, o, i = np.cos(angles), np.sin(angles), np.zeros_like(angles), np.ones_like(angles)
+    turn = np.stack([c, -s, o, s, c, o, o, o, i], axis=1).reshape(-1, 3, 3)
+    flip = np.stack([i, signs, signs], axis=1)[:, :, None]
+    poses = np.tile(np.eye(4), (len(angles), 1, 1))
+    poses[:, :3, :3] = anchor_axes[anchors].transpose(0, 2, 1) @ turn @ (source.axes[references] * flip)
+    moved = np.einsum("kij,kj->ki", poses[:, :3, :3], source.points[references])
+    poses[:, :3, 3] = target.points[target.anchors[anchors]] - moved
+    return poses
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):  # type: ignore[no-untyped-def]
+    """For every anchor the lowest mean probe distance (in field steps) over the spins, and that spin."""
+    spins, probes = local.shape[0], local.shape[1]
+    nx, ny, nz = distance.shape
+    score = np.full(len(anchors), np.float32(255.0), dtype=np.float32)
+    best = np.zeros(len(anchors), dtype=np.int32)
+    for a in range(len(anchors)):
+        ax = (anchors[a, 0] - origin[0]) * per_cell + np.float32(0.5)
+        ay = (anchors[a, 1] - origin[1]) * per_cell + np.float32(0.5)
+        az = (anchors[a, 2] - origin[2]) * per_cell + np.float32(0.5)
+        m = axes[a] * per_cell
+        for s in range(spins):
+            total = 0
+            for k in range(probes):
+                if k == first and total > limit * first:
+                    total = 255 * probes
+                    break
+                x, y, z = local[s, k, 0], local[s, k, 1], local[s, k, 2]
+                i = int(np.floor(ax + m[0, 0] * x + m[1, 0] * y + m[2, 0] * z))
+                j = int(np.floor(ay + m[0, 1] * x + m[1, 1] * y + m[2, 1] * z))
+                l = int(np.floor(az + m[0, 2] * x + m[1, 2] * y + m[2, 2] * z))
+                if i < 0 or j < 0 or l < 0 or i >= nx or j >= ny or l >= nz:
+                    total += 255
+                else:
+                    total += distance[i, j, l]
+            mean = np.float32(total) / np.float32(probes)
+            if mean < score[a]:
+                score[a] = mean
+                best[a] = s
+    return score, best

@@ -1,0 +1,112 @@
+"""Robust point-to-surface refinement: many poses coarsely, a few to the end.
+
+Point-to-plane (Chen and Medioni 1992) with second-order surface elements, Tukey's biweight at a scale that follows
+the residuals, and the offset that noise causes on curved surfaces taken away (see `refinement_kernels`).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core import refinement_kernels as kernels
+from gapr_core.config import RefinementConfig
+from gapr_core.geometry import se3
+from gapr_core.parallel import thread_count
+from gapr_core.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A pose and how the source lies on the target under it.
+
+    Attributes:
+        T: (4, 4) T_target_source, mm.
+        sigma_mm: robust standard deviation of the residuals.
+        signed_mm: (N,) signed distances to the surface, NaN where none is near.
+        weights: (N,) Tukey weights, 0 for outliers.
+        gradients: (N, 3) unit surface normals at the foot points, target frame.
+        elements: (N,) indices of the nearest target points, -1 where none is near.
+        moved: (N, 3) source points in the target frame.
+    """
+
+    T: Array
+    sigma_mm: float
+    signed_mm: Array
+    weights: Array
+    gradients: Array
+    elements: NDArray[np.int64]
+    moved: Array
+
+    @property
+    def jacobian(self) -> Array:
+        """(N, 6) derivative of the residuals by x y z rx ry rz about the moved source's centroid."""
+        return np.hstack([self.gradients, np.cross(self.moved - self.moved.mean(axis=0), self.gradients)])
+
+
+def refine_many(
+    poses: Array, points: Array, target: PreparedTarget, limits_mm: Array, num_threads: int = 0
+) -> tuple[Array, Array]:
+    """Iterate Gauss-Newton from every pose on the same few source points.
+
+    Args:
+        poses: (K, 4, 4) T_target_source, mm.
+        points: (N, 3) source points, mm.
+        target: the prepared target.
+        limits_mm: (iterations,) scale of Tukey's biweight in each iteration, mm, usually falling.
+        num_threads: 0 for all cores.
+
+    Returns:
+        (K, 4, 4) refined poses and (K,) mean squared distances truncated at the last limit, mm^2 (small is good).
+    """
+    threads = thread_count(num_threads)
+    pieces = [p for p in np.array_split(np.ascontiguousarray(poses), 4 * threads) if len(p)]
+    variances = np.zeros_like(limits_mm)
+
+    def work(piece: Array) -> tuple[Array, Array]:
+        return kernels.refine_batch(piece, points, *target.kernel_view, limits_mm, variances)
+
+    with ThreadPoolExecutor(threads) as pool:
+        refined, scores = zip(*pool.map(work, pieces), strict=True)
+    return np.concatenate(refined), np.concatenate(scores)
+
+
+def refine_fully(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
+    """Refine one pose on all points until it rests; the scale of the weights follows the residuals.
+
+    Args:
+        T: (4, 4) T_target_source within the basin, mm.
+        points: (N, 3) source points, mm.
+        target: the prepared target.
+        config: iterations and scales.
+    """
+    for _ in range(config.rounds):
+        sigma_mm = evaluate(T, points, target, config).sigma_mm
+        limits = np.full(config.iterations, config.tukey_scale * sigma_mm)
+        poses, _ = kernels.refine_batch(T[None], points, *target.kernel_view, limits, np.full_like(limits, sigma_mm**2))
+        step = se3.apply(poses[0], points) - se3.apply(T, points)
+        T = poses[0]
+        if np.abs(step).max() < config.rest_mm:
+            break
+    return evaluate(se3.nearest_rigid(T), points, target, config)
+
+
+def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
+    """Residuals, scale and weights of a pose as it is."""
+    signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
+    sigma_mm = _robust_sigma(signed, config)
+    signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
+    square = (np.nan_to_num(signed, nan=np.inf) ** 2 + aside**2) / (config.tukey_scale * sigma_mm) ** 2
+    weights = np.clip(1.0 - square, 0.0, 1.0) ** 2
+    return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
+
+
+def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
+    """1.4826 x median absolute residual, those without a surface near counted as large; within the limits set."""
+    spread = 1.4826 * float(np.median(np.nan_to_num(np.abs(signed), nan=np.inf)))
+    return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)

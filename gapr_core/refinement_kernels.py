@@ -1,0 +1,194 @@
+"""Compiled inner loops of the refinement: nearest surface element, residual, normal equations, one step.
+
+A residual is the signed distance of a moved source point to the quadric that stands for the surface near it. Isotropic
+noise of variance s^2 lifts the expected distance to a curved surface by -s^2 tr(shape) / 2 (outwards where it is
+convex); given that variance, the offset is taken away. Without it the pose of a one-sided cloud is pushed along the
+direction of view.
+"""
+
+# mypy: ignore-errors
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+ELEMENT_RADIUS = 2.0  # of a surface element, in point spacings; beyond it the quadric is not extrapolated
+LARGEST_TURN_RAD = 0.35  # of one step
+FAST = {"cache": True, "nogil": True, "fastmath": True}
+
+
+@numba.njit(inline="always", **FAST)
+def moved(T, p):
+    """Point p (3,) moved by T (4, 4)."""
+    return (
+        T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3],
+        T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3],
+        T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3],
+    )
+
+
+@numba.njit(inline="always", **FAST)
+def element_near(x, y, z, nearest, origin, per_cell):
+    """Index of the target point near (x, y, z), -1 where there is none."""
+    i = int(np.floor((x - origin[0]) * per_cell + 0.5))
+    j = int(np.floor((y - origin[1]) * per_cell + 0.5))
+    k = int(np.floor((z - origin[2]) * per_cell + 0.5))
+    if i < 0 or j < 0 or k < 0 or i >= nearest.shape[0] or j >= nearest.shape[1] or k >= nearest.shape[2]:
+        return -1
+    return nearest[i, j, k]
+
+
+@numba.njit(inline="always", **FAST)
+def residual(x, y, z, q, elements, spacing, variance):
+    """Signed distance to element q, its gradient, and how far aside of the element's disc the point lies.
+
+    A row of `elements` is point (3), normal (3), shape xx xy xz yy yz zz.
+    """
+    e = elements[q]
+    dx, dy, dz = x - e[0], y - e[1], z - e[2]
+    nx, ny, nz = e[3], e[4], e[5]
+    height = nx * dx + ny * dy + nz * dz
+    tx, ty, tz = dx - height * nx, dy - height * ny, dz - height * nz
+    aside, reach = np.sqrt(tx * tx + ty * ty + tz * tz), ELEMENT_RADIUS * spacing
+    if aside > reach:
+        tx, ty, tz = tx * reach / aside, ty * reach / aside, tz * reach / aside
+    sx = e[6] * tx + e[7] * ty + e[8] * tz
+    sy = e[7] * tx + e[9] * ty + e[10] * tz
+    sz = e[8] * tx + e[10] * ty + e[11] * tz
+    nx, ny, nz = nx - sx, ny - sy, nz - sz
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    lift = 0.5 * variance * (e[6] + e[9] + e[11])
+    most = 0.5 * np.sqrt(variance)  # the expansion ends at sharp edges
+    signed = (height - 0.5 * (sx * tx + sy * ty + sz * tz)) / length + min(max(lift, -most), most)
+    return signed, nx / length, ny / length, nz / length, max(aside - reach, 0.0)
+
+
+@numba.njit(**FAST)
+def refine_batch(poses, points, elements, nearest, origin, per_cell, spacing, limits, variances):
+    """Gauss-Newton from every pose (K, 4, 4); one iteration per entry of `limits` (Tukey scale) and `variances`.
+
+    Returns the poses and their mean squared distances, truncated at the last limit.
+    """
+    out, scores = poses.copy(), np.empty(len(poses))
+    H, g = np.empty((6, 6)), np.empty(6)
+    middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
+    for k in range(len(poses)):
+        T, total = out[k], 0.0
+        for i in range(len(limits)):
+            accumulate(T, points, middle, elements, nearest, origin, per_cell, spacing, limits[i], variances[i], H, g)
+            step(T, middle, H, g, len(points))
+        for p in range(len(points)):
+            total += squared_distance(T, points[p], elements, nearest, origin, per_cell, spacing, limits[-1])
+        scores[k] = total / len(points)
+    return out, scores
+
+
+@numba.njit(**FAST)
+def squared_distance(T, point, elements, nearest, origin, per_cell, spacing, limit):
+    """Squared distance of one moved point to the surface, truncated."""
+    x, y, z = moved(T, point)
+    q = element_near(x, y, z, nearest, origin, per_cell)
+    if q < 0:
+        return limit * limit
+    r, _, _, _, aside = residual(x, y, z, q, elements, spacing, 0.0)
+    return min(limit * limit, r * r + aside * aside)
+
+
+@numba.njit(**FAST)
+def accumulate(T, points, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
+    """Normal equations H twist = g, Tukey-weighted; twist = x y z rx ry rz about the moved middle of the source."""
+    H[:] = 0.0
+    g[:] = 0.0
+    J = np.empty(6)
+    mx, my, mz = moved(T, middle)
+    for p in range(len(points)):
+        x, y, z = moved(T, points[p])
+        q = element_near(x, y, z, nearest, origin, per_cell)
+        if q < 0:
+            continue
+        r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, variance)
+        square = (r * r + aside * aside) / (limit * limit)
+        if square >= 1.0:
+            continue
+        w = (1.0 - square) ** 2
+        x, y, z = x - mx, y - my, z - mz
+        J[0], J[1], J[2] = nx, ny, nz
+        J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+        for a in range(6):
+            g[a] -= w * J[a] * r
+            for b in range(a + 1):
+                H[a, b] += w * J[a] * J[b]
+    for a in range(6):
+        for b in range(a):
+            H[b, a] = H[a, b]
+
+
+@numba.njit(**FAST)
+def step(T, middle, H, g, count):
+    """Solve, limit the turn, move T in place."""
+    for a in range(3):
+        H[a, a] += 1e-4 * count
+        H[a + 3, a + 3] += 1e-4 * H[a + 3, a + 3] + 1.0
+    twist = np.linalg.solve(H, g)
+    angle = np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2)
+    if angle > LARGEST_TURN_RAD:
+        twist *= LARGEST_TURN_RAD / angle
+        angle = LARGEST_TURN_RAD
+    centre = np.array(moved(T, middle))
+    R = rotation(twist[3:], angle)
+    T[:3, :3] = R @ np.ascontiguousarray(T[:3, :3])
+    T[:3, 3] = R @ (T[:3, 3] - centre) + centre + twist[:3]
+
+
+@numba.njit(**FAST)
+def rotation(vector, angle):
+    """Rodrigues' formula for a rotation vector of known length."""
+    R = np.eye(3)
+    if angle < 1e-12:
+        return R
+    x, y, z = vector[0] / angle, vector[1] / angle, vector[2] / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return R + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+
+
+@numba.njit(**FAST)
+def residuals_at(T, points, elements, nearest, origin, per_cell, spacing, variance):
+    """(N,) signed distances (NaN beyond the field), (N, 3) gradients, (N,) distances aside, (N,) elements."""
+    n = len(points)
+    signed, gradient = np.full(n, np.nan), np.zeros((n, 3))
+    aside, element = np.zeros(n), np.full(n, -1)
+    for p in range(n):
+        x, y, z = moved(T, points[p])
+        q = element_near(x, y, z, nearest, origin, per_cell)
+        element[p] = q
+        if q >= 0:
+            signed[p], gradient[p, 0], gradient[p, 1], gradient[p, 2], aside[p] = residual(
+                x, y, z, q, elements, spacing, variance
+            )
+    return signed, gradient, aside, element
+
+
+@numba.njit(**FAST)
+def distinct(moved_points, order, tolerance, most):
+    """Indices of at most `most` poses, in `order`, each farther than `tolerance` (rms) from those before it.
+
+    `moved_points` (K, P, 3) are the same few source points under every pose.
+    """
+    kept = np.empty(most, dtype=np.int64)
+    count, points = 0, moved_points.shape[1]
+    for i in order:
+        fresh = True
+        for j in kept[:count]:
+            total = 0.0
+            for p in range(points):
+                for axis in range(3):
+                    total += (moved_points[i, p, axis] - moved_points[j, p, axis]) ** 2
+            if total < tolerance * tolerance * points:
+                fresh = False
+                break
+        if fresh:
+            kept[count] = i
+            count += 1
+            if count == most:
+                break
+    return kept[:count]

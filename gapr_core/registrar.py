@@ -1,0 +1,159 @@
+"""The algorithm on one screen: prepare, propose, verify, refine, assess."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gapr_core import confidence, covariance
+from gapr_core import source as sources
+from gapr_core import target as targets
+from gapr_core.clouds import Surface
+from gapr_core.confidence import Calibration
+from gapr_core.config import RegistrarConfig
+from gapr_core.covariance import PoseUncertainty
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import se3
+from gapr_core.proposals.base import Proposer
+from gapr_core.proposals.search import NormalAlignedSearch
+from gapr_core.refinement import Fit, refine_fully
+from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.source import PreparedSource
+from gapr_core.target import PreparedTarget
+from gapr_core.verification import Candidates, verify
+
+Array = NDArray[np.float64]
+
+LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 5.0, 4.0  # standard deviations beyond which a direction counts as not observed
+CLEAR_MARGIN = 0.03  # a second pose whose residual is larger by less than this share explains the source as well
+
+
+class Registrar:
+    """Lays partial sources on one or many prepared targets.
+
+    Args:
+        config: every setting.
+        proposers: where hypotheses come from; the weight-free search when not given.
+        calibration: the confidence model; the shipped one when not given.
+    """
+
+    name = "gapr"
+
+    def __init__(
+        self,
+        config: RegistrarConfig | None = None,
+        proposers: Sequence[Proposer] | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
+        self.config = config or RegistrarConfig()
+        self.proposers = tuple(proposers or (NormalAlignedSearch(self.config.search, self.config.num_threads),))
+        self.calibration = calibration or Calibration.load()
+
+    @classmethod
+    def from_pretrained(cls, config: RegistrarConfig | None = None) -> Registrar:
+        """The best registrar that ships: shipped proposers and calibration, nothing downloaded."""
+        return cls(config)
+
+    def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
+        """Everything static about a target; see `gapr_core.target.prepare`."""
+        return targets.prepare(target, units, self.config.target)
+
+    def register(
+        self, source: ArrayLike, target: PreparedTarget, initial: ArrayLike | None = None
+    ) -> RegistrationResult:
+        """The pose of a source on the target, or a refusal.
+
+        Args:
+            source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
+            target: from `prepare`.
+            initial: (4, 4) T_target_source to try besides all others, such as the pose of the frame before.
+
+        Raises:
+            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm.
+        """
+        clock = _Clock()
+        prepared = sources.prepare(source, self.config.source)
+        if isinstance(prepared, str):
+            return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=prepared, stage_ms=clock.lap("prepare"))
+        clock.lap("prepare")
+        poses = self._propose(prepared, target, initial)
+        clock.lap("propose")
+        candidates = verify(poses, prepared, target, self.config.verification, self.config.num_threads)
+        clock.lap("verify")
+        fit = refine_fully(candidates.poses[0], prepared.points, target, self.config.refinement)
+        clock.lap("refine")
+        result = self._assess(fit, candidates, prepared, target)
+        return replace(result, stage_ms=clock.lap("assess"))
+
+    def _propose(self, source: PreparedSource, target: PreparedTarget, initial: ArrayLike | None) -> Array:
+        rng = np.random.default_rng(self.config.seed)
+        poses = [proposer.propose(source, target, rng).poses for proposer in self.proposers]
+        if initial is not None:
+            poses.append(_rigid(initial)[None])
+        return np.concatenate(poses)
+
+    def _assess(
+        self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget
+    ) -> RegistrationResult:
+        uncertainty = covariance.estimate(fit, self.config.covariance)
+        figures = confidence.measure(fit, candidates, uncertainty, source, target)
+        probability = self.calibration.probability(figures)
+        common = {
+            "confidence": probability,
+            "inlier_ratio": figures["inlier_ratio"],
+            "alternatives": tuple(candidates.poses[1:]),
+            "details": figures | {"best_pose": fit.T, "bias_mm": uncertainty.bias_mm},
+        }
+        if probability < self.config.min_confidence:
+            status, reason = _why_not(candidates, uncertainty, probability)
+            return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
+        tre_mm = uncertainty.tre_mm(target.points, fit.moved.mean(axis=0))
+        return RegistrationResult(
+            RegistrationStatus.OK, fit.T, uncertainty.covariance, tre_mm=tre_mm, **common  # type: ignore[arg-type]
+        )
+
+
+def _why_not(
+    candidates: Candidates, uncertainty: PoseUncertainty, probability: float
+) -> tuple[RegistrationStatus, str]:
+    """Status and sentence of a refusal."""
+    scores = candidates.scores
+    if uncertainty.largest_turn_deg > LARGEST_TURN_DEG or uncertainty.largest_shift_mm > LARGEST_SHIFT_MM:
+        return RegistrationStatus.DEGENERATE, (
+            f"the turn about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
+            f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
+        )
+    if len(scores) > 1 and scores[1] < (1.0 + CLEAR_MARGIN) * scores[0]:
+        apart = se3.rotation_angle_deg(se3.inverse(candidates.poses[0]) @ candidates.poses[1])
+        return RegistrationStatus.AMBIGUOUS, f"another pose, turned by {apart:.0f} deg, explains the source as well"
+    return RegistrationStatus.LOW_CONFIDENCE, f"the best pose found is right with a probability of {probability:.2f} only"
+
+
+def _named(axis: Array) -> str:
+    return "({:.2f}, {:.2f}, {:.2f})".format(*axis)
+
+
+def _rigid(pose: ArrayLike) -> Array:
+    T = np.asarray(pose, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InvalidPointCloudError("a finite (4, 4) initial pose", f"shape {T.shape}", "pass T_target_source in mm")
+    return se3.nearest_rigid(T)
+
+
+class _Clock:
+    """Wall time of each stage, ms."""
+
+    def __init__(self) -> None:
+        self._stages: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> dict[str, float]:
+        now = time.perf_counter()
+        self._stages[stage] = (now - self._last) * 1000.0
+        self._last = now
+        return dict(self._stages)

@@ -1,0 +1,134 @@
+"""All that is static about the pre-operative bone, computed once when it is loaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core import clouds
+from gapr_core.clouds import Surface
+from gapr_core.config import TargetConfig
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import distance_field, quadrics, sampling, visibility
+from gapr_core.geometry.distance_field import DistanceField
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedTarget:
+    """The bone as registration sees it: its outer shell as oriented, curved surface elements.
+
+    Attributes:
+        points: (M, 3) float64, mm, evenly thinned; only what is visible from outside.
+        normals: (M, 3) unit, outward.
+        shapes: (M, 3, 3) second fundamental forms, 1/mm (see `quadrics.fit_quadrics`).
+        tree: k-d tree of the points.
+        field: nearest points and distances on a grid.
+        anchors: (A,) indices of evenly spread points where the search places the source.
+        spacing_mm: median distance between neighbouring points.
+        surface: what was loaded, mm, for display.
+        elements: (M, 12) points, normals and shapes (xx xy xz yy yz zz) side by side, for the compiled loops.
+        cache: what proposers keep per target (a network's features).
+    """
+
+    points: Array
+    normals: Array
+    shapes: Array
+    tree: cKDTree
+    field: DistanceField
+    anchors: NDArray[np.int64]
+    spacing_mm: float
+    surface: Surface
+    elements: Array
+    cache: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def faces(self) -> NDArray[np.int64] | None:
+        """Faces of the loaded mesh, indices into `surface.points`; None for a cloud."""
+        return self.surface.faces
+
+    @property
+    def kernel_view(self) -> tuple[Array, NDArray[np.int32], Array, float, float]:
+        """Arguments that every loop of `refinement_kernels` takes."""
+        return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
+
+    @property
+    def centroid(self) -> Array:
+        """(3,) mean of the points, mm."""
+        return np.asarray(self.points.mean(axis=0))
+
+    @property
+    def half_extent_mm(self) -> float:
+        """Largest distance of a point to the centroid: the one scale of a pair (method, section 2)."""
+        return float(np.linalg.norm(self.points - self.centroid, axis=1).max())
+
+
+def prepare(
+    target: str | Path | ArrayLike | Surface, units: str = "mm", config: TargetConfig | None = None
+) -> PreparedTarget:
+    """Load and prepare a target.
+
+    Args:
+        target: path, `Surface` or (M, 3) array (see `clouds.load`).
+        units: "mm", "m" or "auto".
+        config: sizes; the defaults suit bones from a cartilage to a pelvis.
+
+    Raises:
+        InvalidPointCloudError: when it cannot be read, cannot be a bone, or is a plane, a line or too small a set.
+    """
+    config = config or TargetConfig()
+    surface = clouds.load(target, units)
+    points, normals = _surface_elements(surface, config)
+    _check_is_a_body(points, config)
+    points, normals = _outer_shell(points, normals, config)
+    tree = cKDTree(points)
+    spacing_mm = quadrics.spacing(points, tree)
+    neighbours = tree.query(points, k=min(config.quadric_neighbours, len(points)))[1]
+    normals, shapes = quadrics.fit_quadrics(points, normals, neighbours)
+    return PreparedTarget(
+        points=points,
+        normals=normals,
+        shapes=shapes,
+        tree=tree,
+        field=distance_field.build(points, normals, spacing_mm, config.field_reach_mm),
+        anchors=sampling.thin(points, config.anchors),
+        spacing_mm=spacing_mm,
+        surface=surface,
+        elements=np.hstack([points, normals, shapes.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]]),
+    )
+
+
+def _surface_elements(surface: Surface, config: TargetConfig) -> tuple[Array, Array]:
+    """Evenly thinned points (M, 3) with unit normals of arbitrary sign."""
+    if surface.faces is not None and len(surface.faces):
+        points, normals = surface.sample(4 * config.most_points, np.random.default_rng(0))
+        keep = sampling.thin(points, config.most_points)
+        return points[keep], normals[keep]
+    unique = np.unique(surface.points, axis=0)
+    points = unique[sampling.thin(unique, config.most_points)]
+    neighbours = cKDTree(points).query(points, k=min(config.normal_neighbours, len(points)))[1]
+    return points, quadrics.local_frames(points, np.atleast_2d(neighbours)).normals
+
+
+def _check_is_a_body(points: Array, config: TargetConfig) -> None:
+    if len(points) < config.fewest_points:
+        given = f"{len(points)} distinct points"
+        raise InvalidPointCloudError(f"a target of at least {config.fewest_points} points", given, "export it denser")
+    spread = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
+    if spread[0] < 1e-3 * spread[2]:
+        shape = "line" if spread[1] < 1e-3 * spread[2] else "plane"
+        raise InvalidPointCloudError("a bone with extent in three directions", f"a {shape}", "check the file")
+
+
+def _outer_shell(points: Array, normals: Array, config: TargetConfig) -> tuple[Array, Array]:
+    """Points visible from outside with outward normals; everything, should that be less than half of them."""
+    votes, counts = visibility.outward_votes(points, normals, quadrics.spacing(points), config.view_directions)
+    normals = quadrics.orient(normals, votes)
+    shell = counts > 0
+    return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)

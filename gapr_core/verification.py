@@ -1,0 +1,71 @@
+"""From many hypotheses to a few distinct, refined and ranked poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import VerificationConfig
+from gapr_core.refinement import refine_many
+from gapr_core.refinement_kernels import distinct
+from gapr_core.source import PreparedSource
+from gapr_core.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+MARKERS = 16  # source points by which two poses are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Distinct poses that explain the source, best first.
+
+    Attributes:
+        poses: (K, 4, 4) T_target_source, mm.
+        scores: (K,) mean squared distance of all source points, truncated, mm^2 (small is good).
+        support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
+    """
+
+    poses: Array
+    scores: Array
+    support: Array
+
+
+def verify(
+    poses: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+) -> Candidates:
+    """Refine all on a few points, the distinct best on more, the best of those on all points.
+
+    Args:
+        poses: (K, 4, 4) hypotheses T_target_source, mm, K >= 1.
+        source: the prepared source.
+        target: the prepared target.
+        config: how many survive each stage.
+        num_threads: 0 for all cores.
+    """
+    few, some = source.subset(config.coarse_points), source.subset(config.middle_points)
+    poses, scores = refine_many(poses, few, target, np.linspace(*config.coarse_limits_mm), num_threads)
+    poses = _distinct(poses, scores, source, config.same_pose_mm, config.middle_poses)[0]
+    poses, scores = refine_many(poses, some, target, np.linspace(*config.middle_limits_mm), num_threads)
+    crowd = poses
+    poses = _distinct(poses, scores, source, config.same_pose_mm, config.final_poses)[0]
+    poses, scores = refine_many(poses, source.points, target, np.linspace(*config.final_limits_mm), num_threads)
+    poses, scores = _distinct(poses, scores, source, config.same_pose_mm, config.final_poses)
+    gaps = np.linalg.norm(_markers(poses, source)[:, None] - _markers(crowd, source)[None], axis=3)
+    support = (np.sqrt((gaps**2).mean(axis=2)) < config.same_pose_mm).mean(axis=1)
+    return Candidates(poses, scores, support)
+
+
+def _distinct(
+    poses: Array, scores: Array, source: PreparedSource, tolerance_mm: float, most: int
+) -> tuple[Array, Array]:
+    """The best poses, none within `tolerance_mm` (root mean square over the markers) of a better one."""
+    kept = distinct(_markers(poses, source), np.argsort(scores, kind="stable"), tolerance_mm, most)
+    return poses[kept], scores[kept]
+
+
+def _markers(poses: Array, source: PreparedSource) -> Array:
+    """(K, MARKERS, 3) the same spread source points under every pose."""
+    return np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(MARKERS)) + poses[:, None, :3, 3]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gapr_ros.observer import Observer
 
 FIRST_STAMP_S = 1_700_000_000.0
-START_LIMIT_S, SILENCE_LIMIT_S = 60.0, 15.0
+START_LIMIT_S, SILENCE_LIMIT_S = 180.0, 20.0  # the first start on a machine compiles
 
 
 class DemoError(RuntimeError):
@@ -169,7 +169,8 @@ def replay(scene: Scene, observer: Observer, folder: Path, console: Any) -> None
     settings = [text for name, value in parameters.items() for text in ("-p", f"{name}:={value}")]
     with child("gapr_ros.register_node", ["--ros-args", *settings], log) as node:
         with _player(observer, folder / "bag") as play:
-            _wait_until_ready(observer, node, log)
+            with console.status("waiting for the node to read the bone (the first time it compiles, up to a minute)"):
+                _wait_until_ready(observer, node, log)
             play()
             _collect(len(scene.sweep.clouds), observer, node, log, console)
 

@@ -1,0 +1,1 @@
+"""Where hypotheses come from: each proposer gives poses, none of them decides."""

@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -41,6 +42,14 @@ def test_every_entry_point_leads_to_something_that_can_be_called():
         assert callable(loaded) or (callable(loaded.add_arguments) and callable(loaded.run))
 
 
+def test_every_folder_of_code_is_a_package_and_gets_installed():
+    folders = {
+        path.parent for name in ("gapr_core", "msg_adapters", "gapr_ros") for path in (ROOT / name).rglob("*.py")
+    }
+    assert len(folders) > 5
+    assert not [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").is_file()]
+
+
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory):
     """A colcon workspace with this package, built."""
@@ -63,15 +72,18 @@ def test_colcon_build_gives_an_executable_that_ros2_run_finds(workspace):
 
 def test_the_node_that_colcon_built_starts_and_uses_the_installed_code(workspace):
     node = workspace / "install/gapr_ros/lib/gapr_ros/register_node"
-    setup = workspace / "install/setup.bash"
-    command = f"source {setup} && python3 -c 'import gapr_ros; print(gapr_ros.__file__)'"
+    where = "python3 -c 'import gapr_ros; print(gapr_ros.__file__)'"
+    command = f"source install/setup.bash; {where}; exec {node} --ros-args -p model_path:=/no/such/file.stl 2>&1"
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    run = subprocess.run(
-        ["bash", "-c", f"{command} && timeout -s INT 5 {node} --ros-args -p model_path:=/no/such/file.stl"],
-        cwd=workspace,
-        env={**os.environ, "PATH": path},
-        capture_output=True,
-        text=True,
+    process = subprocess.Popen(
+        ["bash", "-c", command], cwd=workspace, env={**os.environ, "PATH": path}, stdout=subprocess.PIPE, text=True
     )
-    assert str(workspace / "install") in run.stdout, run.stdout + run.stderr
-    assert "file.stl" in run.stdout + run.stderr
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if "file.stl" in line:  # the node is up, and says why it cannot be configured
+            break
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30)
+    assert str(workspace / "install") in lines[0], lines
+    assert "file.stl" in lines[-1], lines

@@ -64,7 +64,9 @@ def _add_command(commands: Any, entry: Any, arguments: list[str]) -> None:
 
 
 def _add_register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--source", required=True, type=Path, help="partial cloud (PLY, PCD, STL, OBJ, VTK, VTP, NPY, NPZ)")
+    parser.add_argument(
+        "--source", required=True, type=Path, help="partial cloud (PLY, PCD, STL, OBJ, VTK, VTP, NPY, NPZ)"
+    )
     parser.add_argument("--target", required=True, type=Path, help="full bone, mesh or cloud")
     parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of both files (mm)")
     parser.add_argument("--json", type=Path, help="write the result here as well")
@@ -132,7 +134,9 @@ def _pair(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         with np.load(file, allow_pickle=False) as data:
             return data["source"], data["target"]
     except (OSError, ValueError, KeyError) as error:
-        raise InvalidPointCloudError("an .npz with source and target", f"{file.name} ({error})", "make it anew") from error
+        raise InvalidPointCloudError(
+            "an .npz with source and target", f"{file.name} ({error})", "make it anew"
+        ) from error
 
 
 def _as_json(result: RegistrationResult) -> dict[str, Any]:

@@ -135,9 +135,11 @@ def _mm_per_unit(surface: Surface, units: str, name: str) -> float:
 
 
 def _drop_non_finite(surface: Surface, name: str) -> Surface:
-    finite = np.isfinite(surface.points).all(axis=1)
+    finite = np.asarray(np.isfinite(surface.points).all(axis=1))
     if not finite.any():
-        raise InvalidPointCloudError("points", f"{name} with {len(finite)} points, none finite", "check how it was made")
+        raise InvalidPointCloudError(
+            "points", f"{name} with {len(finite)} points, none finite", "check how it was made"
+        )
     if finite.all():
         return surface
     if surface.faces is not None:

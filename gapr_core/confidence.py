@@ -55,8 +55,8 @@ class Calibration:
         data = json.loads(path.read_text())
         if tuple(data["names"]) != FEATURES:
             raise WeightsError(f"a model of {FEATURES}", f"one of {data['names']}", "calibrate again")
-        arrays = [np.asarray(data[key], dtype=np.float64) for key in ("means", "scales", "weights")]
-        return Calibration(FEATURES, *arrays, data["card"])  # type: ignore[arg-type]
+        means, scales, weights = (np.asarray(data[key], dtype=np.float64) for key in ("means", "scales", "weights"))
+        return Calibration(FEATURES, means, scales, weights, data["card"])
 
     def probability(self, features: dict[str, float]) -> float:
         """Probability, 0 to 1, that the pose is within 4 mm and 5 deg."""
@@ -89,7 +89,9 @@ def measure(
         "log_turn_sd": float(np.log(uncertainty.largest_turn_deg)),
         "normal_agreement": float(np.median(agreement[inlier])) if inlier.any() else 0.0,
         "log_points": float(np.log(len(source.points))),
-        "extent": float(np.linalg.norm(source.points - source.points.mean(axis=0), axis=1).max() / target.half_extent_mm),
+        "extent": float(
+            np.linalg.norm(source.points - source.points.mean(axis=0), axis=1).max() / target.half_extent_mm
+        ),
     }
 
 

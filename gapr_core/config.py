@@ -32,6 +32,7 @@ class SourceConfig:
     most_points: int = 6000
     normal_neighbours: int = 30
     smallest_extent_mm: float = 10.0
+    smallest_width_mm: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class SearchConfig:
     probes: int = 32
     first_probes: int = 8
     first_limit_mm: float = 7.0
-    keep: int = 3000
+    keep: int = 1500
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class VerificationConfig:
     """Which proposals are refined further, and when two poses are the same."""
 
     coarse_points: int = 64
-    coarse_limits_mm: tuple[float, float, int] = (10.0, 5.0, 8)  # from, to, iterations
+    coarse_limits_mm: tuple[float, float, int] = (10.0, 5.0, 6)  # from, to, iterations
     middle_points: int = 300
     middle_poses: int = 120
     middle_limits_mm: tuple[float, float, int] = (6.0, 4.0, 10)

@@ -26,7 +26,7 @@ class PoseUncertainty:
     """Covariance of a pose, and what follows from it.
 
     Attributes:
-        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed axes of the target frame, about the moved source's centroid.
+        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
         bias_mm: standard deviation of the smooth misfit that the residuals show.
         weakest_turn: (3,) unit axis, target frame, about which the rotation is least certain.
         weakest_shift: (3,) unit direction, target frame, along which the position is least certain.

@@ -23,14 +23,15 @@ from gapr_core.proposals.base import Proposer
 from gapr_core.proposals.search import NormalAlignedSearch
 from gapr_core.refinement import Fit, refine_fully
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_core.source import PreparedSource
+from gapr_core.source import PreparedSource, Unusable
 from gapr_core.target import PreparedTarget
 from gapr_core.verification import Candidates, verify
 
 Array = NDArray[np.float64]
 
 LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 5.0, 4.0  # standard deviations beyond which a direction counts as not observed
-CLEAR_MARGIN = 0.03  # a second pose whose residual is larger by less than this share explains the source as well
+EQUAL_MARGIN = 0.003  # a second pose whose residual is larger by less than this share explains the source as well
+EQUAL_CONFIDENCE = 0.4  # at most this for one of two poses that explain the source equally well
 
 
 class Registrar:
@@ -51,7 +52,8 @@ class Registrar:
         calibration: Calibration | None = None,
     ) -> None:
         self.config = config or RegistrarConfig()
-        self.proposers = tuple(proposers or (NormalAlignedSearch(self.config.search, self.config.num_threads),))
+        search = NormalAlignedSearch(self.config.search, self.config.num_threads)
+        self.proposers: tuple[Proposer, ...] = tuple(proposers or (search,))
         self.calibration = calibration or Calibration.load()
 
     @classmethod
@@ -78,8 +80,8 @@ class Registrar:
         """
         clock = _Clock()
         prepared = sources.prepare(source, self.config.source)
-        if isinstance(prepared, str):
-            return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=prepared, stage_ms=clock.lap("prepare"))
+        if isinstance(prepared, Unusable):
+            return RegistrationResult(prepared.status, reason=prepared.reason, stage_ms=clock.lap("prepare"))
         clock.lap("prepare")
         poses = self._propose(prepared, target, initial)
         clock.lap("propose")
@@ -103,6 +105,8 @@ class Registrar:
         uncertainty = covariance.estimate(fit, self.config.covariance)
         figures = confidence.measure(fit, candidates, uncertainty, source, target)
         probability = self.calibration.probability(figures)
+        if _is_matched(candidates):
+            probability = min(probability, EQUAL_CONFIDENCE)
         common = {
             "confidence": probability,
             "inlier_ratio": figures["inlier_ratio"],
@@ -114,24 +118,34 @@ class Registrar:
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
         tre_mm = uncertainty.tre_mm(target.points, fit.moved.mean(axis=0))
         return RegistrationResult(
-            RegistrationStatus.OK, fit.T, uncertainty.covariance, tre_mm=tre_mm, **common  # type: ignore[arg-type]
+            RegistrationStatus.OK,
+            fit.T,
+            uncertainty.covariance,
+            tre_mm=tre_mm,
+            **common,  # type: ignore[arg-type]
         )
+
+
+def _is_matched(candidates: Candidates) -> bool:
+    """True when a distinct pose explains the source as well as the best one."""
+    scores = candidates.scores
+    return len(scores) > 1 and bool(scores[1] < (1.0 + EQUAL_MARGIN) * scores[0])
 
 
 def _why_not(
     candidates: Candidates, uncertainty: PoseUncertainty, probability: float
 ) -> tuple[RegistrationStatus, str]:
     """Status and sentence of a refusal."""
-    scores = candidates.scores
     if uncertainty.largest_turn_deg > LARGEST_TURN_DEG or uncertainty.largest_shift_mm > LARGEST_SHIFT_MM:
         return RegistrationStatus.DEGENERATE, (
             f"the turn about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
             f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
         )
-    if len(scores) > 1 and scores[1] < (1.0 + CLEAR_MARGIN) * scores[0]:
+    if _is_matched(candidates):
         apart = se3.rotation_angle_deg(se3.inverse(candidates.poses[0]) @ candidates.poses[1])
         return RegistrationStatus.AMBIGUOUS, f"another pose, turned by {apart:.0f} deg, explains the source as well"
-    return RegistrationStatus.LOW_CONFIDENCE, f"the best pose found is right with a probability of {probability:.2f} only"
+    reason = f"the best pose found is right with a probability of {probability:.2f} only"
+    return RegistrationStatus.LOW_CONFIDENCE, reason
 
 
 def _named(axis: Array) -> str:

@@ -37,12 +37,12 @@ class RegistrationResult:
         covariance: (6, 6) float64 of the pose error as x y z (mm) rx ry rz (rad), fixed axes of the target frame,
             rotation about the transformed source's centroid; None unless `OK`.
         confidence: calibrated probability, 0 to 1, that the pose is within 4 mm and 5 deg of the truth.
-        tre_mm: predicted target registration error, root-mean-square over the target's points, mm; None unless `OK`.
+        tre_mm: predicted target registration error, root-mean-square over the target's points; None unless `OK`.
         inlier_ratio: share of the source points that the pose explains, 0 to 1.
-        alternatives: the next best distinct poses, (4, 4) each, best first (also for refusals: for display, not for use).
+        alternatives: the next best distinct poses, (4, 4) each, best first; with refusals too, to look at, not to use.
         stage_ms: wall time of each stage, ms.
         method: name of the method that answered.
-        reason: one sentence for people: why it was refused, or what limits the pose; empty when there is nothing to say.
+        reason: one sentence for people: why it was refused; empty when there is nothing to say.
         details: figures behind the confidence (residuals, overlap, eigenvalues), for logs and research.
     """
 

@@ -11,8 +11,19 @@ from scipy.spatial import cKDTree
 from gapr_core import clouds
 from gapr_core.config import SourceConfig
 from gapr_core.geometry import quadrics, sampling
+from gapr_core.results import RegistrationStatus
 
 Array = NDArray[np.float64]
+
+MOST_RAW_POINTS = 100_000  # more are drawn from at random before the even thinning
+
+
+@dataclass(frozen=True)
+class Unusable:
+    """Why a source cannot give a pose, whatever the target."""
+
+    status: RegistrationStatus
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,26 +59,35 @@ class PreparedSource:
         return self.points[self.order[:count]]
 
 
-def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSource | str:
+def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSource | Unusable:
     """Clean, thin and describe a source (N, 3), mm.
 
     Returns:
-        The prepared source, or a sentence that says why there is too little of it.
+        The prepared source, or why there is too little of it.
 
     Raises:
         InvalidPointCloudError: for a wrong shape or type, or an extent that cannot be a piece of a bone in mm.
     """
     config = config or SourceConfig()
-    points = np.unique(clouds.finite_points(source), axis=0)
+    points = clouds.finite_points(source)
+    if len(points) > MOST_RAW_POINTS:
+        points = points[np.random.default_rng(0).choice(len(points), MOST_RAW_POINTS, replace=False)]
+    points = np.unique(points, axis=0)
     if len(points) < config.fewest_points:
-        return f"{len(points)} distinct finite points, at least {config.fewest_points} are needed"
+        return _too_few(f"{len(points)} distinct finite points, at least {config.fewest_points} are needed")
     extent_mm = float(np.linalg.norm(np.ptp(points, axis=0)))
     if extent_mm > clouds.EXTENT_LIMITS_MM[1] or extent_mm < 1.0:
         clouds.check_extent(extent_mm, "mm", "the source")
     if extent_mm < config.smallest_extent_mm:
-        return f"a source {extent_mm:.1f} mm across, at least {config.smallest_extent_mm:g} mm are needed"
-    points = points[sampling.thin(points, config.most_points)]
-    return _describe(points, config)
+        return _too_few(f"a source {extent_mm:.1f} mm across, at least {config.smallest_extent_mm:g} mm are needed")
+    width_mm = float(np.sqrt(np.linalg.eigvalsh(np.cov(points.T))[1]))
+    if width_mm < config.smallest_width_mm:
+        return Unusable(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
+    return _describe(points[sampling.thin(points, config.most_points)], config)
+
+
+def _too_few(reason: str) -> Unusable:
+    return Unusable(RegistrationStatus.TOO_FEW_POINTS, reason)
 
 
 def _describe(points: Array, config: SourceConfig) -> PreparedSource:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ class PreparedTarget:
     spacing_mm: float
     surface: Surface
     elements: Array
-    cache: dict[str, Any] = field(default_factory=dict)
+    cache: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def faces(self) -> NDArray[np.int64] | None:

@@ -42,7 +42,7 @@ class DistanceField:
 def build(
     points: Array, normals: Array, spacing_mm: float, reach_mm: float = 12.0, most_cells: int = 2_500_000
 ) -> DistanceField:
-    """The field of a target (N, 3) with unit normals (N, 3), all mm; cells as fine as `most_cells` allows, >= 1.5 mm."""
+    """The field of a target (N, 3), mm, with unit normals (N, 3); cells as fine as `most_cells` allows, >= 1.5 mm."""
     low, high = points.min(axis=0) - reach_mm, points.max(axis=0) + reach_mm
     cell_mm = max(1.5, float(np.prod(high - low) / most_cells) ** (1.0 / 3.0))
     shape = np.ceil((high - low) / cell_mm).astype(int) + 1

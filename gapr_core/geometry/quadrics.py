@@ -97,4 +97,3 @@ def tangent_basis(normals: Array, like: Array | None = None) -> Array:
     first = helper - np.einsum("ni,ni->n", helper, normals)[:, None] * normals
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first)], axis=1)
-

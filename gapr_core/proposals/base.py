@@ -30,7 +30,10 @@ class Proposals:
 class Proposer(Protocol):
     """Suggests poses; verification decides. A right one among many wrong ones is a success."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What figures are printed under."""
+        ...
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """Hypotheses for one pair; may be empty."""

@@ -44,7 +44,9 @@ class NormalAlignedSearch:
         best = np.argsort(score, axis=None, kind="stable")[: self.config.keep]
         view, anchor = np.unravel_index(best, score.shape)
         angles = 2.0 * np.pi * spin[view, anchor] / self.config.spins
-        poses = _poses(source, references[view // 2], np.where(view % 2, -1.0, 1.0), angles, target, anchor_axes, anchor)
+        poses = _poses(
+            source, references[view // 2], np.where(view % 2, -1.0, 1.0), angles, target, anchor_axes, anchor
+        )
         return Proposals(poses, -score[view, anchor].astype(np.float64))
 
     def _score(
@@ -85,7 +87,11 @@ def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config
     probes = (source.subset(config.probes) - source.points[reference]) @ _signed_axes(source, reference, sign).T
     angle = 2.0 * np.pi * np.arange(config.spins)[:, None] / config.spins
     x, y, z = probes.T
-    turned = [np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, np.broadcast_to(z, (len(angle), len(z)))]
+    turned = [
+        np.cos(angle) * x - np.sin(angle) * y,
+        np.sin(angle) * x + np.cos(angle) * y,
+        np.broadcast_to(z, (len(angle), len(z))),
+    ]
     return np.stack(turned, axis=-1).astype(np.float32)
 
 
@@ -94,8 +100,13 @@ def _signed_axes(source: PreparedSource, reference: int, sign: float) -> Array:
 
 
 def _poses(
-    source: PreparedSource, references: NDArray[np.int64], signs: Array, angles: Array, target: PreparedTarget,
-    anchor_axes: Array, anchors: NDArray[np.intp],
+    source: PreparedSource,
+    references: NDArray[np.int64],
+    signs: Array,
+    angles: Array,
+    target: PreparedTarget,
+    anchor_axes: Array,
+    anchors: NDArray[np.intp],
 ) -> Array:
     """(K, 4, 4): R = axes_anchor^T Rz(angle) axes_reference, the reference point on the anchor."""
     c, s, o, i = np.cos(angles), np.sin(angles), np.zeros_like(angles), np.ones_like(angles)
@@ -129,11 +140,11 @@ def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):
                 x, y, z = local[s, k, 0], local[s, k, 1], local[s, k, 2]
                 i = int(np.floor(ax + m[0, 0] * x + m[1, 0] * y + m[2, 0] * z))
                 j = int(np.floor(ay + m[0, 1] * x + m[1, 1] * y + m[2, 1] * z))
-                l = int(np.floor(az + m[0, 2] * x + m[1, 2] * y + m[2, 2] * z))
-                if i < 0 or j < 0 or l < 0 or i >= nx or j >= ny or l >= nz:
+                h = int(np.floor(az + m[0, 2] * x + m[1, 2] * y + m[2, 2] * z))
+                if i < 0 or j < 0 or h < 0 or i >= nx or j >= ny or h >= nz:
                     total += 255
                 else:
-                    total += distance[i, j, l]
+                    total += distance[i, j, h]
             mean = np.float32(total) / np.float32(probes)
             if mean < score[a]:
                 score[a] = mean

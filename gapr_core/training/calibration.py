@@ -25,15 +25,17 @@ from tqdm import tqdm
 
 from gapr_core.confidence import FEATURES, Calibration
 from gapr_core.config import RegistrarConfig
-from gapr_core.data import anatomy, protocols
+from gapr_core.data import pool as bone_pool
+from gapr_core.data import protocols
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
-BONES = ("femur", "tibia", "pelvis")
+BONES = ("femur", "tibia", "pelvis", "thoracic")
+PARAMETRIC_PEOPLE = 9  # where the folder has no such bone
 PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "wrong")
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
-Task = tuple[str, str, str, int]
+Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -100,7 +102,7 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
 
 @cache
 def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
-    return {bone: anatomy.surfaces(folder, bone, split) for bone in BONES}
+    return {bone: bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE, folder) for bone in BONES}
 
 
 @cache
@@ -115,7 +117,7 @@ def _undecided() -> Array:
     return np.zeros(1 + len(FEATURES) + len(FEATURES) * (len(FEATURES) + 1) // 2)
 
 
-def _record(task: tuple[str, str, str, str, int]) -> dict[str, Any]:
+def _record(task: Task) -> dict[str, Any]:
     """One pair registered, judged, and its figures kept."""
     folder, split, protocol, bone, seed = task
     bones = _bones(folder, split)

@@ -1,0 +1,27 @@
+"""One bone of the project's own for the tests of the core."""
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.data.parametric import make_bone
+
+
+@pytest.fixture(scope="session")
+def femur():
+    return make_bone("femur", 3)
+
+
+@pytest.fixture(scope="session")
+def registrar():
+    return Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+
+
+@pytest.fixture(scope="session")
+def femur_cloud(femur):
+    return femur.sample(8192, np.random.default_rng(0))[0]
+
+
+@pytest.fixture(scope="session")
+def target(registrar, femur_cloud):
+    return registrar.prepare(femur_cloud)

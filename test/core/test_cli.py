@@ -1,0 +1,78 @@
+"""The command's contracts: exit codes, JSON, one line for bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gapr_core import cli
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.geometry import se3
+
+
+@pytest.fixture(scope="module")
+def pair(femur):
+    return make_pair("L1", Specimen(femur, "femur", "parametric-3", "parametric"), seed=5)
+
+
+@pytest.fixture
+def files(tmp_path, pair):
+    np.save(tmp_path / "partial.npy", pair.source)
+    np.save(tmp_path / "full.npy", pair.target)
+    return ["--source", str(tmp_path / "partial.npy"), "--target", str(tmp_path / "full.npy")]
+
+
+def test_register_prints_a_pose_and_writes_it_as_json(tmp_path, files, pair, capsys):
+    assert cli.main(["register", *files, "--json", str(tmp_path / "out.json")]) == 0
+    assert capsys.readouterr().out.startswith("OK  confidence")
+    answer = json.loads((tmp_path / "out.json").read_text())
+    assert {"transform", "confidence", "status", "covariance", "seconds"} <= set(answer)
+    rte_mm, rre_deg = se3.pose_error(np.array(answer["transform"]), pair.T_target_source, pair.source)
+    assert rte_mm < 0.5 and rre_deg < 0.5
+
+
+def test_a_refusal_exits_with_2_and_has_no_transform(tmp_path, files, capsys):
+    np.save(tmp_path / "partial.npy", np.random.default_rng(0).uniform(0, 40, (500, 3)))
+    assert cli.main(["register", *files, "--json", str(tmp_path / "out.json")]) == 2
+    answer = json.loads((tmp_path / "out.json").read_text())
+    assert answer["transform"] is None and answer["status"] != "OK" and answer["reason"]
+
+
+def test_bad_input_exits_with_1_and_one_line(tmp_path, files, capsys):
+    (tmp_path / "text.ply").write_text("this is not a bone")
+    assert cli.main(["register", "--source", str(tmp_path / "text.ply"), *files[2:]]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and "text.ply" in captured.err
+
+
+def test_evaluate_answers_every_pair_without_the_truth(tmp_path, pair):
+    folder = tmp_path / "pairs"
+    folder.mkdir()
+    np.savez(folder / "a.npz", source=pair.source, target=pair.target)  # no transform to look at
+    np.savez(folder / "b.npz", source=pair.source[:5], target=pair.target)
+    (folder / "c.npz").write_bytes(b"damaged")
+    assert cli.main(["evaluate", "--pairs", str(folder), "--out", str(tmp_path / "poses.json")]) == 0
+    poses = json.loads((tmp_path / "poses.json").read_text())
+    assert poses["a"]["status"] == "OK" and np.shape(poses["a"]["transform"]) == (4, 4)
+    assert poses["a"]["seconds"] > 0 and poses["a"]["prepare_seconds"] > 0
+    assert poses["b"] | {"transform": None, "status": "TOO_FEW_POINTS"} == poses["b"]
+    assert poses["c"]["status"] == "INVALID_INPUT" and poses["c"]["confidence"] == 0.0
+
+
+def test_evaluate_goes_on_where_it_stopped(tmp_path, pair):
+    folder = tmp_path / "pairs"
+    folder.mkdir()
+    for name in "ab":
+        np.savez(folder / f"{name}.npz", source=pair.source[:5], target=pair.target)
+    run = ["evaluate", "--pairs", str(folder), "--out", str(tmp_path / "poses.json")]
+    assert cli.main([*run, "--limit", "1"]) == 0
+    first = json.loads((tmp_path / "poses.json").read_text())
+    assert cli.main(run) == 0
+    both = json.loads((tmp_path / "poses.json").read_text())
+    assert set(both) == {"a", "b"} and both["a"] == first["a"]
+
+
+def test_a_folder_without_pairs_is_bad_input(tmp_path, capsys):
+    assert cli.main(["evaluate", "--pairs", str(tmp_path), "--out", str(tmp_path / "o.json")]) == 1
+    assert "NAME.npz" in capsys.readouterr().err

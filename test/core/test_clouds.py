@@ -1,0 +1,149 @@
+import struct
+
+import numpy as np
+import pytest
+
+from gapr_core import clouds
+from gapr_core.clouds import Surface
+from gapr_core.errors import InvalidPointCloudError
+
+VERTICES = np.array([[0, 0, 0], [40, 0, 0], [0, 30, 0], [0, 0, 20]], dtype=float)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+def write_with_open3d(path, mesh):
+    import open3d as o3d
+
+    if not mesh:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(VERTICES))
+        assert o3d.io.write_point_cloud(str(path), cloud)
+        return
+    triangles = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(VERTICES), o3d.utility.Vector3iVector(FACES))
+    triangles.compute_triangle_normals()
+    assert o3d.io.write_triangle_mesh(str(path), triangles)
+
+
+def write_vtk(path, binary):
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    points, cells, poly = vtkPoints(), vtkCellArray(), vtkPolyData()
+    points.SetData(numpy_to_vtk(VERTICES, deep=True))
+    for face in FACES:
+        cells.InsertNextCell(3, face)
+    poly.SetPoints(points)
+    poly.SetPolys(cells)
+    writer = vtkXMLPolyDataWriter() if path.suffix == ".vtp" else vtkPolyDataWriter()
+    if path.suffix == ".vtk" and binary:
+        writer.SetFileTypeToBinary()
+    writer.SetFileName(str(path))
+    writer.SetInputData(poly)
+    assert writer.Write()
+
+
+def same_corners(surface):
+    return {tuple(p) for p in surface.points.round(4)} == {tuple(p) for p in VERTICES}
+
+
+@pytest.mark.parametrize("name", ["bone.ply", "bone.stl", "bone.obj"])
+def test_meshes_come_back_with_their_vertices_and_faces(tmp_path, name):
+    write_with_open3d(tmp_path / name, mesh=True)
+    surface = clouds.load(tmp_path / name)
+    assert same_corners(surface)
+    assert surface.faces.shape == (4, 3)
+    assert surface.face_areas_mm2.sum() == pytest.approx(Surface(VERTICES, FACES).face_areas_mm2.sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["bone.vtk", "bone.vtp"])
+def test_vtk_files_come_back_with_their_vertices_and_faces(tmp_path, name):
+    write_vtk(tmp_path / name, binary=name == "bone.vtk")
+    surface = clouds.load(tmp_path / name)
+    assert same_corners(surface) and surface.faces.shape == (4, 3)
+
+
+@pytest.mark.parametrize("name", ["cloud.ply", "cloud.pcd"])
+def test_clouds_come_back_without_faces(tmp_path, name):
+    write_with_open3d(tmp_path / name, mesh=False)
+    surface = clouds.load(tmp_path / name)
+    assert same_corners(surface) and surface.faces is None
+
+
+def test_numpy_files_are_read(tmp_path):
+    np.save(tmp_path / "a.npy", VERTICES.astype(np.float32))
+    np.savez(tmp_path / "a.npz", points=VERTICES, faces=FACES)
+    assert same_corners(clouds.load(tmp_path / "a.npy"))
+    assert clouds.load(tmp_path / "a.npz").faces.shape == (4, 3)
+
+
+def test_metres_become_millimetres(tmp_path):
+    assert clouds.load(VERTICES / 1000.0, units="m").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
+
+
+def test_metres_read_as_millimetres_are_refused_with_the_mend():
+    with pytest.raises(InvalidPointCloudError, match="it looks like m: pass units='m'"):
+        clouds.load(VERTICES / 1000.0, units="mm")
+
+
+def test_millimetres_read_as_metres_are_refused_with_the_mend():
+    with pytest.raises(InvalidPointCloudError, match="it looks like mm"):
+        clouds.load(VERTICES, units="m")
+
+
+def test_auto_guesses_the_unit_and_warns(caplog):
+    assert clouds.load(VERTICES / 1000.0, units="auto").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
+    assert "taken to be in m" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("text.ply", b"this is not a bone\n"),
+        ("empty.stl", b""),
+        ("cut.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
+                    b"property float z\nend_header\n" + struct.pack("<5f", *range(5))),
+        ("text.vtp", b"<VTKFile>"),
+        ("text.vtk", b"no header"),
+        ("text.npz", b"PK nothing"),
+        ("text.pcd", b"# .PCD\nVERSION 7\n"),
+    ],
+)  # fmt: skip
+def test_an_unreadable_file_is_named_in_one_sentence(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InvalidPointCloudError, match=name):
+        clouds.load(tmp_path / name)
+
+
+def test_a_missing_file_and_an_unknown_format_are_told_apart(tmp_path):
+    with pytest.raises(InvalidPointCloudError, match="a file that exists"):
+        clouds.load(tmp_path / "none.ply")
+    with pytest.raises(InvalidPointCloudError, match=r"\.ply \.pcd"):
+        clouds.load(tmp_path / "none.dicom")
+
+
+@pytest.mark.parametrize("array", [np.zeros((4, 2)), np.zeros(3), np.array([["a", "b", "c"]]), np.zeros((2, 3, 3))])
+def test_arrays_of_another_shape_or_type_are_refused(array):
+    with pytest.raises(InvalidPointCloudError):
+        clouds.load(array)
+
+
+def test_rows_that_are_not_finite_are_dropped_but_not_all_of_them():
+    dirty = np.vstack([VERTICES, [[np.nan, 0, 0], [np.inf, 0, 0]]])
+    assert len(clouds.load(dirty).points) == 4
+    with pytest.raises(InvalidPointCloudError, match="none finite"):
+        clouds.load(np.full((5, 3), np.nan))
+
+
+def test_points_are_drawn_uniformly_in_area_on_the_faces():
+    surface = Surface(VERTICES, FACES)
+    points, normals = surface.sample(20_000, np.random.default_rng(0))
+    on_floor = np.isclose(points[:, 2], 0.0) & np.isclose(np.abs(normals[:, 2]), 1.0)
+    share = surface.face_areas_mm2[0] / surface.face_areas_mm2.sum()
+    assert on_floor.mean() == pytest.approx(share, abs=0.01)
+
+
+def test_a_cloud_has_no_faces_to_draw_from():
+    with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
+        Surface(VERTICES).sample(5, np.random.default_rng(0))

@@ -1,0 +1,162 @@
+"""The registrar as a whole, on pairs of known truth."""
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core.clouds import Surface
+from gapr_core.data.parametric import make_bone
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import se3
+
+
+@pytest.fixture(scope="module")
+def pairs(femur):
+    specimen = Specimen(femur, "femur", "parametric-3", "parametric")
+    return {name: make_pair(name, specimen, seed=5) for name in ("paper", "incomplete", "L1")}
+
+
+def rmse(T, pair):
+    return np.sqrt(((se3.apply(T, pair.source) - se3.apply(pair.T_target_source, pair.source)) ** 2).sum(1).mean())
+
+
+@pytest.mark.parametrize("protocol", ["paper", "incomplete", "L1"])
+def test_a_partial_cloud_is_laid_on_its_bone(registrar, pairs, protocol):
+    pair = pairs[protocol]
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert result.ok and result.confidence > 0.9
+    assert rmse(result.T_target_source, pair) < 0.5
+
+
+def test_the_same_input_gives_the_same_answer_on_any_number_of_threads(pairs):
+    answers = []
+    for threads in (1, 2):
+        registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=threads))
+        answers.append(registrar.register(pairs["L1"].source, registrar.prepare(pairs["L1"].target)))
+    assert np.array_equal(answers[0].T_target_source, answers[1].T_target_source)
+    assert answers[0].confidence == answers[1].confidence
+
+
+def test_moving_the_source_moves_the_answer(registrar, pairs):
+    pair, motion = pairs["L1"], se3.exp([40.0, -70.0, 20.0, 1.0, -2.0, 0.5])
+    target = registrar.prepare(pair.target)
+    here = registrar.register(pair.source, target).T_target_source
+    there = registrar.register(se3.apply(motion, pair.source), target).T_target_source
+    assert np.abs(se3.apply(there @ motion, pair.source) - se3.apply(here, pair.source)).max() < 0.05
+
+
+def test_the_order_of_the_points_does_not_matter(registrar, pairs):
+    pair = pairs["L1"]
+    target = registrar.prepare(pair.target)
+    shuffled = np.random.default_rng(0).permutation(pair.source)
+    first, second = (registrar.register(s, target).T_target_source for s in (pair.source, shuffled))
+    assert np.allclose(first, second)
+
+
+def test_the_covariance_is_that_of_a_pose_and_of_plausible_size(registrar, pairs):
+    pair = pairs["paper"]
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert np.allclose(result.covariance, result.covariance.T)
+    assert np.linalg.eigvalsh(result.covariance).min() > 0.0
+    moved, true = (se3.apply(T, pair.source) for T in (result.T_target_source, pair.T_target_source))
+    shift = (moved - true).mean(axis=0)
+    assert shift @ np.linalg.solve(result.covariance[:3, :3], shift) < 22.0  # 1 in 10 000 for 3 degrees of freedom
+
+
+def test_a_good_start_does_no_harm_and_a_bad_one_neither(registrar, pairs):
+    pair = pairs["L1"]
+    target = registrar.prepare(pair.target)
+    for start in (pair.T_target_source, np.eye(4)):
+        assert rmse(registrar.register(pair.source, target, initial=start).T_target_source, pair) < 0.5
+
+
+def test_a_start_that_is_no_pose_is_refused_with_a_sentence(registrar, pairs, target):
+    with pytest.raises(InvalidPointCloudError, match=r"\(4, 4\)"):
+        registrar.register(pairs["L1"].source, target, initial=np.full((4, 4), np.nan))
+
+
+def test_the_cloud_of_another_bone_is_refused(registrar, target):
+    tibia = make_bone("tibia", 8)
+    pair = make_pair("L1", Specimen(tibia, "tibia", "parametric-8", "parametric"), seed=1)
+    result = registrar.register(pair.source, target)
+    assert not result.ok
+    assert result.T_target_source is None and result.covariance is None
+    assert result.reason
+
+
+def random_plane(count, rng):
+    return rng.uniform(-60, 60, (count, 3)) * [1.0, 1.0, 0.0]
+
+
+WORTHLESS = {
+    "nothing": np.zeros((0, 3)),
+    "five points": np.random.default_rng(0).normal(size=(5, 3)) * 20,
+    "no finite point": np.full((500, 3), np.nan),
+    "one point again and again": np.ones((500, 3)),
+    "a speck": np.random.default_rng(0).normal(size=(500, 3)) * 1.0,
+    "a line": np.linspace(0, 100, 500)[:, None] * np.array([[1.0, 0.0, 0.0]]),
+    "a plane": random_plane(800, np.random.default_rng(0)),
+    "a small cube of noise": np.random.default_rng(0).uniform(0, 40, (800, 3)),
+}
+
+
+@pytest.mark.parametrize("what", WORTHLESS)
+def test_no_pose_comes_from(registrar, target, what):
+    result = registrar.register(WORTHLESS[what], target)
+    assert not result.ok and result.T_target_source is None
+    assert result.reason
+
+
+def test_a_plain_sphere_gives_no_pose(registrar):
+    directions = np.random.default_rng(0).normal(size=(6000, 3))
+    ball = 25.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    result = registrar.register(ball[ball[:, 2] > 5.0][:1500] + [100.0, 0.0, 0.0], registrar.prepare(ball))
+    assert not result.ok
+
+
+def test_metres_given_as_millimetres_are_named(registrar, target, femur_cloud):
+    with pytest.raises(InvalidPointCloudError, match="it looks like m"):
+        registrar.register(femur_cloud[:2000] / 1000.0, target)
+
+
+def test_a_source_of_a_wrong_shape_is_an_error_not_a_refusal(registrar, target):
+    with pytest.raises(InvalidPointCloudError, match=r"\(N, 3\)"):
+        registrar.register(np.zeros((100, 4)), target)
+
+
+def test_a_very_large_cloud_is_thinned_and_registered(registrar, femur, target):
+    points, _ = femur.sample(1_000_000, np.random.default_rng(2))
+    motion = se3.exp([10.0, 20.0, 30.0, 0.3, 0.2, 0.1])
+    result = registrar.register(se3.apply(motion, points[points[:, 2] > np.median(points[:, 2])]), target)
+    assert result.ok
+    assert np.abs(result.T_target_source @ motion - np.eye(4)).max() < 0.5
+
+
+BODILESS = {
+    "a plane": random_plane(3000, np.random.default_rng(1)),
+    "a line": np.linspace(0, 100, 500)[:, None] * np.array([[1.0, 0.5, 0.0]]),
+    "fifty points": np.random.default_rng(0).normal(size=(50, 3)) * 50,
+}
+
+
+@pytest.mark.parametrize("what", BODILESS)
+def test_a_target_that_is_no_body_is_refused(registrar, what):
+    with pytest.raises(InvalidPointCloudError):
+        registrar.prepare(BODILESS[what])
+
+
+def test_a_mesh_and_its_cloud_give_the_same_pose(registrar, femur, pairs):
+    pair = pairs["L1"]
+    shifted = Surface(femur.points - pair.metadata["origin_mm"], femur.faces)
+    assert rmse(registrar.register(pair.source, registrar.prepare(shifted)).T_target_source, pair) < 0.5
+
+
+def test_a_refusal_carries_no_pose_and_a_pose_no_refusal():
+    from gapr_core import RegistrationResult
+
+    with pytest.raises(ValueError, match="status OK"):
+        RegistrationResult(RegistrationStatus.AMBIGUOUS, np.eye(4))
+    with pytest.raises(ValueError, match="no pose to apply"):
+        RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two poses").apply(np.zeros((1, 3)))

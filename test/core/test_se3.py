@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gapr_core.geometry import se3
+
+rng = np.random.default_rng(0)
+POINTS = rng.normal(size=(20, 3)) * 50.0
+T = se3.from_rotation_translation(Rotation.random(random_state=1).as_matrix(), [10.0, -20.0, 30.0])
+
+
+def test_the_inverse_takes_points_back():
+    assert np.allclose(se3.apply(se3.inverse(T), se3.apply(T, POINTS)), POINTS)
+
+
+def test_kabsch_finds_the_motion_even_when_points_are_mirrored_flat():
+    assert np.allclose(se3.kabsch(POINTS, se3.apply(T, POINTS)), T)
+    flat = POINTS * [1.0, 1.0, 0.0]
+    found = se3.kabsch(flat, se3.apply(T, flat))
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
+    assert np.allclose(se3.apply(found, flat), se3.apply(T, flat))
+
+
+def test_kabsch_ignores_points_of_no_weight():
+    moved = se3.apply(T, POINTS)
+    moved[0] += 1000.0
+    assert np.allclose(se3.kabsch(POINTS, moved, np.r_[0.0, np.ones(19)]), T)
+
+
+def test_the_rotation_angle_is_the_geodesic_one():
+    turn = se3.from_rotation_translation(Rotation.from_rotvec([0.0, 0.0, np.radians(25.0)]).as_matrix(), [0, 0, 0])
+    assert se3.rotation_angle_deg(turn) == pytest.approx(25.0)
+
+
+def test_exp_turns_about_the_centre_that_is_named():
+    centre = np.array([5.0, 6.0, 7.0])
+    motion = se3.exp([1.0, 2.0, 3.0, 0.1, -0.2, 0.3], centre)
+    assert np.allclose(se3.apply(motion, centre[None])[0], centre + [1.0, 2.0, 3.0])
+
+
+def test_the_translation_error_is_taken_at_the_source_not_at_the_origin():
+    far = POINTS + 1000.0
+    turned = T @ se3.exp([0, 0, 0, 0, 0, np.radians(1.0)], far.mean(axis=0))
+    rte_mm, rre_deg = se3.pose_error(turned, T, far)
+    assert rte_mm == pytest.approx(0.0, abs=1e-9)
+    assert rre_deg == pytest.approx(1.0)
+
+
+def test_the_nearest_rigid_motion_has_a_proper_rotation():
+    R = se3.nearest_rigid(T + rng.normal(size=(4, 4)) * 1e-3)[:3, :3]
+    assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)

@@ -7,11 +7,13 @@ Further commands come from the entry-point group `gapr.commands`; each is a modu
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import logging
 import sys
 import time
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +53,23 @@ def _parser(arguments: list[str]) -> argparse.Namespace:
 
 def _add_command(commands: Any, entry: Any, arguments: list[str]) -> None:
     """A command of another module, which is imported only when it is the one called."""
-    command = commands.add_parser(entry.name, help=f"{entry.name} --help tells more")
+    command = commands.add_parser(entry.name, help=_first_line(entry.module))
     if arguments[:1] != [entry.name]:
         return
     try:
         module = entry.load()
     except ImportError as error:
         raise ConfigError(f"what `gapr {entry.name}` needs", str(error), "pip install 'gapr_ros[ros]'") from error
-    command.description = (module.__doc__ or "").strip().splitlines()[0]
+    command.description = module.__doc__
     module.add_arguments(command)
     command.set_defaults(run=module.run)
+
+
+def _first_line(module: str) -> str:
+    """What a module says of itself, read without running it."""
+    spec = find_spec(module)
+    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text())) if spec and spec.origin else None
+    return (text or "not installed").splitlines()[0].partition(": ")[2] or "not installed"
 
 
 def _add_register(parser: argparse.ArgumentParser) -> None:

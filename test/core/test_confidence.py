@@ -1,0 +1,59 @@
+import json
+
+import numpy as np
+import pytest
+
+from gapr_core.confidence import DEFAULT_CALIBRATION, FEATURES, Calibration
+from gapr_core.errors import WeightsError
+from gapr_core.training import calibration
+
+
+@pytest.fixture(scope="module")
+def records():
+    """A world in which a small margin is wrong, nothing else matters."""
+    rng = np.random.default_rng(0)
+    features = [dict(zip(FEATURES, rng.normal(size=len(FEATURES)), strict=True)) for _ in range(600)]
+    return [{"name": str(i), "features": f, "right": bool(f["margin"] > 0.2), "protocol": "L1"}
+            for i, f in enumerate(features)]  # fmt: skip
+
+
+def test_the_model_learns_what_separates_right_from_wrong(records):
+    model = calibration.fit(records[:400])
+    right = [model.probability(r["features"]) > 0.5 for r in records[400:]]
+    assert np.mean(np.array(right) == [r["right"] for r in records[400:]]) > 0.9
+
+
+def test_a_written_model_reads_back_the_same(records, tmp_path):
+    model = calibration.fit(records)
+    path = tmp_path / "confidence.json"
+    path.write_text(calibration.as_json(model, {"people": "none"}))
+    again = Calibration.load(path)
+    assert again.probability(records[0]["features"]) == pytest.approx(
+        model.probability(records[0]["features"]), abs=1e-3
+    )
+    assert again.card["pairs"] == 600
+
+
+def test_a_missing_model_and_one_of_other_features_are_errors(tmp_path):
+    with pytest.raises(WeightsError, match="reinstall"):
+        Calibration.load(tmp_path / "none.json")
+    data = json.loads(DEFAULT_CALIBRATION.read_text()) | {"names": ["something"]}
+    (tmp_path / "other.json").write_text(json.dumps(data))
+    with pytest.raises(WeightsError, match="calibrate again"):
+        Calibration.load(tmp_path / "other.json")
+
+
+def test_figures_far_outside_the_training_range_do_not_run_away():
+    model = Calibration.load()
+    usual = dict(zip(FEATURES, model.means, strict=True))
+    for name in FEATURES:
+        far, farther = (model.probability(usual | {name: usual[name] + k * 1e3}) for k in (1.0, 1e6))
+        assert far == farther
+
+
+def test_a_solid_of_revolution_has_no_right_pose():
+    pair = calibration.turned_pair(5)
+    assert not pair.has_truth
+    radii = np.linalg.norm(pair.target[:, :2], axis=1)
+    order = np.argsort(pair.target[:, 2])
+    assert np.abs(np.diff(radii[order])).mean() < 0.2  # the radius depends on the height alone

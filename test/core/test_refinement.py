@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+
+from gapr_core import covariance, refinement
+from gapr_core import refinement_kernels as kernels
+from gapr_core.config import CovarianceConfig, RefinementConfig
+from gapr_core.geometry import se3
+
+CONFIG = RefinementConfig()
+
+
+def seen_from_above(femur, count, noise_mm, seed):
+    """Surface points of the upper half of the bone, with isotropic noise."""
+    rng = np.random.default_rng(seed)
+    points, normals = femur.sample(6 * count, rng)
+    seen = points[normals @ [0.0, 1.0, 0.0] > 0.2][:count]
+    return seen + rng.normal(0.0, noise_mm, seen.shape)
+
+
+def test_every_pose_in_the_basin_comes_to_the_same_rest(femur, target):
+    source = seen_from_above(femur, 1500, 0.5, seed=1)
+    rests = []
+    for seed in range(4):
+        twist = np.random.default_rng(seed).normal(size=6) * [2, 2, 2, 0.03, 0.03, 0.03]
+        fit = refinement.refine_fully(se3.exp(twist, source.mean(axis=0)), source, target, CONFIG)
+        rests.append(se3.apply(fit.T, source))
+    assert np.abs(np.array(rests) - rests[0]).max() < 0.02
+    assert np.sqrt(((rests[0] - source) ** 2).sum(axis=1).mean()) < 0.3
+
+
+def test_outliers_get_no_weight(femur, target):
+    source = seen_from_above(femur, 1500, 0.5, seed=2)
+    source[:150] += [0.0, 9.0, 0.0]
+    fit = refinement.refine_fully(np.eye(4), source, target, CONFIG)
+    assert (fit.weights[:150] > 0.1).mean() < 0.05
+    assert (fit.weights[150:] > 0.1).mean() > 0.95
+    assert fit.sigma_mm == pytest.approx(0.5, rel=0.2)
+
+
+def test_noise_does_not_push_a_one_sided_cloud_along_the_view(femur, target):
+    """The offset -s^2 tr(shape) / 2 must be gone: measured over several draws, with and without it."""
+    lifts = {"with": [], "without": []}
+    for seed in range(6):
+        source = seen_from_above(femur, 3000, 1.5, seed)
+        corrected = refinement.refine_fully(np.eye(4), source, target, CONFIG).T
+        limits = np.full(25, CONFIG.tukey_scale * 1.5)
+        plain = kernels.refine_batch(np.eye(4)[None], source, *target.kernel_view, limits, np.zeros(25))[0][0]
+        for name, T in (("with", corrected), ("without", plain)):
+            lifts[name].append((se3.apply(T, source) - source).mean(axis=0)[1])
+    assert abs(np.mean(lifts["with"])) < 0.5 * abs(np.mean(lifts["without"]))
+
+
+def test_residuals_on_a_sphere_are_its_distances():
+    from gapr_core import Registrar
+    from gapr_core.geometry.sampling import fibonacci_directions
+
+    ball = Registrar.from_pretrained().prepare(30.0 * fibonacci_directions(5000))
+    probes = fibonacci_directions(777) * np.linspace(27.0, 33.0, 777)[:, None]
+    fit = refinement.evaluate(np.eye(4), probes, ball, RefinementConfig(largest_sigma_mm=1e-6, smallest_sigma_mm=1e-6))
+    assert fit.signed_mm == pytest.approx(np.linalg.norm(probes, axis=1) - 30.0, abs=0.02)
+
+
+def test_distinct_poses_are_the_best_of_each_group():
+    moved = np.zeros((5, 2, 3))
+    moved[:, :, 0] = np.array([0.0, 1.0, 10.0, 10.5, 30.0])[:, None]
+    assert list(kernels.distinct(moved, np.array([1, 0, 3, 2, 4]), 3.0, 5)) == [1, 3, 4]
+    assert list(kernels.distinct(moved, np.array([1, 0, 3, 2, 4]), 3.0, 2)) == [1, 3]
+
+
+@pytest.fixture(scope="module")
+def fit(femur, target):
+    return refinement.refine_fully(np.eye(4), seen_from_above(femur, 1500, 0.7, seed=4), target, CONFIG)
+
+
+def test_the_predicted_error_at_targets_is_that_of_poses_drawn_from_the_covariance(fit, target):
+    uncertainty = covariance.estimate(fit, CovarianceConfig())
+    centroid = fit.moved.mean(axis=0)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), uncertainty.covariance, 400)
+    squares = [
+        ((se3.apply(se3.exp(twist, centroid), target.points[::40]) - target.points[::40]) ** 2).sum(1).mean()
+        for twist in draws
+    ]
+    predicted = uncertainty.tre_mm(target.points[::40], centroid)
+    assert np.sqrt(np.mean(squares)) == pytest.approx(predicted, rel=0.1)
+
+
+def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target):
+    """Over many draws of noise, without bias, the mean of NEES / 6 is about 1."""
+    config, ratios = CovarianceConfig(bias_floor_mm=0.0, bias_gain=0.0), []
+    for seed in range(30):
+        source = seen_from_above(femur, 1000, 0.8, seed)
+        fit = refinement.refine_fully(np.eye(4), source, target, CONFIG)
+        middle = source.mean(axis=0)
+        shift = se3.apply(fit.T, middle[None])[0] - middle
+        from scipy.spatial.transform import Rotation
+
+        twist = np.concatenate([shift, Rotation.from_matrix(fit.T[:3, :3]).as_rotvec()])
+        ratios.append(twist @ np.linalg.solve(covariance.estimate(fit, config).covariance, twist) / 6.0)
+    assert 0.5 < np.mean(ratios) < 2.5
+
+
+def test_a_smooth_bias_widens_the_covariance(fit):
+    small, large = (
+        covariance.estimate(fit, CovarianceConfig(bias_floor_mm=b, bias_gain=0.0)).covariance for b in (0.01, 1.0)
+    )
+    assert np.trace(large[:3, :3]) > 4.0 * np.trace(small[:3, :3])
+    assert np.linalg.eigvalsh(large - small).min() > -1e-9
+
+
+def test_the_weakest_turn_of_a_shaft_is_about_its_axis():
+    from gapr_core import Registrar
+
+    rng = np.random.default_rng(0)
+    angle, z = rng.uniform(0, 2 * np.pi, 8000), rng.uniform(-120, 120, 8000)
+    shaft = np.stack([14 * np.cos(angle), 12 * np.sin(angle), z], axis=1)
+    source = shaft[(angle < 3.0) & (np.abs(z) < 60)] + rng.normal(
+        0, 0.3, ((((angle < 3.0) & (np.abs(z) < 60)).sum()), 3)
+    )
+    fit = refinement.refine_fully(np.eye(4), source, Registrar.from_pretrained().prepare(shaft), CONFIG)
+    uncertainty = covariance.estimate(fit, CovarianceConfig())
+    assert abs(uncertainty.weakest_shift[2]) > 0.99
+    assert abs(uncertainty.weakest_turn[2]) > 0.99

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+PACKAGES = ("gapr_core", "msg_adapters", "gapr_ros")
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 
 
@@ -43,9 +44,7 @@ def test_every_entry_point_leads_to_something_that_can_be_called():
 
 
 def test_every_folder_of_code_is_a_package_and_gets_installed():
-    folders = {
-        path.parent for name in ("gapr_core", "msg_adapters", "gapr_ros") for path in (ROOT / name).rglob("*.py")
-    }
+    folders = {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
     assert len(folders) > 5
     assert not [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").is_file()]
 
@@ -68,6 +67,14 @@ def test_colcon_build_gives_an_executable_that_ros2_run_finds(workspace):
     assert (prefix / "share/gapr_ros/config/register_node.yaml").is_file()
     for name in ("register_node", "bag_replay", "gapr"):
         assert os.access(prefix / "lib/gapr_ros" / name, os.X_OK)
+
+
+def test_everything_that_the_code_reads_is_installed_with_it(workspace):
+    (site,) = (workspace / "install/gapr_ros/lib").glob("python*/site-packages")
+    files = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
+    files = [path.relative_to(ROOT) for path in files if "__pycache__" not in path.parts]
+    assert len(files) > 50
+    assert not [str(path) for path in files if not (site / path).is_file()]
 
 
 def test_the_node_that_colcon_built_starts_and_uses_the_installed_code(workspace):

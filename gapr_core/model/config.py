@@ -27,6 +27,7 @@ class ModelConfig:
         repositioning: `svd` (paper) or `none`, before the last cross-attention.
         fine_scores: `dot` (eq. 9) or `cosine` with a learnable temperature.
         norm: `group` (statistics over each cloud) or `layer` (each point by itself).
+        centred_features: what all superpoints of the target have in common is taken off before features are compared.
         mlp_projections: a hidden layer before W^Q, W^K and W^V, as the paper's "separate MLP projections".
         pair_width: channels of the hidden layer between a pair's geometry and r_ij; 0 for as many as the features have.
         stages: encoder stages, the bottleneck included.
@@ -61,6 +62,7 @@ class ModelConfig:
     repositioning: str = "svd"
     fine_scores: str = "cosine"
     norm: str = "group"
+    centred_features: bool = True
     mlp_projections: bool = False
     pair_width: int = 32
     stages: int = 4
@@ -68,7 +70,7 @@ class ModelConfig:
     global_width: int = 128
     heads: int = 4
     global_layers: int = 3
-    superpoints: tuple[int, int] = (70, 100)
+    superpoints: tuple[int, int] = (50, 75)
     voxel_growth: float = 1.6
     neighbors: tuple[int, ...] = (16, 16, 16, 16)
     radius_voxels: float = 2.5
@@ -105,7 +107,8 @@ class ModelConfig:
         unknown = sorted(set(values) - known)
         if unknown:
             raise ConfigError(f"keys of ModelConfig ({', '.join(sorted(known))})", ", ".join(unknown), "mend the names")
-        return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+        given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+        return cls(**given)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> ModelConfig:

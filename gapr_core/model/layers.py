@@ -26,7 +26,7 @@ class GroupNorm(nn.Module):
 class LayerNorm(nn.LayerNorm):
     """Each point by itself; nothing depends on how much of the bone is seen."""
 
-    def forward(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:
+    def forward(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:  # type: ignore[override]
         return super().forward(x)
 
 
@@ -55,7 +55,7 @@ def pad(x: Tensor, lengths: tuple[int, ...]) -> Tensor:
     """(N, ...) of clouds one after the other as (B, longest, ...), zeros behind."""
     if len(lengths) == 1:
         return x[None]
-    return nn.utils.rnn.pad_sequence(torch.split(x, list(lengths)), batch_first=True)
+    return nn.utils.rnn.pad_sequence(list(torch.split(x, list(lengths))), batch_first=True)
 
 
 def padding_mask(lengths: tuple[int, ...], device: torch.device) -> Tensor:

@@ -83,9 +83,18 @@ class LocalPairs(Pairs):
         self.same = centres is support
         self.valid = hood.valid[:, None] if index is None else torch.ones_like(index, dtype=torch.bool)[:, None]
         self.p_i, self.n_i = centres.points[:, None, None], centres.normals[:, None, None]
-        self.p_j, self.n_j = self.keys(support.points)[:, None], self.keys(support.normals)[:, None]
         self.c_h, self.c_k = hood.c_h[:, None, None], hood.c_k[:, None, None]
         self.radius = self.reach = hood.radius[:, None, None]
+
+    @cached_property
+    def p_j(self) -> Tensor:  # type: ignore[override]
+        """(N, 1, K, 3)."""
+        return self.keys(self.support.points)[:, None]
+
+    @cached_property
+    def n_j(self) -> Tensor:  # type: ignore[override]
+        """(N, 1, K, 3)."""
+        return self.keys(self.support.normals)[:, None]
 
     def queries(self, x: Tensor) -> Tensor:
         return x[:, None]

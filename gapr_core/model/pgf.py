@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -38,42 +40,47 @@ def embed(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | f
     Returns:
         (..., 11): d_ij, d_jh, d_jk, then sine and cosine of b_ijk, b_ijh, b_hjk, theta.
     """
-    ji, jh, jk = (_parts((p - p_j) / radius) for p in (p_i, c_h, c_k))  # seen from p_j
-    ih, ik, ij = (_parts((p - p_i) / radius) for p in (c_h, c_k, p_j))  # seen from p_i
-    distances = [torch.sqrt(_dot(v, v) + _TINY) for v in (ji, jh, jk)]  # (i) to (iii)
-    angles = [*_angle(ji, jk), *_angle(ji, jh), *_angle(jh, jk), *_dihedral(ik, ih, ij)]  # (iv) to (vii)
-    return torch.stack(torch.broadcast_tensors(*distances, *angles), dim=-1)
+    j, h, k = (_parts((p - p_i) / radius) for p in (p_j, c_h, c_k))  # seen from p_i
+    ji, jh, jk = [-x for x in j], _minus(h, j), _minus(k, j)  # seen from p_j
+    ii, hh, kk = _dot(ji, ji), _dot(jh, jh), _dot(jk, jk)
+    distances = [torch.sqrt(squared + _TINY) for squared in (ii, hh, kk)]  # (i) to (iii)
+    angles = [*_angle(ji, jk, ii * kk), *_angle(ji, jh, ii * hh), *_angle(jh, jk, hh * kk)]  # (iv) to (vi)
+    return torch.stack(torch.broadcast_tensors(*distances, *angles, *_dihedral(k, h, j)), dim=-1)
 
 
-Vectors = tuple[Tensor, Tensor, Tensor]  # x, y and z apart: several times faster than a last axis of three
+Parts = Sequence[Tensor]  # x, y and z apart: several times faster than a last axis of three
 
 
-def _parts(v: Tensor) -> Vectors:
-    x, y, z = v.movedim(-1, 0).contiguous()
-    return x, y, z
+def _parts(v: Tensor) -> Parts:
+    return v.movedim(-1, 0).contiguous().unbind()
 
 
-def _dot(a: Vectors, b: Vectors) -> Tensor:
+def _minus(a: Parts, b: Parts) -> Parts:
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a: Parts, b: Parts) -> Tensor:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: Vectors, b: Vectors) -> Vectors:
+def _cross(a: Parts, b: Parts) -> Parts:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _angle(a: Vectors, b: Vectors) -> tuple[Tensor, Tensor]:
-    """Sine and cosine of the unsigned angle between vectors."""
-    cross = _cross(a, b)
-    scale = torch.rsqrt(_dot(a, a) * _dot(b, b) + _TINY_PLANE)
+def _angle(a: Parts, b: Parts, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """Sine and cosine of the unsigned angle between vectors whose squared lengths multiply to `squared`."""
+    cross, scale = _cross(a, b), torch.rsqrt(squared + _TINY_PLANE)
     return torch.sqrt(_dot(cross, cross) + _TINY_PLANE * 1e-8) * scale, _dot(a, b) * scale
 
 
-def _dihedral(axis: Vectors, first: Vectors, second: Vectors) -> tuple[Tensor, Tensor]:
-    """Sine and cosine of the signed turn about `axis` from the half-plane of `first` to that of `second`."""
+def _dihedral(axis: Parts, first: Parts, second: Parts) -> tuple[Tensor, Tensor]:
+    """Sine and cosine of the signed turn about `axis` from the half-plane of `first` to that of `second`.
+
+    With n_1 = axis x first and n_2 = axis x second, n_1 x n_2 = axis (n_1 . second).
+    """
     n_1, n_2 = _cross(axis, first), _cross(axis, second)
     scale = torch.rsqrt(_dot(n_1, n_1) * _dot(n_2, n_2) + _TINY_PLANE)
-    sine = _dot(_cross(n_1, n_2), axis) * torch.rsqrt(_dot(axis, axis) + _TINY)
-    return sine * scale, _dot(n_1, n_2) * scale
+    return torch.sqrt(_dot(axis, axis) + _TINY) * _dot(n_1, second) * scale, _dot(n_1, n_2) * scale
 
 
 def ball_centroids(centres: Tensor, support: Tensor, valid: Tensor, radius: Tensor | float) -> Tensor:

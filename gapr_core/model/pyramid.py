@@ -49,8 +49,8 @@ def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Clou
     resolutions = pyramid((points - centre) / frame.scale_mm, frame.voxel, config)
     if len(resolutions[-1]) > 4 * config.superpoints[1]:
         raise InvalidPointCloudError(
-            f"at most {4 * config.superpoints[1]} superpoints", f"{len(resolutions[-1])}: a cloud far larger than its target",
-            "check the units of both clouds",
+            f"at most {4 * config.superpoints[1]} superpoints",
+            f"{len(resolutions[-1])}: a cloud far larger than its target", "check the units of both clouds",
         )
     trees = [cKDTree(p) for p in resolutions]
     radii = [config.radius_voxels * frame.voxel * config.voxel_growth**s for s in range(config.stages)]

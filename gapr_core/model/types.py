@@ -117,6 +117,11 @@ class Features:
     fine: Tensor
     coarse: Tensor
 
+    def chosen(self, clouds: Cloud, rows: tuple[int, ...]) -> Features:
+        """The features of some of `clouds`, in this order; one may stand several times."""
+        fine, coarse = self.fine.split(clouds.fine.lengths), self.coarse.split(clouds.coarse.lengths)
+        return Features(torch.cat([fine[row] for row in rows]), torch.cat([coarse[row] for row in rows]))
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -186,8 +191,11 @@ def _join_levels(pyramids: list[tuple[Level, ...]], depth: int) -> Level:
     if depth < len(pyramids[0]) - 1:
         coarser = _starts([len(levels[depth + 1].points) for levels in pyramids])
         up = torch.cat([level.up + start for level, start in zip(own, coarser, strict=True) if level.up is not None])
+    points, normals, certainty = (
+        torch.cat([getattr(level, name) for level in own]) for name in ("points", "normals", "certainty")
+    )
     return Level(
-        *(torch.cat([getattr(level, name) for level in own]) for name in ("points", "normals", "certainty")),
+        points, normals, certainty,
         tuple(n for level in own for n in level.lengths), _join([level.within for level in own], starts), below, up,
     )
 

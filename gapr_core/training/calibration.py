@@ -3,8 +3,8 @@
     python -m gapr_core.training.calibration --anatomy ../shared/anatomy --count 150 --records runs/calibration.jsonl
 
 Pairs come from the train people only, over all protocols and `wrong`. Finished pairs are kept in the records file, so
-a stopped run goes on where it was. The model is a ridge logistic regression, weighted so that pairs with and without
-a right answer count as the protocols deliver them.
+a stopped run goes on where it was. The model is a ridge logistic regression in which wrong answers count twice: the
+probability errs on the side of doubt.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit
 from tqdm import tqdm
 
 from gapr_core.confidence import FEATURES, Calibration
@@ -33,7 +34,7 @@ from gapr_core.geometry import se3
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # where the folder has no such bone
-PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "wrong")
+PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "wrong", "turned")
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
@@ -70,19 +71,20 @@ def collect(folder: Path, split: str, count: int, seed: int, path: Path, jobs: i
     return list(done.values())
 
 
-def fit(records: list[dict[str, Any]], ridge: float = 1.0) -> Calibration:
-    """Penalised maximum likelihood over all records whose figures were measured."""
+def fit(records: list[dict[str, Any]], ridge: float = 3.0, caution: float = 2.0) -> Calibration:
+    """Penalised maximum likelihood; a record whose pose is wrong counts `caution` times."""
     x = np.array([[r["features"][name] for name in FEATURES] for r in records])
     y = np.array([r["right"] for r in records], dtype=np.float64)
     scales = np.maximum(x.std(axis=0), 1e-9)
     model = Calibration(FEATURES, x.mean(axis=0), scales, np.zeros(0), {})
     terms = model.design(x)
+    counts = np.where(y > 0.0, 1.0, caution)
     penalty = np.concatenate([[0.0], np.full(len(FEATURES), 0.3), np.ones(terms.shape[1] - 1 - len(FEATURES))])
 
     def loss(w: Array) -> tuple[float, Array]:
         logit = terms @ w
-        value = np.logaddexp(0.0, logit).sum() - y @ logit + 0.5 * ridge * (penalty * w**2).sum()
-        return float(value), terms.T @ (1.0 / (1.0 + np.exp(-logit)) - y) + ridge * penalty * w
+        value = counts @ (np.logaddexp(0.0, logit) - y * logit) + 0.5 * ridge * (penalty * w**2).sum()
+        return float(value), terms.T @ (counts * (expit(logit) - y)) + ridge * penalty * w
 
     best = minimize(loss, np.zeros(terms.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 2000})
     return Calibration(FEATURES, model.means, scales, best.x, {"pairs": len(records), "right": float(y.mean())})
@@ -123,11 +125,34 @@ def _record(task: Task) -> dict[str, Any]:
     bones = _bones(folder, split)
     specimen = bones[bone][seed % len(bones[bone])]
     others = [s for group in bones.values() for s in group]
-    pair = protocols.make_pair(protocol, specimen, seed, others)
+    if protocol == "turned":
+        pair = turned_pair(len(BONES) * seed + BONES.index(bone))
+    else:
+        pair = protocols.make_pair(protocol, specimen, seed, others)
     registrar = _registrar()
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     return {"name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone, "person": pair.person,
             "features": {name: result.details[name] for name in FEATURES}} | _judge(result, pair)  # fmt: skip
+
+
+def turned_pair(seed: int) -> protocols.Pair:
+    """A solid of revolution, seen from one side: the spin about its axis cannot be known, so no pose is right."""
+    rng = np.random.default_rng([seed, 7])
+    length, radius, waist = rng.uniform(40.0, 300.0), rng.uniform(8.0, 35.0), rng.uniform(0.0, 0.4)
+    phase = rng.uniform(0.0, 2.0 * np.pi)
+
+    def draw(count: int) -> Array:
+        z, angle = rng.uniform(-0.5, 0.5, count), rng.uniform(0.0, 2.0 * np.pi, count)
+        r = radius * np.sqrt(1.0 - (1.98 * z) ** 2) * (1.0 - waist * np.cos(7.0 * z + phase))
+        return np.stack([r * np.cos(angle), r * np.sin(angle), length * z], axis=1)
+
+    seen = draw(6000)
+    seen = seen[(seen[:, 0] > 0.0) & (np.abs(seen[:, 2]) < rng.uniform(0.2, 0.5) * length)]
+    source = seen + rng.normal(0.0, rng.uniform(0.1, 1.5), seen.shape)
+    nowhere = np.full((4, 4), np.nan)
+    return protocols.Pair(
+        source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
+    )
 
 
 def _judge(result: Any, pair: protocols.Pair) -> dict[str, Any]:

@@ -12,7 +12,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr train`."""
     parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
     parser.add_argument("--model", default=None, help="yaml of config/model; over the one that --config names")
-    parser.add_argument("--anatomy", type=Path, help="folder of corresponded meshes with splits.json; else parametric bones")
+    parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; an interrupted run goes on")
     parser.add_argument("--pairs", type=int, default=None, help="length of the schedule, in pairs")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")

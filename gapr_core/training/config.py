@@ -31,6 +31,7 @@ class TrainConfig:
         warmup: share of the schedule with a rising learning rate; a cosine falls from there to `final_rate` of it.
         ema: decay of the averaged weights, which are what is validated and exported.
         pool: how many bones are in use at once; each serves `reuse` pairs before the next person comes in.
+        share: neighbouring pairs that look at the same target, whose features are then computed once.
         synthetic: share of bones that are drawn from the shape model instead of being a person of the split.
         seed: of weights, bones, pairs and patches.
         workers: processes that make pairs; 0 makes them in the training process.
@@ -49,11 +50,12 @@ class TrainConfig:
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
     clip: float = 1.0
-    warmup: float = 0.03
+    warmup: float = 0.02
     final_rate: float = 0.01
     ema: float = 0.995
     pool: int = 128
     reuse: int = 16
+    share: int = 2
     synthetic: float = 0.7
     seed: int = 0
     workers: int = 0
@@ -79,7 +81,8 @@ class TrainConfig:
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise ConfigError("keys of TrainConfig", ", ".join(unknown), "mend the names")
-        return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+        given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+        return cls(**given)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> TrainConfig:

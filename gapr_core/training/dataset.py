@@ -34,7 +34,8 @@ class People:
     def __init__(self, bone: str, folder: Path | None, split: str) -> None:
         self.bone, self.split = bone, split
         self.real = anatomy.surfaces(folder, bone, split) if folder else []
-        sets = [c.of({s.person for s in self.real}) for c in anatomy.corresponded(folder, bone)] if self.real else []
+        known = anatomy.corresponded(folder, bone) if folder else []
+        sets = [c.of({s.person for s in self.real}) for c in known]
         self.models = [ShapeModel.of(c) for c in sets if len(c.points) > 2]
         if not self.real and bone not in parametric.BONES:
             raise ConfigError(f"meshes or a parametric model of {bone}", "neither", "leave it out of `bones`")
@@ -54,11 +55,12 @@ class People:
 
 @dataclass
 class PooledBone:
-    """A bone in use and the pyramid of its target, in the frame of the scan."""
+    """A bone in use: its target's pyramid in a frame of its own, which `turn` (4, 4) takes it to from the scan's."""
 
     specimen: Specimen
     frame: Frame
     target: Cloud
+    turn: Array
 
 
 class TrainingPairs(Dataset[TrainingPair]):
@@ -80,33 +82,39 @@ class TrainingPairs(Dataset[TrainingPair]):
         return join([self.pair(first + i) for i in range(self.train.micro_batch)])
 
     def pair(self, number: int) -> TrainingPair:
-        """Pair `number`; the rare one without enough points or overlap is replaced by a later draw of the same number."""
+        """Pair `number`; the rare one with too few points or overlap gives way to a later draw of the same number."""
         rng = np.random.default_rng([self.train.seed, 1, number])
         for _ in range(20):
-            bone = self._bone(number // self.train.reuse + int(rng.integers(self.train.pool)))
+            bone = self._bone(self._bone_number(number))
             made = make_pair(str(rng.choice(self.protocols, p=self.weights)), bone.specimen, int(rng.integers(2**31)))
-            found = self._prepare(made, bone, rng) if len(made.source) >= FEWEST_POINTS else None
+            found = self._prepare(made, bone) if len(made.source) >= FEWEST_POINTS else None
             if found is not None and bool((found.overlaps > 0.1).any()):
                 return found
         raise RuntimeError(f"no usable pair under number {number}")
 
-    def _prepare(self, made: Pair, bone: PooledBone, rng: np.random.Generator) -> TrainingPair:
+    def _bone_number(self, number: int) -> int:
+        """Neighbouring pairs share a bone, and so its features."""
+        rng = np.random.default_rng([self.train.seed, 3, number // self.train.share])
+        return number // self.train.reuse + int(rng.integers(self.train.pool))
+
+    def _prepare(self, made: Pair, bone: PooledBone) -> TrainingPair:
         frame, target, T = bone.frame, bone.target, made.T_target_source.copy()
+        T[:3, 3] += made.metadata["origin_mm"]
         if made.protocol in OWN_TARGET:
-            frame = target_frame(made.target, self.model)
-            target = build_cloud(made.target, frame, self.model)
-        else:
-            T[:3, 3] += made.metadata["origin_mm"]
-        turn = se3.from_rotation_translation(se3.random_rotation(rng), np.zeros(3))
-        return training_pair(build_cloud(made.source, frame, self.model), target.turned(turn), turn @ T, frame)
+            own = made.target + made.metadata["origin_mm"]
+            frame = target_frame(own, self.model)
+            target = build_cloud(own, frame, self.model).turned(bone.turn)
+        return training_pair(build_cloud(made.source, frame, self.model), target, bone.turn @ T, frame)
 
     def _bone(self, number: int) -> PooledBone:
         if number not in self._pool:
             people = self.people[number % len(self.people)]
             specimen = people.draw(number, self.train.synthetic, self.train.seed)
-            points, _ = specimen.sample(8192, np.random.default_rng([self.train.seed, 2, number]))
+            rng = np.random.default_rng([self.train.seed, 2, number])
+            points, _ = specimen.sample(8192, rng)
             frame = target_frame(points, self.model)
-            self._pool[number] = PooledBone(specimen, frame, build_cloud(points, frame, self.model))
+            turn = se3.from_rotation_translation(se3.random_rotation(rng), np.zeros(3))
+            self._pool[number] = PooledBone(specimen, frame, build_cloud(points, frame, self.model).turned(turn), turn)
         self._pool.move_to_end(number)
         while len(self._pool) > 2 * self.train.pool:
             self._pool.popitem(last=False)

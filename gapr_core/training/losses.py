@@ -68,8 +68,12 @@ def assignment_loss(log_z: Tensor, labels: Tensor) -> Tensor:
 
 
 def compute_losses(network: GAPRNet, pair: TrainingPair, generator: torch.Generator) -> tuple[Losses, Aggregated]:
-    """One pass of a batch with the truth: the fine loss looks at true patch pairs, so it need not wait for good ones."""
-    f_p, f_q = network.backbone(pair.source), network.backbone(pair.target)
+    """One pass of a batch with the truth: the fine loss looks at true patch pairs and need not wait for good ones."""
+    f_p = network.backbone(pair.source)
+    if pair.distinct is None:
+        f_q = network.backbone(pair.target)
+    else:
+        f_q = network.backbone(pair.distinct).chosen(pair.distinct, pair.which)
     a = network.aggregation(pair.source, pair.target, f_p.coarse, f_q.coarse)
     coarse = circle_loss(a.source, a.target, pair.overlaps, a.source_valid, a.target_valid)
     early = circle_loss(a.early_source, a.early_target, pair.overlaps, a.source_valid, a.target_valid)

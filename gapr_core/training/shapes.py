@@ -21,7 +21,7 @@ class ShapeModel:
 
     mean: Array
     deviations: Array
-    faces: NDArray[np.integer]
+    faces: NDArray[np.int64]
 
     @classmethod
     def of(cls, people: Corresponded, rounds: int = 3) -> ShapeModel:
@@ -31,7 +31,7 @@ class ShapeModel:
         for _ in range(rounds):
             points = np.stack([se3.apply(se3.kabsch(p, mean), p) for p in points])
             mean = points.mean(axis=0)
-        return cls(mean, points - mean, people.faces)
+        return cls(mean, points - mean, np.asarray(people.faces, dtype=np.int64))
 
     def draw(self, rng: np.random.Generator) -> Surface:
         """A person of the Gaussian that the people span: the same as drawing every principal component."""

@@ -30,6 +30,8 @@ class TrainingPair:
         T: (B, 3, 4) true T_target_source in the clouds' units.
         overlaps: (B, n, m) mean share of two patches' points that have a match in the other.
         radius: (B,) matching radius in units.
+        distinct: the different targets, each once; None for a single pair.
+        which: row of `distinct` for each pair.
     """
 
     source: Cloud
@@ -37,6 +39,8 @@ class TrainingPair:
     T: Tensor
     overlaps: Tensor
     radius: Tensor
+    distinct: Cloud | None = None
+    which: tuple[int, ...] = ()
 
     def to(self, device: torch.device | str) -> TrainingPair:
         """The same on another device."""
@@ -97,12 +101,17 @@ def _hits(point: NDArray[np.int64], own: NDArray[np.int64], other: NDArray[np.in
 
 
 def join(pairs: list[TrainingPair]) -> TrainingPair:
-    """A batch; overlaps are padded with zeros."""
+    """A batch; overlaps are padded with zeros, targets that are one and the same object are kept as one as well."""
+    if len(pairs) == 1:
+        return pairs[0]
     n, m = (max(p.overlaps.shape[axis] for p in pairs) for axis in (1, 2))
+    distinct = list({id(p.target): p.target for p in pairs}.values())
+    which = tuple(next(row for row, cloud in enumerate(distinct) if cloud is p.target) for p in pairs)
     overlaps = [pad_tensor(p.overlaps, (0, m - p.overlaps.shape[2], 0, n - p.overlaps.shape[1])) for p in pairs]
     return TrainingPair(
         collate([p.source for p in pairs]), collate([p.target for p in pairs]),
         torch.cat([p.T for p in pairs]), torch.cat(overlaps), torch.cat([p.radius for p in pairs]),
+        collate(distinct), which,
     )
 
 

@@ -51,7 +51,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     network, ema = GAPRNet(model).to(device), GAPRNet(model).to(device)
     ema.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    state = {"step": 0, "seconds": 0.0}
+    state: dict[str, Any] = {"step": 0, "seconds": 0.0}
     if (folder / "checkpoint.safetensors").exists():
         state = load_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer)
     steps = config.pairs // config.batch
@@ -61,7 +61,8 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     begun, saved, validated = time.monotonic(), time.monotonic(), time.monotonic()
     earlier = state["seconds"]
 
-    progress = tqdm(range(state["step"], steps), initial=state["step"], total=steps, disable=rank > 0 or None, unit="step")
+    ahead = range(state["step"], steps)
+    progress = tqdm(ahead, initial=state["step"], total=steps, disable=rank > 0 or None, unit="step")
     for step in progress:
         rate = learning_rate(config, step / steps)
         for group in optimizer.param_groups:
@@ -149,7 +150,9 @@ def settle(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> 
         path.write_text(json.dumps(settings, indent=1) + "\n")
 
 
-def log_row(state: dict[str, Any], config: TrainConfig, rate: float, norm: float, parts: list[Losses]) -> dict[str, Any]:
+def log_row(
+    state: dict[str, Any], config: TrainConfig, rate: float, norm: float, parts: list[Losses]
+) -> dict[str, Any]:
     """One line of log.csv."""
     means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in ("coarse", "fine", "early")}
     row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
@@ -169,8 +172,9 @@ def report(
         append(folder / "validation.csv", row | figures)
     total = scores["all"]
     tqdm.write(
-        f"{state['step'] * config.batch} pairs  {state['seconds'] / 60:.0f} min  coarse inliers {total.coarse_inliers:.2f}  "
-        f"fine inliers {total.fine_inliers:.2f}  recall 4 mm/5 deg {total.first:.2f}  among the proposals {total.among:.2f}"
+        f"{state['step'] * config.batch} pairs  {state['seconds'] / 60:.0f} min  inliers: coarse "
+        f"{total.coarse_inliers:.2f}, fine {total.fine_inliers:.2f}  recall: 4 mm/5 deg {total.first:.2f}, "
+        f"a near pose among the proposals {total.among:.2f}"
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gapr_core.data import anatomy, parametric
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import make_pair
+from gapr_core.data.protocols import Pair, make_pair
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet, Output
@@ -68,7 +68,7 @@ def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) 
     return found
 
 
-def _validation_pair(protocol: str, bone: str, made: object, model: ModelConfig) -> ValidationPair:
+def _validation_pair(protocol: str, bone: str, made: Pair, model: ModelConfig) -> ValidationPair:
     frame = target_frame(made.target, model)
     source, target = build_cloud(made.source, frame, model), build_cloud(made.target, frame, model)
     pair = training_pair(source, target, made.T_target_source, frame)

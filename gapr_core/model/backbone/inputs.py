@@ -19,8 +19,8 @@ def ones(cloud: Cloud) -> Tensor:
 def invariant(cloud: Cloud) -> Tensor:
     """(N, 4 x levels + 3): how each point lies to the balls of every scale, and the spread of its own neighbours.
 
-    For each level, seen from the point's nearest ancestor there: distance to c_h and to c_k in radii, height of c_h over
-    the tangent plane (signed as far as the side is certain) and its absolute value. All invariant under rigid motion.
+    For each level, seen from the point's nearest ancestor there: distance to c_h and to c_k in radii, height of c_h
+    over the tangent plane (signed as far as the side is certain) and its absolute value. None changes under motion.
     """
     with torch.no_grad():
         ancestor = torch.arange(len(cloud.levels[0].points), device=cloud.levels[0].points.device)

@@ -1,7 +1,7 @@
 """Kernel point convolution (Thomas et al., ICCV 2019) in plain PyTorch.
 
-(F * g)(p_i) = 1/|N_i| sum_j sum_k max(0, 1 - |y_ij - x_k| / sigma) f_j W_k, with y_ij the neighbour's place seen from p_i.
-The influences do not depend on features: they are made once per set of pairs, then one batched product weighs the
+(F * g)(p_i) = 1/|N_i| sum_j sum_k max(0, 1 - |y_ij - x_k| / sigma) f_j W_k, with y_ij the neighbour's place seen from
+p_i. The influences do not depend on features: they are made once per set of pairs, then one batched product weighs the
 neighbours for all kernel points and one matrix product applies all W_k.
 """
 
@@ -35,8 +35,8 @@ def world_places(pairs: LocalPairs) -> Tensor:
 def surface_places(pairs: LocalPairs) -> Tensor:
     """Rotation-invariant places: height over the tangent plane, distance along it, and bending.
 
-    Height is signed as far as the normal's side is certain and fades to zero where it is not; bending joins the unsigned
-    height and the angle between the normals, which need no side.
+    Height is signed as far as the normal's side is certain and fades to zero where it is not; bending joins the
+    unsigned height and the angle between the normals, which need no side.
     """
     offset, n_i, n_j = pairs.offset[:, 0] / pairs.reach, pairs.n_i[:, 0], pairs.n_j[:, 0]
     height = (offset * n_i).sum(-1)
@@ -50,11 +50,10 @@ KERNEL_FRAMES: dict[str, Callable[[LocalPairs], Tensor]] = {"world": world_place
 
 
 def influences(places: Tensor, valid: Tensor, kernel: Tensor, sigma: float) -> Tensor:
-    """(N, 15, K) linear influence of each kernel point on each neighbour, over the number of neighbours."""
-    squared = (places * places).sum(-1)[:, None] - 2.0 * kernel @ places.transpose(1, 2)
-    distance = torch.sqrt((squared + (kernel * kernel).sum(-1)[:, None]).clamp(min=1e-12))
-    weight = valid / valid.sum(1, keepdim=True)
-    return (1.0 - distance / sigma).clamp(min=0.0) * weight[:, None]
+    """(N, K, 15) linear influence of each kernel point on each neighbour, over the number of neighbours."""
+    squared = (places * places).sum(-1, keepdim=True) - 2.0 * places @ kernel.T + (kernel * kernel).sum(-1)
+    reach = (1.0 - squared.clamp(min=1e-12).sqrt() / sigma).clamp(min=0.0)
+    return reach * (valid / valid.sum(1, keepdim=True))[..., None]
 
 
 class KPConv(nn.Module):
@@ -73,7 +72,7 @@ class KPConv(nn.Module):
     def forward(self, x: Tensor, pairs: LocalPairs) -> Tensor:
         with torch.no_grad():
             influence = influences(self.places(pairs), pairs.hood.valid, self.kernel, self.sigma)
-        return (influence.to(x.dtype) @ pairs.keys(x)).flatten(1) @ self.weight
+        return (influence.to(x.dtype).transpose(1, 2) @ pairs.keys(x)).flatten(1) @ self.weight
 
 
 class KPConvBlock(nn.Module):

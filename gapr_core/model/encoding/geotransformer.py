@@ -1,8 +1,8 @@
 """Geometric structure embedding (Qin et al., CVPR 2022): pair-wise distances and triplet-wise angles, sinusoidal.
 
 r_ij = d_ij W^D + max_x a_ijx W^A over the three nearest neighbours x of i, with angles between x - i and j - i.
-The paper's sigma_d is an absolute length; here it is the reach of a neighbourhood over 5, so that it follows the target's
-voxel; sigma_a is 15 degrees. Only in the keys, as there.
+The paper's sigma_d is an absolute length; here it is the reach of a neighbourhood over 5, so that it follows the
+target's voxel; sigma_a is 15 degrees. Only in the keys, as there.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class GeometricEncoder(nn.Module):
 
     def forward(self, pairs: Pairs) -> PairEncoding:
         distance = torch.linalg.vector_norm(pairs.offset, dim=-1) / (SIGMA_DISTANCE * pairs.reach)
-        angles = torch.stack([_angles(pairs, x) for x in range(min(NEIGHBORS, pairs.offset.shape[2] - 1))] or [distance])
+        ranks = range(min(NEIGHBORS, pairs.offset.shape[2] - 1))
+        angles = [_angles(pairs, rank) for rank in ranks] or [torch.zeros_like(distance)]
         embedded = torch.stack([self.angle(self._sinusoid(a / SIGMA_ANGLE)) for a in angles]).amax(0)
         return self.relative(self.distance(self._sinusoid(distance)) + embedded)
 

@@ -16,7 +16,7 @@ class PGAEncoder(nn.Module):
 
     def __init__(self, dim: int, hidden: int, in_values: bool) -> None:
         super().__init__()
-        self.first = nn.Sequential(nn.Linear(EMBEDDED, hidden), nn.ReLU())
+        self.first = nn.Sequential(nn.Linear(EMBEDDED, hidden), nn.ReLU(inplace=True))
         self.relative = RelativeEncoder(hidden, dim, in_values)
 
     def forward(self, pairs: Pairs) -> PairEncoding:

@@ -1,7 +1,7 @@
 """PPF attention (Yu et al., RoITr, CVPR 2023): point-pair features as pose-agnostic coordinates in keys and values.
 
-PPF(i, j) = (|d|, angle(n_i, d), angle(n_j, d), angle(n_i, n_j)). Signs of normals that points alone cannot tell make its
-angles ambiguous on thin plates; that is this variant's own weakness, kept.
+PPF(i, j) = (|d|, angle(n_i, d), angle(n_j, d), angle(n_i, n_j)). Signs of normals that points alone cannot tell make
+its angles ambiguous on thin plates; that is this variant's own weakness, kept.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PPFEncoder(nn.Module):
 
     def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
-        self.first = nn.Sequential(nn.Linear(4, hidden), nn.ReLU())
+        self.first = nn.Sequential(nn.Linear(4, hidden), nn.ReLU(inplace=True))
         self.relative = RelativeEncoder(hidden, dim, in_values=True)
 
     def forward(self, pairs: Pairs) -> PairEncoding:

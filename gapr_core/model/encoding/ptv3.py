@@ -70,7 +70,7 @@ class SerialEncoder(nn.Module):
 
 
 class OffsetConvolution(nn.Module):
-    """x_i + W mean_j k(p_j - p_i) * x_j over the neighbours within reach: a depth-wise convolution in continuous space."""
+    """x_i + W mean_j k(p_j - p_i) * x_j over the neighbours within reach: depth-wise, in continuous space."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

@@ -38,7 +38,7 @@ class RotaryEncoder(nn.Module):
         super().__init__()
         each = -(-dim // 6)
         frequency = torch.exp(torch.arange(each) * (-math.log(10000.0) / each))
-        self.half = dim // 2
+        self.turns = dim // 2
         self.register_buffer("frequency", frequency, persistent=False)
 
     def forward(self, pairs: Pairs) -> PairEncoding:
@@ -47,7 +47,7 @@ class RotaryEncoder(nn.Module):
 
     def _angles(self, position: Tensor) -> Tensor:
         """(B, n, C/2): frequencies of x, y, z interleaved, cut to the channels there are."""
-        return (position[..., None, :] * self.frequency[:, None]).flatten(-2)[..., : self.half]
+        return (position[..., None, :] * self.frequency[:, None]).flatten(-2)[..., : self.turns]
 
 
 def _turn(x: Tensor, angle: Tensor) -> Tensor:

@@ -14,8 +14,18 @@ from gapr_core.model.pyramid import build_cloud, target_frame
 
 torch.set_num_threads(1)
 SMALL = dict(
-    width=16, global_width=32, superpoints=(14, 26), neighbors=(10, 10, 10, 10), pair_width=16, patch_size=32,
-    train_pairs=12, test_pairs=24, sinkhorn_iterations=12, reposition_top=16, voxel_growth=1.6, fine_stage=0,
+    width=16,
+    global_width=32,
+    superpoints=(14, 26),
+    neighbors=(10, 10, 10, 10),
+    pair_width=16,
+    patch_size=32,
+    train_pairs=12,
+    test_pairs=24,
+    sinkhorn_iterations=12,
+    reposition_top=16,
+    voxel_growth=1.6,
+    fine_stage=0,
 )
 
 
@@ -29,7 +39,11 @@ def bone(count: int = 500, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     d = rng.normal(size=(count, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    bump = 1.0 + 0.35 * np.exp(-6 * ((d - [0.6, 0.6, 0.5]) ** 2).sum(1)) + 0.25 * np.exp(-8 * ((d - [-0.9, 0.1, 0.4]) ** 2).sum(1))
+    bump = (
+        1.0
+        + 0.35 * np.exp(-6 * ((d - [0.6, 0.6, 0.5]) ** 2).sum(1))
+        + 0.25 * np.exp(-8 * ((d - [-0.9, 0.1, 0.4]) ** 2).sum(1))
+    )
     points = d * bump[:, None] * [100.0, 45.0, 30.0]
     return points + np.stack([0.002 * points[:, 1] ** 2, 0.1 * points[:, 0] * (points[:, 0] > 0), 0 * points[:, 0]], 1)
 

@@ -76,7 +76,11 @@ def test_padding_changes_no_answer_of_any_encoding(toy):
             getattr(padded, part)[:, :9] = getattr(short, part)
         padded.c_h = short.c_h
         torch.testing.assert_close(
-            layer(x, x, padded)[:, :9], layer(x[:, :9], x[:, :9], short), atol=1e-5, rtol=1e-4, msg=f"{name} saw padding"
+            layer(x, x, padded)[:, :9],
+            layer(x[:, :9], x[:, :9], short),
+            atol=1e-5,
+            rtol=1e-4,
+            msg=f"{name} saw padding",
         )
 
 

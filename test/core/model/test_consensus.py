@@ -17,7 +17,9 @@ def scene(share_right: float, second_share: float = 0.0, seed: int = 0):
     target[:right] = se3.apply(T, source[:right].reshape(-1, 3)).reshape(-1, 8, 3)
     target[right:second] = se3.apply(other, source[right:second].reshape(-1, 3)).reshape(-1, 8, 3)
     target += rng.normal(0, 0.5, target.shape)
-    found = Correspondences(source.reshape(-1, 3), target.reshape(-1, 3), rng.uniform(0.2, 1, 480), np.repeat(np.arange(60), 8))
+    found = Correspondences(
+        source.reshape(-1, 3), target.reshape(-1, 3), rng.uniform(0.2, 1, 480), np.repeat(np.arange(60), 8)
+    )
     return found, T, other
 
 
@@ -40,7 +42,9 @@ def test_two_motions_that_both_have_support_are_both_proposed():
 def test_proposed_poses_are_rigid_and_distinct():
     found, _, _ = scene(0.2)
     poses, _ = local_to_global(found, 4.0, count=10)
-    np.testing.assert_allclose(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-9
+    )
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0) and 1 < len(poses) <= 10
     again = distinct(poses, np.arange(len(poses), 0, -1.0), found.source.mean(0), 10)
     assert len(again) == len(poses)

@@ -17,8 +17,10 @@ def bools(*shape):
 
 def test_coarse_scores_equal_equations_six_and_seven():
     f_p, f_q = torch.randn(4, 8), torch.randn(5, 8)
-    s = torch.exp(-torch.cdist(f_p, f_q) ** 2)
-    expected = torch.stack([torch.stack([s[i, j] / s[i].sum() * s[i, j] / s[:, j].sum() for j in range(5)]) for i in range(4)])
+    s = torch.exp(-(torch.cdist(f_p, f_q) ** 2))
+    expected = torch.stack(
+        [torch.stack([s[i, j] / s[i].sum() * s[i, j] / s[:, j].sum() for j in range(5)]) for i in range(4)]
+    )
     found = coarse_scores(f_p[None], f_q[None], bools(1, 4), bools(1, 5)).exp()
     torch.testing.assert_close(found[0], expected, atol=1e-7, rtol=1e-3)
 
@@ -83,14 +85,25 @@ def test_mutual_top_k_keeps_what_is_among_the_best_of_row_and_column():
 
 def test_dot_scores_are_scaled_and_cosine_scores_ignore_length():
     f_p, f_q = torch.randn(1, 3, 16), torch.randn(1, 4, 16)
-    torch.testing.assert_close(DotScores()(f_p, f_q), f_p @ f_q.transpose(1, 2) / 4.0)
-    torch.testing.assert_close(CosineScores()(3 * f_p, f_q), CosineScores()(f_p, f_q))
+    dot, cosine = DotScores(), CosineScores()
+    torch.testing.assert_close(dot(dot.prepare(f_p), dot.prepare(f_q)), f_p @ f_q.transpose(1, 2) / 4.0)
+    expected = 10.0 * torch.cosine_similarity(f_p[:, :, None], f_q[:, None], dim=-1)
+    torch.testing.assert_close(cosine(cosine.prepare(3 * f_p), cosine.prepare(f_q)), expected)
+
+
+def test_transport_of_huge_scores_stays_finite_with_finite_gradients():
+    scores = (300.0 * torch.randn(2, 6, 5)).requires_grad_()
+    log_z = log_optimal_transport(scores, torch.tensor(1.0), bools(2, 6), bools(2, 5), 30)
+    log_z.exp().sum().backward()
+    assert log_z.isfinite().all() and scores.grad.isfinite().all()
 
 
 def test_weighted_svd_equals_the_float64_reference():
     rng = np.random.default_rng(0)
     p, w = rng.normal(size=(20, 3)), rng.uniform(size=20)
-    q = se3.apply(se3.from_rotation_translation(se3.random_rotation(rng), [1, 2, 3]), p) + 0.1 * rng.normal(size=(20, 3))
+    q = se3.apply(se3.from_rotation_translation(se3.random_rotation(rng), [1, 2, 3]), p) + 0.1 * rng.normal(
+        size=(20, 3)
+    )
     T, _ = weighted_svd(*(torch.from_numpy(x)[None] for x in (p, q, w)))
     np.testing.assert_allclose(T[0].numpy(), se3.kabsch(p, q, w)[:3], atol=1e-5)
 

@@ -19,9 +19,22 @@ from gapr_core.training.targets import join, training_pair
 
 YAMLS = sorted((Path(__file__).parents[3] / "config" / "model").glob("*.yaml"))
 ABLATIONS = {
-    "best", "faithful", "faithful_small", "backbone_kpconv", "backbone_pga", "backbone_kpconv_pga", "cross_standard",
-    "cross_pga", "cross_pga_repositioning", "transformer_pga", "transformer_vanilla", "transformer_geotransformer",
-    "transformer_ppf", "transformer_rotary", "transformer_gcn", "transformer_ptv3",
+    "best",
+    "faithful",
+    "faithful_small",
+    "backbone_kpconv",
+    "backbone_pga",
+    "backbone_kpconv_pga",
+    "cross_standard",
+    "cross_pga",
+    "cross_pga_repositioning",
+    "transformer_pga",
+    "transformer_vanilla",
+    "transformer_geotransformer",
+    "transformer_ppf",
+    "transformer_rotary",
+    "transformer_gcn",
+    "transformer_ptv3",
 }
 
 
@@ -29,12 +42,27 @@ def tiny(path: Path, toy) -> ModelConfig:
     """The yaml's variant at the size of a test; what the yaml says beside sizes stays."""
     named = ModelConfig.from_yaml(path)
     sizes = toy.small_config()
-    return replace(sizes, **{
-        key: getattr(named, key) for key in (
-            "name", "inputs", "backbone", "kernel_frame", "encoding", "values_encoded", "final_cross", "repositioning",
-            "fine_scores", "norm", "mlp_projections", "coarse_temperature", "fine_stage",
-        )
-    })
+    return replace(
+        sizes,
+        **{
+            key: getattr(named, key)
+            for key in (
+                "name",
+                "inputs",
+                "backbone",
+                "kernel_frame",
+                "encoding",
+                "values_encoded",
+                "final_cross",
+                "repositioning",
+                "fine_scores",
+                "norm",
+                "mlp_projections",
+                "coarse_temperature",
+                "fine_stage",
+            )
+        },
+    )
 
 
 def pair(config, toy, seed=3, share=0.5):
@@ -105,7 +133,9 @@ def test_the_faithful_configuration_is_not_invariant_and_a_mirrored_cloud_is_ano
     config = toy.small_config()
     frame, net = target_frame(toy.bone(), config), network(config).eval()
     with torch.inference_mode():
-        left, right = (net.backbone(build_cloud(toy.bone() * side, frame, config)).coarse for side in ([1, 1, 1], [-1, 1, 1]))
+        left, right = (
+            net.backbone(build_cloud(toy.bone() * side, frame, config)).coarse for side in ([1, 1, 1], [-1, 1, 1])
+        )
     gap = torch.cdist(left, right).amin(1)  # every superpoint against its best mirrored one
     assert gap.median() > 0.01 * torch.cdist(left, left).median()
 
@@ -131,17 +161,23 @@ def test_the_features_of_a_target_may_be_given(toy):
 
 
 @pytest.mark.parametrize("name", ["sixteen points", "a line", "a plane", "two clumps", "one far outlier"])
-@pytest.mark.parametrize("stem", ["best", "faithful", "transformer_geotransformer", "transformer_gcn", "transformer_ptv3"])
+@pytest.mark.parametrize(
+    "stem", ["best", "faithful", "transformer_geotransformer", "transformer_gcn", "transformer_ptv3"]
+)
 def test_small_and_degenerate_sources_give_finite_answers(stem, name, toy):
     rng = np.random.default_rng(0)
     source = {
-        "sixteen points": toy.bone()[:16], "a line": np.outer(np.linspace(-80, 80, 60), [1.0, 0.5, 0.2]),
-        "a plane": rng.uniform(-40, 40, (100, 3)) * [1, 1, 0], "two clumps": rng.normal(size=(40, 3)) + 60 * (np.arange(40) % 2)[:, None],
+        "sixteen points": toy.bone()[:16],
+        "a line": np.outer(np.linspace(-80, 80, 60), [1.0, 0.5, 0.2]),
+        "a plane": rng.uniform(-40, 40, (100, 3)) * [1, 1, 0],
+        "two clumps": rng.normal(size=(40, 3)) + 60 * (np.arange(40) % 2)[:, None],
         "one far outlier": np.vstack([toy.view(toy.bone()), [[300.0, 0, 0]]]),
     }[name]
     config = tiny(next(p for p in YAMLS if p.stem == stem), toy)
     frame = target_frame(toy.bone(), config)
-    example = training_pair(build_cloud(source, frame, config), build_cloud(toy.bone(), frame, config), np.eye(4), frame)
+    example = training_pair(
+        build_cloud(source, frame, config), build_cloud(toy.bone(), frame, config), np.eye(4), frame
+    )
     net = network(config)
     losses, _ = compute_losses(net, example, torch.Generator().manual_seed(0))
     losses.total.backward()

@@ -39,7 +39,9 @@ def test_the_share_of_the_target_is_computed_once(toy, pair, monkeypatch):
     assert len([k for k in target.cache if k.startswith("network")]) == 1
     calls = []
     forward = type(one.network.backbone).forward
-    monkeypatch.setattr(type(one.network.backbone), "forward", lambda self, c: calls.append(len(c.fine.points)) or forward(self, c))
+    monkeypatch.setattr(
+        type(one.network.backbone), "forward", lambda self, c: calls.append(len(c.fine.points)) or forward(self, c)
+    )
     second = one.propose(pair[0], target, np.random.default_rng(0))
     assert len(calls) == 1 and np.array_equal(first.poses, second.poses)
 
@@ -56,7 +58,10 @@ def test_moving_the_source_moves_every_proposal(toy, pair):
 def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
     one = proposer(toy)
     weights.save(one.network, tmp_path / "w.safetensors")
-    first, second = (p.propose(*pair, np.random.default_rng(0)) for p in (one, NetworkProposer.from_weights(tmp_path / "w.safetensors")))
+    first, second = (
+        p.propose(*pair, np.random.default_rng(0))
+        for p in (one, NetworkProposer.from_weights(tmp_path / "w.safetensors"))
+    )
     assert np.array_equal(first.poses, second.poses)
 
 

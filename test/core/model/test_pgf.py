@@ -26,7 +26,10 @@ def reference(p_i, p_j, c_h, c_k, radius):
     lengths = [np.linalg.norm(p_i - p_j), np.linalg.norm(c_h - p_j), np.linalg.norm(c_k - p_j)]
     return [
         *(d / radius for d in lengths),
-        angle(p_i - p_j, c_k - p_j), angle(p_i - p_j, c_h - p_j), angle(c_h - p_j, c_k - p_j), theta,
+        angle(p_i - p_j, c_k - p_j),
+        angle(p_i - p_j, c_h - p_j),
+        angle(c_h - p_j, c_k - p_j),
+        theta,
     ]
 
 

@@ -23,7 +23,10 @@ def test_neighbours_are_the_nearest_points_within_the_radius(clouds, config):
 
 def test_a_moved_cloud_has_the_same_neighbours_and_moved_points(config, toy):
     frame = target_frame(toy.bone(), config)
-    still, moved = build_cloud(toy.bone(), frame, config), build_cloud(se3.apply(toy.motion(1), toy.bone()), frame, config)
+    still, moved = (
+        build_cloud(toy.bone(), frame, config),
+        build_cloud(se3.apply(toy.motion(1), toy.bone()), frame, config),
+    )
     R = torch.from_numpy(toy.motion(1)[:3, :3]).float()
     for a, b in zip(still.levels, moved.levels, strict=True):
         assert torch.equal(a.within.index, b.within.index)
@@ -99,9 +102,17 @@ def test_concatenated_clouds_keep_their_own_neighbours(clouds, config, toy):
     joined = collate([source, small, target])
     start = len(source.levels[0].points) + len(small.levels[0].points)
     own = joined.levels[0].within
-    assert joined.levels[0].lengths == (len(source.levels[0].points), len(small.levels[0].points), len(target.levels[0].points))
-    assert torch.equal(own.index[start:][own.valid[start:]] - start, target.levels[0].within.index[target.levels[0].within.valid])
-    assert torch.equal(joined.levels[1].points[joined.levels[0].up[start:]], target.levels[1].points[target.levels[0].up])
+    assert joined.levels[0].lengths == (
+        len(source.levels[0].points),
+        len(small.levels[0].points),
+        len(target.levels[0].points),
+    )
+    assert torch.equal(
+        own.index[start:][own.valid[start:]] - start, target.levels[0].within.index[target.levels[0].within.valid]
+    )
+    assert torch.equal(
+        joined.levels[1].points[joined.levels[0].up[start:]], target.levels[1].points[target.levels[0].up]
+    )
 
 
 def test_each_stage_is_coarser_than_the_one_before(config, toy):

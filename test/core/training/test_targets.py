@@ -62,13 +62,20 @@ def test_fine_labels_of_a_hand_made_patch(pair):
         return replace(cloud, levels=(replace(cloud.levels[0], points=points), *cloud.levels[1:]))
 
     made = replace(
-        pair, source=with_points(pair.source, p), target=with_points(pair.target, q), T=torch.eye(3, 4)[None],
+        pair,
+        source=with_points(pair.source, p),
+        target=with_points(pair.target, q),
+        T=torch.eye(3, 4)[None],
         radius=torch.tensor([0.5]),
     )
     ones = torch.ones(1, 3, dtype=torch.bool)
-    labels = fine_labels(made, torch.arange(3)[None], torch.arange(2)[None], ones, ones[:, :2], torch.zeros(1, dtype=torch.long))
+    labels = fine_labels(
+        made, torch.arange(3)[None], torch.arange(2)[None], ones, ones[:, :2], torch.zeros(1, dtype=torch.long)
+    )
     assert labels[0].int().tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]]
     masked = ones.clone()
     masked[0, 2] = False
-    labels = fine_labels(made, torch.arange(3)[None], torch.arange(2)[None], masked, ones[:, :2], torch.zeros(1, dtype=torch.long))
+    labels = fine_labels(
+        made, torch.arange(3)[None], torch.arange(2)[None], masked, ones[:, :2], torch.zeros(1, dtype=torch.long)
+    )
     assert labels[0, 2].sum() == 0

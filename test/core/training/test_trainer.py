@@ -41,8 +41,17 @@ def settings(toy, tmp_path_factory):
     small = toy.small_config(superpoints=(10, 20), width=8, global_width=16, train_pairs=6)
     path.write_text(yaml.safe_dump({k: list(v) if isinstance(v, tuple) else v for k, v in small.to_dict().items()}))
     return TrainConfig(
-        model=str(path), bones=("femur",), mix={"L1": 1.0, "paper": 1.0}, pairs=12, batch=4, micro_batch=2, pool=3,
-        validation_pairs=1, warmup=0.2, checkpoint_minutes=0.0, validate_minutes=1e9,
+        model=str(path),
+        bones=("femur",),
+        mix={"L1": 1.0, "paper": 1.0},
+        pairs=12,
+        batch=4,
+        micro_batch=2,
+        pool=3,
+        validation_pairs=1,
+        warmup=0.2,
+        checkpoint_minutes=0.0,
+        validate_minutes=1e9,
     )
 
 
@@ -75,7 +84,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(settings, anatomy,
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
     logs = [list(csv.DictReader((tmp_path / name / "log.csv").open())) for name in ("whole", "parts")]
     assert [r["loss"] for r in logs[0]] == [r["loss"] for r in logs[1]] and len(logs[0]) == 3
-    assert {r["protocol"] for r in csv.DictReader((tmp_path / "whole" / "validation.csv").open())} == {"L1", "paper", "all"}
+    assert {r["protocol"] for r in csv.DictReader((tmp_path / "whole" / "validation.csv").open())} == {
+        "L1",
+        "paper",
+        "all",
+    }
     with pytest.raises(ConfigError, match="begun"):
         trainer.train(replace(settings, seed=1), tmp_path / "whole", anatomy)
 
@@ -118,7 +131,10 @@ def test_a_varied_bone_keeps_its_faces_outward(toy):
     points = toy.bone(300)
     faces = ConvexHull(points).simplices
     corners = points[faces]
-    inward = np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(1)) < 0
+    inward = (
+        np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(1))
+        < 0
+    )
     faces[inward] = faces[inward][:, ::-1]
     for seed in range(4):
         assert volume_mm3(vary(Surface(points, faces, None), np.random.default_rng(seed))) > 0
@@ -127,3 +143,14 @@ def test_a_varied_bone_keeps_its_faces_outward(toy):
 def test_unknown_keys_of_a_run_are_named():
     with pytest.raises(ConfigError, match="lerning_rate"):
         TrainConfig.from_dict({"lerning_rate": 1})
+
+
+def test_pairs_that_share_a_target_learn_what_they_learn_alone(settings, anatomy):
+    model = trainer.ModelConfig.from_yaml(settings.model)
+    batch = TrainingPairs(settings, model, anatomy)[1]
+    assert batch.which == (0, 0) and len(batch.distinct) == 1
+    torch.manual_seed(0)
+    net = trainer.GAPRNet(model)
+    shared = trainer.compute_losses(net, batch, torch.Generator().manual_seed(0))[0].total
+    alone = trainer.compute_losses(net, replace(batch, distinct=None), torch.Generator().manual_seed(0))[0].total
+    torch.testing.assert_close(shared, alone)

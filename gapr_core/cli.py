@@ -60,7 +60,7 @@ def _add_command(commands: Any, entry: Any, arguments: list[str]) -> None:
         module = entry.load()
     except ImportError as error:
         raise ConfigError(f"what `gapr {entry.name}` needs", str(error), "pip install 'gapr_ros[ros]'") from error
-    command.description = module.__doc__
+    command.description, command.formatter_class = module.__doc__, argparse.RawDescriptionHelpFormatter
     module.add_arguments(command)
     command.set_defaults(run=module.run)
 

@@ -86,7 +86,7 @@ def soak(folder: Path, frames: int = 200, hz: float = 10.0, storage: str = "mcap
     sampler = threading.Thread(target=_sample, args=(node, rss_mb, done))
     sampler.start()
     sent = _play(folder / "bag")
-    counts = _settled(client, sent)
+    counts = _settled(client, node, sent)
     done.set()
     sampler.join()
     errors = [_error_mm(pose, bone) for pose in client.poses]
@@ -112,12 +112,13 @@ def _play(path: Path) -> int:
         ros.try_shutdown()
 
 
-def _settled(client: Client, sent: int) -> list[int]:
+def _settled(client: Client, node: NodeProcess, sent: int) -> list[int]:
     def counts() -> list[int]:
         values = client.values()
         return [int(values[f"frames_{kind}"]) for kind in ("received", "accepted", "refused", "dropped", "lost")]
 
-    wait_until(lambda: sum(counts()[1:]) == sent, 90.0, f"{sent} clouds; have {counts()}")
+    wait_until(lambda: sum(counts()[1:]) == sent or node.process.poll() is not None, 90.0, f"{sent}; have {counts()}")
+    assert node.process.poll() is None, node.log
     time.sleep(1.0)
     return counts()
 

@@ -416,3 +416,51 @@ def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands
         looked_up.lookup("tracker", "unknown", None, 0.1)
     assert caught.value.reason is Reason.TF_MISSING
     assert 0.1 <= time.monotonic() - start < 1.0
+
+
+def test_the_model_is_scaled_turned_and_converted_before_it_is_prepared(tmp_path, client, method):
+    points_m = np.random.default_rng(2).normal(size=(400, 3)) * [0.06, 0.02, 0.015]
+    np.save(tmp_path / "metres.npy", points_m)
+    options = {"model_unit": "m", "model_scale": 1.1, "model_axes": "lps_to_ras"}
+    with node_in_thread(method, tmp_path / "metres.npy", **options):
+        client.wait_for_state("active")
+        prepared = method.calls[0]["target"].points
+    np.testing.assert_allclose(prepared, points_m * 1000.0 * 1.1 * [-1.0, -1.0, 1.0], atol=1e-9)
+
+
+def test_a_guessed_model_unit_is_warned_about(tmp_path, client, method, capfd):
+    np.save(tmp_path / "unknown.npy", np.random.default_rng(2).normal(size=(400, 3)) * 0.05)
+    with node_in_thread(method, tmp_path / "unknown.npy", model_unit="auto"):
+        client.wait_for_state("active")
+    assert "taken to be in m; name the unit to be sure" in capfd.readouterr().err
+
+
+def test_clouds_in_millimetres_are_taken_as_such(blob_path, client, method):
+    with node_in_thread(method, blob_path, cloud_unit="mm"):
+        client.wait_for_state("active")
+        assert client.ask(GOOD * 1000.0)["level"] == 0
+    np.testing.assert_allclose(method.calls[-1]["source"], GOOD * 1000.0, atol=1e-3)
+
+
+def test_thinning_is_seeded(blob_path, client, method):
+    with node_in_thread(method, blob_path, max_points=300, seed=7):
+        client.wait_for_state("active")
+        client.ask(GOOD)
+        client.ask(GOOD)
+    first, second = method.calls[-2]["source"], method.calls[-1]["source"]
+    assert len(first) == 300
+    np.testing.assert_array_equal(first, second)
+
+
+def test_no_exception_of_a_callback_ends_the_node(live):
+    node, client, method = live
+
+    def broken():
+        raise RuntimeError("broken call")
+
+    node.call_soon(broken)
+    node.session._publishers.send, send = broken, node.session._publishers.send
+    client.send(GOOD)
+    wait_until(lambda: node.counters.accepted == 1)
+    node.session._publishers.send = send
+    assert client.ask(GOOD)["level"] == 0

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gapr_ros.observer import Observer
 
 FIRST_STAMP_S = 1_700_000_000.0
-START_LIMIT_S, SILENCE_LIMIT_S = 180.0, 20.0  # the first start on a machine compiles
+START_LIMIT_S, SILENCE_LIMIT_S = 180.0, 60.0  # the first start on a machine compiles
 
 
 class DemoError(RuntimeError):
@@ -165,7 +165,7 @@ def replay(scene: Scene, observer: Observer, folder: Path, console: Any) -> None
     from gapr_ros.children import child
 
     log = folder / "register_node.log"
-    parameters = {"model_path": scene.path.resolve(), "model_unit": "mm", "diagnostics_period": 0.2}
+    parameters = {"model_path": scene.path.resolve(), "model_unit": "mm", "timeout": 30.0, "diagnostics_period": 0.2}
     settings = [text for name, value in parameters.items() for text in ("-p", f"{name}:={value}")]
     with child("gapr_ros.register_node", ["--ros-args", *settings], log) as node:
         with _player(observer, folder / "bag") as play:

@@ -34,7 +34,7 @@ class Acquisition:
     width_mm: float = 45.0
     slab_mm: float = 25.0
     swing_deg: float = 50.0
-    points_per_frame: int = 150
+    points_per_frame: int = 220
     noise_mm: float = 0.7
     bias_mm: float = 0.5
     outlier_share: float = 0.05

@@ -23,7 +23,7 @@ def test_the_cloud_grows_and_keeps_what_it_had(swept):
     for before, after in zip(swept.clouds, swept.clouds[1:], strict=False):
         assert len(after) >= len(before)
         np.testing.assert_array_equal(after[: len(before)], before)
-    assert len(swept.clouds[0]) < 200 and len(swept.clouds[-1]) > 2000
+    assert len(swept.clouds[0]) < 300 and len(swept.clouds[-1]) > 3000
 
 
 def test_the_truth_lays_the_points_on_the_bone(femur, swept):

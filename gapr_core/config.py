@@ -51,10 +51,10 @@ class SearchConfig:
 class VerificationConfig:
     """Which proposals are refined further, and when two poses are the same."""
 
-    coarse_points: int = 64
+    coarse_points: int = 192
     coarse_limits_mm: tuple[float, float, int] = (10.0, 5.0, 6)  # from, to, iterations
     middle_points: int = 300
-    middle_poses: int = 120
+    middle_poses: int = 200
     middle_limits_mm: tuple[float, float, int] = (6.0, 4.0, 10)
     final_poses: int = 8
     final_limits_mm: tuple[float, float, int] = (5.0, 4.0, 8)
@@ -77,8 +77,8 @@ class RefinementConfig:
 class CovarianceConfig:
     """The smooth bias that the covariance reckons with."""
 
-    bias_floor_mm: float = 0.05
-    bias_gain: float = 1.0
+    bias_floor_mm: float = 0.03
+    bias_gain: float = 1.75
     correlation_mm: float = 25.0
     correlation_points: int = 400
     smooth_neighbours: int = 30

@@ -29,9 +29,9 @@ from gapr_core.verification import Candidates, verify
 
 Array = NDArray[np.float64]
 
-LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 5.0, 4.0  # standard deviations beyond which a direction counts as not observed
-EQUAL_MARGIN = 0.003  # a second pose whose residual is larger by less than this share explains the source as well
-EQUAL_CONFIDENCE = 0.4  # at most this for one of two poses that explain the source equally well
+LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 4.0, 3.5  # standard deviations beyond which a direction counts as not observed
+EQUAL_MARGIN = 0.015  # a second pose whose residual is larger by less than this share explains the source as well
+DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says that the pose may be another one
 
 
 class Registrar:
@@ -105,8 +105,8 @@ class Registrar:
         uncertainty = covariance.estimate(fit, self.config.covariance)
         figures = confidence.measure(fit, candidates, uncertainty, source, target)
         probability = self.calibration.probability(figures)
-        if _is_matched(candidates):
-            probability = min(probability, EQUAL_CONFIDENCE)
+        if _is_matched(candidates) or _is_loose(uncertainty):
+            probability = min(probability, DOUBT)
         common = {
             "confidence": probability,
             "inlier_ratio": figures["inlier_ratio"],
@@ -132,11 +132,16 @@ def _is_matched(candidates: Candidates) -> bool:
     return len(scores) > 1 and bool(scores[1] < (1.0 + EQUAL_MARGIN) * scores[0])
 
 
+def _is_loose(uncertainty: PoseUncertainty) -> bool:
+    """True when a direction of motion is not observed: a spin about a shaft, a slide along it."""
+    return uncertainty.largest_turn_deg > LARGEST_TURN_DEG or uncertainty.largest_shift_mm > LARGEST_SHIFT_MM
+
+
 def _why_not(
     candidates: Candidates, uncertainty: PoseUncertainty, probability: float
 ) -> tuple[RegistrationStatus, str]:
     """Status and sentence of a refusal."""
-    if uncertainty.largest_turn_deg > LARGEST_TURN_DEG or uncertainty.largest_shift_mm > LARGEST_SHIFT_MM:
+    if _is_loose(uncertainty):
         return RegistrationStatus.DEGENERATE, (
             f"the turn about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
             f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"

@@ -73,6 +73,13 @@ def test_evaluate_goes_on_where_it_stopped(tmp_path, pair):
     assert set(both) == {"a", "b"} and both["a"] == first["a"]
 
 
+def test_wrong_usage_is_bad_input_not_a_refusal(capsys):
+    with pytest.raises(SystemExit) as exit:
+        cli.main(["register", "--source", "only.ply"])
+    assert exit.value.code == 1
+    assert "--target" in capsys.readouterr().err
+
+
 def test_a_folder_without_pairs_is_bad_input(tmp_path, capsys):
     assert cli.main(["evaluate", "--pairs", str(tmp_path), "--out", str(tmp_path / "o.json")]) == 1
     assert "NAME.npz" in capsys.readouterr().err

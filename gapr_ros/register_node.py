@@ -15,9 +15,10 @@ import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.signals import uninstall_signal_handlers
 
 from gapr_ros import parameters
 from gapr_ros.diagnostics import Counters
@@ -194,9 +195,8 @@ def _steady_clock() -> Clock:
     return Clock(clock_type=ClockType.STEADY_TIME)
 
 
-def spin(node: RegisterNode) -> None:
+def spin(node: RegisterNode, executor: Executor) -> None:
     """Run the node until it is asked to stop; no exception of a callback ends it."""
-    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     while node.context.ok():
         try:
@@ -205,7 +205,6 @@ def spin(node: RegisterNode) -> None:
             break
         except Exception as error:
             node.get_logger().error(f"a callback failed: {describe(error)}", throttle_duration_sec=5.0)
-    executor.shutdown(timeout_sec=0.0)
 
 
 def main(args: list[str] | None = None) -> int:
@@ -213,6 +212,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args)
         node = RegisterNode()
+        executor = SingleThreadedExecutor()
     except KeyboardInterrupt:
         return 0
     except Exception as error:
@@ -221,11 +221,13 @@ def main(args: list[str] | None = None) -> int:
         rclpy.try_shutdown()
         return 1
     try:
-        spin(node)
+        spin(node, executor)
         node.close()
     except KeyboardInterrupt:
         pass
     rclpy.try_shutdown()
+    uninstall_signal_handlers()  # joins rclpy's thread for signals, which may be using the executor's guard condition
+    executor.shutdown(timeout_sec=0.0)
     return 0
 
 

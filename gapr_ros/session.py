@@ -119,9 +119,11 @@ class Session:
         self._node.counters.settle(outcome)
         if not outcome.ok:
             self._log_refusal(outcome)
-        self._publishers.send(outcome, self.model)
-        outcome.tell()
-        self._node.reporter.send()
+        try:
+            self._publishers.send(outcome, self.model)
+        finally:
+            outcome.tell()
+            self._node.reporter.send()
 
     def _decide(self, outcome: Outcome) -> None:
         if outcome.job.epoch != self._epoch:

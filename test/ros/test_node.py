@@ -461,6 +461,6 @@ def test_no_exception_of_a_callback_ends_the_node(live):
     node.call_soon(broken)
     node.session._publishers.send, send = broken, node.session._publishers.send
     client.send(GOOD)
-    wait_until(lambda: node.counters.accepted == 1)
+    wait_until(lambda: client.values()["frames_accepted"] == "1")
     node.session._publishers.send = send
     assert client.ask(GOOD)["level"] == 0

@@ -29,7 +29,7 @@ from gapr_core.verification import Candidates, verify
 
 Array = NDArray[np.float64]
 
-LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 4.0, 3.5  # standard deviations beyond which a direction counts as not observed
+LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations beyond which a direction counts as not observed
 EQUAL_MARGIN = 0.015  # a second pose whose residual is larger by less than this share explains the source as well
 DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says that the pose may be another one
 

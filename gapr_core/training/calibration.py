@@ -2,9 +2,9 @@
 
     python -m gapr_core.training.calibration --anatomy ../shared/anatomy --count 150 --records runs/calibration.jsonl
 
-Pairs come from the train people only, over all protocols and `wrong`. Finished pairs are kept in the records file, so
-a stopped run goes on where it was. The model is a ridge logistic regression in which wrong answers count twice: the
-probability errs on the side of doubt.
+Pairs come from train people only, real and parametric, over all protocols, `wrong` and solids of revolution. Finished
+pairs are kept in the records file, so a stopped run goes on where it was. The model is a ridge logistic regression in
+which wrong answers count twice: the probability errs on the side of doubt.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tqdm import tqdm
 
 from gapr_core.confidence import FEATURES, Calibration
 from gapr_core.config import RegistrarConfig
+from gapr_core.data import anatomy, protocols
 from gapr_core.data import pool as bone_pool
-from gapr_core.data import protocols
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
-PARAMETRIC_PEOPLE = 9  # where the folder has no such bone
+PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
 PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "wrong", "turned")
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
@@ -104,7 +104,8 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
 
 @cache
 def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
-    return {bone: bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE, folder) for bone in BONES}
+    parametric = {bone: bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE) for bone in BONES}
+    return {bone: anatomy.surfaces(folder, bone, split) + parametric[bone] for bone in BONES}
 
 
 @cache

@@ -36,7 +36,7 @@ class Soak:
     Attributes:
         sent: clouds that were played.
         received, accepted, refused, dropped, lost: as the node counts them.
-        confidences, poses: how many messages arrived.
+        confidences, poses, transforms: how many messages arrived.
         errors_mm: of every pose, at the cloud's centroid.
         rss_mb: of the node, once a second.
         exit_code: after SIGINT.
@@ -50,6 +50,7 @@ class Soak:
     lost: int
     confidences: int
     poses: int
+    transforms: int
     errors_mm: list[float]
     rss_mb: list[float] = field(repr=False)
     exit_code: int = 0
@@ -65,7 +66,8 @@ class Soak:
         assert self.received + self.lost == self.sent, self
         assert self.accepted + self.refused + self.dropped == self.received, self
         assert self.confidences == self.accepted + self.refused, "every processed cloud is answered"
-        assert self.poses == self.accepted, self
+        assert self.transforms == self.accepted, self
+        assert 0 < self.poses <= self.accepted, "~/pose keeps the last only: a slow reader may miss some"
         assert self.errors_mm and max(self.errors_mm) < 1.0, self
         assert self.growth_mb < 20.0, (self.growth_mb, self.rss_mb)
         assert self.exit_code == 0, self
@@ -90,7 +92,7 @@ def soak(folder: Path, frames: int = 200, hz: float = 10.0, storage: str = "mcap
     done.set()
     sampler.join()
     errors = [_error_mm(pose, bone) for pose in client.poses]
-    result = Soak(sent, *counts, len(client.confidences), len(client.poses), errors, rss_mb)
+    result = Soak(sent, *counts, len(client.confidences), len(client.poses), len(client.transforms), errors, rss_mb)
     client.close()
     result.exit_code = node.stop()
     return result
@@ -141,7 +143,7 @@ def main() -> int:
     report = (
         f"sent {result.sent}  received {result.received}  accepted {result.accepted}  refused {result.refused}  "
         f"dropped {result.dropped}  lost {result.lost}\n"
-        f"answers: {result.confidences} confidences, {result.poses} poses\n"
+        f"answers: {result.confidences} confidences, {result.transforms} transforms, {result.poses} poses\n"
         f"largest error {max(result.errors_mm, default=float('nan')):.3f} mm\n"
         f"memory: {min(result.rss_mb):.0f} to {max(result.rss_mb):.0f} MB, growth {result.growth_mb:+.1f} MB\n"
         f"exit code {result.exit_code}, {time.monotonic() - start:.0f} s\n"

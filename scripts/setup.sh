@@ -1,11 +1,10 @@
 #!/usr/bin/env bash
 # Creates .venv with everything that `make demo` and `make test` need, and says what it does.
 #   PYTHON       the Python to use, 3.10 to 3.13; default: the first of these that is installed
-#   TORCH_INDEX  where CPU builds of torch are; set it empty to take torch from your usual index
+#   TORCH_INDEX  an index with CPU builds of torch, where your usual one has the larger builds with CUDA
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-TORCH_INDEX=${TORCH_INDEX-https://download.pytorch.org/whl/cpu}
 say() { printf '==> %s\n' "$*"; }
 fail() { printf 'error: %s\n' "$*" >&2; exit 1; }
 
@@ -64,22 +63,11 @@ create_environment() {
 
 pip_install() { .venv/bin/python -m pip install -qq --disable-pip-version-check "$@"; }
 
-# On Linux the usual index has torch with CUDA, some gigabytes; nothing here needs a GPU.
+# Nothing here needs a GPU; torch is there for the network and its tests.
 install_torch() {
   .venv/bin/python -c 'import torch' 2>/dev/null && return
-  say "installing torch for the CPU (200 MB)"
-  if [ -n "$TORCH_INDEX" ] && .venv/bin/python - "$TORCH_INDEX" <<'PY' 2>/dev/null
-import sys
-import urllib.request
-
-urllib.request.urlopen(sys.argv[1] + "/torch/", timeout=10)
-PY
-  then
-    pip_install --extra-index-url "$TORCH_INDEX" 'torch==2.13.0'
-  else
-    say "${TORCH_INDEX:-no CPU index} cannot be reached: taking torch from the usual index"
-    pip_install 'torch==2.13.0'
-  fi
+  say "installing torch${TORCH_INDEX:+ from $TORCH_INDEX}"
+  pip_install ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} 'torch==2.13.0'
 }
 
 install_project() {

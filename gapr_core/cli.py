@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.console import say
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.results import RegistrationResult
 
@@ -100,10 +101,10 @@ def register(args: argparse.Namespace) -> int:
     result = method.register(source, method.prepare(args.target, args.units))
     if args.json:
         _write(args.json, _as_json(result))
-    _say(str(result))
+    say(str(result))
     if result.T_target_source is None:
         return REFUSED
-    _say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
+    say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
     return OK
 
 
@@ -194,12 +195,8 @@ def _write(path: Path, content: dict[str, Any]) -> None:
         raise ConfigError("a file that can be written", f"{path} ({error.strerror})", "choose another path") from error
 
 
-def _say(text: str) -> None:
-    print(text)
-
-
 def _complain(text: str) -> int:
-    print(f"gapr: {text}", file=sys.stderr)
+    sys.stderr.write(f"gapr: {text}\n")
     return BAD_INPUT
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from gapr_core.console import say
 from gapr_core.data import anatomy, pool
 from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
 from gapr_core.data.protocols import PROTOCOLS, make_pair
@@ -67,8 +68,8 @@ def run(args: Namespace) -> int:
     manifest = write_pairs(recipe, bones, args.out)
     for bone, found in bones.items():
         cohorts = ", ".join(sorted({s.cohort for s in found}))
-        print(f"{bone}: {len(found)} people of split {recipe.split} ({cohorts})")
-    print(f"{len(manifest['pairs'])} pairs in {args.out}, hash {manifest['hash'][:16]}")
+        say(f"{bone}: {len(found)} people of split {recipe.split} ({cohorts})")
+    say(f"{len(manifest['pairs'])} pairs in {args.out}, hash {manifest['hash'][:16]}")
     return 0
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from gapr_core.console import say
 from gapr_core.data.pair_files import load_pair, pair_hash
 from gapr_core.errors import ConfigError
 from gapr_core.evaluation import benchmark_report, records, runner, table, writers
@@ -54,7 +55,7 @@ def run(args: Namespace) -> int:
             raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
         methods = [name.strip() for name in args.methods.split(",") if name.strip()]
         rows = benchmark(args.pairs, methods, args.out, _shard(args.shard), args.jobs, args.threads, args.ours)
-    print(f"{len(rows)} rows in {args.out / 'table.md'}; for people: {args.out / 'report.html'}")
+    say(f"{len(rows)} rows in {args.out / 'table.md'}; for people: {args.out / 'report.html'}")
     return 0
 
 

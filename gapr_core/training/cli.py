@@ -7,6 +7,8 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from gapr_core.console import say
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr train`."""
@@ -27,5 +29,5 @@ def run(args: Namespace) -> int:
     config = TrainConfig.from_yaml(args.config) if args.config else TrainConfig()
     given = {name: getattr(args, name) for name in ("model", "pairs", "workers") if getattr(args, name) is not None}
     written = train(replace(config, **given), args.out, args.anatomy, args.minutes)
-    print(f"weights in {written}")
+    say(f"weights in {written}")
     return 0

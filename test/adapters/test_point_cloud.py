@@ -35,7 +35,8 @@ def layouts(draw):
     seed = draw(st.integers(0, 2**32 - 1))
     return {"fields": fields, "step": step, "height": height, "width": width, "big": draw(st.booleans()),
             "row_padding": draw(st.integers(0, 9)), "row_step": draw(st.sampled_from(["right", "zero", "whole"])),
-            "padded_end": draw(st.booleans()), "points": np.random.default_rng(seed).normal(size=(height * width, 3))}  # fmt: skip
+            "padded_end": draw(st.booleans()),
+            "points": np.random.default_rng(seed).normal(size=(height * width, 3))}  # fmt: skip
 
 
 def build(layout) -> PointCloud2:

@@ -46,7 +46,7 @@ def test_four_of_five_files_have_at_most_250_lines_and_none_more_than_500():
 
 
 FORBIDDEN = {
-    "print in library code": (r"^\s*print\(", {"gapr_core/cli.py", "gapr_core/training/cli.py"}),
+    "print in library code": (r"^\s*print\(", set()),
     "a debugger": (r"\bbreakpoint\(|import i?pdb", set()),
     "a pickle that runs code": (r"\bpickle\.loads?\(|torch\.load\((?!.*weights_only=True)|allow_pickle=True", set()),
     "a device chosen for the user": (r"\.cuda\(", set()),

@@ -53,17 +53,21 @@ def test_the_demo_finds_right_poses_and_writes_its_report(tmp_path):
     assert not processes_naming(str(tmp_path))
 
 
+def own_nodes(folder):
+    return [command for command in processes_naming("gapr_ros.register_node") if str(folder) in command]
+
+
 def test_ctrl_c_ends_the_demo_and_its_node(tmp_path):
     process = start("--out", str(tmp_path), "--frames", "30")
     deadline = time.monotonic() + 60.0
-    while not processes_naming("gapr_ros.register_node") and time.monotonic() < deadline:
+    while not (ours := own_nodes(tmp_path)) and time.monotonic() < deadline:
         time.sleep(0.2)
-    assert any(str(tmp_path) in command for command in processes_naming("gapr_ros.register_node"))
+    assert ours
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=30)
     assert process.returncode == 130, output
     assert "Traceback" not in output
-    assert not [c for c in processes_naming("gapr_ros.register_node") if str(tmp_path) in c]
+    assert not own_nodes(tmp_path)
 
 
 def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkeypatch):

@@ -122,6 +122,8 @@ def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
         time.sleep(0.02)
     wait_until(lambda: node.counters.lost + node.counters.received == 6, 5.0, node.counters)
     assert node.counters.lost >= 1
+    settled = ("frames_accepted", "frames_refused", "frames_dropped", "frames_lost")
+    wait_until(lambda: sum(int(client.values()[name]) for name in settled) == 6)
     assert client.ask(GOOD)["frames_lost"] == str(node.counters.lost)
 
 

@@ -300,6 +300,7 @@ def test_the_lifecycle_goes_round_and_the_node_works_after_it(live):
     node, client, method = live
     client.ask(GOOD)
     assert change_state(client, Transition.TRANSITION_DEACTIVATE)
+    wait_until(lambda: client.points.get_subscription_count() == 0)  # or the next cloud would go to the old one
     assert not client.call("register").success
     assert change_state(client, Transition.TRANSITION_CLEANUP)
     answer = client.call("reload_model")

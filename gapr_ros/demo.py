@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bone", default="femur", help="femur, pelvis, ...: a parametric bone (default: femur)")
     parser.add_argument("--seed", type=int, default=1, help="which person, which sweep, where the patient lies")
     parser.add_argument("--frames", type=int, default=24, help="clouds in the bag (default: 24)")
-    parser.add_argument("--period", type=float, default=1.5, metavar="S", help="time between clouds (default: 1.5 s)")
+    parser.add_argument("--period", type=float, default=1.0, metavar="S", help="time between two clouds (default: 1 s)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag")
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder (default: demo_output)")
 

@@ -42,7 +42,7 @@ def processes_naming(text):
 
 
 def test_the_demo_finds_right_poses_and_writes_its_report(tmp_path):
-    process = start("--out", str(tmp_path), "--frames", "8", "--period", "1.5")
+    process = start("--out", str(tmp_path), "--frames", "8", "--period", "1.0")
     output, _ = process.communicate(timeout=110)
     assert process.returncode == 0, output
     assert "right poses" in output and "WRONG" not in output
@@ -59,7 +59,7 @@ def own_nodes(folder):
 
 def test_ctrl_c_ends_the_demo_and_its_node(tmp_path):
     process = start("--out", str(tmp_path), "--frames", "30")
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 80.0
     while not (ours := own_nodes(tmp_path)) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert ours

@@ -28,7 +28,7 @@ from gapr_ros.bags import Bag, BagError, open_bag, recorded_qos
 
 CLOCK_HZ = 40.0
 DISCOVERY_S = 1.0
-SETTLE_S = 0.2  # a listener that we know of knows us a little later
+SETTLE_S = 0.5  # a listener that we know of knows us a little later
 MUTUAL_S = 1.0  # a listener that we have discovered may not have discovered us yet
 DRAIN_S = 5.0
 LARGEST_STEP_S = 0.1  # of one sleep, so that Ctrl-C is heard

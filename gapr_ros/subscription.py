@@ -9,7 +9,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from sensor_msgs.msg import PointCloud2
 
-from gapr_ros.diagnostics import Input
+from gapr_ros.diagnostics import Gaps, Input
 from gapr_ros.guard import guarded
 from gapr_ros.session import Session
 
@@ -30,7 +30,7 @@ class Subscriptions:
         self._node, self._session = node, session
         self._auto = node.parameters.cloud_reliability == "auto"
         self._best_effort = node.parameters.cloud_reliability == "best_effort"
-        self._mismatch, self._closed, self._last_number = "", False, 0
+        self._mismatch, self._closed, self._gaps = "", False, Gaps()
         self._clouds = self._subscribe()
         self._seeds = node.create_subscription(PoseWithCovarianceStamped, SEEDS, self._on_seed, 1)
 
@@ -59,16 +59,10 @@ class Subscriptions:
 
     @guarded
     def _on_cloud(self, data: bytes, info: dict[str, Any]) -> None:
-        self._count_lost(info["publication_sequence_number"])
+        number = info["publication_sequence_number"]  # None where the middleware has none
+        if number is not None:
+            self._node.counters.lost += self._gaps.note(number)
         self._session.take_cloud(data)
-
-    def _count_lost(self, number: int | None) -> None:
-        """Gaps in the numbers of a single publisher are clouds that the middleware lost or pushed out."""
-        if number is None:
-            return
-        if 0 < self._last_number < number and self._node.count_publishers(self._clouds.topic_name) == 1:
-            self._node.counters.lost += number - self._last_number - 1
-        self._last_number = number
 
     @guarded
     def _on_seed(self, message: PoseWithCovarianceStamped) -> None:

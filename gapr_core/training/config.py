@@ -47,7 +47,7 @@ class TrainConfig:
     pairs: int = 24_000
     batch: int = 8
     micro_batch: int = 4
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     weight_decay: float = 1e-4
     clip: float = 1.0
     warmup: float = 0.02

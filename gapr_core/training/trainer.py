@@ -50,7 +50,9 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     torch.manual_seed(config.seed)
     network, ema = GAPRNet(model).to(device), GAPRNet(model).to(device)
     ema.load_state_dict(network.state_dict())
-    optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    optimizer = torch.optim.AdamW(
+        network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
+    )
     state: dict[str, Any] = {"step": 0, "seconds": 0.0}
     if (folder / "checkpoint.safetensors").exists():
         state = load_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer)

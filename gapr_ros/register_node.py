@@ -216,6 +216,8 @@ def main(args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     except Exception as error:
+        if "context is invalid" in str(error):  # asked to stop while starting
+            return 0
         text = str(error) if isinstance(error, ParameterError) else describe(error)
         sys.stderr.write(f"register_node: {text}\n")
         rclpy.try_shutdown()

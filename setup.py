@@ -16,6 +16,7 @@ TEST = [
     "colcon-common-extensions",
     "hypothesis",
     "import-linter",
+    "psutil",
     "pytest>=7.4",
     "pytest-timeout",
     "pytest-xdist",

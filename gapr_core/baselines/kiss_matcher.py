@@ -17,6 +17,7 @@ class KissMatcher(Baseline):
     """KISS-Matcher at one voxel size, mm.
 
     The library's noise bounds are meant for metres and clamped to 1.0; here the unit is mm, so clamping is off.
+    On several cores its poses differ in the last digits from call to call (issue 89 of MIT-SPARK/KISS-Matcher).
 
     Args:
         voxel_mm: edge of the voxels that thin both clouds; features look at 5 of them.

@@ -13,7 +13,8 @@ from gapr_core.errors import ConfigError
 
 
 def _default_mix() -> dict[str, float]:
-    return {"L1": 0.2, "L2": 0.3, "L3": 0.25, "paper": 0.15, "incomplete": 0.1}
+    one_sided = {"L1": 0.15, "L2": 0.25, "L3": 0.2, "L2-region": 0.1, "L3-region": 0.05}
+    return one_sided | {"paper": 0.15, "incomplete": 0.1}
 
 
 @dataclass(frozen=True)

@@ -90,12 +90,21 @@ def test_without_a_seed_icp_starts_from_centroid_on_centroid(bone):
     assert se3.pose_error(result.T_target_source, base.translation([-500.0, -600.0, -700.0]), source)[0] < 1.0
 
 
-@pytest.mark.parametrize("name", ["kiss4", "fpfh_ransac+point_to_plane", "point_to_plane", "icp"])
+@pytest.mark.parametrize("name", ["fpfh_ransac+point_to_plane", "point_to_plane", "icp"])
 def test_the_same_call_twice_gives_the_same_pose(name, bone):
     needs(name)
     source, _ = a_pair(bone, 100.0)
     first, second = (baselines.make(name).register(source, bone) for _ in range(2))
     assert np.array_equal(first.T_target_source, second.T_target_source)
+
+
+def test_kiss4_twice_gives_nearly_the_same_pose(bone):
+    """Not to the last bit: on several cores KISS-Matcher sums in another order every time (its issue 89)."""
+    needs("kiss4")
+    source, _ = a_pair(bone, 100.0)
+    first, second = (baselines.make("kiss4").register(source, bone).T_target_source for _ in range(2))
+    rte, rre = se3.pose_error(first, second, source)
+    assert rte < 0.5 and rre < 0.5
 
 
 def test_the_refined_composition_keeps_the_pose_with_the_lowest_residual(bone):

@@ -104,9 +104,24 @@ def test_a_one_sided_source_lies_on_the_side_of_the_probe(level):
     clean = np.abs(np.linalg.norm(local, axis=1) - RADIUS) < 3.0
     assert ((local[clean] @ pair.metadata["view_direction"]) > -5.0).mean() > 0.99
     low, high = LEVELS[level].share
-    assert low <= pair.metadata["region_share"] <= high
-    assert pair.metadata["visible_share"] <= pair.metadata["region_share"]
+    assert low <= pair.metadata["share"] <= high
+    assert pair.metadata["overlap"] <= pair.metadata["share"] + 1e-3
     assert len(pair.source) <= LEVELS[level].max_points
+
+
+def thin_specimen():
+    """A flat ellipsoid, which has as much surface on its far side as on its near one."""
+    ball = ball_specimen(RADIUS).surface
+    return Specimen(Surface(ball.points * [1.0, 1.0, 0.1], ball.faces), "disc", "p0")
+
+
+@pytest.mark.parametrize("level", ["L2", "L3"])
+def test_the_share_is_of_what_is_seen_or_of_a_region_whose_far_side_is_lost(level):
+    seen, region = (
+        [make_pair(name, thin_specimen(), seed).metadata for seed in range(6)] for name in (level, f"{level}-region")
+    )
+    assert all(m["overlap"] == pytest.approx(m["share"], abs=0.01) for m in seen)
+    assert all(m["overlap"] < 0.7 * m["share"] for m in region)
 
 
 def test_a_point_behind_another_part_of_the_bone_is_not_seen():

@@ -17,10 +17,22 @@ class GroupNorm(nn.Module):
         self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:
-        grouped = x.float().view(len(x), self.groups, -1)
-        centred = grouped - _cloud_mean(grouped, lengths)
-        variance = _cloud_mean(centred * centred, lengths)
-        return (centred * torch.rsqrt(variance + 1e-5)).view(x.shape).to(x.dtype) * self.weight + self.bias
+        x = x.float()
+        centred = x - self._mean(x, lengths)
+        variance = self._mean(centred * centred, lengths)
+        return centred * (torch.rsqrt(variance + 1e-5) * self.weight) + self.bias
+
+    def _mean(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:
+        """Mean over each cloud's points and each group's channels, at its points and channels: (1 or N, C).
+
+        Over the points first: a sum over whole rows is several times faster than one over a group's few channels.
+        """
+        means = torch.stack([part.mean(0) for part in x.split(list(lengths))])
+        means = means.view(len(lengths), self.groups, -1).mean(-1)
+        means = means.repeat_interleave(x.shape[1] // self.groups, dim=1)
+        if len(lengths) == 1:
+            return means
+        return means.repeat_interleave(torch.tensor(lengths, device=x.device), dim=0, output_size=len(x))
 
 
 class LayerNorm(nn.LayerNorm):
@@ -61,14 +73,3 @@ def pad(x: Tensor, lengths: tuple[int, ...]) -> Tensor:
 def padding_mask(lengths: tuple[int, ...], device: torch.device) -> Tensor:
     """(B, longest) bool, True where there is a point."""
     return torch.arange(max(lengths), device=device) < torch.tensor(lengths, device=device)[:, None]
-
-
-def _cloud_mean(x: Tensor, lengths: tuple[int, ...]) -> Tensor:
-    """Mean over each cloud's points and channels of a group: (1 or N, groups, 1)."""
-    x = x.mean(-1)
-    if len(lengths) == 1:
-        return x.mean(0)[None, :, None]
-    count = torch.tensor(lengths, device=x.device)
-    cloud = torch.repeat_interleave(torch.arange(len(lengths), device=x.device), count, output_size=len(x))
-    sums = torch.zeros(len(lengths), x.shape[1], device=x.device, dtype=x.dtype).index_add(0, cloud, x)
-    return (sums / count[:, None])[cloud][..., None]

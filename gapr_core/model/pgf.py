@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
+
+from gapr_core.model.vectors import Parts, cross, dot, minus, parts
 
 EMBEDDED = 11  # 3 distances, sine and cosine of 4 angles
 _TINY = 1e-12
@@ -40,37 +40,20 @@ def embed(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | f
     Returns:
         (..., 11): d_ij, d_jh, d_jk, then sine and cosine of b_ijk, b_ijh, b_hjk, theta.
     """
-    j, h, k = (_parts((p - p_i) / radius) for p in (p_j, c_h, c_k))  # seen from p_i
-    ji, jh, jk = [-x for x in j], _minus(h, j), _minus(k, j)  # seen from p_j
-    ii, hh, kk = _dot(ji, ji), _dot(jh, jh), _dot(jk, jk)
+    radius = torch.as_tensor(radius, device=p_i.device).squeeze(-1)
+    j, h, k = ([x / radius for x in minus(parts(p), parts(p_i))] for p in (p_j, c_h, c_k))  # seen from p_i
+    ji, jh, jk = [-x for x in j], minus(h, j), minus(k, j)  # seen from p_j
+    ii, hh, kk = dot(ji, ji), dot(jh, jh), dot(jk, jk)
     distances = [torch.sqrt(squared + _TINY) for squared in (ii, hh, kk)]  # (i) to (iii)
     angles = [*_angle(ji, jk, ii * kk), *_angle(ji, jh, ii * hh), *_angle(jh, jk, hh * kk)]  # (iv) to (vi)
-    return torch.stack(torch.broadcast_tensors(*distances, *angles, *_dihedral(k, h, j)), dim=-1)
-
-
-Parts = Sequence[Tensor]  # x, y and z apart: several times faster than a last axis of three
-
-
-def _parts(v: Tensor) -> Parts:
-    return v.movedim(-1, 0).contiguous().unbind()
-
-
-def _minus(a: Parts, b: Parts) -> Parts:
-    return [x - y for x, y in zip(a, b, strict=True)]
-
-
-def _dot(a: Parts, b: Parts) -> Tensor:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Parts, b: Parts) -> Parts:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    features = torch.broadcast_tensors(*distances, *angles, *_dihedral(k, h, j))  # the dihedral is (vii)
+    return torch.stack(features).movedim(0, -1).contiguous()  # five times faster than to stack along the last axis
 
 
 def _angle(a: Parts, b: Parts, squared: Tensor) -> tuple[Tensor, Tensor]:
     """Sine and cosine of the unsigned angle between vectors whose squared lengths multiply to `squared`."""
-    cross, scale = _cross(a, b), torch.rsqrt(squared + _TINY_PLANE)
-    return torch.sqrt(_dot(cross, cross) + _TINY_PLANE * 1e-8) * scale, _dot(a, b) * scale
+    normal, scale = cross(a, b), torch.rsqrt(squared + _TINY_PLANE)
+    return torch.sqrt(dot(normal, normal) + _TINY_PLANE * 1e-8) * scale, dot(a, b) * scale
 
 
 def _dihedral(axis: Parts, first: Parts, second: Parts) -> tuple[Tensor, Tensor]:
@@ -78,9 +61,9 @@ def _dihedral(axis: Parts, first: Parts, second: Parts) -> tuple[Tensor, Tensor]
 
     With n_1 = axis x first and n_2 = axis x second, n_1 x n_2 = axis (n_1 . second).
     """
-    n_1, n_2 = _cross(axis, first), _cross(axis, second)
-    scale = torch.rsqrt(_dot(n_1, n_1) * _dot(n_2, n_2) + _TINY_PLANE)
-    return torch.sqrt(_dot(axis, axis) + _TINY) * _dot(n_1, second) * scale, _dot(n_1, n_2) * scale
+    n_1, n_2 = cross(axis, first), cross(axis, second)
+    scale = torch.rsqrt(dot(n_1, n_1) * dot(n_2, n_2) + _TINY_PLANE)
+    return torch.sqrt(dot(axis, axis) + _TINY) * dot(n_1, second) * scale, dot(n_1, n_2) * scale
 
 
 def ball_centroids(centres: Tensor, support: Tensor, valid: Tensor, radius: Tensor | float) -> Tensor:

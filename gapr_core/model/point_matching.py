@@ -46,6 +46,7 @@ class CosineScores(nn.Module):
 
 
 _NEVER, _TINY = -1e6, 1e-30
+_LOWEST = -87.0  # below, exp underflows in float32, and is many times slower for it
 FINE_SCORES: dict[str, type[nn.Module]] = {"dot": DotScores, "cosine": CosineScores}
 
 
@@ -87,7 +88,7 @@ class FineMatching(nn.Module):
 
     def correspondences(self, source: Cloud, target: Cloud, fine: FineAssignment, chosen: PatchPairs) -> Matches:
         """Eq. (10): the union of the mutual top-k matches of all patch pairs."""
-        z = fine.log_z[:, :-1, :-1].exp()
+        z = fine.log_z[:, :-1, :-1].clamp(min=_LOWEST).exp()
         z = z * (fine.source_valid[:, :, None] & fine.target_valid[:, None])
         kept = mutual_top_k(z, self.mutual_k) & (z > self.confidence)
         patch, a, b = kept.nonzero(as_tuple=True)
@@ -126,11 +127,11 @@ def _scale(log_z: Tensor, mu: Tensor, nu: Tensor, rounds: int) -> Tensor:
 
     The same iteration as in log space, at a tenth of the cost; what underflows is below 1e-38 of a point's mass.
     """
-    kernel = log_z.exp()
-    b = torch.ones_like(nu)
-    a = torch.ones_like(mu)
+    kernel = log_z.clamp(min=_LOWEST).exp()
+    transposed = kernel.transpose(1, 2).contiguous()
+    a, b = torch.ones_like(mu), torch.ones_like(nu)
     for _ in range(rounds):
-        a = mu / (kernel @ b[..., None])[..., 0].clamp(min=_TINY)
+        a = mu / (b[:, None] @ transposed)[:, 0].clamp(min=_TINY)
         b = nu / (a[:, None] @ kernel)[:, 0].clamp(min=_TINY)
     return log_z + a.clamp(min=_TINY).log()[..., None] + b.clamp(min=_TINY).log()[:, None]
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from gapr_core.model.config import ModelConfig, choose
 from gapr_core.model.layers import Unary, make_norm
 from gapr_core.model.pairs import LocalPairs
+from gapr_core.model.vectors import dot, minus, parts
 
 KERNEL_POINTS = 15
 
@@ -38,22 +39,25 @@ def surface_places(pairs: LocalPairs) -> Tensor:
     Height is signed as far as the normal's side is certain and fades to zero where it is not; bending joins the
     unsigned height and the angle between the normals, which need no side.
     """
-    offset, n_i, n_j = pairs.offset[:, 0] / pairs.reach, pairs.n_i[:, 0], pairs.n_j[:, 0]
-    height = (offset * n_i).sum(-1)
-    along = torch.sqrt(((offset * offset).sum(-1) - height * height).clamp(min=1e-12))
-    bending = 2.0 * height.abs() + 1.0 - (n_i * n_j).sum(-1).abs()
+    p_i, p_j, n_i, n_j = (parts(v[:, 0]) for v in (pairs.p_i, pairs.p_j, pairs.n_i, pairs.n_j))
+    offset = [x / pairs.reach[:, 0] for x in minus(p_j, p_i)]
+    height = dot(offset, n_i)
+    along = torch.sqrt((dot(offset, offset) - height * height).clamp(min=1e-12))
+    bending = 2.0 * height.abs() + 1.0 - dot(n_i, n_j).abs()
     signed = 2.0 * height * pairs.centres.certainty[:, None]
-    return torch.stack([signed, 2.0 * along - 1.0, bending - 0.5], dim=-1)
+    return torch.stack([signed, 2.0 * along - 1.0, bending - 0.5]).movedim(0, -1)
 
 
 KERNEL_FRAMES: dict[str, Callable[[LocalPairs], Tensor]] = {"world": world_places, "surface": surface_places}
 
 
 def influences(places: Tensor, valid: Tensor, kernel: Tensor, sigma: float) -> Tensor:
-    """(N, K, 15) linear influence of each kernel point on each neighbour, over the number of neighbours."""
-    squared = (places * places).sum(-1, keepdim=True) - 2.0 * places @ kernel.T + (kernel * kernel).sum(-1)
-    reach = (1.0 - squared.clamp(min=1e-12).sqrt() / sigma).clamp(min=0.0)
-    return reach * (valid / valid.sum(1, keepdim=True))[..., None]
+    """(N, 15, K) linear influence of each kernel point on each neighbour's place (N, K, 3); 0 on missing neighbours."""
+    y = places.flatten(0, 1).T  # (3, N K)
+    far = (y * y).sum(0).masked_fill(~valid.flatten(), float("inf"))
+    squared = torch.addmm(far, kernel, y, alpha=-2.0).add_((kernel * kernel).sum(1, keepdim=True))  # |y - x_k|^2
+    reach = squared.clamp_(min=1e-12).sqrt_().mul_(-1.0 / sigma).add_(1.0).clamp_(min=0.0)
+    return reach.view(-1, *valid.shape).movedim(0, 1)
 
 
 class KPConv(nn.Module):
@@ -70,9 +74,10 @@ class KPConv(nn.Module):
         self.register_buffer("kernel", kernel_layout(), persistent=False)
 
     def forward(self, x: Tensor, pairs: LocalPairs) -> Tensor:
-        with torch.no_grad():
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
             influence = influences(self.places(pairs), pairs.hood.valid, self.kernel, self.sigma)
-        return (influence.to(x.dtype).transpose(1, 2) @ pairs.keys(x)).flatten(1) @ self.weight
+        weighed = influence.to(x.dtype) @ pairs.keys(x)  # (M, 15, C_in)
+        return weighed.flatten(1) @ self.weight / pairs.hood.valid.sum(1, keepdim=True)
 
 
 class KPConvBlock(nn.Module):

@@ -1,15 +1,18 @@
-"""Settings of a training run; `config/train.yaml` holds only what differs from these defaults."""
+"""Settings of a training run, `config/train.yaml` holds only what differs from these defaults; plan of an ablation."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+import os
+import sysconfig
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from gapr_core.errors import ConfigError
+from gapr_core.model.config import ModelConfig
 
 
 def _default_mix() -> dict[str, float]:
@@ -93,3 +96,38 @@ class TrainConfig:
     def to_dict(self) -> dict[str, Any]:
         """All entries, as `from_dict` takes them."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of a table: its label, the yaml of its network, and the paper's recall in % where it has one."""
+
+    table: str
+    label: str
+    model: Path
+    paper: float | None
+
+
+def default_plan() -> Path:
+    """config/ablation.yaml of the source tree, or where the package was installed with its data."""
+    places = [Path(__file__).resolve().parents[2], Path(sysconfig.get_path("data")) / "share" / "gapr_ros"]
+    found = [place / "config" / "ablation.yaml" for place in places if (place / "config" / "ablation.yaml").is_file()]
+    if not found:
+        raise ConfigError("config/ablation.yaml", "none installed", "name one with --plan")
+    return found[0]
+
+
+def read_plan(path: Path) -> list[Variant]:
+    """The rows of all tables; paths relative to the working folder, so that they mean the same on another machine."""
+    models = Path(os.path.relpath(path.resolve().parent / "model"))
+    tables = yaml.safe_load(path.read_text())
+    return [
+        Variant(table, row["label"], models / f"{row['model']}.yaml", row.get("paper"))
+        for table, rows in tables.items() for row in rows
+    ]  # fmt: skip
+
+
+def trained_as(plan: Sequence[Variant]) -> dict[Path, Path]:
+    """For every yaml the first one with the same network: what is equal but for its name is trained once."""
+    networks = {v.model: replace(ModelConfig.from_yaml(v.model), name="") for v in plan}
+    return {path: next(p for p, other in networks.items() if other == network) for path, network in networks.items()}

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from gapr_core.errors import ConfigError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
-from gapr_core.training import distributed
+from gapr_core.training import distributed, provenance
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, one_thread
@@ -30,13 +31,16 @@ from gapr_core.training.losses import Losses, compute_losses
 from gapr_core.training.targets import TrainingPair
 from gapr_core.training.validation import validate, validation_set
 
+log = logging.getLogger(__name__)
+
 
 def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: float = math.inf, card: Any = None) -> Path:
     """Run until the schedule ends or `minutes` are over, from where the last call in `folder` stopped.
 
     Args:
         config: the run; must be the one that `folder` was begun with.
-        folder: gets config.json, checkpoint.safetensors, log.csv, validation.csv and weights.safetensors.
+        folder: gets config.json, provenance.json, checkpoint.safetensors, log.csv, validation.csv, curves.png and
+            weights.safetensors.
         anatomy: real bones for training and validation; None for parametric ones.
         minutes: budget of this call.
         card: goes into the header of the weights.
@@ -57,6 +61,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     if (folder / "checkpoint.safetensors").exists():
         state = load_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer)
     steps = config.pairs // config.batch
+    origin = provenance.append(folder, config, anatomy, state["step"], world) if rank == 0 else []
     per_step = config.batch // config.micro_batch // world
     batches = micro_batches(config, model, anatomy, state["step"] * config.batch // config.micro_batch, rank, world)
     held_out = validation_set(config, model, anatomy) if rank == 0 else []
@@ -91,10 +96,12 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
             if last or time.monotonic() - validated > 60.0 * config.validate_minutes:
                 validated = time.monotonic()
                 report(folder, ema, held_out, state, config, device)
+                draw_curves(folder)
             if last or time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
                 saved = time.monotonic()
                 save_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer, state)
-                weights.save(ema, folder / "weights.safetensors", {**(card or {}), "run": config.to_dict(), **state})
+                header = {**(card or {}), "run": config.to_dict(), **state, "provenance": origin}
+                weights.save(ema, folder / "weights.safetensors", header)
         if distributed.agree(last, world):
             break
     distributed.stop(world)
@@ -124,7 +131,7 @@ def micro_batches(
 def learning_rate(config: TrainConfig, progress: float) -> float:
     """Linear warm-up, then a cosine; `progress` from 0 to 1."""
     if progress < config.warmup:
-        return config.learning_rate * (progress + 1e-3) / config.warmup
+        return config.learning_rate * min(1.0, (progress + 1e-3) / config.warmup)
     fallen = 0.5 * (1.0 + math.cos(math.pi * (progress - config.warmup) / (1.0 - config.warmup)))
     return config.learning_rate * (config.final_rate + (1.0 - config.final_rate) * fallen)
 
@@ -139,16 +146,20 @@ def average(ema: GAPRNet, network: GAPRNet, decay: float) -> None:
 def settle(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> None:
     """Write the run's settings, or check that they are those the folder was begun with.
 
+    The network's settings count, not the path of their yaml; an entry that did not exist then stood at its default.
+
     Raises:
         ConfigError: the folder holds another run.
     """
-    settings = json.loads(json.dumps({"train": config.to_dict(), "model": model.to_dict()}))
     path = folder / "config.json"
     if path.exists():
-        if json.loads(path.read_text()) != settings:
+        begun = json.loads(path.read_text())
+        there = TrainConfig.from_dict(begun["train"]), ModelConfig.from_dict(begun["model"])
+        if (replace(there[0], model=config.model), there[1]) != (config, model):
             raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
     elif rank == 0:
         folder.mkdir(parents=True, exist_ok=True)
+        settings = {"train": config.to_dict(), "model": model.to_dict()}
         path.write_text(json.dumps(settings, indent=1) + "\n")
 
 
@@ -180,11 +191,25 @@ def report(
     )
 
 
+def draw_curves(folder: Path) -> None:
+    """curves.png anew; where even matplotlib cannot be loaded, a warning instead of the end of the run."""
+    try:
+        from gapr_core.training import curves
+    except ImportError as error:
+        log.warning("no curves of %s: %s", folder, error)
+    else:
+        curves.draw_or_warn(folder)
+
+
 def append(path: Path, row: dict[str, Any]) -> None:
-    """One line at the end of a CSV file, with a head if it is new."""
-    new = not path.exists()
+    """One line at the end of a CSV file, with a head if it is new; in place of one that a crash cut off."""
+    with path.open("a+b") as file:
+        size = file.seek(0, 2)
+        file.seek(max(size - 4096, 0))
+        whole = size - len(file.read().rpartition(b"\n")[2])
+        file.truncate(whole)
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, list(row))
-        if new:
+        if whole == 0:
             writer.writeheader()
         writer.writerow(row)

@@ -18,24 +18,6 @@ from gapr_core.training.shapes import ShapeModel, vary
 
 
 @pytest.fixture(scope="module")
-def anatomy(tmp_path_factory, toy):
-    """Nine people with one made-up bone in vertex correspondence, in the layout of the anatomy folder."""
-    from scipy.spatial import ConvexHull
-
-    folder = tmp_path_factory.mktemp("anatomy")
-    points = toy.bone(400)
-    faces = ConvexHull(points).simplices
-    rng = np.random.default_rng(0)
-    people = np.stack([points * rng.uniform(0.8, 1.2, 3) for _ in range(9)]).astype(np.float32)
-    names = [f"p{i}" for i in range(9)]
-    np.savez(folder / "femur_toy.npz", points=people, faces=faces, person=np.array(names))
-    (folder / "splits.json").write_text(
-        '{"train": ["p0", "p1", "p2", "p3", "p4"], "val": ["p5", "p6"], "test": ["p7", "p8"]}'
-    )
-    return folder
-
-
-@pytest.fixture(scope="module")
 def settings(toy, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "toy.yaml"
     small = toy.small_config(superpoints=(10, 20), width=8, global_width=16, train_pairs=6)

@@ -1,0 +1,303 @@
+"""gapr ablate: train the paper's ablations at one budget, examine them on people they never saw, and compare.
+
+gapr ablate --out runs/ablation --pairs 8000 --anatomy DIR --jobs 2
+
+Stop it at any time and call it again: finished networks stay, the one under way goes on from its checkpoint. OUT gets
+table.md, table.json, table.csv and curves_*.png anew after every network, pairs/ with the examination's pairs, and one
+folder a network and seed, as `gapr train` writes it, with exam.json.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import re
+import time
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from gapr_core import metrics, target
+from gapr_core.config import RefinementConfig
+from gapr_core.console import say
+from gapr_core.data.anatomy import SPLITS
+from gapr_core.data.make_pairs import Recipe, read_manifest, write_pairs
+from gapr_core.data.pair_files import load_pair
+from gapr_core.data.pool import specimens
+from gapr_core.data.protocols import Pair
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.model import weights
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
+from gapr_core.model.pyramid import build_cloud, target_frame
+from gapr_core.proposals.consensus import local_to_global
+from gapr_core.proposals.network import correspondences_mm
+from gapr_core.refinement import refine_fully
+from gapr_core.training import curves, provenance
+from gapr_core.training.config import TrainConfig, Variant, default_plan, read_plan, trained_as
+from gapr_core.training.dataset import available
+from gapr_core.training.targets import training_pair
+from gapr_core.training.trainer import settle, train
+from gapr_core.training.validation import inlier_ratios
+
+Record = dict[str, Any]
+FIGURES = {  # of a record -> what the column is called
+    "coarse": "coarse inliers", "fine": "fine inliers", "rr_paper": "recall RMSE < 0.02", "rr_4_5": "recall 4 mm / 5°",
+    "refined_rr_paper": "refined: RMSE < 0.02", "refined_rr_4_5": "refined: 4 mm / 5°",
+}  # fmt: skip
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One network to train and to examine."""
+
+    folder: Path
+    config: TrainConfig
+    anatomy: Path | None
+    pairs: Path
+    deadline: float  # of the clock, seconds
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """The options of `gapr ablate`."""
+    parser.add_argument("--out", type=Path, required=True, help="folder of the comparison; an interrupted one goes on")
+    parser.add_argument("--pairs", type=int, required=True, help="budget of every network, in training pairs")
+    parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
+    parser.add_argument("--plan", type=Path, help="which networks, in which tables (config/ablation.yaml)")
+    parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of every network, seeds 0, 1, ... (1)")
+    parser.add_argument("--protocols", default="paper,L1,L2", help="of the examination, with commas (paper,L1,L2)")
+    parser.add_argument("--count", type=int, default=10, help="pairs of the examination, per protocol and bone (10)")
+    parser.add_argument("--split", default="test", choices=[s for s in SPLITS if s != "train"], help="whose bones")
+    parser.add_argument("--jobs", type=int, default=1, help="networks at a time, which share the cores (1)")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
+
+
+def run(args: Namespace) -> int:
+    """Train and examine what is missing, and say where the table is."""
+    config = replace(TrainConfig.from_yaml(args.config) if args.config else TrainConfig(), pairs=args.pairs)
+    plan = read_plan(args.plan or default_plan())
+    bones = tuple(available(config.bones, args.anatomy))
+    origin = "anatomy" if args.anatomy else "parametric"
+    recipe = Recipe(tuple(args.protocols.split(",")), bones, args.count, 0, args.split, args.count, origin)
+    missing = ablate(plan, config, args.out, args.anatomy, recipe, args.seeds, args.jobs, args.minutes)
+    say(f"table in {args.out / 'table.md'}" + (f"; {missing} networks are left, call again" if missing else ""))
+    return 0
+
+
+def ablate(
+    plan: Sequence[Variant], config: TrainConfig, out: Path, anatomy: Path | None, recipe: Recipe, seeds: int = 1,
+    jobs: int = 1, minutes: float = math.inf,
+) -> int:
+    """Bring the comparison in `out` to its end, or as far as `minutes` suffice.
+
+    Args:
+        plan: the rows.
+        config: of every training but for model and seed.
+        out: folder of the comparison.
+        anatomy: real bones; None for parametric ones.
+        recipe: pairs of the examination.
+        seeds: trainings of every network.
+        jobs: processes.
+        minutes: budget of this call.
+
+    Returns:
+        How many networks are not finished yet.
+
+    Raises:
+        ConfigError: `out` holds a comparison with other settings.
+    """
+    deadline = time.time() + 60.0 * minutes
+    todo = {
+        folder_of(out, model, seed): replace(config, model=str(model), seed=seed)
+        for seed in range(seeds) for model in dict.fromkeys(trained_as(plan).values())
+    }  # fmt: skip
+    for folder, settings in todo.items():
+        if (folder / "config.json").exists():
+            settle(folder, settings, ModelConfig.from_yaml(settings.model), 1)
+    examination(recipe, out / "pairs", anatomy)
+    tasks = [Task(folder, settings, anatomy, out / "pairs", deadline) for folder, settings in todo.items()]
+    missing = [task for task in tasks if not (task.folder / "exam.json").exists()]
+    left, written = len(missing), False
+    with tqdm(total=len(tasks), initial=len(tasks) - left, unit="network", desc="ablation", disable=None) as bar:
+        for done in finish_all(missing, jobs):
+            left, written = left - done, done
+            bar.update(done)
+            if done:
+                write(out, plan, config, recipe, seeds)
+    if not written:
+        write(out, plan, config, recipe, seeds)
+    return left
+
+
+def folder_of(out: Path, model: Path, seed: int) -> Path:
+    """Where a network is trained."""
+    return out / f"{model.stem}_seed{seed}"
+
+
+def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
+    """The pairs of the examination, made once: the same for every network."""
+    if "wrong" in recipe.protocols:
+        raise ConfigError("protocols with a true pose", "wrong", "leave it out")
+    complete = (folder / "manifest.json").exists() and read_manifest(folder)
+    if not (complete and complete["hash"] and complete["recipe"] == json.loads(json.dumps(asdict(recipe)))):
+        people = {bone: specimens(bone, recipe.split, recipe.people, anatomy) for bone in recipe.bones}
+        write_pairs(recipe, people, folder)
+
+
+def finish_all(tasks: Sequence[Task], jobs: int) -> Iterator[bool]:
+    """Finish one task after the other, or `jobs` at a time, each in a process with its share of the cores."""
+    if jobs == 1:
+        yield from map(finish, tasks)
+        return
+    threads = max(1, len(os.sched_getaffinity(0)) // jobs)
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        waiting = [pool.submit(finish_quietly, task, threads) for task in tasks]
+        yield from (future.result() for future in as_completed(waiting))
+
+
+def finish_quietly(task: Task, threads: int) -> bool:
+    """`finish` in a process beside others; what it says goes to output.log in the task's folder."""
+    torch.set_num_threads(threads)
+    task.folder.mkdir(parents=True, exist_ok=True)
+    with (task.folder / "output.log").open("a") as file, redirect_stderr(file), redirect_stdout(file):
+        return finish(task)
+
+
+def finish(task: Task) -> bool:
+    """Train and examine one network, from where an earlier call stopped; False when the time was up."""
+    minutes = (task.deadline - time.time()) / 60.0
+    if not trained(task) and minutes > 0.0:
+        train(task.config, task.folder, task.anatomy, minutes)
+    if not trained(task):
+        return False
+    network = weights.load(task.folder / "weights.safetensors")[0]
+    files = sorted(task.pairs.glob("*.npz"))
+    records = [examine(network, load_pair(f)) for f in tqdm(files, task.folder.name, False, unit="pair", disable=None)]
+    new = task.folder / "exam.new"
+    new.write_text(json.dumps({"pairs": read_manifest(task.pairs)["hash"], "records": records}, indent=1) + "\n")
+    os.replace(new, task.folder / "exam.json")
+    return True
+
+
+def trained(task: Task) -> bool:
+    """Whether the schedule is at its end."""
+    path = task.folder / "weights.safetensors"
+    return path.exists() and weights.load(path)[1]["step"] >= task.config.pairs // task.config.batch
+
+
+@torch.inference_mode()
+def examine(network: GAPRNet, pair: Pair) -> Record:
+    """Inlier ratios and the best raw pose of one pair, as it is and refined; a pair without a pose is a failure."""
+    record: Record = {"pair": pair.name, "protocol": pair.protocol, "bone": pair.bone, "person": pair.person}
+    frame = target_frame(pair.target, network.config)
+    try:
+        source, full = (build_cloud(cloud, frame, network.config) for cloud in (pair.source, pair.target))
+    except InvalidPointCloudError:
+        return record | dict.fromkeys(FIGURES, 0.0)
+    truth = training_pair(source, full, pair.T_target_source, frame)
+    output = network(source, full)
+    record["coarse"], record["fine"] = inlier_ratios(output, source, truth)
+    radius_mm = float(truth.radius[0]) * float(source.scale_mm[0])
+    poses, _ = local_to_global(correspondences_mm(output.matches, source, full), 1.5 * radius_mm)
+    if not len(poses):
+        return record | dict.fromkeys([name for name in FIGURES if "rr_" in name], 0.0)
+    refined = refine_fully(poses[0], pair.source, target.prepare(pair.target), RefinementConfig()).T
+    return record | _recalled(pair, poses[0], "") | _recalled(pair, refined, "refined_")
+
+
+def _recalled(pair: Pair, T: Any, prefix: str) -> Record:
+    half_extent = float(np.linalg.norm(pair.target - pair.target.mean(axis=0), axis=1).max())
+    close = metrics.within_paper_limit(metrics.rmse_mm(T, pair.T_target_source, pair.source), half_extent)
+    strict = metrics.pose_error(T, pair.T_target_source, pair.source).within(4.0, 5.0)
+    return {f"{prefix}rr_paper": float(close), f"{prefix}rr_4_5": float(strict)}
+
+
+def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recipe, seeds: int) -> None:
+    """table.md, table.json, table.csv and the curves of each table, from whatever is finished."""
+    folders = {v: [folder_of(out, trained_as(plan)[v.model], seed) for seed in range(seeds)] for v in plan}
+    rows = [row(v, protocol, folders[v], recipe) for v in plan for protocol in _protocols(recipe)]
+    made = provenance.summary([folder for found in folders.values() for folder in found])
+    settings = {"train": config.to_dict(), "exam": asdict(recipe), "seeds": seeds, "made": made}
+    (out / "table.json").write_text(json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n")
+    with (out / "table.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    tables = list(dict.fromkeys(v.table for v in plan))
+    pictures = {table: draw(out, {v: folders[v] for v in plan if v.table == table}) for table in tables}
+    (out / "table.md").write_text(markdown(rows, pictures, settings))
+
+
+def row(variant: Variant, protocol: str, folders: Sequence[Path], recipe: Recipe) -> Record:
+    """Means over pairs and seeds with 95 % intervals over people; None where no seed is finished."""
+    exams = [json.loads((f / "exam.json").read_text())["records"] for f in folders if (f / "exam.json").exists()]
+    chosen = [r for records in exams for r in records if protocol in (ALL, r["protocol"])]
+    found: Record = {"table": variant.table, "network": variant.label, "model": variant.model.stem}
+    on_paper = variant.paper if protocol == "paper" else None
+    found |= {"protocol": protocol, "seeds": len(exams), "pairs": len(chosen), "paper_rr_percent": on_paper}
+    for name in FIGURES:
+        values, people = [r[name] for r in chosen], [r["person"] for r in chosen]
+        figures = (float(np.mean(values)), *metrics.interval(values, people)) if chosen else (None,) * 3
+        for end, value in zip(("", "_low", "_high"), figures, strict=True):
+            found[name + end] = None if value is None else round(value, 4)
+    return found
+
+
+def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
+    """The curves of one table's networks; the picture's name, None while there is nothing to draw."""
+    begun = {v.label: found[0] for v, found in folders.items() if (found[0] / "log.csv").exists()}
+    if not begun:
+        return None
+    name = re.sub("[^a-z]+", "_", next(iter(folders)).table.partition("(")[0].lower()).strip("_")
+    return curves.draw(list(begun.values()), out / f"curves_{name}.png", list(begun)).name
+
+
+def markdown(rows: Sequence[Record], pictures: dict[str, str | None], settings: Record) -> str:
+    """The tables for people, the paper's figures in a column of their own."""
+    parts = ["# Ablations", _preamble(settings)]
+    for table, picture in pictures.items():
+        own = [r for r in rows if r["table"] == table]
+        parts.append(f"## {table}")
+        for protocol in dict.fromkeys(r["protocol"] for r in own):
+            head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if protocol == "paper" else [])]
+            lines = [head, ["---"] * len(head), *(_cells(r) for r in own if r["protocol"] == protocol)]
+            count = max(r["pairs"] for r in own if r["protocol"] == protocol)
+            parts += [f"Protocol {protocol}, {count} pairs", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+        parts += [f"![curves]({picture})"] if picture else []
+    return "\n\n".join([*parts, *settings["made"]]) + "\n"
+
+
+def _preamble(settings: Record) -> str:
+    run, exam = settings["train"], settings["exam"]
+    return (
+        f"{run['pairs']} training pairs a network, {settings['seeds']} seed(s), the same pairs in the same order for "
+        f"all; examined on people of split {exam['split']}, {exam['count']} pairs a protocol and bone "
+        f"({', '.join(exam['bones'])}).\n\nIn %, with 95 % intervals from a bootstrap over people. Recall is of the "
+        "best raw pose (local-to-global consensus, no search): RMSE < 0.02 x the target's half extent, or 4 mm and 5° "
+        "at the source's centroid; refined: after the point-to-surface refinement. The paper's figures are on its own "
+        "data at its own budget: compare the order of the rows, not the figures. A dash: not finished, or no figure."
+    )
+
+
+def _cells(r: Record) -> list[str]:
+    own = [f"{100 * r[n]:.1f} ({100 * r[n + '_low']:.1f} to {100 * r[n + '_high']:.1f})" if r["pairs"] else "–"
+           for n in FIGURES]  # fmt: skip
+    on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
+    return [r["network"], *own, *(on_paper if r["protocol"] == "paper" else [])]
+
+
+def _protocols(recipe: Recipe) -> list[str]:
+    return [*recipe.protocols, ALL] if len(recipe.protocols) > 1 else list(recipe.protocols)

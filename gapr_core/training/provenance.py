@@ -1,0 +1,140 @@
+"""Where a run comes from: code, machine and data, one entry for each time it was begun or taken up again.
+
+Kept in a file of its own beside config.json: another commit or machine is no reason to refuse to go on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from datetime import datetime, timezone
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import gapr_core.data
+from gapr_core.data import anatomy
+from gapr_core.training.config import TrainConfig
+
+FILE = "provenance.json"
+PARAMETRIC = ("parametric.py", "parameters.py", "solid.py", "deformation.py", "degradation.py", "bones/*.py")
+Entry = dict[str, Any]
+
+
+def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, world: int) -> list[Entry]:
+    """Add an entry to the folder's provenance.json.
+
+    Args:
+        folder: of the run.
+        config: its settings.
+        bones: the anatomy folder, None for parametric bones.
+        step: optimiser steps that were done before.
+        world: processes that train together.
+
+    Returns:
+        All entries, the oldest first; what the header of the weights carries.
+    """
+    path = folder / FILE
+    entries = json.loads(path.read_text()) if path.exists() else []
+    entries.append({"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)})
+    new = path.with_suffix(".new")
+    new.write_text(json.dumps(entries, indent=1) + "\n")
+    os.replace(new, path)
+    return list(entries)
+
+
+def summary(folders: Iterable[Path]) -> list[str]:
+    """One sentence for every kind of code, machine and data that these runs had, in order; none of runs not begun."""
+    files = [folder / FILE for folder in folders if (folder / FILE).exists()]
+    return list(dict.fromkeys(_sentence(entry) for file in files for entry in json.loads(file.read_text())))
+
+
+def _sentence(entry: Entry) -> str:
+    by, drawn = entry["commit"] or f"version {entry['gapr']}", entry["data"]
+    return (
+        f"Trained by {by}, torch {entry['torch']}, {entry['processes']} process(es) of "
+        f"{entry['threads']} thread(s) on {entry['gpu'] or entry['cpu']}, {entry['platform']}; data: "
+        f"{drawn['train_people']} real train people (hash {drawn['anatomy']}), parametric model {drawn['parametric']}."
+    )
+
+
+def code() -> Entry:
+    """When, and what runs: the commit of the source tree (`-dirty` where it was changed since), and versions."""
+    return {
+        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "commit": commit(), "gapr": release(),
+        "torch": torch.__version__, "python": platform.python_version(),
+    }  # fmt: skip
+
+
+def commit() -> str | None:
+    """The source tree's commit; None where the package was installed without its repository."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    asked = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        answer = subprocess.run(asked, capture_output=True, text=True, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return None  # no git here: the version stands beside it
+    return answer.stdout.strip() or None
+
+
+def release() -> str | None:
+    """The installed package's version."""
+    try:
+        return version("gapr_ros")
+    except PackageNotFoundError:
+        return None
+
+
+def machine() -> Entry:
+    """Operating system, processor and threads; nothing that names the computer."""
+    return {
+        "platform": f"{platform.system()} {platform.release()} {platform.machine()}", "cpu": cpu_name(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "cores": len(os.sched_getaffinity(0)), "threads": torch.get_num_threads(),
+    }  # fmt: skip
+
+
+def cpu_name() -> str:
+    """The processor as the system calls it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or platform.machine())
+
+
+def data(bones: Iterable[str], folder: Path | None) -> Entry:
+    """What the bones are drawn from: how many train people, a hash over them and their meshes, the parametric model."""
+    people = sorted(anatomy.splits(folder)["train"]) if folder else []
+    return {
+        "train_people": len(people), "anatomy": meshes_hash(bones, people, folder) if folder else None,
+        "parametric": parametric_version(),
+    }  # fmt: skip
+
+
+def meshes_hash(bones: Iterable[str], people: list[str], folder: Path) -> str:
+    """sha256 (16 digits) over the people and over names and contents of their mesh files, wherever the folder lies."""
+    files = sorted({path for bone in bones for path in folder.glob(f"{bone}_*.npz")}, key=lambda path: path.name)
+    return _digest([*people, *(part for path in files for part in (path.name, path.read_bytes()))])
+
+
+def parametric_version() -> str:
+    """sha256 (16 digits) over the source that draws parametric bones: another one, other bones."""
+    root = Path(gapr_core.data.__file__).parent
+    files = sorted({path for pattern in PARAMETRIC for path in root.glob(pattern)})
+    return _digest([part for path in files for part in (str(path.relative_to(root)), path.read_bytes())])
+
+
+def _digest(parts: list[str | bytes]) -> str:
+    digest = sha256()
+    for part in parts:
+        content = part.encode() if isinstance(part, str) else part
+        digest.update(len(content).to_bytes(8, "big") + content)
+    return digest.hexdigest()[:16]

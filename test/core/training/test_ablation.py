@@ -1,0 +1,135 @@
+"""The driver of the ablations: every row, whole after any interruption, and the same again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gapr_core import cli
+from gapr_core.data.make_pairs import Recipe
+from gapr_core.errors import ConfigError
+from gapr_core.model import weights
+from gapr_core.model.config import ModelConfig
+from gapr_core.training import ablation
+from gapr_core.training.config import TrainConfig, default_plan, read_plan, trained_as
+
+ROOT = Path(__file__).parents[3]
+EXAM = Recipe(("paper", "L2"), ("femur",), 2, 0, "test", 2, "anatomy")
+BUDGET = TrainConfig(
+    bones=("femur",), mix={"paper": 1.0}, pairs=4, batch=2, micro_batch=2, pool=1, validation_pairs=1
+)
+
+
+@pytest.fixture(scope="module")
+def plan(toy, tmp_path_factory):
+    """Two tables of tiny networks, three rows, of which two are the same network."""
+    folder = tmp_path_factory.mktemp("plan")
+    (folder / "model").mkdir()
+    small = toy.small_config(superpoints=(10, 20), width=8, global_width=16, train_pairs=6)
+    for name, final in (("standard", "vanilla"), ("ours", "pga"), ("ours_again", "pga")):
+        values = replace(small, name=name, final_cross=final, repositioning="none").to_dict()
+        plain = {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+        (folder / "model" / f"{name}.yaml").write_text(yaml.safe_dump(plain))
+    (folder / "ablation.yaml").write_text(
+        "Cross (table IV):\n"
+        "- {label: standard, model: standard, paper: 91.2}\n"
+        "- {label: ours, model: ours, paper: 94.2}\n"
+        "Transformer:\n- {label: ours too, model: ours_again}\n"
+    )
+    return folder / "ablation.yaml"
+
+
+@pytest.fixture(scope="module")
+def whole(plan, anatomy, tmp_path_factory):
+    """A comparison that nothing interrupted."""
+    out = tmp_path_factory.mktemp("whole")
+    assert ablation.ablate(read_plan(plan), BUDGET, out, anatomy, EXAM) == 0
+    return out
+
+
+def rows(out):
+    return json.loads((out / "table.json").read_text())["rows"]
+
+
+def test_a_stopped_driver_goes_on_and_comes_to_the_same_table(plan, whole, anatomy, tmp_path, monkeypatch):
+    """Every training is stopped after each of its two steps."""
+    real, begun = ablation.train, []
+
+    def one_step(config, folder, anatomy, minutes):
+        begun.append(folder.name)
+        return real(config, folder, anatomy, minutes=0.0)
+
+    monkeypatch.setattr(ablation, "train", one_step)
+    monkeypatch.setattr(ablation.curves, "draw", lambda folders, out, names=(): out)  # slow, and not the question here
+    assert ablation.ablate(read_plan(plan), BUDGET, tmp_path, anatomy, EXAM) == 2
+    assert len(rows(tmp_path)) == len(rows(whole)) and not rows(tmp_path)[0]["pairs"]
+    assert "| standard | – |" in (tmp_path / "table.md").read_text()
+    assert ablation.ablate(read_plan(plan), BUDGET, tmp_path, anatomy, EXAM) == 0
+    assert begun == ["standard_seed0", "ours_seed0"] * 2
+    assert rows(tmp_path) == rows(whole)
+    steps = [line.split(",")[0] for line in (tmp_path / "ours_seed0" / "log.csv").read_text().split()]
+    assert steps == ["step", "1", "2"]
+    assert [e["step"] for e in json.loads((tmp_path / "ours_seed0" / "provenance.json").read_text())] == [0, 1]
+
+
+def test_the_same_command_again_trains_nothing_and_writes_the_same_files(plan, whole, anatomy, monkeypatch):
+    monkeypatch.setattr(ablation, "train", lambda *_: pytest.fail("trained again"))
+    names = ("table.md", "table.json", "table.csv")
+    before = [(whole / name).read_bytes() for name in names]
+    assert ablation.ablate(read_plan(plan), BUDGET, whole, anatomy, EXAM) == 0
+    assert [(whole / name).read_bytes() for name in names] == before
+
+
+def test_the_table_has_every_row_with_intervals_and_the_papers_figure_apart(whole):
+    found = {(r["network"], r["protocol"]): r for r in rows(whole)}
+    assert set(found) == {(n, p) for n in ("standard", "ours", "ours too") for p in ("paper", "L2", "all")}
+    assert [found["standard", p]["paper_rr_percent"] for p in ("paper", "L2", "all")] == [91.2, None, None]
+    assert [found["ours", p]["pairs"] for p in ("paper", "L2", "all")] == [2, 2, 4]
+    for row in found.values():
+        assert all(0.0 <= row[f"{n}_low"] <= row[n] <= row[f"{n}_high"] <= 1.0 for n in ablation.FIGURES)
+    text = (whole / "table.md").read_text()
+    assert "compare the order" in text and "5 real train people" in text and "4 training pairs" in text
+    assert (whole / "curves_cross.png").exists() and (whole / "curves_transformer.png").exists()
+    assert len((whole / "table.csv").read_text().splitlines()) == 1 + len(found)
+
+
+def test_a_network_that_stands_in_two_tables_is_trained_once(whole):
+    assert sorted(f.name for f in whole.iterdir() if f.is_dir()) == ["ours_seed0", "pairs", "standard_seed0"]
+    ours, again = ([r for r in rows(whole) if r["network"] == n] for n in ("ours", "ours too"))
+    assert [r["coarse"] for r in ours] == [r["coarse"] for r in again]
+
+
+def test_a_folder_with_other_settings_is_refused(plan, whole, anatomy):
+    with pytest.raises(ConfigError, match="begun"):
+        ablation.ablate(read_plan(plan), replace(BUDGET, pairs=6), whole, anatomy, EXAM)
+    with pytest.raises(ConfigError, match="recipe"):
+        ablation.ablate(read_plan(plan), BUDGET, whole, anatomy, replace(EXAM, count=3))
+
+
+def test_the_weights_carry_where_they_come_from(whole):
+    card = weights.load(whole / "ours_seed0" / "weights.safetensors")[1]
+    (entry,) = card["provenance"]
+    assert {"commit", "gapr", "torch", "platform", "cpu", "threads", "data"} <= set(entry) and card["step"] == 2
+
+
+def test_the_examination_is_of_other_people_than_the_training(whole):
+    people = {p["person"] for p in json.loads((whole / "pairs" / "manifest.json").read_text())["pairs"]}
+    assert people == {"p7", "p8"}  # of the split `test`
+
+
+def test_the_plan_that_ships_holds_the_papers_tables():
+    plan = read_plan(default_plan())
+    papers = {(v.table.split(" (")[0], v.label): v.paper for v in plan}
+    assert list(papers.values()) == [88.8, 91.9, 94.2, 91.2, 90.0, 94.2, None, 80.8, 92.4, 91.5, 92.9, 91.1, 94.2]
+    assert len(set(trained_as(plan).values())) == 11
+    assert all(ModelConfig.from_yaml(v.model).name == v.model.stem for v in plan)
+
+
+def test_the_command_wants_a_budget(capsys, tmp_path):
+    with pytest.raises(SystemExit):
+        cli.main(["ablate", "--out", str(tmp_path)])
+    assert "--pairs" in capsys.readouterr().err

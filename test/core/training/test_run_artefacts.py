@@ -1,0 +1,137 @@
+"""Curves and provenance: what a run leaves beside its weights."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gapr_core import cli
+from gapr_core.errors import ConfigError
+from gapr_core.model.config import ModelConfig
+from gapr_core.training import curves, provenance, trainer
+from gapr_core.training.config import TrainConfig
+
+PNG = b"\x89PNG\r\n"
+LOG = "step,pairs,seconds,rate,norm,loss,coarse,fine,early\n"
+SCORES = "pairs,seconds,protocol,coarse_inliers,fine_inliers,first,near,among\n"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A folder with 40 steps of 8 pairs and two validations over two protocols."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    steps = [f"{s},{8 * s},{s}.5,0.0005,1.0,4.0,{2 - s / 40},{3 - s / 40},1.0\n" for s in range(1, 41)]
+    (folder / "log.csv").write_text(LOG + "".join(steps))
+    scores = [f"{p},9.0,{name},0.5,0.2,0.25,0.5,1.0\n" for p in (160, 320) for name in ("L1", "all", "paper")]
+    (folder / "validation.csv").write_text(SCORES + "".join(scores))
+    return folder
+
+
+def lines(figure, panel):
+    return [line for line in figure.axes[panel].get_lines() if len(line.get_xdata())]
+
+
+def test_the_curves_of_a_run_show_what_its_files_say(run):
+    drawn = curves.figure([curves.read(run, "run")])
+    rate, recall = lines(drawn, 1)[0], {line.get_label(): line for line in lines(drawn, 3)}
+    assert set(recall) == {"L1", "paper", "all protocols"}
+    np.testing.assert_allclose(recall["L1"].get_xydata(), [[160, 0.25], [320, 0.25]])
+    np.testing.assert_allclose(rate.get_xydata(), [[8 * s, 0.5] for s in range(1, 41)])
+    assert all(axes.get_ylabel() and axes.get_title(loc="left") for axes in drawn.axes)
+
+
+def test_curves_are_drawn_from_files_that_are_half_written_and_say_so(run, tmp_path, caplog):
+    whole = curves.read(run, "run")
+    for name, rest in (("log.csv", "41,328,41.5,0.0005,1.0,4.0,0.9,0.9,1"), ("validation.csv", "480,9.0,L1,0.5\n")):
+        with (run / name).open("a") as file:
+            file.write(rest)
+    with caplog.at_level(logging.WARNING):
+        cut = curves.read(run, "run")
+    assert caplog.text.count("1 incomplete line") == 2
+    np.testing.assert_array_equal(cut.steps["pairs"], whole.steps["pairs"])
+    assert len(cut.scores["L1"]["pairs"]) == 2
+    assert curves.draw([run], tmp_path / "a.png").read_bytes().startswith(PNG)
+
+
+def test_steps_that_were_done_again_after_a_crash_count_once(run):
+    with (run / "log.csv").open("a") as file:
+        file.write("31,248,50.0,0.0005,1.0,4.0,7.0,7.0,1.0\n")
+    steps = curves.read(run, "run").steps
+    assert steps["step"].tolist() == list(range(1, 32)) and steps["coarse"][-1] == 7.0
+
+
+def test_a_running_mean_leaves_out_what_is_not_finite():
+    values = np.array([1.0, np.nan, 3.0, 5.0, np.nan, np.nan, np.nan])
+    np.testing.assert_allclose(curves.smooth(values, 1), [1.0, 2.0, 4.0, 4.0, 5.0, np.nan, np.nan])
+
+
+def test_a_line_after_a_crash_takes_the_place_of_the_one_that_was_cut_off(tmp_path):
+    path = tmp_path / "log.csv"
+    trainer.append(path, {"pairs": 8, "loss": 1.0})
+    path.write_bytes(path.read_bytes() + b"16,0.")
+    trainer.append(path, {"pairs": 24, "loss": 2.0})
+    assert curves.read_csv(path) == [{"pairs": 8.0, "loss": 1.0}, {"pairs": 24.0, "loss": 2.0}]
+
+
+def test_a_picture_that_cannot_be_drawn_is_a_warning_and_no_error(tmp_path, caplog):
+    trainer.draw_curves(tmp_path / "nowhere")
+    assert "no curves of" in caplog.text and "log.csv" in caplog.text
+
+
+def test_the_command_lays_runs_over_each_other_under_names_that_differ(run, tmp_path, capsys):
+    other = tmp_path / "other" / "run"
+    other.parent.mkdir()
+    other.symlink_to(run)
+    assert curves.labels([tmp_path / "run", tmp_path / "x" / "run"])[1] == "x/run"
+    assert cli.main(["train", "--plot", str(run), str(run), "--out", str(tmp_path / "two.png")]) == 0
+    assert (tmp_path / "two.png").read_bytes().startswith(PNG) and "two.png" in capsys.readouterr().out
+    assert cli.main(["train", "--plot", str(run), str(run)]) == cli.BAD_INPUT
+    assert cli.main(["train"]) == cli.BAD_INPUT
+
+
+def test_every_resumption_adds_an_entry_and_keeps_the_earlier_ones(tmp_path):
+    for step in (0, 7):
+        entries = provenance.append(tmp_path, TrainConfig(), None, step, 1)
+    assert [e["step"] for e in entries] == [0, 7] == [e["step"] for e in json.loads(provenance_of(tmp_path))]
+    assert entries[1]["cpu"] and entries[1]["threads"] >= 1 and entries[1]["data"]["anatomy"] is None
+    assert len(provenance.summary([tmp_path])) == 1
+
+
+def provenance_of(folder):
+    return (folder / provenance.FILE).read_text()
+
+
+def test_the_commit_is_the_one_that_git_names_or_none():
+    asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=provenance.Path(provenance.__file__).parent,
+                           capture_output=True, text=True)  # fmt: skip
+    found = provenance.commit()
+    assert found is None if asked.returncode else found.removesuffix("-dirty") == asked.stdout[:12]
+
+
+def test_the_hash_of_the_data_knows_people_and_meshes_but_not_the_folder(tmp_path):
+    def folder(name, people, mesh):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "femur_a.npz").write_bytes(mesh)
+        (tmp_path / name / "splits.json").write_text(json.dumps({"train": people, "val": ["v"], "test": ["t"]}))
+        return provenance.data(["femur"], tmp_path / name)["anatomy"]
+
+    first = folder("a", ["p", "q"], b"mesh")
+    assert first == folder("b", ["q", "p"], b"mesh")
+    assert len({first, folder("c", ["p"], b"mesh"), folder("d", ["p", "q"], b"other")}) == 3
+
+
+def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused(tmp_path):
+    """As in the folders of older commits: no provenance.json, fewer entries, the yaml elsewhere."""
+    begun = {"train": replace(TrainConfig(), model="old/best.yaml").to_dict(), "model": ModelConfig().to_dict()}
+    del begun["train"]["share"], begun["model"]["centred_features"]
+    (tmp_path / "config.json").write_text(json.dumps(begun))
+    trainer.settle(tmp_path, replace(TrainConfig(), model="new/best.yaml"), ModelConfig(), 0)
+    for config, model in ((TrainConfig(share=3), ModelConfig()), (TrainConfig(), ModelConfig(centred_features=False))):
+        with pytest.raises(ConfigError, match="begun"):
+            trainer.settle(tmp_path, config, model, 0)

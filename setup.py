@@ -68,6 +68,7 @@ setup(
             "bag_replay = gapr_ros.bag_replay:main",
         ],
         "gapr.commands": [
+            "ablate = gapr_core.training.ablation",
             "benchmark = gapr_core.evaluation.benchmark",
             "demo = gapr_ros.demo",
             "make-pairs = gapr_core.data.make_pairs",

@@ -51,9 +51,8 @@ setup(
         files("launch", "*.launch.py"),
         files("rviz", "*.rviz"),
     ],
-    install_requires=[*CORE, "pyyaml"],
+    install_requires=[*CORE, *NETWORK, "pyyaml"],
     extras_require={
-        "network": NETWORK,
         "bags": BAGS,
         "ros": [*ROS_WHEELS, *BAGS],
         "baselines": ["kiss-matcher", "pycpd", "small_gicp"],

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.covariance import PoseUncertainty, smooth_misfit_mm
+from gapr_core.covariance import PoseUncertainty
 from gapr_core.errors import WeightsError
 from gapr_core.refinement import Fit
 from gapr_core.source import PreparedSource
@@ -23,6 +23,7 @@ from gapr_core.verification import Candidates
 Array = NDArray[np.float64]
 
 DEFAULT_CALIBRATION = Path(__file__).parent / "weights" / "confidence.json"
+NETWORK_CALIBRATION = Path(__file__).parent / "weights" / "confidence_network.json"
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,14 @@ class Calibration:
         means, scales, weights = (np.asarray(data[key], dtype=np.float64) for key in ("means", "scales", "weights"))
         return Calibration(FEATURES, means, scales, weights, data["card"])
 
+    @staticmethod
+    def shipped(proposer: str) -> Calibration:
+        """The model for an answer whose last hypotheses came from `proposer`.
+
+        The network's few poses say less about rivals than an exhaustive search: they have a model of their own.
+        """
+        return Calibration.load(NETWORK_CALIBRATION if proposer == "network" else DEFAULT_CALIBRATION)
+
     def probability(self, features: dict[str, float]) -> float:
         """Probability, 0 to 1, that the pose is within 4 mm and 5 deg."""
         logit = self.design(np.array([[features[name] for name in self.names]])) @ self.weights
@@ -80,7 +89,7 @@ def measure(
     return {
         "log_sigma": float(np.log(fit.sigma_mm)),
         "log_excess": float(np.log(fit.sigma_mm / max(source.noise_mm, 0.1))),
-        "smooth_misfit": smooth_misfit_mm(fit, SMOOTH_NEIGHBOURS),
+        "smooth_misfit": uncertainty.smooth_mm,
         "inlier_ratio": float(inlier.mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
         "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
@@ -95,7 +104,6 @@ def measure(
     }
 
 
-SMOOTH_NEIGHBOURS = 30
 FEATURES = (
     "log_sigma", "log_excess", "smooth_misfit", "inlier_ratio", "residual", "margin", "support", "log_shift_sd",
     "log_turn_sd", "normal_agreement", "log_points", "extent",

@@ -63,11 +63,20 @@ class VerificationConfig:
 
 @dataclass(frozen=True)
 class RefinementConfig:
-    """The last, robust point-to-surface refinement."""
+    """The last, robust point-to-surface refinement.
+
+    Attributes:
+        rounds, iterations, rest_mm: Gauss-Newton until the points move less than `rest_mm`.
+        tukey_scale: end of Tukey's weight in standard deviations; `clean_tukey_scale` where less than `clean_share` of
+            the residuals are beyond three of them (the normal distribution has 0.3 %).
+        smallest_sigma_mm, largest_sigma_mm: limits of the robust standard deviation.
+    """
 
     rounds: int = 12
     iterations: int = 3
-    tukey_scale: float = 3.5
+    tukey_scale: float = 3.0
+    clean_tukey_scale: float = 5.0
+    clean_share: float = 0.015
     rest_mm: float = 1e-3
     smallest_sigma_mm: float = 0.15
     largest_sigma_mm: float = 3.0
@@ -86,7 +95,14 @@ class CovarianceConfig:
 
 @dataclass(frozen=True)
 class RegistrarConfig:
-    """Everything a `Registrar` can be told."""
+    """Everything a `Registrar` can be told.
+
+    Attributes:
+        min_confidence: answers below it are refused.
+        sure: an answer at or above it is final; below it the next proposer is asked as well.
+        num_threads: of search, verification and refinement; 0 for all cores.
+        seed: of whatever is drawn at random.
+    """
 
     target: TargetConfig = field(default_factory=TargetConfig)
     source: SourceConfig = field(default_factory=SourceConfig)
@@ -95,7 +111,8 @@ class RegistrarConfig:
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     min_confidence: float = 0.5
-    num_threads: int = 0  # 0: all cores
+    sure: float = 0.95
+    num_threads: int = 0
     seed: int = 0
 
 

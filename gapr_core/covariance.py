@@ -27,13 +27,15 @@ class PoseUncertainty:
 
     Attributes:
         covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
-        bias_mm: standard deviation of the smooth misfit that the residuals show.
+        bias_mm: standard deviation of the smooth bias that the covariance reckons with.
+        smooth_mm: the smooth misfit that the residuals show (see `smooth_misfit_mm`).
         weakest_turn: (3,) unit axis, target frame, about which the rotation is least certain.
         weakest_shift: (3,) unit direction, target frame, along which the position is least certain.
     """
 
     covariance: Array
     bias_mm: float
+    smooth_mm: float
     weakest_turn: Array
     weakest_shift: Array
 
@@ -63,12 +65,13 @@ def estimate(fit: Fit, config: CovarianceConfig) -> PoseUncertainty:
     J, w = fit.jacobian, fit.weights
     H = (J * w[:, None]).T @ J + np.diag([1e-6] * 3 + [1e-3] * 3)
     noise = fit.sigma_mm**2 * (J * (w**2)[:, None]).T @ J
-    bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_misfit_mm(fit, config.smooth_neighbours))
+    smooth_mm = smooth_misfit_mm(fit, config.smooth_neighbours)
+    bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_mm)
     H_inverse = np.linalg.inv(H)
     covariance = H_inverse @ (noise + bias_mm**2 * _correlated(fit, config)) @ H_inverse
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     return PoseUncertainty(
-        covariance, float(bias_mm), _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
+        covariance, float(bias_mm), smooth_mm, _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
     )
 
 

@@ -86,8 +86,9 @@ def refine_fully(T: Array, points: Array, target: PreparedTarget, config: Refine
         config: iterations and scales.
     """
     for _ in range(config.rounds):
-        sigma_mm = evaluate(T, points, target, config).sigma_mm
-        limits = np.full(config.iterations, config.tukey_scale * sigma_mm)
+        signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
+        sigma_mm = _robust_sigma(signed, config)
+        limits = np.full(config.iterations, _tukey_limit(signed, sigma_mm, config))
         poses, _ = kernels.refine_batch(T[None], points, *target.kernel_view, limits, np.full_like(limits, sigma_mm**2))
         step = se3.apply(poses[0], points) - se3.apply(T, points)
         T = poses[0]
@@ -100,8 +101,9 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
     """Residuals, scale and weights of a pose as it is."""
     signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     sigma_mm = _robust_sigma(signed, config)
+    limit_mm = _tukey_limit(signed, sigma_mm, config)
     signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
-    square = (np.nan_to_num(signed, nan=np.inf) ** 2 + aside**2) / (config.tukey_scale * sigma_mm) ** 2
+    square = (np.nan_to_num(signed, nan=np.inf) ** 2 + aside**2) / limit_mm**2
     weights = np.clip(1.0 - square, 0.0, 1.0) ** 2
     return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
 
@@ -110,3 +112,9 @@ def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
     """1.4826 x median absolute residual, those without a surface near counted as large; within the limits set."""
     spread = 1.4826 * float(np.median(np.nan_to_num(np.abs(signed), nan=np.inf)))
     return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
+
+
+def _tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
+    """Where Tukey's weight ends, mm: far out, and so more efficient, where almost nothing lies beyond 3 sigma."""
+    beyond = np.mean(np.nan_to_num(np.abs(signed), nan=np.inf) > 3.0 * sigma_mm)
+    return sigma_mm * (config.clean_tukey_scale if beyond < config.clean_share else config.tukey_scale)

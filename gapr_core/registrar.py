@@ -17,7 +17,7 @@ from gapr_core.clouds import Surface
 from gapr_core.confidence import Calibration
 from gapr_core.config import RegistrarConfig
 from gapr_core.covariance import PoseUncertainty
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.proposals.base import Proposer
 from gapr_core.proposals.search import NormalAlignedSearch
@@ -37,10 +37,13 @@ DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says 
 class Registrar:
     """Lays partial sources on one or many prepared targets.
 
+    Proposers are asked in turn, each round with the poses of all so far, until an answer is sure: with the shipped
+    weights the network first, and the exhaustive search only where the network's answer leaves a doubt.
+
     Args:
         config: every setting.
         proposers: where hypotheses come from; the weight-free search when not given.
-        calibration: the confidence model; the shipped one when not given.
+        calibrations: the confidence model of each round; the shipped ones when not given.
     """
 
     name = "gapr"
@@ -49,21 +52,36 @@ class Registrar:
         self,
         config: RegistrarConfig | None = None,
         proposers: Sequence[Proposer] | None = None,
-        calibration: Calibration | None = None,
+        calibrations: Sequence[Calibration] | None = None,
     ) -> None:
         self.config = config or RegistrarConfig()
-        search = NormalAlignedSearch(self.config.search, self.config.num_threads)
-        self.proposers: tuple[Proposer, ...] = tuple(proposers or (search,))
-        self.calibration = calibration or Calibration.load()
+        self.proposers: tuple[Proposer, ...] = tuple(proposers or (_search(self.config),))
+        self.calibrations = tuple(calibrations or (Calibration.shipped(p.name) for p in self.proposers))
+        if len(self.calibrations) != len(self.proposers):
+            given = f"{len(self.calibrations)} for {len(self.proposers)} proposers"
+            raise ConfigError("one confidence model for each proposer", given, "pass as many")
 
     @classmethod
-    def from_pretrained(cls, config: RegistrarConfig | None = None) -> Registrar:
-        """The best registrar that ships: shipped proposers and calibration, nothing downloaded."""
-        return cls(config)
+    def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu") -> Registrar:
+        """The best registrar that ships: GAPR-Net, then the search; nothing is downloaded.
+
+        Args:
+            config: every setting.
+            device: where the network runs: "cpu", "cuda", or "auto" for the GPU where there is one.
+
+        Raises:
+            MethodUnavailableError: torch is not installed; `Registrar()` works without.
+            ConfigError: no such device.
+        """
+        config = config or RegistrarConfig()
+        return cls(config, (_network(device), _search(config)))
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Everything static about a target; see `gapr_core.target.prepare`."""
-        return targets.prepare(target, units, self.config.target)
+        """Everything static about a target, the proposers' share included; see `gapr_core.target.prepare`."""
+        prepared = targets.prepare(target, units, self.config.target)
+        for proposer in self.proposers:
+            proposer.prepare(prepared)
+        return prepared
 
     def register(
         self, source: ArrayLike, target: PreparedTarget, initial: ArrayLike | None = None
@@ -83,28 +101,29 @@ class Registrar:
         if isinstance(prepared, Unusable):
             return RegistrationResult(prepared.status, reason=prepared.reason, stage_ms=clock.lap("prepare"))
         clock.lap("prepare")
-        poses = self._propose(prepared, target, initial)
-        clock.lap("propose")
-        candidates = verify(poses, prepared, target, self.config.verification, self.config.num_threads)
-        clock.lap("verify")
-        fit = refine_fully(candidates.poses[0], prepared.points, target, self.config.refinement)
-        clock.lap("refine")
-        result = self._assess(fit, candidates, prepared, target)
-        return replace(result, stage_ms=clock.lap("assess"))
-
-    def _propose(self, source: PreparedSource, target: PreparedTarget, initial: ArrayLike | None) -> Array:
-        rng = np.random.default_rng(self.config.seed)
-        poses = [proposer.propose(source, target, rng).poses for proposer in self.proposers]
-        if initial is not None:
-            poses.append(_rigid(initial)[None])
-        return np.concatenate(poses)
+        poses = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
+        result = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="nothing was proposed")
+        for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
+            rng = np.random.default_rng(self.config.seed)
+            poses = np.concatenate([poses, proposer.propose(prepared, target, rng).poses])
+            clock.lap("propose")
+            if len(poses):
+                candidates = verify(poses, prepared, target, self.config.verification, self.config.num_threads)
+                clock.lap("verify")
+                fit = refine_fully(candidates.poses[0], prepared.points, target, self.config.refinement)
+                clock.lap("refine")
+                result = self._assess(fit, candidates, prepared, target, calibration)
+            result = replace(result, stage_ms=clock.lap("assess"), details=result.details | {"rounds": number})
+            if result.confidence >= self.config.sure:
+                break
+        return result
 
     def _assess(
-        self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget
+        self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget, calibration: Calibration
     ) -> RegistrationResult:
         uncertainty = covariance.estimate(fit, self.config.covariance)
         figures = confidence.measure(fit, candidates, uncertainty, source, target)
-        probability = self.calibration.probability(figures)
+        probability = calibration.probability(figures)
         if _is_matched(candidates) or _is_loose(uncertainty):
             probability = min(probability, DOUBT)
         common = {
@@ -124,6 +143,19 @@ class Registrar:
             tre_mm=tre_mm,
             **common,  # type: ignore[arg-type]
         )
+
+
+def _network(device: str) -> Proposer:
+    try:
+        from gapr_core.proposals.network import NetworkProposer
+    except ImportError as error:
+        mend = "run: pip install torch safetensors, or take Registrar(), which needs no network"
+        raise MethodUnavailableError("torch and safetensors for GAPR-Net", str(error), mend) from error
+    return NetworkProposer.from_weights(device=device)
+
+
+def _search(config: RegistrarConfig) -> NormalAlignedSearch:
+    return NormalAlignedSearch(config.search, config.num_threads)
 
 
 def _is_matched(candidates: Candidates) -> bool:
@@ -165,7 +197,7 @@ def _rigid(pose: ArrayLike) -> Array:
 
 
 class _Clock:
-    """Wall time of each stage, ms."""
+    """Wall time of each stage, ms, summed over the rounds."""
 
     def __init__(self) -> None:
         self._stages: dict[str, float] = {}
@@ -173,6 +205,6 @@ class _Clock:
 
     def lap(self, stage: str) -> dict[str, float]:
         now = time.perf_counter()
-        self._stages[stage] = (now - self._last) * 1000.0
+        self._stages[stage] = self._stages.get(stage, 0.0) + (now - self._last) * 1000.0
         self._last = now
         return dict(self._stages)

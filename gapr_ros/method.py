@@ -14,4 +14,4 @@ def default_method(parameters: NodeParameters) -> Any:
     config = RegistrarConfig(
         min_confidence=parameters.min_confidence, num_threads=parameters.num_threads, seed=parameters.seed
     )
-    return Registrar.from_pretrained(config)
+    return Registrar.from_pretrained(config, parameters.device)

@@ -63,7 +63,7 @@ create_environment() {
 
 pip_install() { .venv/bin/python -m pip install -qq --disable-pip-version-check "$@"; }
 
-# Nothing here needs a GPU; torch is there for the network and its tests.
+# Nothing here needs a GPU: a CPU build of torch is enough.
 install_torch() {
   .venv/bin/python -c 'import torch' 2>/dev/null && return
   say "installing torch${TORCH_INDEX:+ from $TORCH_INDEX}"
@@ -73,10 +73,10 @@ install_torch() {
 install_project() {
   if [ -n "${ROS_DISTRO:-}" ]; then
     say "installing GAPR and its libraries; ROS is the sourced $ROS_DISTRO"
-    pip_install --editable '.[bags,network,baselines,test]'
+    pip_install --editable '.[bags,baselines,test]'
   else
     say "installing GAPR and its libraries; ROS 2 (rclpy, Fast DDS) from wheels, as no ROS is sourced (some minutes)"
-    pip_install --editable '.[ros,network,baselines,test]'
+    pip_install --editable '.[ros,baselines,test]'
   fi
 }
 

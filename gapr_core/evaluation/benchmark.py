@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from gapr_core import origin
 from gapr_core.console import say
 from gapr_core.data.pair_files import load_pair, pair_hash
 from gapr_core.errors import ConfigError
@@ -173,24 +172,8 @@ def _command() -> str:
 
 def _commit() -> str:
     """Commit of the source tree that runs, or the version of the installed package."""
-    here = Path(__file__).resolve().parent
-    asked = subprocess.run(
-        ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True
-    ) if _in_repository(here) else None  # fmt: skip
-    if asked and asked.returncode == 0:
-        return asked.stdout.strip()
-    try:
-        return f"version {version('gapr_ros')}"
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def _in_repository(here: Path) -> bool:
-    return (here.parents[1] / ".git").exists()
+    return origin.commit() or f"version {origin.release() or 'unknown'}"
 
 
 def _machine() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
-    return f"{model or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    return f"{origin.cpu_name()}, {os.cpu_count()} cores, Python {platform.python_version()}"

@@ -11,20 +11,41 @@ from gapr_core.errors import ConfigError
 OURS = "gapr"
 
 
+def _from_pretrained() -> RegistrationMethod:
+    from gapr_core import Registrar
+
+    return Registrar.from_pretrained()
+
+
+def _search_alone() -> RegistrationMethod:
+    from gapr_core import Registrar
+
+    return Registrar()
+
+
+def _network_alone() -> RegistrationMethod:
+    from gapr_core import Registrar
+    from gapr_core.proposals.network import NetworkProposer
+
+    return Registrar(proposers=[NetworkProposer.from_weights()])
+
+
+OWN = {OURS: _from_pretrained, "gapr_search": _search_alone, "gapr_network": _network_alone}
+
+
 def make(name: str) -> RegistrationMethod:
     """A new instance of a method.
 
     Args:
-        name: "gapr" (the `Registrar` with the shipped weights), a baseline of `gapr_core.baselines.REGISTRY`, or
+        name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
+            proposers alone), a baseline of `gapr_core.baselines.REGISTRY`, or
             "package.module:factory" for a callable without arguments that returns a `RegistrationMethod`.
 
     Raises:
         ConfigError: for a name that leads nowhere.
     """
-    if name == OURS:
-        from gapr_core import Registrar
-
-        return Registrar.from_pretrained()
+    if name in OWN:
+        return OWN[name]()
     if ":" in name:
         return _from_module(*name.split(":", 1))
     return baselines.make(name)

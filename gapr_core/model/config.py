@@ -19,13 +19,13 @@ class ModelConfig:
     Attributes:
         name: what the variant is called in tables.
         inputs: features of the points before the first layer: `ones` (paper) or `invariant`.
-        backbone: blocks of an encoder stage: `kpconv`, `pga` or `kpconv+pga` (paper, table V).
+        backbone: blocks of an encoder stage: `kpconv`, `pga` or `kpconv+pga` (paper, table IV).
         kernel_frame: coordinates in which KPConv places its kernel: `world` (paper) or `surface` (rotation-invariant).
-        encoding: geometry in local and global self-attention (paper, table VI).
+        encoding: geometry in local and global self-attention (paper, table V).
         values_encoded: the pair's geometry also enters the attention's values, not its weights alone.
-        final_cross: encoding of the last cross-attention; `vanilla` is the standard one (paper, table V).
+        final_cross: encoding of the last cross-attention; `vanilla` is the standard one (paper, table IV).
         repositioning: `svd` (paper) or `none`, before the last cross-attention.
-        fine_scores: `dot` (eq. 9) or `cosine` with a learnable temperature.
+        fine_scores: `dot` (eq. 8) or `cosine` with a learnable temperature.
         norm: `group` (statistics over each cloud) or `layer` (each point by itself).
         centred_features: what all superpoints of the target have in common is taken off before features are compared.
         mlp_projections: a hidden layer before W^Q, W^K and W^V, as the paper's "separate MLP projections".

@@ -35,6 +35,10 @@ class Proposer(Protocol):
         """What figures are printed under."""
         ...
 
+    def prepare(self, target: PreparedTarget) -> object:
+        """Do once what a target needs, so that the first `propose` is as fast as later ones; kept in its `cache`."""
+        ...
+
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """Hypotheses for one pair; may be empty."""
         ...

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,11 @@ class Correspondences:
     target: Array
     score: Array
     patch: NDArray[np.int64]
+
+    @cached_property
+    def products(self) -> Array:
+        """(C, 9) outer products of each pair, what a weighted covariance sums."""
+        return (self.source[:, :, None] * self.target[:, None, :]).reshape(-1, 9)
 
 
 def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -> tuple[Array, Array]:
@@ -97,17 +104,29 @@ def distinct(
 
 def _support(poses: Array, found: Correspondences, radius_mm: float) -> Array:
     """(K, C) the score of every correspondence that agrees with a pose, else 0."""
-    moved = found.source @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-    squared = ((moved - found.target) ** 2).sum(axis=2)
-    return np.where(squared < radius_mm**2, found.score, 0.0)
+    return _agreeing(np.ascontiguousarray(poses), found.source, found.target, found.score, radius_mm**2)
+
+
+@numba.njit(cache=True, nogil=True)
+def _agreeing(poses, source, target, score, limit):  # type: ignore[no-untyped-def]
+    weights = np.zeros((len(poses), len(source)))
+    for k in range(len(poses)):
+        T = poses[k]
+        for c in range(len(source)):
+            squared = 0.0
+            for i in range(3):
+                moved = T[i, 0] * source[c, 0] + T[i, 1] * source[c, 1] + T[i, 2] * source[c, 2] + T[i, 3]
+                squared += (moved - target[c, i]) ** 2
+            if squared < limit:
+                weights[k, c] = score[c]
+    return weights
 
 
 def _batched_kabsch(found: Correspondences, weights: Array) -> Array:
     """Weighted SVD of all correspondences under each row of weights (K, C)."""
     total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
     p_mean, q_mean = weights @ found.source / total, weights @ found.target / total
-    products = (found.source[:, :, None] * found.target[:, None, :]).reshape(-1, 9)
-    covariance = (weights @ products / total).reshape(-1, 3, 3) - p_mean[:, :, None] * q_mean[:, None]
+    covariance = (weights @ found.products / total).reshape(-1, 3, 3) - p_mean[:, :, None] * q_mean[:, None]
     return _poses(covariance, p_mean, q_mean)
 
 

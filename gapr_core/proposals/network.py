@@ -19,6 +19,7 @@ from gapr_core.target import PreparedTarget
 
 Array = NDArray[np.float64]
 METHODS = ("local_to_global", "ransac")
+SHIPPED = Path(__file__).parents[1] / "weights" / "gapr_net.safetensors"
 
 
 class NetworkProposer:
@@ -41,15 +42,16 @@ class NetworkProposer:
         self._key = f"network {weights_name or id(network)}"
 
     @classmethod
-    def from_weights(cls, path: str | Path, device: str = "cpu", **options: Any) -> NetworkProposer:
-        """The network in a safetensors file.
+    def from_weights(cls, path: str | Path = SHIPPED, device: str = "cpu", **options: Any) -> NetworkProposer:
+        """The network in a safetensors file, the shipped one when no path is given.
 
         Raises:
             WeightsError: the file is missing, damaged or of another format.
+            ConfigError: no such device.
         """
         from gapr_core.model import weights
 
-        return cls(weights.load(path, device)[0], weights_name=str(path), **options)
+        return cls(weights.load(path, _available(device))[0], weights_name=str(path), **options)
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """Distinct poses, best first; none where the source is too small or too large for the network."""
@@ -87,6 +89,17 @@ class NetworkProposer:
     @property
     def _device(self) -> Any:
         return next(self.network.parameters()).device
+
+
+def _available(device: str) -> str:
+    """The device meant; "auto" is the GPU where there is one."""
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError("a device of this machine", f"{device}, but torch sees no GPU", "choose cpu or auto")
+    return device
 
 
 def correspondences_mm(matches: Matches, source: Cloud, target: Cloud) -> Correspondences:

@@ -34,6 +34,9 @@ class NormalAlignedSearch:
     num_threads: int = 0
     name: str = "search"
 
+    def prepare(self, target: PreparedTarget) -> None:
+        """Nothing: the distance field is part of every prepared target."""
+
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """The best spin of every (reference, sign, anchor), best `keep` of them all."""
         references = _references(source, self.config.references)

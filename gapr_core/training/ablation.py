@@ -9,11 +9,9 @@ folder a network and seed, as `gapr train` writes it, with exam.json.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
-import re
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
@@ -44,7 +42,7 @@ from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.proposals.consensus import local_to_global
 from gapr_core.proposals.network import correspondences_mm
 from gapr_core.refinement import refine_fully
-from gapr_core.training import curves, provenance
+from gapr_core.training.ablation_table import FIGURES, folder_of, write
 from gapr_core.training.config import TrainConfig, Variant, default_plan, read_plan, trained_as
 from gapr_core.training.dataset import available
 from gapr_core.training.targets import training_pair
@@ -52,11 +50,6 @@ from gapr_core.training.trainer import settle, train
 from gapr_core.training.validation import inlier_ratios
 
 Record = dict[str, Any]
-FIGURES = {  # of a record -> what the column is called
-    "coarse": "coarse inliers", "fine": "fine inliers", "rr_paper": "recall RMSE < 0.02", "rr_4_5": "recall 4 mm / 5°",
-    "refined_rr_paper": "refined: RMSE < 0.02", "refined_rr_4_5": "refined: 4 mm / 5°",
-}  # fmt: skip
-ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -142,11 +135,6 @@ def ablate(
     return left
 
 
-def folder_of(out: Path, model: Path, seed: int) -> Path:
-    """Where a network is trained."""
-    return out / f"{model.stem}_seed{seed}"
-
-
 def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
     """The pairs of the examination, made once: the same for every network."""
     if "wrong" in recipe.protocols:
@@ -223,81 +211,3 @@ def _recalled(pair: Pair, T: Any, prefix: str) -> Record:
     close = metrics.within_paper_limit(metrics.rmse_mm(T, pair.T_target_source, pair.source), half_extent)
     strict = metrics.pose_error(T, pair.T_target_source, pair.source).within(4.0, 5.0)
     return {f"{prefix}rr_paper": float(close), f"{prefix}rr_4_5": float(strict)}
-
-
-def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recipe, seeds: int) -> None:
-    """table.md, table.json, table.csv and the curves of each table, from whatever is finished."""
-    folders = {v: [folder_of(out, trained_as(plan)[v.model], seed) for seed in range(seeds)] for v in plan}
-    rows = [row(v, protocol, folders[v], recipe) for v in plan for protocol in _protocols(recipe)]
-    made = provenance.summary([folder for found in folders.values() for folder in found])
-    settings = {"train": config.to_dict(), "exam": asdict(recipe), "seeds": seeds, "made": made}
-    (out / "table.json").write_text(json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n")
-    with (out / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    tables = list(dict.fromkeys(v.table for v in plan))
-    pictures = {table: draw(out, {v: folders[v] for v in plan if v.table == table}) for table in tables}
-    (out / "table.md").write_text(markdown(rows, pictures, settings))
-
-
-def row(variant: Variant, protocol: str, folders: Sequence[Path], recipe: Recipe) -> Record:
-    """Means over pairs and seeds with 95 % intervals over people; None where no seed is finished."""
-    exams = [json.loads((f / "exam.json").read_text())["records"] for f in folders if (f / "exam.json").exists()]
-    chosen = [r for records in exams for r in records if protocol in (ALL, r["protocol"])]
-    found: Record = {"table": variant.table, "network": variant.label, "model": variant.model.stem}
-    on_paper = variant.paper if protocol == "paper" else None
-    found |= {"protocol": protocol, "seeds": len(exams), "pairs": len(chosen), "paper_rr_percent": on_paper}
-    for name in FIGURES:
-        values, people = [r[name] for r in chosen], [r["person"] for r in chosen]
-        figures = (float(np.mean(values)), *metrics.interval(values, people)) if chosen else (None,) * 3
-        for end, value in zip(("", "_low", "_high"), figures, strict=True):
-            found[name + end] = None if value is None else round(value, 4)
-    return found
-
-
-def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
-    """The curves of one table's networks; the picture's name, None while there is nothing to draw."""
-    begun = {v.label: found[0] for v, found in folders.items() if (found[0] / "log.csv").exists()}
-    if not begun:
-        return None
-    name = re.sub("[^a-z]+", "_", next(iter(folders)).table.partition("(")[0].lower()).strip("_")
-    return curves.draw(list(begun.values()), out / f"curves_{name}.png", list(begun)).name
-
-
-def markdown(rows: Sequence[Record], pictures: dict[str, str | None], settings: Record) -> str:
-    """The tables for people, the paper's figures in a column of their own."""
-    parts = ["# Ablations", _preamble(settings)]
-    for table, picture in pictures.items():
-        own = [r for r in rows if r["table"] == table]
-        parts.append(f"## {table}")
-        for protocol in dict.fromkeys(r["protocol"] for r in own):
-            head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if protocol == "paper" else [])]
-            lines = [head, ["---"] * len(head), *(_cells(r) for r in own if r["protocol"] == protocol)]
-            count = max(r["pairs"] for r in own if r["protocol"] == protocol)
-            parts += [f"Protocol {protocol}, {count} pairs", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
-        parts += [f"![curves]({picture})"] if picture else []
-    return "\n\n".join([*parts, *settings["made"]]) + "\n"
-
-
-def _preamble(settings: Record) -> str:
-    run, exam = settings["train"], settings["exam"]
-    return (
-        f"{run['pairs']} training pairs a network, {settings['seeds']} seed(s), the same pairs in the same order for "
-        f"all; examined on people of split {exam['split']}, {exam['count']} pairs a protocol and bone "
-        f"({', '.join(exam['bones'])}).\n\nIn %, with 95 % intervals from a bootstrap over people. Recall is of the "
-        "best raw pose (local-to-global consensus, no search): RMSE < 0.02 x the target's half extent, or 4 mm and 5° "
-        "at the source's centroid; refined: after the point-to-surface refinement. The paper's figures are on its own "
-        "data at its own budget: compare the order of the rows, not the figures. A dash: not finished, or no figure."
-    )
-
-
-def _cells(r: Record) -> list[str]:
-    own = [f"{100 * r[n]:.1f} ({100 * r[n + '_low']:.1f} to {100 * r[n + '_high']:.1f})" if r["pairs"] else "–"
-           for n in FIGURES]  # fmt: skip
-    on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
-    return [r["network"], *own, *(on_paper if r["protocol"] == "paper" else [])]
-
-
-def _protocols(recipe: Recipe) -> list[str]:
-    return [*recipe.protocols, ALL] if len(recipe.protocols) > 1 else list(recipe.protocols)

@@ -1,9 +1,10 @@
-"""Fit the confidence model: register many pairs of known truth, learn when the answer is right.
+"""Fit the confidence models: register many pairs of known truth, learn when the answer is right.
 
     python -m gapr_core.training.calibration --anatomy ../shared/anatomy --count 150 --records runs/calibration.jsonl
 
+There are two models, for what is known after each round of the `Registrar`: the network alone, and with the search.
 Pairs come from train people only, real and parametric, over all protocols, `wrong` and solids of revolution. Finished
-pairs are kept in the records file, so a stopped run goes on where it was. The model is a ridge logistic regression in
+pairs are kept in the records file, so a stopped run goes on where it was. Each model is a ridge logistic regression in
 which wrong answers count twice: the probability errs on the side of doubt.
 """
 
@@ -13,6 +14,7 @@ import argparse
 import json
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,17 +26,19 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from tqdm import tqdm
 
-from gapr_core.confidence import FEATURES, Calibration
+from gapr_core.confidence import DEFAULT_CALIBRATION, FEATURES, NETWORK_CALIBRATION, Calibration
 from gapr_core.config import RegistrarConfig
 from gapr_core.data import anatomy, protocols
 from gapr_core.data import pool as bone_pool
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
+from gapr_core.registrar import Registrar
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
-PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "wrong", "turned")
+PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "wrong", "turned", "mixed")
+ROUNDS = {"network": NETWORK_CALIBRATION, "search": DEFAULT_CALIBRATION}
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
@@ -48,11 +52,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=10_000)
     parser.add_argument("--records", type=Path, default=Path("runs/calibration.jsonl"))
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, help="where the model goes; without it only the records are made")
+    parser.add_argument("--out", type=Path, help="folder for the models; without it only the records are made")
     args = parser.parse_args(arguments)
     records = collect(args.anatomy, args.split, args.count, args.seed, args.records, args.jobs)
-    if args.out:
-        args.out.write_text(as_json(fit(records), {"people": f"{args.split} people of {args.anatomy.name}"}))
+    for proposer, path in ROUNDS.items() if args.out else ():
+        model = fit([record[proposer] for record in records if proposer in record])
+        card = {"people": f"{args.split} people of {args.anatomy.name}", "hypotheses": proposer}
+        (args.out / path.name).write_text(as_json(model, card))
     return 0
 
 
@@ -71,7 +77,7 @@ def collect(folder: Path, split: str, count: int, seed: int, path: Path, jobs: i
     return list(done.values())
 
 
-def fit(records: list[dict[str, Any]], ridge: float = 3.0, caution: float = 2.0) -> Calibration:
+def fit(records: list[dict[str, Any]], ridge: float = 10.0, caution: float = 2.0) -> Calibration:
     """Penalised maximum likelihood; a record whose pose is wrong counts `caution` times."""
     x = np.array([[r["features"][name] for name in FEATURES] for r in records])
     y = np.array([r["right"] for r in records], dtype=np.float64)
@@ -109,11 +115,15 @@ def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
 
 
 @cache
-def _registrar() -> Any:
-    from gapr_core.registrar import Registrar
-
+def _registrars() -> dict[str, Registrar]:
+    """The two rounds, as they are when the answer of the first one is not sure."""
     untrained = Calibration(FEATURES, np.zeros(len(FEATURES)), np.ones(len(FEATURES)), _undecided(), {})
-    return Registrar(RegistrarConfig(num_threads=1, min_confidence=0.0), calibration=untrained)
+    config = RegistrarConfig(num_threads=1, min_confidence=0.0, sure=2.0)
+    network, search = Registrar.from_pretrained(config).proposers
+    return {
+        "network": Registrar(config, [network], [untrained]),
+        "search": Registrar(config, [network, search], [untrained, untrained]),
+    }
 
 
 def _undecided() -> Array:
@@ -128,12 +138,20 @@ def _record(task: Task) -> dict[str, Any]:
     others = [s for group in bones.values() for s in group]
     if protocol == "turned":
         pair = turned_pair(len(BONES) * seed + BONES.index(bone))
+    elif protocol == "mixed":
+        pair = mixed_pair(specimen, seed)
     else:
         pair = protocols.make_pair(protocol, specimen, seed, others)
-    registrar = _registrar()
-    result = registrar.register(pair.source, registrar.prepare(pair.target))
-    return {"name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone, "person": pair.person,
-            "features": {name: result.details[name] for name in FEATURES}} | _judge(result, pair)  # fmt: skip
+    record: dict[str, Any] = {
+        "name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone, "person": pair.person
+    }
+    target = _registrars()["search"].prepare(pair.target)
+    for proposer, registrar in _registrars().items():
+        result = registrar.register(pair.source, target)
+        if result.ok:
+            features = {name: result.details[name] for name in FEATURES}
+            record[proposer] = {"features": features} | _judge(result, pair)
+    return record
 
 
 def turned_pair(seed: int) -> protocols.Pair:
@@ -154,6 +172,24 @@ def turned_pair(seed: int) -> protocols.Pair:
     return protocols.Pair(
         source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
     )
+
+
+def mixed_pair(specimen: Specimen, seed: int) -> protocols.Pair:
+    """Between and beyond the protocols: from clean points of the target itself to tiny, noisy, biased, dirty views."""
+    rng = np.random.default_rng([seed, 11])
+    share = rng.uniform(0.1, 0.9)
+    if rng.random() < 0.25:
+        target, _ = specimen.sample(protocols.TARGET_POINTS, rng)
+        distance = ((target - target[rng.integers(len(target))]) ** 2).sum(axis=1)
+        source = target[distance <= np.quantile(distance, share)]
+        source = source[rng.permutation(len(source))[: rng.integers(300, 6000)]]
+        return protocols.Pair(source, target, np.eye(4), f"mixed-{seed}", specimen.bone, specimen.person, "mixed")
+    noise_mm, bias_mm, outliers = (rng.uniform(0.0, most) * (rng.random() < 0.7) for most in (2.0, 1.5, 0.25))
+    share_of = str(rng.choice(["seen", "region"]))
+    points = int(np.exp(rng.uniform(np.log(300), np.log(6000))))
+    level = protocols.Level((share, share), share_of, noise_mm, bias_mm, outliers, points)
+    pair = protocols.one_sided(specimen, rng, level)
+    return replace(pair, name=f"mixed-{seed}", protocol="mixed")
 
 
 def _judge(result: Any, pair: protocols.Pair) -> dict[str, Any]:

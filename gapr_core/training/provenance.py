@@ -8,11 +8,9 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Iterable
 from datetime import datetime, timezone
 from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,7 @@ import torch
 
 import gapr_core.data
 from gapr_core.data import anatomy
+from gapr_core.origin import commit, cpu_name, release
 from gapr_core.training.config import TrainConfig
 
 FILE = "provenance.json"
@@ -72,27 +71,6 @@ def code() -> Entry:
     }  # fmt: skip
 
 
-def commit() -> str | None:
-    """The source tree's commit; None where the package was installed without its repository."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    asked = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        answer = subprocess.run(asked, capture_output=True, text=True, timeout=30)
-    except (OSError, subprocess.TimeoutExpired):
-        return None  # no git here: the version stands beside it
-    return answer.stdout.strip() or None
-
-
-def release() -> str | None:
-    """The installed package's version."""
-    try:
-        return version("gapr_ros")
-    except PackageNotFoundError:
-        return None
-
-
 def machine() -> Entry:
     """Operating system, processor and threads; nothing that names the computer."""
     return {
@@ -100,14 +78,6 @@ def machine() -> Entry:
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cores": len(os.sched_getaffinity(0)), "threads": torch.get_num_threads(),
     }  # fmt: skip
-
-
-def cpu_name() -> str:
-    """The processor as the system calls it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(named, platform.processor() or platform.machine())
 
 
 def data(bones: Iterable[str], folder: Path | None) -> Entry:

@@ -1,4 +1,4 @@
-"""Variants of the transformer (paper, table VI), each after its own paper: one file, one line here, one yaml."""
+"""Variants of the transformer (paper, table V), each after its own paper: one file, one line here, one yaml."""
 
 from __future__ import annotations
 

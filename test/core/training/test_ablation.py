@@ -14,7 +14,7 @@ from gapr_core.data.make_pairs import Recipe
 from gapr_core.errors import ConfigError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
-from gapr_core.training import ablation
+from gapr_core.training import ablation, ablation_table
 from gapr_core.training.config import TrainConfig, default_plan, read_plan, trained_as
 
 ROOT = Path(__file__).parents[3]
@@ -64,7 +64,7 @@ def test_a_stopped_driver_goes_on_and_comes_to_the_same_table(plan, whole, anato
         return real(config, folder, anatomy, minutes=0.0)
 
     monkeypatch.setattr(ablation, "train", one_step)
-    monkeypatch.setattr(ablation.curves, "draw", lambda folders, out, names=(): out)  # slow, and not the question here
+    monkeypatch.setattr(ablation_table.curves, "draw", lambda folders, out, names=(): out)  # slow
     assert ablation.ablate(read_plan(plan), BUDGET, tmp_path, anatomy, EXAM) == 2
     assert len(rows(tmp_path)) == len(rows(whole)) and not rows(tmp_path)[0]["pairs"]
     assert "| standard | – |" in (tmp_path / "table.md").read_text()
@@ -90,7 +90,7 @@ def test_the_table_has_every_row_with_intervals_and_the_papers_figure_apart(whol
     assert [found["standard", p]["paper_rr_percent"] for p in ("paper", "L2", "all")] == [91.2, None, None]
     assert [found["ours", p]["pairs"] for p in ("paper", "L2", "all")] == [2, 2, 4]
     for row in found.values():
-        assert all(0.0 <= row[f"{n}_low"] <= row[n] <= row[f"{n}_high"] <= 1.0 for n in ablation.FIGURES)
+        assert all(0.0 <= row[f"{n}_low"] <= row[n] <= row[f"{n}_high"] <= 1.0 for n in ablation_table.FIGURES)
     text = (whole / "table.md").read_text()
     assert "compare the order" in text and "5 real train people" in text and "4 training pairs" in text
     assert (whole / "curves_cross.png").exists() and (whole / "curves_transformer.png").exists()

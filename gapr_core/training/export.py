@@ -1,0 +1,44 @@
+"""Turn the weights of a run into the file that ships: half precision, with a card in its header.
+
+python -m gapr_core.training.export runs/best --out gapr_core/weights/gapr_net.safetensors
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gapr_core.console import say
+from gapr_core.model import weights
+
+LICENCES = {
+    "femur, tibia, pelvis (llp26)": "MAP client plug-in fieldworklowerlimb2sidegenerationstep, Apache-2.0",
+    "pelvis (jhu40)": "Atlas-of-Pelvis-Segmentation-and-Trajectory-Planning, CC BY 4.0",
+    "femur surfaces (gias2)": "gias2, MPL-2.0",
+    "thoracic cartilage": "parametric, of this project, Apache-2.0",
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Read a run's averaged weights, write them as they ship."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder that `gapr train` wrote")
+    parser.add_argument("--out", required=True, type=Path, help="*.safetensors")
+    args = parser.parse_args(arguments)
+    network, trained = weights.load(args.run / "weights.safetensors")
+    digest = weights.save(network, args.out, card(trained), torch.float16)
+    say(f"{args.out}: {args.out.stat().st_size / 1e6:.1f} MB, sha256 of the tensors {digest}")
+    return 0
+
+
+def card(trained: dict[str, Any]) -> dict[str, Any]:
+    """What the header says about the weights: the run's own card, data, licences and split."""
+    people = "train people of splits.json only, their shape models, and parametric bones"
+    return {**trained, "data": people, "licences": LICENCES, "precision": "float16"}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

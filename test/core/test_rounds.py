@@ -1,0 +1,117 @@
+"""Who is asked, and how often: the network first, the search only where a doubt remains."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core.confidence import DEFAULT_CALIBRATION, NETWORK_CALIBRATION, Calibration
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.evaluation import methods
+from gapr_core.geometry import se3
+from gapr_core.proposals.base import Proposals
+from gapr_core.proposals.network import NetworkProposer
+from gapr_core.proposals.search import NormalAlignedSearch
+
+ONE_THREAD = RegistrarConfig(num_threads=1)
+
+
+class Fixed:
+    """Proposes what it is told to, and counts how often it is asked."""
+
+    def __init__(self, name, poses):
+        self.name, self.poses, self.asked, self.prepared = name, poses, 0, 0
+
+    def prepare(self, target):
+        self.prepared += 1
+
+    def propose(self, source, target, rng):
+        self.asked += 1
+        return Proposals(self.poses, np.zeros(len(self.poses)))
+
+
+@pytest.fixture(scope="module")
+def pair(femur):
+    return make_pair("L1", Specimen(femur, "femur", "parametric-3", "parametric"), seed=5)
+
+
+def test_a_sure_answer_ends_the_rounds(pair):
+    right, never = Fixed("network", pair.T_target_source[None]), Fixed("search", np.eye(4)[None])
+    registrar = Registrar(ONE_THREAD, [right, never], [Calibration.load()] * 2)
+    target = registrar.prepare(pair.target)
+    result = registrar.register(pair.source, target)
+    assert result.ok and result.details["rounds"] == 1
+    assert (right.prepared, right.asked, never.prepared, never.asked) == (1, 1, 1, 0)
+
+
+def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair):
+    near = se3.exp([6.0, -5.0, 4.0, 0.05, 0.05, -0.05]) @ pair.T_target_source
+    first, second = Fixed("network", near[None]), Fixed("search", np.eye(4)[None])
+    config = RegistrarConfig(num_threads=1, sure=1.1)
+    registrar = Registrar(config, [first, second])
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert (first.asked, second.asked, result.details["rounds"]) == (1, 1, 2)
+    assert se3.pose_error(result.details["best_pose"], pair.T_target_source, pair.source)[0] < 1.0
+
+
+def test_without_any_hypothesis_the_answer_is_a_refusal(pair):
+    registrar = Registrar(ONE_THREAD, [Fixed("network", np.empty((0, 4, 4)))])
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert result.status is RegistrationStatus.LOW_CONFIDENCE and result.T_target_source is None
+
+
+def test_the_shipped_network_and_the_search_are_asked_in_this_order():
+    registrar = Registrar.from_pretrained(ONE_THREAD)
+    assert [p.name for p in registrar.proposers] == ["network", "search"]
+    assert isinstance(registrar.proposers[0], NetworkProposer)
+    assert isinstance(Registrar().proposers[0], NormalAlignedSearch) and len(Registrar().proposers) == 1
+
+
+def test_each_round_has_the_confidence_model_that_was_fitted_for_it():
+    network, search = Registrar.from_pretrained(ONE_THREAD).calibrations
+    assert np.array_equal(network.weights, Calibration.load(NETWORK_CALIBRATION).weights)
+    assert np.array_equal(search.weights, Calibration.load(DEFAULT_CALIBRATION).weights)
+    assert not np.array_equal(network.weights, search.weights)
+
+
+def test_the_network_alone_finds_a_one_sided_view(pair):
+    registrar = Registrar(ONE_THREAD, [NetworkProposer.from_weights()])
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert se3.pose_error(result.details["best_pose"], pair.T_target_source, pair.source)[0] < 1.0
+
+
+def test_as_many_confidence_models_as_proposers_are_needed():
+    with pytest.raises(ConfigError, match="2 for 1"):
+        Registrar(calibrations=[Calibration.load()] * 2)
+
+
+def test_a_gpu_that_is_not_there_and_a_missing_torch_are_named(monkeypatch):
+    import torch
+
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="no GPU"):
+            Registrar.from_pretrained(device="cuda")
+    monkeypatch.setitem(sys.modules, "gapr_core.proposals.network", None)
+    with pytest.raises(MethodUnavailableError, match="pip install torch"):
+        Registrar.from_pretrained()
+
+
+@pytest.mark.parametrize(("name", "proposers"), [
+    ("gapr", ["network", "search"]), ("gapr_search", ["search"]), ("gapr_network", ["network"]),
+])  # fmt: skip
+def test_the_benchmark_knows_the_whole_and_its_parts(name, proposers):
+    assert [p.name for p in methods.make(name).proposers] == proposers
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_clean_piece_of_the_target_itself_is_found_and_accepted(registrar, femur_cloud, share):
+    """What a newcomer tries first: cut a piece off, move it, and ask for it back."""
+    target = registrar.prepare(femur_cloud)
+    motion = se3.exp([40.0, -70.0, 20.0, 1.0, -2.0, 0.5])
+    piece = femur_cloud[femur_cloud[:, 2] > np.quantile(femur_cloud[:, 2], 1.0 - share)]
+    result = registrar.register(se3.apply(motion, piece), target)
+    assert result.ok, str(result)
+    assert np.abs(se3.apply(result.T_target_source, se3.apply(motion, piece)) - piece).max() < 0.1

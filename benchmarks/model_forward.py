@@ -1,9 +1,10 @@
-"""Time of one forward pass on one CPU thread, against the same network with naive hot operators.
+"""Time of one forward pass on one CPU thread, beside a fixed matrix product and naive forms of the hot operators.
 
-python benchmarks/model_forward.py [--pairs 5] [--json out.json]
+nice python benchmarks/model_forward.py [--pairs 3] [--repeats 40] [--superpoints 90 110] [--model YAML] [--json FILE]
 
-Sizes are those of the default configuration: about 1700 points and 90 superpoints on the target. The times are the
-least of several repetitions (CPU time of the process, so that other work on the machine counts less).
+CPU time of the process. On a shared machine it depends on what the others do, by its caches and its clock: all forms
+are therefore measured in turn within every repetition, each after one untimed call of its own. The minimum and the
+median are over the repetitions, and so are the ratios, which say more about the code than the times do.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from statistics import mean, median
 from typing import Any
 from unittest.mock import patch
 
@@ -31,6 +34,8 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.model.pairs import LocalPairs
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.model.types import Cloud
+
+REFERENCE = "reference: ten products of 512 x 512 matrices"
 
 
 class NaiveEncoding:
@@ -83,7 +88,8 @@ def naive_scale(log_z: Tensor, mu: Tensor, nu: Tensor, rounds: int) -> Tensor:
 def naive_operators() -> Iterator[None]:
     """The network with the textbook form of its hot operators."""
     with (
-        patch.object(RelativeEncoder, "forward", naive_relative), patch.object(KPConv, "forward", naive_kpconv),
+        patch.object(RelativeEncoder, "forward", naive_relative),
+        patch.object(KPConv, "forward", naive_kpconv),
         patch.object(point_matching, "_scale", naive_scale),
     ):
         yield
@@ -99,59 +105,133 @@ def clouds(config: ModelConfig, count: int) -> list[tuple[Cloud, Cloud]]:
     return found
 
 
-def least_ms(call: Callable[[], Any], repeats: int = 10) -> float:
-    """CPU time of the fastest of some calls, ms."""
-    times = []
+def cpu_ms(call: Callable[[], Any]) -> float:
+    """CPU time of a call, ms, after an untimed one."""
+    call()
+    begun = time.process_time()
+    call()
+    return 1e3 * (time.process_time() - begun)
+
+
+def forms(network: GAPRNet, source: Cloud, target: Cloud) -> dict[str, Callable[[], Any]]:
+    """What is timed, by the name of its row."""
+    matrix, kept = torch.ones(512, 512), network.backbone(target)
+
+    def naive() -> None:
+        with naive_operators():
+            network(source, target)
+
+    return {
+        REFERENCE: lambda: [matrix @ matrix for _ in range(10)],
+        "forward": lambda: network(source, target),
+        "forward, the target's features kept": lambda: network(source, target, kept),
+        "forward, the whole target as the source": lambda: network(target, target),
+        "naive operators": naive,
+    }
+
+
+def times(network: GAPRNet, pairs: list[tuple[Cloud, Cloud]], repeats: int) -> dict[str, list[float]]:
+    """CPU times, ms, of every form, repetition by repetition; each is the mean over the pairs."""
+    found: dict[str, list[float]] = {}
+    calls = [forms(network, *pair) for pair in pairs]
     for _ in range(repeats):
-        begun = time.process_time()
-        call()
-        times.append(time.process_time() - begun)
-    return 1e3 * min(times)
+        rows = [{name: cpu_ms(call) for name, call in own.items()} for own in calls]
+        for name in rows[0]:
+            found.setdefault(name, []).append(mean(row[name] for row in rows))
+    return found
 
 
-def measure(config: ModelConfig, count: int) -> dict[str, Any]:
-    """Mean times over the pairs, and the largest items of the profile."""
+def check_naive(network: GAPRNet, source: Cloud, target: Cloud) -> None:
+    """The naive operators must say the same."""
+    answer = network(source, target).coarse
+    with naive_operators():
+        torch.testing.assert_close(network(source, target).coarse, answer, atol=1e-2, rtol=1e-2)
+
+
+def largest_items(network: GAPRNet, pairs: list[tuple[Cloud, Cloud]], count: int = 5) -> dict[str, str]:
+    """Share of the CPU time of the operators that take most of it."""
+    with torch.profiler.profile() as profile:
+        for _ in range(5):
+            for pair in pairs:
+                network(*pair)
+    items = sorted(profile.key_averages(), key=lambda e: -e.self_cpu_time_total)
+    total = sum(e.self_cpu_time_total for e in items)
+    return {e.key: f"{100 * e.self_cpu_time_total / total:.0f} %" for e in items[:count]}
+
+
+@torch.inference_mode()
+def measure(config: ModelConfig, count: int, repeats: int) -> dict[str, Any]:
+    """Sizes, times and ratios, and the largest items of the profile."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network, pairs = GAPRNet(config).eval(), clouds(config, count)
-    rows = []
-    with torch.inference_mode():
-        for source, target in pairs:
-            kept = network.backbone(target)
-            row = {"both_ms": least_ms(lambda s=source, t=target: network(s, t)),
-                   "target_kept_ms": least_ms(lambda s=source, t=target, k=kept: network(s, t, k))}
-            answer = network(source, target).coarse
-            with naive_operators():
-                row["naive_ms"] = least_ms(lambda s=source, t=target: network(s, t), 3)
-                torch.testing.assert_close(network(source, target).coarse, answer, atol=1e-2, rtol=1e-2)
-            rows.append(row)
-        with torch.profiler.profile() as profile:
-            network(*pairs[0])
-    items = sorted(profile.key_averages(), key=lambda e: -e.self_cpu_time_total)[:5]
-    total = sum(e.self_cpu_time_total for e in profile.key_averages())
-    means = {name: round(sum(r[name] for r in rows) / len(rows), 1) for name in rows[0]}
-    source, target = pairs[0]
+    check_naive(network, *pairs[0])
+    ms = times(network, pairs, repeats)
+    sides = dict(zip(("source", "target"), zip(*pairs, strict=True), strict=True))
     return {
-        "points": [source.fine.lengths[0], target.fine.lengths[0]],
-        "superpoints": [source.coarse.lengths[0], target.coarse.lengths[0]],
-        "parameters": sum(p.numel() for p in network.parameters()), **means,
-        "naive_over_ours": round(means["naive_ms"] / means["both_ms"], 2),
-        "largest_items": {e.key: f"{100 * e.self_cpu_time_total / total:.0f} %" for e in items},
+        "torch": torch.__version__,
+        "repeats": repeats,
+        "pairs": count,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "points": {side: mean(c.fine.lengths[0] for c in found) for side, found in sides.items()},
+        "superpoints": {side: mean(c.coarse.lengths[0] for c in found) for side, found in sides.items()},
+        "times": {
+            name: {
+                "min_ms": min(own),
+                "median_ms": median(own),
+                "over_reference": ratio(own, ms[REFERENCE]),
+                "over_forward": ratio(own, ms["forward"]),
+            }
+            for name, own in ms.items()
+        },
+        "largest_items": largest_items(network, pairs),
     }
+
+
+def ratio(a: list[float], b: list[float]) -> float:
+    """Median over the repetitions."""
+    return median(x / y for x, y in zip(a, b, strict=True))
+
+
+def table(figures: dict[str, Any]) -> str:
+    """The figures as markdown."""
+    points, superpoints = figures["points"], figures["superpoints"]
+    lines = [
+        f"{figures['parameters'] / 1e6:.2f} M parameters, torch {figures['torch']}, one thread; mean over "
+        f"{figures['pairs']} pairs, {figures['repeats']} repetitions; source of {points['source']:.0f} points and "
+        f"{superpoints['source']:.0f} superpoints, target of {points['target']:.0f} and {superpoints['target']:.0f}",
+        "",
+        "| CPU time | minimum, ms | median, ms | over the reference | over the forward pass |",
+        "|---|---|---|---|---|",
+    ]
+    for name, row in figures["times"].items():
+        lines.append(
+            f"| {name} | {row['min_ms']:.1f} | {row['median_ms']:.1f} | {row['over_reference']:.2f} "
+            f"| {row['over_forward']:.2f} |"
+        )
+    return "\n".join(
+        [
+            *lines,
+            "",
+            "Largest items: " + ", ".join(f"{name} {share}" for name, share in figures["largest_items"].items()),
+        ]
+    )
 
 
 def main() -> int:
     """Print the figures, and write them where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, help="yaml of config/model; default: the defaults")
-    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--superpoints", type=int, nargs=2, default=(90, 110), help="of the target, from and to")
+    parser.add_argument("--pairs", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=40)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    figures = measure(ModelConfig.from_yaml(args.model) if args.model else ModelConfig(), args.pairs)
-    text = json.dumps(figures, indent=1)
-    print(text)
+    config = ModelConfig.from_yaml(args.model) if args.model else ModelConfig()
+    figures = measure(replace(config, superpoints=tuple(args.superpoints)), args.pairs, args.repeats)
+    print(table(figures))
     if args.json:
-        args.json.write_text(text + "\n")
+        args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0
 
 

@@ -66,7 +66,7 @@ class Attention(nn.Module):
         blocks = q[:, :, None] * self.heads_of.to(q.dtype)  # (B, n, H, C)
         batch, n = q.shape[:2]
         logits = (blocks.flatten(1, 2) @ encoding.key(k).transpose(1, 2)).view(batch, n, self.heads, -1)
-        logits = encoding.bias(logits, blocks) * self.scale  # eq. (2), (4), (5)
+        logits = encoding.bias(logits, blocks) * self.scale  # in the softmax of eq. (2), (4), (5)
         weights = torch.softmax(logits.masked_fill(~pairs.valid[:, :, None], float("-inf")), dim=-1)
         out = (weights.flatten(1, 2) @ v).view(batch, n, self.heads, self.dim)  # eq. (1), (3)
         out = encoding.values(out, weights).view(batch, n, self.heads, self.heads, -1)
@@ -84,6 +84,7 @@ class TransformerLayer(nn.Module):
         self.norm_attention, self.norm_out = nn.LayerNorm(dim), nn.LayerNorm(dim)
 
     def forward(self, x_q: Tensor, x_s: Tensor, pairs: Pairs) -> Tensor:
+        """Features of the queries, from x_q and of what they look at, x_s; all in the layout of `pairs`."""
         x = self.norm_attention(x_q + self.out(self.attention(x_q, x_s, pairs)))
         return self.norm_out(x + self.feed_forward(x))
 

@@ -51,7 +51,7 @@ def make_norm(name: str, width: int) -> nn.Module:
 
 
 class Unary(nn.Module):
-    """Linear, norm and, unless `plain`, leaky ReLU, on every point."""
+    """Linear, norm and, unless `plain`, leaky ReLU, on every point: (N, C_in) to (N, C_out)."""
 
     def __init__(self, width_in: int, width: int, norm: str, plain: bool = False) -> None:
         super().__init__()

@@ -30,7 +30,7 @@ class GAPRNet(nn.Module):
     """The network, with every part taken from the slot that the configuration names.
 
     Shapes for one pair, default widths (C = 128, fine 64):
-        source, target          N = 1000, M = 2000 fine points; n = 60, m = 110 superpoints
+        source, target          N = 850, M = 1200 fine points; n = 40, m = 65 superpoints
         ├── backbone            fine (N, 64), (M, 64); coarse (n, 256), (m, 256)
         ├── aggregation         (1, n, 128), (1, m, 128), unit length; T_reposition (1, 3, 4)
         ├── coarse matching     (1, n, m) -> P = 128 patch pairs
@@ -47,12 +47,12 @@ class GAPRNet(nn.Module):
     def forward(self, source: Cloud, target: Cloud, target_features: Features | None = None) -> Output:
         """Correspondences of a batch of pairs; the truth is not needed, the target's features may be given."""
         f_p = self.backbone(source)  # sections IV-A and IV-B
-        f_q = target_features or self.backbone(target)
+        f_q = self.backbone(target) if target_features is None else target_features
         aggregated = self.aggregation(source, target, f_p.coarse, f_q.coarse)  # section IV-C, eq. (3) to (5)
         coarse = self.coarse_scores(source, target, aggregated)  # eq. (6), (7)
-        chosen = patch_pairs(coarse, self.config.test_pairs, source.coarse.lengths, target.coarse.lengths)
-        fine = self.fine_matching(source, target, f_p.fine, f_q.fine, chosen)  # eq. (9)
-        matches = self.fine_matching.correspondences(source, target, fine, chosen)  # eq. (10)
+        chosen = patch_pairs(coarse, self.config.test_pairs, source.coarse.lengths, target.coarse.lengths)  # C'
+        fine = self.fine_matching(source, target, f_p.fine, f_q.fine, chosen)  # eq. (8)
+        matches = self.fine_matching.correspondences(source, target, fine, chosen)  # eq. (9)
         return Output(aggregated, coarse, chosen, fine, matches)
 
     def coarse_scores(self, source: Cloud, target: Cloud, aggregated: Aggregated) -> Tensor:

@@ -56,13 +56,13 @@ class Pairs:
         return torch.linalg.vector_norm(self.offset, dim=-1).masked_fill(~self.valid, float("inf"))
 
     def nearest(self, count: int) -> Tensor:
-        """(B, n, count) columns of the nearest keys, nearest first, without the first: the query itself."""
-        keys = self.distance.shape[-1]
-        columns = self.distance.topk(min(count + 1, keys), largest=False).indices
-        return columns[..., 1:] if keys > 1 else columns
+        """(B, n, count) columns of the nearest keys, nearest first; the query itself, where it is one, is left out."""
+        keys, skipped = self.distance.shape[-1], int(self.same)
+        columns = self.distance.topk(min(count + skipped, keys), largest=False).indices
+        return columns[..., skipped:] if keys > skipped else columns
 
     def queries(self, x: Tensor) -> Tensor:
-        """Features of the query points as (B, n, C)."""
+        """Features of the query points, in the layout of the pairs, as (B, n, C)."""
         raise NotImplementedError
 
     def keys(self, x: Tensor) -> Tensor:

@@ -40,8 +40,8 @@ def embed(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | f
     Returns:
         (..., 11): d_ij, d_jh, d_jk, then sine and cosine of b_ijk, b_ijh, b_hjk, theta.
     """
-    radius = torch.as_tensor(radius, device=p_i.device).squeeze(-1)
-    j, h, k = ([x / radius for x in minus(parts(p), parts(p_i))] for p in (p_j, c_h, c_k))  # seen from p_i
+    radius, i = torch.as_tensor(radius, device=p_i.device).squeeze(-1), parts(p_i)
+    j, h, k = ([x / radius for x in minus(parts(p), i)] for p in (p_j, c_h, c_k))  # seen from p_i
     ji, jh, jk = [-x for x in j], minus(h, j), minus(k, j)  # seen from p_j
     ii, hh, kk = dot(ji, ji), dot(jh, jh), dot(jk, jk)
     distances = [torch.sqrt(squared + _TINY) for squared in (ii, hh, kk)]  # (i) to (iii)

@@ -14,7 +14,7 @@ from gapr_core.model.types import Cloud, Matches, PatchPairs
 
 
 class DotScores(nn.Module):
-    """Eq. (9): F_p F_q^T / sqrt(d)."""
+    """Eq. (8): F_p F_q^T / sqrt(d)."""
 
     dustbin = 1.0
 
@@ -87,7 +87,7 @@ class FineMatching(nn.Module):
         return FineAssignment(log_z, index_p, index_q, valid_p, valid_q)
 
     def correspondences(self, source: Cloud, target: Cloud, fine: FineAssignment, chosen: PatchPairs) -> Matches:
-        """Eq. (10): the union of the mutual top-k matches of all patch pairs."""
+        """Eq. (9): the union of the mutual top-k matches of all patch pairs."""
         z = fine.log_z[:, :-1, :-1].clamp(min=_LOWEST).exp()
         z = z * (fine.source_valid[:, :, None] & fine.target_valid[:, None])
         kept = mutual_top_k(z, self.mutual_k) & (z > self.confidence)

@@ -83,14 +83,14 @@ class GlobalAggregation(nn.Module):
         x_p, x_q = self.enter(pad(x_p, source.coarse.lengths)), self.enter(pad(x_q, target.coarse.lengths))
         self_p, self_q, cross_p, cross_q = p.look_at_self(), q.look_at_self(), p.look_at(q), q.look_at(p)
         for self_layer, cross_layer in zip(self.self_layers[:-1], self.cross_layers[:-1], strict=True):
-            x_p, x_q = self_layer(x_p, x_p, self_p), self_layer(x_q, x_q, self_q)
-            x_p, x_q = cross_layer(x_p, x_q, cross_p), cross_layer(x_q, x_p, cross_q)  # eq. (4)
+            x_p, x_q = self_layer(x_p, x_p, self_p), self_layer(x_q, x_q, self_q)  # eq. (1), (2)
+            x_p, x_q = cross_layer(x_p, x_q, cross_p), cross_layer(x_q, x_p, cross_q)  # eq. (3), (4)
         x_p, x_q = self.self_layers[-1](x_p, x_p, self_p), self.self_layers[-1](x_q, x_q, self_q)
         early_p, early_q = self.compared(self.early(x_p), self.early(x_q), q.valid)
-        T = self.reposition(early_p, early_q, p.points, q.points, p.valid, q.valid)
+        T = self.reposition(early_p, early_q, p.points, q.points, p.valid, q.valid)  # T_r
         p = p.moved(T)
         final = self.cross_layers[-1]
-        x_p, x_q = final(x_p, x_q, p.look_at(q)), final(x_q, x_p, q.look_at(p))  # eq. (5)
+        x_p, x_q = final(x_p, x_q, p.look_at(q)), final(x_q, x_p, q.look_at(p))  # eq. (3), (5)
         f_p, f_q = self.compared(self.leave(x_p), self.leave(x_q), q.valid)
         return Aggregated(f_p, f_q, p.valid, q.valid, early_p, early_q, T)
 

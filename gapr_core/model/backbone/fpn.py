@@ -1,4 +1,4 @@
-"""The encoder-decoder shared by source and target (paper, Fig. 2)."""
+"""The encoder-decoder shared by source and target (paper, section IV and Fig. 2)."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Backbone(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         bring, refine = choose("backbone", STAGES, config.backbone)
-        self.inputs, width_in = choose("inputs", INPUTS, config.inputs)
-        widths = config.stage_widths
+        self.inputs, fixed, for_each_stage = choose("inputs", INPUTS, config.inputs)
+        width_in, widths = fixed + for_each_stage * config.stages, config.stage_widths
         self.bring = nn.ModuleList(bring(i, o, config) for i, o in zip((width_in, *widths), widths, strict=False))
         self.refine = nn.ModuleList(refine(width, width, config) for width in widths)
         self.fine_stage, self.fine_width = config.fine_stage, 2 * config.width

@@ -51,4 +51,5 @@ def _spread(level: Level) -> Tensor:
     return torch.stack([trace, second.sqrt(), determinant ** (1.0 / 3.0)], dim=-1) * 4.0
 
 
-INPUTS: dict[str, tuple[Callable[[Cloud], Tensor], int]] = {"ones": (ones, 1), "invariant": (invariant, 19)}
+# the function, its channels, and how many more there are for each stage
+INPUTS: dict[str, tuple[Callable[[Cloud], Tensor], int, int]] = {"ones": (ones, 1, 0), "invariant": (invariant, 3, 4)}

@@ -81,7 +81,7 @@ class KPConv(nn.Module):
 
 
 class KPConvBlock(nn.Module):
-    """Bottleneck residual block around a KPConv (KPConv-FPN)."""
+    """Bottleneck residual block around a KPConv (KPConv-FPN), (M, C_in) at the support to (N, C_out) at the centres."""
 
     def __init__(self, width_in: int, width: int, config: ModelConfig) -> None:
         super().__init__()

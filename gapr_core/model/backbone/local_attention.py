@@ -10,7 +10,10 @@ from gapr_core.model.pairs import LocalPairs
 
 
 class AttentionBlock(nn.Module):
-    """A transformer layer on neighbourhoods; from one level to the next coarser one, or within a level."""
+    """A transformer layer on neighbourhoods, (M, C_in) at the support to (N, C_out) at the centres.
+
+    The support is the next finer level (table IV, "PGA only") or the level itself.
+    """
 
     def __init__(self, width_in: int, width: int, config: ModelConfig) -> None:
         super().__init__()

@@ -109,6 +109,15 @@ def test_geotransformer_angles_are_those_at_i_between_its_nearest_neighbour_and_
             torch.testing.assert_close(_angles(pairs, 0)[0, i, j].cos(), cosine, atol=1e-5, rtol=0)
 
 
+def test_the_nearest_keys_leave_out_the_query_only_where_it_is_one_of_them(clouds):
+    fine, coarse = clouds[0].levels[:2]
+    for pairs in (LocalPairs(coarse, coarse, coarse.within), LocalPairs(coarse, fine, coarse.below)):
+        order = pairs.distance[:, 0].argsort(stable=True)
+        first = pairs.distance[:, 0].gather(1, pairs.nearest(3)[:, 0])[:, 0]
+        expected = pairs.distance[:, 0].gather(1, order)[:, 1 if pairs.same else 0]
+        assert torch.equal(first, expected) and (first > 0).any()
+
+
 def test_point_pair_features_of_two_hand_made_points():
     pairs = dense(1, 2)
     pairs.p_i = torch.tensor([[[[0.0, 0, 0]], [[2.0, 0, 0]]]])

@@ -206,6 +206,15 @@ def test_a_batch_trains_like_its_pairs(toy):
     assert min(alone) * 0.99 <= losses.coarse <= max(alone) * 1.01
 
 
+@pytest.mark.parametrize("stages", [3, 5])
+def test_networks_of_fewer_or_more_stages_run_with_either_kind_of_inputs(stages, toy):
+    for inputs in ("ones", "invariant"):
+        config = toy.small_config(stages=stages, neighbors=(10,) * stages, inputs=inputs)
+        p = pair(config, toy)
+        with torch.inference_mode():
+            assert network(config).eval()(p.source, p.target).matches.score.isfinite().all()
+
+
 def test_unknown_keys_and_options_are_named():
     with pytest.raises(ConfigError, match="widht"):
         ModelConfig.from_dict({"widht": 3})

@@ -5,7 +5,7 @@
 There are two models, for what is known after each round of the `Registrar`: the network alone, and with the search.
 Pairs come from train people only, real and parametric, over all protocols, `wrong` and solids of revolution. Finished
 pairs are kept in the records file, so a stopped run goes on where it was. Each model is a ridge logistic regression in
-which wrong answers count twice: the probability errs on the side of doubt.
+which wrong answers count twice and bones that are not the target's eight times: it errs on the side of doubt.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
 PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "wrong", "turned", "mixed")
 ROUNDS = {"network": NETWORK_CALIBRATION, "search": DEFAULT_CALIBRATION}
+COUNTS = {"wrong": 8.0, "else": 2.0}  # how often a record without a right pose counts, by protocol
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
@@ -56,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     records = collect(args.anatomy, args.split, args.count, args.seed, args.records, args.jobs)
     for proposer, path in ROUNDS.items() if args.out else ():
-        model = fit([record[proposer] for record in records if proposer in record])
+        model = fit([record[proposer] | {"protocol": record["protocol"]} for record in records if proposer in record])
         card = {"people": f"{args.split} people of {args.anatomy.name}", "hypotheses": proposer}
         (args.out / path.name).write_text(as_json(model, card))
     return 0
@@ -77,14 +78,14 @@ def collect(folder: Path, split: str, count: int, seed: int, path: Path, jobs: i
     return list(done.values())
 
 
-def fit(records: list[dict[str, Any]], ridge: float = 10.0, caution: float = 2.0) -> Calibration:
-    """Penalised maximum likelihood; a record whose pose is wrong counts `caution` times."""
+def fit(records: list[dict[str, Any]], ridge: float = 10.0) -> Calibration:
+    """Penalised maximum likelihood; what must not be believed counts more than once (`COUNTS`)."""
     x = np.array([[r["features"][name] for name in FEATURES] for r in records])
     y = np.array([r["right"] for r in records], dtype=np.float64)
     scales = np.maximum(x.std(axis=0), 1e-9)
     model = Calibration(FEATURES, x.mean(axis=0), scales, np.zeros(0), {})
     terms = model.design(x)
-    counts = np.where(y > 0.0, 1.0, caution)
+    counts = np.array([1.0 if r["right"] else COUNTS.get(r.get("protocol", ""), COUNTS["else"]) for r in records])
     penalty = np.concatenate([[0.0], np.full(len(FEATURES), 0.3), np.ones(terms.shape[1] - 1 - len(FEATURES))])
 
     def loss(w: Array) -> tuple[float, Array]:

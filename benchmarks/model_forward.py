@@ -3,8 +3,8 @@
 nice python benchmarks/model_forward.py [--pairs 3] [--repeats 40] [--superpoints 90 110] [--model YAML] [--json FILE]
 
 CPU time of the process. On a shared machine it depends on what the others do, by its caches and its clock: all forms
-are therefore measured in turn within every repetition, each after one untimed call of its own. The minimum and the
-median are over the repetitions, and so are the ratios, which say more about the code than the times do.
+are therefore measured in turn within every repetition, each after one untimed call of its own. Minimum and median over
+the repetitions of each pair, then the mean over the pairs; ratios are medians over all of them.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -130,15 +131,11 @@ def forms(network: GAPRNet, source: Cloud, target: Cloud) -> dict[str, Callable[
     }
 
 
-def times(network: GAPRNet, pairs: list[tuple[Cloud, Cloud]], repeats: int) -> dict[str, list[float]]:
-    """CPU times, ms, of every form, repetition by repetition; each is the mean over the pairs."""
-    found: dict[str, list[float]] = {}
+def times(network: GAPRNet, pairs: list[tuple[Cloud, Cloud]], repeats: int) -> dict[str, Any]:
+    """CPU times, ms, of every form: (repetitions, pairs)."""
     calls = [forms(network, *pair) for pair in pairs]
-    for _ in range(repeats):
-        rows = [{name: cpu_ms(call) for name, call in own.items()} for own in calls]
-        for name in rows[0]:
-            found.setdefault(name, []).append(mean(row[name] for row in rows))
-    return found
+    rows = [[{name: cpu_ms(call) for name, call in own.items()} for own in calls] for _ in range(repeats)]
+    return {name: np.array([[ms[name] for ms in row] for row in rows]) for name in calls[0]}
 
 
 def check_naive(network: GAPRNet, source: Cloud, target: Cloud) -> None:
@@ -177,20 +174,15 @@ def measure(config: ModelConfig, count: int, repeats: int) -> dict[str, Any]:
         "superpoints": {side: mean(c.coarse.lengths[0] for c in found) for side, found in sides.items()},
         "times": {
             name: {
-                "min_ms": min(own),
-                "median_ms": median(own),
-                "over_reference": ratio(own, ms[REFERENCE]),
-                "over_forward": ratio(own, ms["forward"]),
+                "min_ms": float(own.min(axis=0).mean()),
+                "median_ms": float(np.median(own, axis=0).mean()),
+                "over_reference": float(np.median(own / ms[REFERENCE])),
+                "over_forward": float(np.median(own / ms["forward"])),
             }
             for name, own in ms.items()
         },
         "largest_items": largest_items(network, pairs),
     }
-
-
-def ratio(a: list[float], b: list[float]) -> float:
-    """Median over the repetitions."""
-    return median(x / y for x, y in zip(a, b, strict=True))
 
 
 def table(figures: dict[str, Any]) -> str:

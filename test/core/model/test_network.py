@@ -58,6 +58,8 @@ def tiny(path: Path, toy) -> ModelConfig:
                 "fine_scores",
                 "norm",
                 "mlp_projections",
+                "pair_width",
+                "centred_features",
                 "coarse_temperature",
                 "fine_stage",
             )

@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 PACKAGE = "gapr_ros"
 
-CORE = ["matplotlib", "numba", "numpy", "open3d>=0.18", "plotly>=5.20", "rich", "scipy>=1.10", "tqdm", "vtk"]
+CORE = ["matplotlib", "numba", "numpy", "open3d>=0.18", "plotly>=5.20", "plyfile", "rich", "scipy>=1.10", "tqdm", "vtk"]
 NETWORK = ["safetensors", "torch>=2.4,<2.14"]
 BASELINES = ["kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
 BAGS = ["rosbags>=0.10"]

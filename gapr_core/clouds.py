@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -170,6 +171,32 @@ def _unreadable(path: Path, why: str) -> InvalidPointCloudError:
     return InvalidPointCloudError(f"a readable {kind} file", f"{path.name} ({why})", "export it again")
 
 
+def _read_ply(path: Path) -> Surface:
+    """With plyfile: Open3D hands out uninitialised memory for what a cut file lacks."""
+    from plyfile import PlyData, PlyParseError
+
+    try:  # triangles are read at once, other polygons one by one
+        data = PlyData.read(str(path), known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
+    except PlyParseError:
+        data = PlyData.read(str(path))
+    columns = data["vertex"].data
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    if "face" in data and data["face"].count:
+        name = next(n for n in data["face"].data.dtype.names if n in ("vertex_indices", "vertex_index"))
+        return Surface(points, _triangles(data["face"].data[name]))
+    normals = ("nx", "ny", "nz")
+    known = all(n in columns.dtype.names for n in normals)
+    return Surface(points, None, np.stack([columns[n] for n in normals], axis=1).astype(np.float64) if known else None)
+
+
+def _triangles(polygons: Any) -> NDArray[np.int64]:
+    """(F, 3) fans of polygons: an (F, 3) array already, or one array of vertex indices for each."""
+    if polygons.dtype != object:
+        return np.asarray(polygons, dtype=np.int64)
+    fans = [np.column_stack([np.full(len(p) - 2, p[0]), p[1:-1], p[2:]]) for p in polygons if len(p) > 2]
+    return np.concatenate(fans).astype(np.int64)
+
+
 def _read_open3d(path: Path) -> Surface:
     import open3d as o3d
 
@@ -178,7 +205,7 @@ def _read_open3d(path: Path) -> Surface:
         if mesh.has_triangles():
             mesh.remove_duplicated_vertices()  # STL repeats every vertex in each face
             return Surface(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
-        cloud = o3d.io.read_point_cloud(str(path)) if path.suffix.lower() in (".ply", ".pcd") else mesh
+        cloud = o3d.io.read_point_cloud(str(path)) if path.suffix.lower() == ".pcd" else mesh
         points = np.asarray(cloud.points if hasattr(cloud, "points") else cloud.vertices).copy()
         return Surface(points, None, np.asarray(cloud.normals).copy() if _has_normals(cloud) else None)
 
@@ -220,7 +247,7 @@ def _read_numpy(path: Path) -> Surface:
 
 
 READERS: dict[str, Callable[[Path], Surface]] = {
-    ".ply": _read_open3d,
+    ".ply": _read_ply,
     ".pcd": _read_open3d,
     ".stl": _read_open3d,
     ".obj": _read_open3d,

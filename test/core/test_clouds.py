@@ -57,6 +57,17 @@ def test_meshes_come_back_with_their_vertices_and_faces(tmp_path, name):
     assert surface.face_areas_mm2.sum() == pytest.approx(Surface(VERTICES, FACES).face_areas_mm2.sum(), rel=1e-5)
 
 
+def test_polygons_of_a_ply_file_become_triangles(tmp_path):
+    (tmp_path / "quad.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n100 0 0\n100 50 0\n0 50 0\n0 0 70\n4 0 1 2 3\n3 0 1 4\n"
+    )
+    surface = clouds.load(tmp_path / "quad.ply")
+    np.testing.assert_array_equal(surface.faces, [[0, 1, 2], [0, 2, 3], [0, 1, 4]])
+    assert surface.face_areas_mm2.sum() == pytest.approx(100 * 50 + 100 * 70 / 2)
+
+
 @pytest.mark.parametrize("name", ["bone.vtk", "bone.vtp"])
 def test_vtk_files_come_back_with_their_vertices_and_faces(tmp_path, name):
     write_vtk(tmp_path / name, binary=name == "bone.vtk")

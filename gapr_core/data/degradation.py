@@ -22,7 +22,7 @@ def half_extent(points: Array) -> float:
 
 
 def vary_density(points: Array, scale: float, rng: np.random.Generator, rounds: int = 6) -> Array:
-    """Paper, section II: thin out or fill up balls of 0.10-0.15 x `scale` (the half extent) around random points.
+    """Paper, section III: thin out or fill up balls of 0.10-0.15 x `scale` (the half extent) around random points.
 
     Thinning discards half of a ball, filling adds half as many points again, each alpha p1 + (1 - alpha) p2 of two
     points of the ball; either with even chance, `rounds` times (the paper says "multiple").

@@ -1,6 +1,6 @@
 """The test protocols: each a pure seeded function from one bone surface to one pair with its true pose.
 
-paper, overlap-40/50/60/70 and incomplete follow section II and the experiments of the paper (arXiv 2606.13488);
+paper, overlap-40/50/60/70 and incomplete follow section III and the experiments of the paper (arXiv 2606.13488);
 L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gives them, and L2-region and L3-region
 the same of about half the size; wrong pairs have no pose.
 """
@@ -103,7 +103,7 @@ def make_pair(
 
 
 def paper(specimen: Specimen, rng: np.random.Generator, share: tuple[float, float] = (0.40, 0.70)) -> Pair:
-    """Section II of the paper: a KNN crop of the target's own points, density change, noise, U[0, 180] deg per axis."""
+    """Section III of the paper: a KNN crop of the target's own points, density change, noise, U[0, 180] deg per axis."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     kept = rng.uniform(*share)
     source = target[_nearest(target, target[_crop_centre(target, rng)], kept)]

@@ -27,12 +27,12 @@ class Losses:
 
     @property
     def total(self) -> Tensor:
-        """Eq. (11), with half of the auxiliary loss."""
+        """Eq. (10), with half of the auxiliary loss."""
         return self.coarse + self.fine + 0.5 * self.early
 
 
 def circle_loss(f_p: Tensor, f_q: Tensor, overlaps: Tensor, valid_p: Tensor, valid_q: Tensor) -> Tensor:
-    """Overlap-aware circle loss, eq. (12) and (13), mean over both directions.
+    """Overlap-aware circle loss, eq. (11) and (12), mean over both directions.
 
     Args:
         f_p, f_q: (B, n, C), (B, m, C) unit features.
@@ -50,7 +50,7 @@ def circle_loss(f_p: Tensor, f_q: Tensor, overlaps: Tensor, valid_p: Tensor, val
     push = (LOG_SCALE * weight_n * (MARGIN_NEGATIVE - distance)).masked_fill(~negative, float("-inf"))
     rows = _mean_circle(pull, push, positive, negative, 2)
     columns = _mean_circle(pull, push, positive, negative, 1)
-    return 0.5 * (rows + columns)  # eq. (12)
+    return 0.5 * (rows + columns)  # eq. (11)
 
 
 def _mean_circle(pull: Tensor, push: Tensor, positive: Tensor, negative: Tensor, axis: int) -> Tensor:
@@ -59,11 +59,11 @@ def _mean_circle(pull: Tensor, push: Tensor, positive: Tensor, negative: Tensor,
     if not bool(chosen.any()):
         return 0.0 * pull.masked_fill(pull.isneginf(), 0.0).sum()  # nothing to learn, and still a gradient: zero
     pull, push = pull.movedim(axis, -1)[chosen], push.movedim(axis, -1)[chosen]
-    return softplus(pull.logsumexp(-1) + push.logsumexp(-1)).mean() / LOG_SCALE  # eq. (13)
+    return softplus(pull.logsumexp(-1) + push.logsumexp(-1)).mean() / LOG_SCALE  # eq. (12)
 
 
 def assignment_loss(log_z: Tensor, labels: Tensor) -> Tensor:
-    """Eq. (14) and (15): mean negative log-likelihood of the labelled entries of (P, a + 1, b + 1)."""
+    """Eq. (13) and (14): mean negative log-likelihood of the labelled entries of (P, a + 1, b + 1)."""
     return -log_z[labels].mean() if bool(labels.any()) else log_z.new_zeros(())
 
 

@@ -103,7 +103,7 @@ def make_pair(
 
 
 def paper(specimen: Specimen, rng: np.random.Generator, share: tuple[float, float] = (0.40, 0.70)) -> Pair:
-    """Section III of the paper: a KNN crop of the target's own points, density change, noise, U[0, 180] deg per axis."""
+    """Section III: a KNN crop of the target's own points, density change, noise, U[0, 180] deg per axis."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     kept = rng.uniform(*share)
     source = target[_nearest(target, target[_crop_centre(target, rng)], kept)]

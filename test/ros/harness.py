@@ -144,12 +144,23 @@ class Client:
         wait_until(lambda: _answered(self.values()) == before + 1, timeout_s, f"an answer; last: {self.values()}")
         return self.values()
 
+    def ready(self, kind: Any, name: str, tries: int = 3) -> Any:
+        """A client whose service has been found; another one is made where DDS loses the discovery of the first."""
+        for left in reversed(range(tries)):
+            client = self.node.create_client(kind, name)
+            try:
+                wait_until(client.service_is_ready, 8.0, f"service {name}")
+                return client
+            except AssertionError:
+                self.node.destroy_client(client)
+                if not left:
+                    raise
+
     def call(self, name: str, request: Any = None, timeout_s: float = 20.0) -> Any:
         """The response of one of the node's services."""
         request = request or Trigger.Request()
         kind = SetBool if isinstance(request, SetBool.Request) else Trigger
-        client = self.node.create_client(kind, f"{NODE}/{name}")
-        wait_until(client.service_is_ready, 10.0, f"service {name}")
+        client = self.ready(kind, f"{NODE}/{name}")
         future = client.call_async(request)
         wait_until(future.done, timeout_s, f"the answer of {name}")
         self.node.destroy_client(client)

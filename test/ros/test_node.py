@@ -288,8 +288,7 @@ def test_a_model_that_cannot_be_used_fails_configure_with_its_reason_and_the_nod
 
 
 def change_state(client, transition):
-    service = client.node.create_client(ChangeState, "/register_node/change_state")
-    wait_until(service.service_is_ready)
+    service = client.ready(ChangeState, "/register_node/change_state")
     future = service.call_async(ChangeState.Request(transition=Transition(id=transition)))
     wait_until(future.done)
     client.node.destroy_client(service)

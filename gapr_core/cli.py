@@ -175,10 +175,6 @@ def _as_json(result: RegistrationResult) -> dict[str, Any]:
 
 
 def _method(name: str) -> Any:
-    if name == "gapr":
-        from gapr_core.registrar import Registrar
-
-        return Registrar.from_pretrained()
     from gapr_core.evaluation import methods
 
     return methods.make(name)

@@ -163,7 +163,13 @@ def _read(path: Path) -> Surface:
         raise _unreadable(path, str(error)) from error
     if len(surface.points) == 0:
         raise _unreadable(path, "no points in it")
+    if surface.faces is not None and len(surface.faces) and not _in_range(surface.faces, len(surface.points)):
+        raise _unreadable(path, f"faces that point beyond its {len(surface.points)} vertices")
     return surface
+
+
+def _in_range(faces: NDArray[np.int64], count: int) -> bool:
+    return bool(faces.min() >= 0 and faces.max() < count)
 
 
 def _unreadable(path: Path, why: str) -> InvalidPointCloudError:

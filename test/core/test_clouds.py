@@ -115,6 +115,9 @@ def test_auto_guesses_the_unit_and_warns(caplog):
         ("empty.stl", b""),
         ("cut.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
                     b"property float z\nend_header\n" + struct.pack("<5f", *range(5))),
+        ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+                      b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+                      b"0 0 0\n100 0 0\n0 100 0\n3 0 1 9\n"),
         ("text.vtp", b"<VTKFile>"),
         ("text.vtk", b"no header"),
         ("text.npz", b"PK nothing"),

@@ -12,5 +12,5 @@ sys.path.insert(0, str(Path(__file__).parent))  # the hand-made shapes beside th
 def anatomy_folder() -> Path:
     folder = anatomy.default_folder()
     if not folder.is_dir():
-        pytest.skip(f"no anatomy in {folder}; set {anatomy.ENVIRONMENT_VARIABLE}")
+        pytest.skip(f"the real bones do not ship and {folder} is absent: set {anatomy.ENVIRONMENT_VARIABLE}")
     return folder

@@ -93,7 +93,7 @@ def test_the_report_needs_nothing_but_itself(report):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="opens the report in a browser: apt install chromium")
 def test_a_browser_lays_the_report_out(report, tmp_path):
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
              "--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path}"]  # fmt: skip

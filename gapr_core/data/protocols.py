@@ -2,7 +2,7 @@
 
 paper, overlap-40/50/60/70 and incomplete follow section III and the experiments of the paper (arXiv 2606.13488);
 L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gives them, and L2-region and L3-region
-the same of about half the size; wrong pairs have no pose.
+the same of about half the size; sweep is the band that a probe covers on its way; wrong pairs have no pose.
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ class Pair:
 class Level:
     """How hard a one-sided view is.
 
-    `share` is of the whole surface's area: of what the probe sees (`seen`), or of a region around the point that it
-    looks at, whose far side is then cut away ("region"), which leaves about half.
+    `share` is of the whole surface's area: of what the probe sees (`seen`), of a band of that along its longest
+    direction ("band"), or of a region around the point that it looks at, whose far side is then cut away ("region"),
+    which leaves about half.
     """
 
     share: tuple[float, float]
@@ -75,6 +76,7 @@ LEVELS = {
     "L3": Level((0.10, 0.20), "seen", 1.5, 1.5, 0.20, 1000),
     "L2-region": Level((0.20, 0.35), "region", 1.5, 1.0, 0.10, 2000),
     "L3-region": Level((0.10, 0.20), "region", 1.5, 1.5, 0.20, 1000),
+    "sweep": Level((0.05, 0.20), "band", 1.0, 1.0, 0.05, 2000),
 }
 
 
@@ -255,8 +257,18 @@ def _nearest_seen(specimen: Specimen, points: Array, direction: Array, share: fl
     return seen if len(seen) <= wanted else seen[_nearest(points[seen], points[0], wanted / len(seen))]
 
 
-VIEWS = {"region": _seen_of_region, "seen": _nearest_seen}
-ENOUGH_SHOWN = {"region": 0.25, "seen": 0.7}  # of the share asked for
+def _band_seen(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
+    """The visible points nearest to a line through the first one, along what is visible, until they are `share`."""
+    seen = np.flatnonzero(specimen.visible_from(points, direction))
+    in_view = points[seen] - points[0]
+    in_view -= np.outer(in_view @ direction, direction)
+    along = np.linalg.eigh(np.cov(in_view.T))[1][:, 2]
+    across = np.abs(in_view @ np.cross(direction, along))
+    return seen[np.argsort(across, kind="stable")[: round(share * len(points))]]
+
+
+VIEWS = {"region": _seen_of_region, "seen": _nearest_seen, "band": _band_seen}
+ENOUGH_SHOWN = {"region": 0.25, "seen": 0.7, "band": 0.7}  # of the share asked for
 
 
 def _probe_direction(specimen: Specimen, point: Array, normal: Array, rng: np.random.Generator) -> Array | None:

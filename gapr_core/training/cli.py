@@ -19,6 +19,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr train`."""
     parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
     parser.add_argument("--model", default=None, help="yaml of config/model; over the one that --config names")
+    parser.add_argument("--initial", default=None, help="weights (safetensors) of the same network to begin with")
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--out", type=Path, help="folder of the run, an interrupted one goes on; with --plot a PNG")
     parser.add_argument("--pairs", type=int, default=None, help="length of the schedule, in pairs")
@@ -39,7 +40,8 @@ def run(args: Namespace) -> int:
     from gapr_core.training.trainer import train
 
     config = TrainConfig.from_yaml(args.config) if args.config else TrainConfig()
-    given = {name: getattr(args, name) for name in ("model", "pairs", "workers") if getattr(args, name) is not None}
+    options = {name: getattr(args, name) for name in ("model", "initial", "pairs", "workers")}
+    given = {name: value for name, value in options.items() if value is not None}
     written = train(replace(config, **given), args.out, args.anatomy, args.minutes)
     say(f"weights in {written}")
     return 0

@@ -16,8 +16,8 @@ from gapr_core.model.config import ModelConfig
 
 
 def _default_mix() -> dict[str, float]:
-    one_sided = {"L1": 0.15, "L2": 0.25, "L3": 0.2, "L2-region": 0.1, "L3-region": 0.05}
-    return one_sided | {"paper": 0.15, "incomplete": 0.1}
+    one_sided = {"L1": 0.15, "L2": 0.25, "L3": 0.2, "L2-region": 0.05, "L3-region": 0.05, "sweep": 0.1}
+    return one_sided | {"paper": 0.12, "incomplete": 0.08}
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class TrainConfig:
 
     Attributes:
         model: path of a yaml in `config/model`; empty for the defaults (`best`).
+        initial: weights (safetensors) of the same network to begin with; empty for random ones.
         bones: bone types.
         mix: protocols and how often each is drawn.
         pairs: length of the schedule, in pairs.
@@ -46,6 +47,7 @@ class TrainConfig:
     """
 
     model: str = ""
+    initial: str = ""
     bones: tuple[str, ...] = ("femur", "tibia", "pelvis", "thoracic")
     mix: dict[str, float] = field(default_factory=_default_mix)
     pairs: int = 24_000

@@ -41,7 +41,9 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
     """
     path = folder / FILE
     entries = json.loads(path.read_text()) if path.exists() else []
-    entries.append({"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)})
+    begun_with = _digest([Path(config.initial).read_bytes()]) if config.initial else None
+    entry = {"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)}
+    entries.append(entry | {"initial": begun_with})
     new = path.with_suffix(".new")
     new.write_text(json.dumps(entries, indent=1) + "\n")
     os.replace(new, path)

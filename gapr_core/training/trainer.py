@@ -52,7 +52,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     model = ModelConfig.from_yaml(config.model) if config.model else ModelConfig()
     settle(folder, config, model, rank)
     torch.manual_seed(config.seed)
-    network, ema = GAPRNet(model).to(device), GAPRNet(model).to(device)
+    network, ema = begin(config, model).to(device), GAPRNet(model).to(device)
     ema.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(
         network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
@@ -106,6 +106,22 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
             break
     distributed.stop(world)
     return folder / "weights.safetensors"
+
+
+def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
+    """A network to train: with the weights of `config.initial`, or random ones.
+
+    Raises:
+        ConfigError: `config.initial` is of another network.
+        WeightsError: it cannot be read.
+    """
+    if not config.initial:
+        return GAPRNet(model)
+    network = weights.load(config.initial)[0]
+    if replace(network.config, name=model.name) != model:
+        raise ConfigError("initial weights of the network that is trained", f"another in {config.initial}",
+                          "train the network of that file (--model), or begin without it")
+    return network.train()
 
 
 def forward(network: GAPRNet, pair: TrainingPair, generator: torch.Generator, precision: str) -> Losses:

@@ -78,6 +78,15 @@ def test_on_long_bones_the_paper_crops_at_an_end_and_on_round_ones_anywhere():
     assert round_bone.min() < 0.3
 
 
+def test_a_sweep_covers_a_narrow_band_from_end_to_end():
+    pair = make_pair("sweep", ball_specimen(40.0, stretch=6.0), 1)
+    swept = in_target_frame(pair)
+    along, across = np.ptp(swept[:, 2]), min(np.ptp(swept[:, 0]), np.ptp(swept[:, 1]))
+    assert along > 0.8 * np.ptp(pair.target[:, 2])
+    assert across < 0.7 * np.ptp(pair.target[:, 0])
+    assert 0.02 < pair.metadata["overlap"] <= 0.20
+
+
 def test_the_rotations_of_the_paper_stay_within_a_half_turn_per_axis_and_the_levels_cover_all():
     def angles(protocol):
         inverse = [make_pair(protocol, ball_specimen(), seed).T_target_source[:3, :3].T for seed in range(60)]

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,6 +75,22 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(settings, anatomy,
     }
     with pytest.raises(ConfigError, match="begun"):
         trainer.train(replace(settings, seed=1), tmp_path / "whole", anatomy)
+
+
+def test_a_run_can_begin_with_the_weights_of_another_one(settings, anatomy, tmp_path):
+    first = trainer.train(replace(settings, pairs=4), tmp_path / "first", anatomy)
+    going_on = replace(settings, initial=str(first), learning_rate=1e-12, ema=0.0, pairs=4)
+    second = trainer.train(going_on, tmp_path / "second", anatomy)
+    before, after = weights.load(first)[0], weights.load(second)[0]
+    for a, b in zip(before.parameters(), after.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0.0, atol=1e-6)
+    provenance = json.loads((tmp_path / "second" / "provenance.json").read_text())
+    assert len(provenance[0]["initial"]) == 16
+
+    wider = yaml.safe_load(Path(settings.model).read_text()) | {"width": 16}
+    (tmp_path / "wider.yaml").write_text(yaml.safe_dump(wider))
+    with pytest.raises(ConfigError, match="initial weights"):
+        trainer.train(replace(going_on, model=str(tmp_path / "wider.yaml")), tmp_path / "third", anatomy)
 
 
 def test_workers_make_the_same_pairs_in_the_same_order(settings, anatomy):

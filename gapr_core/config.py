@@ -13,12 +13,24 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TargetConfig:
-    """How the target is prepared."""
+    """How the target is prepared.
+
+    Attributes:
+        most_points, fewest_points: of its outer shell.
+        normal_neighbours, quadric_neighbours: points that give a normal, and a surface element.
+        misfit_neighbours, misfit_gain: a surface element's variance is the mean square distance of so many neighbours
+            to it times the gain.
+        view_directions: from which it is asked what can be seen.
+        anchors: points where the search places the source.
+        field_reach_mm: of the grid around it.
+    """
 
     most_points: int = 10_000
     fewest_points: int = 200
     normal_neighbours: int = 12
     quadric_neighbours: int = 16
+    misfit_neighbours: int = 10
+    misfit_gain: float = 0.5
     view_directions: int = 96
     anchors: int = 1200
     field_reach_mm: float = 12.0
@@ -69,6 +81,8 @@ class RefinementConfig:
         rounds, iterations, rest_mm: Gauss-Newton until the points move less than `rest_mm`.
         tukey_scale: end of Tukey's weight in standard deviations; `clean_tukey_scale` where less than `clean_share` of
             the residuals are beyond three of them (the normal distribution has 0.3 %).
+        patch_points, patch_scale: neighbours that make the patch of a point, and the end of Tukey's weight for its mean
+            residual, in robust standard deviations of these means; from round `free_rounds` on.
         smallest_sigma_mm, largest_sigma_mm: limits of the robust standard deviation.
     """
 
@@ -78,6 +92,9 @@ class RefinementConfig:
     clean_tukey_scale: float = 5.0
     clean_share: float = 0.015
     rest_mm: float = 1e-3
+    free_rounds: int = 2
+    patch_points: int = 30
+    patch_scale: float = 6.0
     smallest_sigma_mm: float = 0.15
     largest_sigma_mm: float = 3.0
 

@@ -1,16 +1,18 @@
 """Robust point-to-surface refinement: many poses coarsely, a few to the end.
 
 Point-to-plane (Chen and Medioni 1992) with second-order surface elements, Tukey's biweight at a scale that follows
-the residuals, and the offset that noise causes on curved surfaces taken away (see `refinement_kernels`).
+the residuals, and the offset that noise causes on curved surfaces taken away (see `refinement_kernels`). In the end
+elements that fit their surroundings badly weigh less, and a patch of the source that is off as a whole weighs nothing.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gapr_core import refinement_kernels as kernels
 from gapr_core.config import RefinementConfig
@@ -29,7 +31,7 @@ class Fit:
         T: (4, 4) T_target_source, mm.
         sigma_mm: robust standard deviation of the residuals.
         signed_mm: (N,) signed distances to the surface, NaN where none is near.
-        weights: (N,) Tukey weights, 0 for outliers.
+        weights: (N,) of the points in the normal equations, 0 for outliers.
         gradients: (N, 3) unit surface normals at the foot points, target frame.
         elements: (N,) indices of the nearest target points, -1 where none is near.
         moved: (N, 3) source points in the target frame.
@@ -66,17 +68,20 @@ def refine_many(
     """
     threads = thread_count(num_threads)
     pieces = [p for p in np.array_split(np.ascontiguousarray(poses), 4 * threads) if len(p)]
-    variances = np.zeros_like(limits_mm)
+    variances, trust = np.zeros_like(limits_mm), np.ones(len(points))
 
     def work(piece: Array) -> tuple[Array, Array]:
-        return kernels.refine_batch(piece, points, *target.kernel_view, limits_mm, variances)
+        return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances)
 
     with ThreadPoolExecutor(threads) as pool:
         refined, scores = zip(*pool.map(work, pieces), strict=True)
     return np.concatenate(refined), np.concatenate(scores)
 
 
-def refine_fully(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
+def refine_fully(
+    T: Array, points: Array, target: PreparedTarget, config: RefinementConfig,
+    neighbours: NDArray[np.int64] | None = None,
+) -> Fit:
     """Refine one pose on all points until it rests; the scale of the weights follows the residuals.
 
     Args:
@@ -84,28 +89,46 @@ def refine_fully(T: Array, points: Array, target: PreparedTarget, config: Refine
         points: (N, 3) source points, mm.
         target: the prepared target.
         config: iterations and scales.
+        neighbours: (N, k) of each point, itself among them, that make its patch; looked up when None.
     """
-    for _ in range(config.rounds):
-        signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
-        sigma_mm = _robust_sigma(signed, config)
-        limits = np.full(config.iterations, _tukey_limit(signed, sigma_mm, config))
-        poses, _ = kernels.refine_batch(T[None], points, *target.kernel_view, limits, np.full_like(limits, sigma_mm**2))
-        step = se3.apply(poses[0], points) - se3.apply(T, points)
-        T = poses[0]
-        if np.abs(step).max() < config.rest_mm:
+    if neighbours is None:
+        neighbours = cKDTree(points).query(points, k=list(range(1, min(config.patch_points, len(points)) + 1)))[1]
+    fit = evaluate(T, points, target, config)
+    for number in range(config.rounds):
+        trust = patch_trust(fit, neighbours, config) if number >= config.free_rounds else np.ones(len(points))
+        limits = np.full(config.iterations, _tukey_limit(fit.signed_mm, fit.sigma_mm, config))
+        variances = np.full_like(limits, fit.sigma_mm**2)
+        poses, _ = kernels.refine_batch(fit.T[None], points, trust, *target.kernel_view, limits, variances)
+        step = se3.apply(poses[0], points) - fit.moved
+        fit = evaluate(poses[0], points, target, config)
+        if number >= config.free_rounds and np.abs(step).max() < config.rest_mm:
             break
-    return evaluate(se3.nearest_rigid(T), points, target, config)
+    fit = evaluate(se3.nearest_rigid(fit.T), points, target, config)
+    return replace(fit, weights=fit.weights * patch_trust(fit, neighbours, config))
 
 
 def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
-    """Residuals, scale and weights of a pose as it is."""
+    """Residuals, scale and weights of a pose as it is; no patch is distrusted."""
     signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     sigma_mm = _robust_sigma(signed, config)
     limit_mm = _tukey_limit(signed, sigma_mm, config)
     signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
     square = (np.nan_to_num(signed, nan=np.inf) ** 2 + aside**2) / limit_mm**2
-    weights = np.clip(1.0 - square, 0.0, 1.0) ** 2
+    weights = np.clip(1.0 - square, 0.0, 1.0) ** 2 * sigma_mm**2 / (sigma_mm**2 + target.elements[elements, 12])
     return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
+
+
+def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfig) -> Array:
+    """(N,) Tukey weights of the patches' mean residuals, whose scale is their own median.
+
+    A dent, a filled hole or soft tissue takes a patch off the surface as a whole by less than its points' noise: what
+    no point shows alone its neighbours show together.
+    """
+    signed = np.nan_to_num(fit.signed_mm)
+    means = (fit.weights * signed)[neighbours].sum(axis=1) / (fit.weights[neighbours].sum(axis=1) + 1e-9)
+    by_noise = fit.sigma_mm / np.sqrt(neighbours.shape[1])
+    limit_mm = config.patch_scale * max(1.4826 * float(np.median(np.abs(means))), by_noise)
+    return np.clip(1.0 - (means / limit_mm) ** 2, 0.0, 1.0) ** 2
 
 
 def _robust_sigma(signed: Array, config: RefinementConfig) -> float:

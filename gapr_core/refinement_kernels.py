@@ -42,7 +42,7 @@ def element_near(x, y, z, nearest, origin, per_cell):
 def residual(x, y, z, q, elements, spacing, variance):
     """Signed distance to element q, its gradient, and how far aside of the element's disc the point lies.
 
-    A row of `elements` is point (3), normal (3), shape xx xy xz yy yz zz.
+    A row of `elements` is point (3), normal (3), shape xx xy xz yy yz zz, variance.
     """
     e = elements[q]
     dx, dy, dz = x - e[0], y - e[1], z - e[2]
@@ -64,21 +64,24 @@ def residual(x, y, z, q, elements, spacing, variance):
 
 
 @numba.njit(**FAST)
-def refine_batch(poses, points, elements, nearest, origin, per_cell, spacing, limits, variances):
+def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spacing, limits, variances):
     """Gauss-Newton from every pose (K, 4, 4); one iteration per entry of `limits` (Tukey scale) and `variances`.
 
-    Returns the poses and their mean squared distances, truncated at the last limit.
+    `trust` (N,) are weights of the points beside Tukey's. Where the variance of the noise is given, a residual also
+    weighs as much as the noise's share in its variance; the rest is the element's. Returns the poses and their mean
+    squared distances, truncated at the last limit.
     """
     out, scores = poses.copy(), np.empty(len(poses))
+    surface = elements, nearest, origin, per_cell, spacing
     H, g = np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
     for k in range(len(poses)):
         T, total = out[k], 0.0
         for i in range(len(limits)):
-            accumulate(T, points, middle, elements, nearest, origin, per_cell, spacing, limits[i], variances[i], H, g)
+            accumulate(T, points, trust, middle, *surface, limits[i], variances[i], H, g)
             step(T, middle, H, g, len(points))
         for p in range(len(points)):
-            total += squared_distance(T, points[p], elements, nearest, origin, per_cell, spacing, limits[-1])
+            total += squared_distance(T, points[p], *surface, limits[-1])
         scores[k] = total / len(points)
     return out, scores
 
@@ -95,8 +98,8 @@ def squared_distance(T, point, elements, nearest, origin, per_cell, spacing, lim
 
 
 @numba.njit(**FAST)
-def accumulate(T, points, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
-    """Normal equations H twist = g, Tukey-weighted; twist = x y z rx ry rz about the moved middle of the source."""
+def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
+    """Normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle of the source."""
     H[:] = 0.0
     g[:] = 0.0
     J = np.empty(6)
@@ -110,7 +113,9 @@ def accumulate(T, points, middle, elements, nearest, origin, per_cell, spacing, 
         square = (r * r + aside * aside) / (limit * limit)
         if square >= 1.0:
             continue
-        w = (1.0 - square) ** 2
+        w = trust[p] * (1.0 - square) ** 2
+        if variance > 0.0:
+            w *= variance / (variance + elements[q, 12])
         x, y, z = x - mx, y - my, z - mz
         J[0], J[1], J[2] = nx, ny, nz
         J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx

@@ -110,7 +110,9 @@ class Registrar:
             if len(poses):
                 candidates = verify(poses, prepared, target, self.config.verification, self.config.num_threads)
                 clock.lap("verify")
-                fit = refine_fully(candidates.poses[0], prepared.points, target, self.config.refinement)
+                fit = refine_fully(
+                    candidates.poses[0], prepared.points, target, self.config.refinement, prepared.neighbours
+                )
                 clock.lap("refine")
                 result = self._assess(fit, candidates, prepared, target, calibration)
             result = replace(result, stage_ms=clock.lap("assess"), details=result.details | {"rounds": number})

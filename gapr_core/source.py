@@ -34,6 +34,7 @@ class PreparedSource:
         points: (N, 3) float64, mm, in the source frame.
         axes: (N, 3, 3) local frames; rows are two tangents and the unit normal, whose sign is arbitrary.
         flatness_mm: (N,) root-mean-square distance of a point's neighbours to their plane.
+        neighbours: (N, k) indices of each point's nearest points, itself first.
         order: (N,) indices such that every prefix is spread over the whole cloud, trustworthy points first.
         spacing_mm: median distance between neighbouring points.
     """
@@ -41,6 +42,7 @@ class PreparedSource:
     points: Array
     axes: Array
     flatness_mm: Array
+    neighbours: NDArray[np.int64]
     order: NDArray[np.int64]
     spacing_mm: float
 
@@ -98,7 +100,8 @@ def _describe(points: Array, config: SourceConfig) -> PreparedSource:
         points[neighbours[:, -1]] - points, axis=1
     )
     return PreparedSource(
-        points, frames.axes, frames.flatness_mm, _spread_order(points, lonely), quadrics.spacing(points, tree)
+        points, frames.axes, frames.flatness_mm, neighbours, _spread_order(points, lonely),
+        quadrics.spacing(points, tree),
     )
 
 

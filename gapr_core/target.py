@@ -34,7 +34,8 @@ class PreparedTarget:
         anchors: (A,) indices of evenly spread points where the search places the source.
         spacing_mm: median distance between neighbouring points.
         surface: what was loaded, mm, for display.
-        elements: (M, 12) points, normals and shapes (xx xy xz yy yz zz) side by side, for the compiled loops.
+        elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
+            surroundings, at an edge or a thin blade) side by side, for the compiled loops.
         cache: what proposers keep per target (a network's features).
     """
 
@@ -91,7 +92,9 @@ def prepare(
     tree = cKDTree(points)
     spacing_mm = quadrics.spacing(points, tree)
     neighbours = tree.query(points, k=min(config.quadric_neighbours, len(points)))[1]
-    normals, shapes = quadrics.fit_quadrics(points, normals, neighbours)
+    for _ in range(2):  # the second fit knows better which neighbours are on the other side of a blade
+        normals, shapes = quadrics.fit_quadrics(points, normals, neighbours)
+    misfit = quadrics.misfit_mm(points, normals, shapes, neighbours[:, 1 : 1 + config.misfit_neighbours])
     return PreparedTarget(
         points=points,
         normals=normals,
@@ -101,7 +104,9 @@ def prepare(
         anchors=sampling.thin(points, config.anchors),
         spacing_mm=spacing_mm,
         surface=surface,
-        elements=np.hstack([points, normals, shapes.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]]),
+        elements=np.hstack(
+            [points, normals, shapes.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]], config.misfit_gain * misfit[:, None] ** 2]
+        ),
     )
 
 

@@ -91,6 +91,26 @@ def fit_quadrics(points: Array, normals: Array, neighbours: NDArray[np.int64]) -
     return corrected, np.einsum("nai,nab,nbj->nij", tangents, form, tangents)
 
 
+def misfit_mm(
+    points: Array, normals: Array, shapes: Array, neighbours: NDArray[np.int64], most_mm: float = 5.0
+) -> Array:
+    """(N,) root-mean-square distance, mm, of each point's neighbours to its quadric, each at most `most_mm`.
+
+    Args:
+        points: (N, 3), mm.
+        normals, shapes: (N, 3) and (N, 3, 3) from `fit_quadrics`.
+        neighbours: (N, k) indices into points, without the points themselves.
+        most_mm: beyond it a neighbour is simply elsewhere.
+    """
+    offsets = points[neighbours] - points[:, None]
+    height = np.einsum("nki,ni->nk", offsets, normals)
+    tangents = offsets - height[..., None] * normals[:, None]
+    bent = np.einsum("nij,nkj->nki", shapes, tangents)
+    slope = np.linalg.norm(normals[:, None] - bent, axis=2)
+    off = (height - 0.5 * np.einsum("nki,nki->nk", bent, tangents)) / slope
+    return np.asarray(np.sqrt((np.minimum(np.abs(off), most_mm) ** 2).mean(axis=1)))
+
+
 def tangent_basis(normals: Array, like: Array | None = None) -> Array:
     """(N, 2, 3) orthonormal tangents to (N, 3) unit normals; the first one close to `like` (N, 3) when given."""
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]) if like is None else like

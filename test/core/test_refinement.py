@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -5,6 +7,7 @@ from gapr_core import covariance, refinement
 from gapr_core import refinement_kernels as kernels
 from gapr_core.config import CovarianceConfig, RefinementConfig
 from gapr_core.geometry import se3
+from gapr_core.target import prepare
 
 CONFIG = RefinementConfig()
 
@@ -44,7 +47,8 @@ def test_noise_does_not_push_a_one_sided_cloud_along_the_view(femur, target):
         source = seen_from_above(femur, 3000, 1.5, seed)
         corrected = refinement.refine_fully(np.eye(4), source, target, CONFIG).T
         limits = np.full(25, CONFIG.tukey_scale * 1.5)
-        plain = kernels.refine_batch(np.eye(4)[None], source, *target.kernel_view, limits, np.zeros(25))[0][0]
+        start, trust = np.eye(4)[None], np.ones(len(source))
+        plain = kernels.refine_batch(start, source, trust, *target.kernel_view, limits, np.zeros(25))[0][0]
         for name, T in (("with", corrected), ("without", plain)):
             lifts[name].append((se3.apply(T, source) - source).mean(axis=0)[1])
     assert abs(np.mean(lifts["with"])) < 0.5 * abs(np.mean(lifts["without"]))
@@ -58,6 +62,32 @@ def test_residuals_on_a_sphere_are_its_distances():
     probes = fibonacci_directions(777) * np.linspace(27.0, 33.0, 777)[:, None]
     fit = refinement.evaluate(np.eye(4), probes, ball, RefinementConfig(largest_sigma_mm=1e-6, smallest_sigma_mm=1e-6))
     assert fit.signed_mm == pytest.approx(np.linalg.norm(probes, axis=1) - 30.0, abs=0.02)
+
+
+def test_a_patch_that_is_off_as_a_whole_is_left_out(femur, target):
+    """A dent little deeper than the noise: hardly a point shows it, its neighbours together do."""
+    source = seen_from_above(femur, 3000, 0.8, seed=5)
+    dent = np.linalg.norm(source - source[0], axis=1) < 20.0
+    source[dent] -= [0.0, 1.2, 0.0]
+    careless = replace(CONFIG, patch_scale=1e6)
+    careful, plain = (refinement.refine_fully(np.eye(4), source, target, c) for c in (CONFIG, careless))
+    assert dent.sum() > 60
+    assert np.median(careful.weights[dent]) < 0.5 * np.median(plain.weights[dent])
+    assert np.median(careful.weights[~dent]) > 0.5
+    shifts = [np.sqrt(((fit.moved - source) ** 2).sum(axis=1).mean()) for fit in (careful, plain)]
+    assert shifts[0] < 0.7 * shifts[1]
+
+
+def test_elements_at_edges_weigh_less_than_those_on_faces():
+    rng = np.random.default_rng(0)
+    faces = rng.uniform(-30.0, 30.0, (9000, 3))
+    sides = rng.integers(3, size=9000)
+    faces[np.arange(9000), sides] = rng.choice([-30.0, 30.0], 9000)
+    box = prepare(faces)
+    to_edge = 30.0 - np.sort(np.abs(box.points), axis=1)[:, 1]
+    fit = refinement.evaluate(np.eye(4), box.points, box, CONFIG)
+    assert box.elements[to_edge < 0.5, 12].mean() > 20.0 * box.elements[to_edge > 6.0, 12].mean()
+    assert fit.weights[to_edge < 0.5].mean() < 0.7 < 0.95 < fit.weights[to_edge > 6.0].mean()
 
 
 def test_distinct_poses_are_the_best_of_each_group():

@@ -3,9 +3,10 @@
     python -m gapr_core.training.calibration --anatomy ../shared/anatomy --count 150 --records runs/calibration.jsonl
 
 There are two models, for what is known after each round of the `Registrar`: the network alone, and with the search.
-Pairs come from train people only, real and parametric, over all protocols, `wrong` and solids of revolution. Finished
-pairs are kept in the records file, so a stopped run goes on where it was. Each model is a ridge logistic regression in
-which wrong answers count twice and bones that are not the target's eight times: it errs on the side of doubt.
+Pairs come from train people only, real and parametric, over all protocols, wrong bones and solids of revolution.
+Finished pairs are kept in the records file, so a stopped run goes on where it was. Each model is a ridge logistic
+regression in which wrong answers count twice and bones that are not the target's eight times: it errs on the side of
+doubt.
 """
 
 from __future__ import annotations
@@ -37,9 +38,12 @@ from gapr_core.registrar import Registrar
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
-PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "wrong", "turned", "mixed")
+PROTOCOLS = (
+    "paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "sweep", "mixed",
+    "wrong", "wrong_sweep", "turned",
+)  # fmt: skip
 ROUNDS = {"network": NETWORK_CALIBRATION, "search": DEFAULT_CALIBRATION}
-COUNTS = {"wrong": 8.0, "else": 2.0}  # how often a record without a right pose counts, by protocol
+COUNTS = {"wrong": 8.0, "wrong_sweep": 8.0, "else": 2.0}  # how often a record without a right pose counts, by protocol
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
@@ -141,6 +145,8 @@ def _record(task: Task) -> dict[str, Any]:
         pair = turned_pair(len(BONES) * seed + BONES.index(bone))
     elif protocol == "mixed":
         pair = mixed_pair(specimen, seed)
+    elif protocol == "wrong_sweep":
+        pair = wrong_sweep_pair(specimen, others, seed)
     else:
         pair = protocols.make_pair(protocol, specimen, seed, others)
     record: dict[str, Any] = {
@@ -173,6 +179,19 @@ def turned_pair(seed: int) -> protocols.Pair:
     return protocols.Pair(
         source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
     )
+
+
+def wrong_sweep_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:
+    """A probe's sweep along another bone, or along the same bone of somebody else; no pose is right."""
+    rng = np.random.default_rng([seed, 13])
+    same_bone = rng.random() < 0.5
+    same, other = ([o for o in others if (o.bone == specimen.bone) == is_same] for is_same in (True, False))
+    strangers = [o for o in same if o.person != specimen.person] if same_bone else other
+    stranger = strangers[int(rng.integers(len(strangers)))]
+    pair = protocols.make_pair("sweep", specimen, seed)
+    swept = protocols.make_pair("sweep", stranger, seed).source
+    nowhere = np.full((4, 4), np.nan)
+    return replace(pair, source=swept, T_target_source=nowhere, name=f"wrong_sweep-{seed}", protocol="wrong_sweep")
 
 
 def mixed_pair(specimen: Specimen, seed: int) -> protocols.Pair:

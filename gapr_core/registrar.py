@@ -21,7 +21,7 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavaila
 from gapr_core.geometry import se3
 from gapr_core.proposals.base import Proposer
 from gapr_core.proposals.search import NormalAlignedSearch
-from gapr_core.refinement import Fit, refine_fully
+from gapr_core.refinement import Fit, evaluate, refine_fully
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.source import PreparedSource, Unusable
 from gapr_core.target import PreparedTarget
@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 
 LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations beyond which a direction counts as not observed
 EQUAL_MARGIN = 0.015  # a second pose whose residual is larger by less than this share explains the source as well
+BOTH_WALLS = 0.82  # a source follows both walls of a hollow bone when they leave less than this share of its residuals
 DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says that the pose may be another one
 
 
@@ -80,7 +81,8 @@ class Registrar:
         """Everything static about a target, the proposers' share included; see `gapr_core.target.prepare`."""
         prepared = targets.prepare(target, units, self.config.target)
         for proposer in self.proposers:
-            proposer.prepare(prepared)
+            for each in filter(None, (prepared, prepared.both_walls)):
+                proposer.prepare(each)
         return prepared
 
     def register(
@@ -102,6 +104,15 @@ class Registrar:
             return RegistrationResult(prepared.status, reason=prepared.reason, stage_ms=clock.lap("prepare"))
         clock.lap("prepare")
         poses = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
+        result = self._in_rounds(prepared, target, poses, clock)
+        if target.both_walls is not None and self._follows_both_walls(prepared, target.both_walls, result):
+            result = self._in_rounds(prepared, target.both_walls, result.details["best_pose"][None], clock)
+        return replace(result, stage_ms=clock.stages)
+
+    def _in_rounds(
+        self, prepared: PreparedSource, target: PreparedTarget, poses: Array, clock: _Clock
+    ) -> RegistrationResult:
+        """Ask one proposer after the other until an answer is sure."""
         result = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="nothing was proposed")
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(self.config.seed)
@@ -115,10 +126,20 @@ class Registrar:
                 )
                 clock.lap("refine")
                 result = self._assess(fit, candidates, prepared, target, calibration)
-            result = replace(result, stage_ms=clock.lap("assess"), details=result.details | {"rounds": number})
+            result = replace(result, details=result.details | {"rounds": number})
+            clock.lap("assess")
             if result.confidence >= self.config.sure:
                 break
         return result
+
+    def _follows_both_walls(
+        self, prepared: PreparedSource, both_walls: PreparedTarget, result: RegistrationResult
+    ) -> bool:
+        """True when the inner wall explains much of what the outer one leaves open: no probe sees it, a mesh has it."""
+        if "best_pose" not in result.details:
+            return False
+        fit = evaluate(result.details["best_pose"], prepared.points, both_walls, self.config.refinement)
+        return bool(fit.sigma_mm < BOTH_WALLS * np.exp(result.details["log_sigma"]))
 
     def _assess(
         self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget, calibration: Calibration
@@ -202,11 +223,11 @@ class _Clock:
     """Wall time of each stage, ms, summed over the rounds."""
 
     def __init__(self) -> None:
-        self._stages: dict[str, float] = {}
+        self.stages: dict[str, float] = {}
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> dict[str, float]:
         now = time.perf_counter()
-        self._stages[stage] = self._stages.get(stage, 0.0) + (now - self._last) * 1000.0
+        self.stages[stage] = self.stages.get(stage, 0.0) + (now - self._last) * 1000.0
         self._last = now
-        return dict(self._stages)
+        return self.stages

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ class PreparedTarget:
         anchors: (A,) indices of evenly spread points where the search places the source.
         spacing_mm: median distance between neighbouring points.
         surface: what was loaded, mm, for display.
+        both_walls: of a hollow bone the same with its inner wall, for a source that follows both; else None.
         elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
             surroundings, at an edge or a thin blade) side by side, for the compiled loops.
         cache: what proposers keep per target (a network's features).
@@ -48,6 +49,7 @@ class PreparedTarget:
     spacing_mm: float
     surface: Surface
     elements: Array
+    both_walls: PreparedTarget | None = None
     cache: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
@@ -88,7 +90,13 @@ def prepare(
     surface = clouds.load(target, units)
     points, normals = _surface_elements(surface, config)
     _check_is_a_body(points, config)
-    points, normals = _outer_shell(points, normals, config)
+    whole = _described(*_outer_shell(points, normals, config), surface, config)
+    outer = _outer_wall(points, normals, config)
+    return whole if outer is None else replace(_described(*outer, surface, config), both_walls=whole)
+
+
+def _described(points: Array, normals: Array, surface: Surface, config: TargetConfig) -> PreparedTarget:
+    """Everything that follows from points (M, 3) with outward normals (M, 3)."""
     tree = cKDTree(points)
     spacing_mm = quadrics.spacing(points, tree)
     neighbours = tree.query(points, k=min(config.quadric_neighbours, len(points)))[1]
@@ -138,3 +146,13 @@ def _outer_shell(points: Array, normals: Array, config: TargetConfig) -> tuple[A
     normals = quadrics.orient(normals, votes)
     shell = counts > 0
     return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)
+
+
+def _outer_wall(points: Array, normals: Array, config: TargetConfig) -> tuple[Array, Array] | None:
+    """Points and outward normals of a hollow bone's outer wall; None for a bone of one surface."""
+    found = visibility.outer_layer(points, normals, quadrics.spacing(points), config.view_directions)
+    if found is None:
+        return None
+    points, outward = points[found[0]], found[1][found[0]]
+    neighbours = cKDTree(points).query(points, k=min(config.normal_neighbours, len(points)))[1]
+    return points, quadrics.orient(quadrics.local_frames(points, neighbours).normals, outward)

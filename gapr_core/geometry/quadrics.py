@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
+FEWEST_NEIGHBOURS = 16  # that give a trustworthy normal and quadric
 
 
 @dataclass(frozen=True)
@@ -103,12 +104,22 @@ def misfit_mm(
         most_mm: beyond it a neighbour is simply elsewhere.
     """
     offsets = points[neighbours] - points[:, None]
-    height = np.einsum("nki,ni->nk", offsets, normals)
-    tangents = offsets - height[..., None] * normals[:, None]
-    bent = np.einsum("nij,nkj->nki", shapes, tangents)
-    slope = np.linalg.norm(normals[:, None] - bent, axis=2)
-    off = (height - 0.5 * np.einsum("nki,nki->nk", bent, tangents)) / slope
+    off = heights(offsets, normals[:, None], shapes[:, None])
     return np.asarray(np.sqrt((np.minimum(np.abs(off), most_mm) ** 2).mean(axis=1)))
+
+
+def heights(offsets: Array, normals: Array, shapes: Array) -> Array:
+    """(...) signed distances to quadrics of points that lie `offsets` (..., 3) from the quadrics' own points, mm.
+
+    Args:
+        offsets: (..., 3), mm.
+        normals, shapes: (..., 3) and (..., 3, 3) from `fit_quadrics`.
+    """
+    height = (offsets * normals).sum(axis=-1)
+    tangents = offsets - height[..., None] * normals
+    bent = np.einsum("...ij,...j->...i", shapes, tangents)
+    slope = np.linalg.norm(normals - bent, axis=-1)
+    return np.asarray((height - 0.5 * (bent * tangents).sum(axis=-1)) / slope)
 
 
 def tangent_basis(normals: Array, like: Array | None = None) -> Array:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 STEEPEST = 2.0  # tangent of the steepest slope that the depth buffer makes room for
 FEWEST_VIEWS = 0.05  # share of the views that must see a point of the outer layer: gaps between outer points let some
-HOLLOW_FROM = 0.25  # share of inner points that makes a bone a hollow one; deep folds of a solid one reach 0.15
+HOLLOW_FROM = 0.15  # share of inner points that makes a bone a hollow one; deep folds of a solid pelvis reach 0.12
 
 
 def seen_from(direction: Array, points: Array, normals: Array, pixel_mm: float) -> NDArray[np.bool_]:
@@ -119,15 +119,17 @@ def outer_layer(
         votes[free] += direction
         counts += free
     outer = counts >= FEWEST_VIEWS * directions
-    if outer.mean() > 1.0 - HOLLOW_FROM or outer.sum() < quadrics.FEWEST_NEIGHBOURS:
+    if outer.sum() < quadrics.FEWEST_NEIGHBOURS:
         return None
     for _ in range(3):
         _grow(outer, votes, points, spacing_mm)
-    return outer, votes
+    return None if outer.mean() > 1.0 - HOLLOW_FROM else (outer, votes)
 
 
 def _grow(outer: NDArray[np.bool_], outward: Array, points: Array, spacing_mm: float) -> None:
     """Add, in place, the points that lie on the surface elements of those already in the mask."""
+    if outer.all():
+        return
     inside = np.flatnonzero(outer)
     tree = cKDTree(points[inside])
     neighbours = tree.query(points[inside], k=quadrics.FEWEST_NEIGHBOURS)[1]

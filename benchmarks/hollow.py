@@ -1,0 +1,95 @@
+"""Hollow bones: the outer wall alone against both walls as the target, on the same pairs in one run.
+
+    python benchmarks/hollow.py --anatomy DIR [--split val] [--count 6] [--walls 2.5,4]
+
+Each bone gets an inner wall, its own surface moved inwards. Sources are one-sided views of the outer wall (L1 to L3),
+or pieces of both walls (paper, incomplete).
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.clouds import Surface
+from gapr_core.console import say
+from gapr_core.data.pool import specimens
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult
+
+PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3")
+BONES = ("femur", "tibia", "pelvis")
+
+
+def main() -> int:
+    """Register every pair in three ways, print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--count", type=int, default=6, help="pairs per bone, wall and protocol")
+    parser.add_argument("--walls", default="2.5,4", help="thicknesses, mm, with commas")
+    args = parser.parse_args()
+    registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+    head = ("wall", "source", "pairs", "inner wall found", "as shipped: right, accepted, wrong at 0.9 or more",
+            "outer wall only", "both walls always")
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for wall_mm in map(float, args.walls.split(",")):
+        for protocol in PROTOCOLS:
+            rows = [measure(registrar, hollowed(people[i % len(people)], wall_mm), protocol, 100 + i)
+                    for bone in BONES for people in [specimens(bone, args.split, 3, args.anatomy)]
+                    for i in tqdm(range(args.count), f"{protocol} {bone}", leave=False)]
+            lines.append(line(wall_mm, protocol, np.array(rows)))
+    say("\n".join(lines))
+    return 0
+
+
+def hollowed(specimen: Specimen, wall_mm: float) -> Specimen:
+    """The same bone with an inner wall: its vertices moved inwards along their normals."""
+    import open3d as o3d
+
+    points, faces = specimen.surface.points, specimen.surface.faces
+    assert faces is not None
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(points), o3d.utility.Vector3iVector(faces))
+    normals = np.asarray(mesh.compute_vertex_normals().vertex_normals)
+    volume = np.einsum("ij,ij->i", points[faces[:, 0]], np.cross(points[faces[:, 1]], points[faces[:, 2]])).sum()
+    inner = points - wall_mm * np.sign(volume) * normals
+    both = Surface(np.vstack([points, inner]), np.vstack([faces, faces[:, ::-1] + len(points)]))
+    return replace(specimen, surface=both)
+
+
+def measure(registrar: Registrar, specimen: Specimen, protocol: str, seed: int) -> list[float]:
+    """Whether an inner wall was found, then right, accepted, wrong at 0.9 or more: shipped, outer only, both only."""
+    pair = make_pair(protocol, specimen, seed)
+    target = registrar.prepare(pair.target)
+    both = target.both_walls or target
+    row = [float(target.both_walls is not None)]
+    for given in (target, replace(target, both_walls=None), both):
+        row += judged(registrar.register(pair.source, given), pair.T_target_source, pair.source)
+    return row
+
+
+def judged(result: RegistrationResult, truth: np.ndarray, source: np.ndarray) -> list[float]:
+    """Right (accepted within 4 mm and 5 deg), accepted, and wrong at a confidence of 0.9 or more."""
+    if not result.ok:
+        return [0.0, 0.0, 0.0]
+    rte_mm, rre_deg = se3.pose_error(result.T_target_source, truth, source)
+    right = rte_mm <= 4.0 and rre_deg <= 5.0
+    return [float(right), 1.0, float(not right and result.confidence >= 0.9)]
+
+
+def line(wall_mm: float, protocol: str, rows: np.ndarray) -> str:
+    """One row of the table."""
+    found, *counts = rows.sum(axis=0).astype(int)
+    cells = [", ".join(map(str, counts[i : i + 3])) for i in (0, 3, 6)]
+    return f"| {wall_mm:g} mm | {protocol} | {len(rows)} | {found} | " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

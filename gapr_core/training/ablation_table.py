@@ -77,8 +77,9 @@ def markdown(rows: Sequence[Record], pictures: dict[str, str | None], settings: 
         own = [r for r in rows if r["table"] == table]
         parts.append(f"## {table}")
         for protocol in dict.fromkeys(r["protocol"] for r in own):
-            head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if protocol == "paper" else [])]
-            lines = [head, ["---"] * len(head), *(_cells(r) for r in own if r["protocol"] == protocol)]
+            beside = any(r["paper_rr_percent"] for r in own if r["protocol"] == protocol)
+            head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if beside else [])]
+            lines = [head, ["---"] * len(head), *(_cells(r, beside) for r in own if r["protocol"] == protocol)]
             count = max(r["pairs"] for r in own if r["protocol"] == protocol)
             parts += [f"Protocol {protocol}, {count} pairs", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
         parts += [f"![curves]({picture})"] if picture else []
@@ -97,11 +98,11 @@ def _preamble(settings: Record) -> str:
     )
 
 
-def _cells(r: Record) -> list[str]:
+def _cells(r: Record, beside: bool) -> list[str]:
     own = [f"{100 * r[n]:.1f} ({100 * r[n + '_low']:.1f} to {100 * r[n + '_high']:.1f})" if r["pairs"] else "–"
            for n in FIGURES]  # fmt: skip
     on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
-    return [r["network"], *own, *(on_paper if r["protocol"] == "paper" else [])]
+    return [r["network"], *own, *(on_paper if beside else [])]
 
 
 def _protocols(recipe: Recipe) -> list[str]:

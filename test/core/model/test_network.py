@@ -35,6 +35,10 @@ ABLATIONS = {
     "transformer_rotary",
     "transformer_gcn",
     "transformer_ptv3",
+    "ours_world",
+    "ours_weights",
+    "ours_dot",
+    "ours_uncentred",
 }
 
 

@@ -9,6 +9,8 @@ those that it keeps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -17,6 +19,7 @@ from gapr_core.geometry import quadrics
 from gapr_core.geometry.sampling import fibonacci_directions
 
 Array = NDArray[np.float64]
+View = Callable[[Array, Array, Array, float], NDArray[np.bool_]]  # direction, points, normals, pixel_mm -> seen
 
 STEEPEST = 2.0  # tangent of the steepest slope that the depth buffer makes room for
 FEWEST_VIEWS = 0.05  # share of the views that must see a point of the outer layer: gaps between outer points let some
@@ -76,7 +79,7 @@ def _pixels(direction: Array, points: Array, pixel_mm: float) -> tuple[NDArray[n
 
 
 def outward_votes(
-    points: Array, normals: Array, spacing_mm: float, directions: int = 96
+    points: Array, normals: Array, spacing_mm: float, directions: int = 96, seen_from: View = seen_from
 ) -> tuple[Array, NDArray[np.int64]]:
     """Sum of the directions from which each point is seen, and their number.
 
@@ -85,6 +88,7 @@ def outward_votes(
         normals: (N, 3), unit; the sign does not matter.
         spacing_mm: typical distance between neighbouring points.
         directions: how many views, evenly spread.
+        seen_from: which depth buffer, `seen_from` or `unobstructed_from`.
 
     Returns:
         (N, 3) sums of unit view directions, which point out of the body, and (N,) counts; a count of zero marks a
@@ -92,7 +96,7 @@ def outward_votes(
     """
     votes, counts = np.zeros_like(points), np.zeros(len(points), dtype=np.int64)
     for direction in fibonacci_directions(directions):
-        seen = seen_from(direction, points, normals, pixel_mm=1.5 * spacing_mm)
+        seen = seen_from(direction, points, normals, 1.5 * spacing_mm)
         votes[seen] += direction
         counts += seen
     return votes, counts
@@ -113,11 +117,7 @@ def outer_layer(
         (N,) mask and (N, 3) vectors that point out of the body; None for a bone of one surface. A wall thinner than
         the spacing of the points cannot be told from one surface.
     """
-    votes, counts = np.zeros_like(points), np.zeros(len(points), dtype=np.int64)
-    for direction in fibonacci_directions(directions):
-        free = unobstructed_from(direction, points, normals, pixel_mm=1.5 * spacing_mm)
-        votes[free] += direction
-        counts += free
+    votes, counts = outward_votes(points, normals, spacing_mm, directions, unobstructed_from)
     outer = counts >= FEWEST_VIEWS * directions
     if outer.sum() < quadrics.FEWEST_NEIGHBOURS:
         return None

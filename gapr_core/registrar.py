@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations beyond which a direction counts as not observed
 EQUAL_MARGIN = 0.015  # a second pose whose residual is larger by less than this share explains the source as well
 BOTH_WALLS = 0.82  # a source follows both walls of a hollow bone when they leave less than this share of its residuals
+UNFAMILIAR = 0.85  # such a source, which no probe gives, is not what the confidence was fitted on: it is at most this
 DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says that the pose may be another one
 
 
@@ -107,6 +108,7 @@ class Registrar:
         result = self._in_rounds(prepared, target, poses, clock)
         if target.both_walls is not None and self._follows_both_walls(prepared, target.both_walls, result):
             result = self._in_rounds(prepared, target.both_walls, result.details["best_pose"][None], clock)
+            result = replace(result, confidence=min(result.confidence, UNFAMILIAR))
         return replace(result, stage_ms=clock.stages)
 
     def _in_rounds(

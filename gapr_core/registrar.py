@@ -107,14 +107,13 @@ class Registrar:
         poses = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
         result = self._in_rounds(prepared, target, poses, clock)
         if target.both_walls is not None and self._follows_both_walls(prepared, target.both_walls, result):
-            result = self._in_rounds(prepared, target.both_walls, result.details["best_pose"][None], clock)
-            result = replace(result, confidence=min(result.confidence, UNFAMILIAR))
+            result = self._in_rounds(prepared, target.both_walls, result.details["best_pose"][None], clock, UNFAMILIAR)
         return replace(result, stage_ms=clock.stages)
 
     def _in_rounds(
-        self, prepared: PreparedSource, target: PreparedTarget, poses: Array, clock: _Clock
+        self, prepared: PreparedSource, target: PreparedTarget, poses: Array, clock: _Clock, most: float = 1.0
     ) -> RegistrationResult:
-        """Ask one proposer after the other until an answer is sure."""
+        """Ask one proposer after the other until an answer is sure; `most` limits the confidence."""
         result = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="nothing was proposed")
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(self.config.seed)
@@ -127,7 +126,7 @@ class Registrar:
                     candidates.poses[0], prepared.points, target, self.config.refinement, prepared.neighbours
                 )
                 clock.lap("refine")
-                result = self._assess(fit, candidates, prepared, target, calibration)
+                result = self._assess(fit, candidates, prepared, target, calibration, most)
             result = replace(result, details=result.details | {"rounds": number})
             clock.lap("assess")
             if result.confidence >= self.config.sure:
@@ -144,11 +143,12 @@ class Registrar:
         return bool(fit.sigma_mm < BOTH_WALLS * np.exp(result.details["log_sigma"]))
 
     def _assess(
-        self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget, calibration: Calibration
+        self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget,
+        calibration: Calibration, most: float,
     ) -> RegistrationResult:
         uncertainty = covariance.estimate(fit, self.config.covariance)
         figures = confidence.measure(fit, candidates, uncertainty, source, target)
-        probability = calibration.probability(figures)
+        probability = min(calibration.probability(figures), most)
         if _is_matched(candidates) or _is_loose(uncertainty):
             probability = min(probability, DOUBT)
         common = {

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gapr_core import Registrar, RegistrarConfig
 from gapr_core.geometry import quadrics, se3, visibility
 
 WALL_MM = 4.0
@@ -62,3 +63,10 @@ def test_a_source_that_follows_both_walls_is_registered_to_both(registrar, hollo
     assert result.ok
     assert se3.pose_error(result.T_target_source, np.eye(4), source)[0] < 0.5
     assert result.confidence <= 0.85  # such sources were no part of the calibration
+
+
+def test_who_wants_more_than_such_a_source_can_give_gets_a_refusal(hollow, hollow_cloud):
+    strict = Registrar.from_pretrained(RegistrarConfig(num_threads=1, min_confidence=0.9))
+    points = hollow_cloud[0]
+    result = strict.register(points[points[:, 2] > np.quantile(points[:, 2], 0.5)], hollow)
+    assert not result.ok and result.confidence <= 0.85

@@ -68,5 +68,6 @@ def test_a_source_that_follows_both_walls_is_registered_to_both(registrar, hollo
 def test_who_wants_more_than_such_a_source_can_give_gets_a_refusal(hollow, hollow_cloud):
     strict = Registrar.from_pretrained(RegistrarConfig(num_threads=1, min_confidence=0.9))
     points = hollow_cloud[0]
-    result = strict.register(points[points[:, 2] > np.quantile(points[:, 2], 0.5)], hollow)
+    end = points[points[:, 2] > np.quantile(points[:, 2], 0.5)]
+    result = strict.register(end + np.random.default_rng(3).normal(0.0, 1.0, end.shape), hollow)
     assert not result.ok and result.confidence <= 0.85

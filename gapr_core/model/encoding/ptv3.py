@@ -15,6 +15,7 @@ from gapr_core.model.config import ModelConfig
 from gapr_core.model.pairs import LocalPairs, Pairs
 
 PATCH = 32
+ELSEWHERE = -1e9  # finite: a padded point has no valid partner in its patch, and a row of infinities makes NaN
 BITS = 10
 
 
@@ -54,7 +55,7 @@ class SamePatch(PairEncoding):
         self.same = same
 
     def bias(self, logits: Tensor, blocks: Tensor) -> Tensor:
-        return logits.masked_fill(~self.same[:, :, None], float("-inf"))
+        return logits.masked_fill(~self.same[:, :, None], ELSEWHERE)
 
 
 class SerialEncoder(nn.Module):

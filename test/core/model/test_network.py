@@ -11,6 +11,7 @@ from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.geometry import se3
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
+from gapr_core.model.encoding import ptv3
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.model.types import collate
@@ -144,6 +145,18 @@ def test_the_faithful_configuration_is_not_invariant_and_a_mirrored_cloud_is_ano
         )
     gap = torch.cdist(left, right).amin(1)  # every superpoint against its best mirrored one
     assert gap.median() > 0.01 * torch.cdist(left, left).median()
+
+
+@pytest.mark.parametrize("path", YAMLS, ids=lambda p: p.stem)
+def test_clouds_of_unequal_sizes_in_a_batch_have_finite_losses_and_gradients(path, toy, monkeypatch):
+    monkeypatch.setattr(ptv3, "PATCH", 4)  # as the real clouds have, several patches and padding that fills some
+    config = tiny(path, toy)
+    net = network(config)
+    batch = join([pair(config, toy, seed, share) for seed, share in ((3, 0.5), (4, 0.9))])
+    losses, _ = compute_losses(net, batch, torch.Generator().manual_seed(0))
+    losses.total.backward()
+    assert torch.isfinite(losses.total)
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
 
 
 def test_a_batch_gives_each_pair_what_it_gets_alone(toy):

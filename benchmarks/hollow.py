@@ -21,8 +21,7 @@ from gapr_core.console import say
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
-from gapr_core.geometry import se3
-from gapr_core.results import RegistrationResult
+from gapr_core.evaluation.judge import judge
 
 PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3")
 BONES = ("femur", "tibia", "pelvis")
@@ -71,17 +70,10 @@ def measure(registrar: Registrar, specimen: Specimen, protocol: str, seed: int) 
     both = target.both_walls or target
     row = [float(target.both_walls is not None)]
     for given in (target, replace(target, both_walls=None), both):
-        row += judged(registrar.register(pair.source, given), pair.T_target_source, pair.source)
+        result = registrar.register(pair.source, given)
+        judged = judge(pair, result)
+        row += [judged["right"], result.ok, judged["false_accept"] and result.confidence >= 0.9]
     return row
-
-
-def judged(result: RegistrationResult, truth: np.ndarray, source: np.ndarray) -> list[float]:
-    """Right (accepted within 4 mm and 5 deg), accepted, and wrong at a confidence of 0.9 or more."""
-    if not result.ok:
-        return [0.0, 0.0, 0.0]
-    rte_mm, rre_deg = se3.pose_error(result.T_target_source, truth, source)
-    right = rte_mm <= 4.0 and rre_deg <= 5.0
-    return [float(right), 1.0, float(not right and result.confidence >= 0.9)]
 
 
 def line(wall_mm: float, protocol: str, rows: np.ndarray) -> str:

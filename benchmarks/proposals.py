@@ -85,10 +85,10 @@ def one_list(proposer: Proposer, source: PreparedSource, target: PreparedTarget,
         return {"near": None, "raw_paper": 0, "raw": 0, "refined_paper": 0, "right": 0,
                 "propose_s": proposed - start, "total_s": proposed - start}
     best = verify(poses, source, target, CONFIG.verification, 1).poses[0]
-    best = refine_fully(best, source.points, target, CONFIG.refinement).T
+    best = refine_fully(best, source.points, target, CONFIG.refinement, source.neighbours).T
     done = time.perf_counter()
     first = refine_fully(verify(poses[:1], source, target, CONFIG.verification, 1).poses[0], source.points, target,
-                         CONFIG.refinement).T
+                         CONFIG.refinement, source.neighbours).T
     near = next((i + 1 for i, T in enumerate(poses) if within(T, pair, NEAR_MM, NEAR_DEG)), None)
     return {"near": near, "raw_paper": int(paper(poses[0], pair)), "raw": int(within(poses[0], pair, 4.0, 5.0)),
             "refined_paper": int(paper(first, pair)), "right": int(within(best, pair, 4.0, 5.0)),

@@ -81,8 +81,8 @@ class RefinementConfig:
         rounds, iterations, rest_mm: Gauss-Newton until the points move less than `rest_mm`.
         tukey_scale: end of Tukey's weight in standard deviations; `clean_tukey_scale` where less than `clean_share` of
             the residuals are beyond three of them (the normal distribution has 0.3 %).
-        patch_points, patch_scale: neighbours that make the patch of a point, and the end of Tukey's weight for its mean
-            residual, in robust standard deviations of these means; from round `free_rounds` on.
+        patch_scale: end of Tukey's weight for the mean residual of a point and its neighbours, in robust standard
+            deviations of these means; from round `free_rounds` on.
         smallest_sigma_mm, largest_sigma_mm: limits of the robust standard deviation.
     """
 
@@ -93,7 +93,6 @@ class RefinementConfig:
     clean_share: float = 0.015
     rest_mm: float = 1e-3
     free_rounds: int = 2
-    patch_points: int = 30
     patch_scale: float = 6.0
     smallest_sigma_mm: float = 0.15
     largest_sigma_mm: float = 3.0

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core import refinement_kernels as kernels
-from gapr_core.config import RefinementConfig
+from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.parallel import thread_count
 from gapr_core.target import PreparedTarget
 
 Array = NDArray[np.float64]
+
+PATCH_POINTS = SourceConfig().normal_neighbours  # of a source that was not prepared
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +91,11 @@ def refine_fully(
         points: (N, 3) source points, mm.
         target: the prepared target.
         config: iterations and scales.
-        neighbours: (N, k) of each point, itself among them, that make its patch; looked up when None.
+        neighbours: (N, k) of each point, itself among them, that make its patch, as `PreparedSource.neighbours`; looked
+            up when None.
     """
     if neighbours is None:
-        neighbours = cKDTree(points).query(points, k=list(range(1, min(config.patch_points, len(points)) + 1)))[1]
+        neighbours = cKDTree(points).query(points, k=list(range(1, min(PATCH_POINTS, len(points)) + 1)))[1]
     fit = evaluate(T, points, target, config)
     for number in range(config.rounds):
         trust = patch_trust(fit, neighbours, config) if number >= config.free_rounds else np.ones(len(points))

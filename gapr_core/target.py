@@ -90,8 +90,9 @@ def prepare(
     surface = clouds.load(target, units)
     points, normals = _surface_elements(surface, config)
     _check_is_a_body(points, config)
-    whole = _described(*_outer_shell(points, normals, config), surface, config)
-    outer = _outer_wall(points, normals, config)
+    spacing_mm = quadrics.spacing(points)
+    whole = _described(*_outer_shell(points, normals, spacing_mm, config), surface, config)
+    outer = _outer_wall(points, normals, spacing_mm, config)
     return whole if outer is None else replace(_described(*outer, surface, config), both_walls=whole)
 
 
@@ -140,17 +141,19 @@ def _check_is_a_body(points: Array, config: TargetConfig) -> None:
         raise InvalidPointCloudError("a bone with extent in three directions", f"a {shape}", "check the file")
 
 
-def _outer_shell(points: Array, normals: Array, config: TargetConfig) -> tuple[Array, Array]:
+def _outer_shell(points: Array, normals: Array, spacing_mm: float, config: TargetConfig) -> tuple[Array, Array]:
     """Points visible from outside with outward normals; everything, should that be less than half of them."""
-    votes, counts = visibility.outward_votes(points, normals, quadrics.spacing(points), config.view_directions)
+    votes, counts = visibility.outward_votes(points, normals, spacing_mm, config.view_directions)
     normals = quadrics.orient(normals, votes)
     shell = counts > 0
     return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)
 
 
-def _outer_wall(points: Array, normals: Array, config: TargetConfig) -> tuple[Array, Array] | None:
+def _outer_wall(
+    points: Array, normals: Array, spacing_mm: float, config: TargetConfig
+) -> tuple[Array, Array] | None:
     """Points and outward normals of a hollow bone's outer wall; None for a bone of one surface."""
-    found = visibility.outer_layer(points, normals, quadrics.spacing(points), config.view_directions)
+    found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions)
     if found is None:
         return None
     points, outward = points[found[0]], found[1][found[0]]

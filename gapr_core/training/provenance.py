@@ -41,7 +41,7 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
     """
     path = folder / FILE
     entries = json.loads(path.read_text()) if path.exists() else []
-    begun_with = _digest([Path(config.initial).read_bytes()]) if config.initial else None
+    begun_with = _digest([Path(config.initial).read_bytes()]) if config.initial and not step else None
     entry = {"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)}
     entries.append(entry | {"initial": begun_with})
     new = path.with_suffix(".new")

@@ -33,6 +33,8 @@ from gapr_core.training.validation import validate, validation_set
 
 log = logging.getLogger(__name__)
 
+MOST_LOST = 10  # steps in a row without finite gradients: one is bad luck and is left out, so many are a defect
+
 
 def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: float = math.inf, card: Any = None) -> Path:
     """Run until the schedule ends or `minutes` are over, from where the last call in `folder` stopped.
@@ -47,26 +49,31 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
 
     Returns:
         The averaged weights, ready for `NetworkProposer`.
+
+    Raises:
+        FloatingPointError: step after step had gradients that are not finite.
     """
     rank, world, device = distributed.start(config.device)
     model = ModelConfig.from_yaml(config.model) if config.model else ModelConfig()
     settle(folder, config, model, rank)
     torch.manual_seed(config.seed)
-    network, ema = begin(config, model).to(device), GAPRNet(model).to(device)
+    checkpoint = folder / "checkpoint.safetensors"
+    network = (GAPRNet(model) if checkpoint.exists() else begin(config, model)).to(device)
+    ema = GAPRNet(model).to(device)
     ema.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(
         network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
     )
     state: dict[str, Any] = {"step": 0, "seconds": 0.0}
-    if (folder / "checkpoint.safetensors").exists():
-        state = load_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer)
+    if checkpoint.exists():
+        state = load_checkpoint(checkpoint, network, ema, optimizer)
     steps = config.pairs // config.batch
     origin = provenance.append(folder, config, anatomy, state["step"], world) if rank == 0 else []
     per_step = config.batch // config.micro_batch // world
     batches = micro_batches(config, model, anatomy, state["step"] * config.batch // config.micro_batch, rank, world)
     held_out = validation_set(config, model, anatomy) if rank == 0 else []
     begun, saved, validated = time.monotonic(), time.monotonic(), time.monotonic()
-    earlier = state["seconds"]
+    earlier, lost = state["seconds"], 0
 
     ahead = range(state["step"], steps)
     progress = tqdm(ahead, initial=state["step"], total=steps, disable=rank > 0 or None, unit="step")
@@ -82,7 +89,10 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
             parts.append(losses)
         distributed.sum_gradients(network, world)
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip)
-        if torch.isfinite(norm):
+        lost = 0 if torch.isfinite(norm) else lost + 1
+        if lost == MOST_LOST:
+            raise FloatingPointError(f"{lost} steps in a row, up to {step + 1}, had gradients that are not finite")
+        if not lost:
             optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         average(ema, network, min(config.ema, (1 + step) / (10 + step)))
@@ -99,7 +109,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
                 draw_curves(folder)
             if last or time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
                 saved = time.monotonic()
-                save_checkpoint(folder / "checkpoint.safetensors", network, ema, optimizer, state)
+                save_checkpoint(checkpoint, network, ema, optimizer, state)
                 header = {**(card or {}), "run": config.to_dict(), **state, "provenance": origin}
                 weights.save(ema, folder / "weights.safetensors", header)
         if distributed.agree(last, world):

@@ -30,7 +30,7 @@ PACKAGE = {"kiss_matcher": "kiss-matcher"}
 
 def needs(name):
     for part in name.split("+"):
-        pytest.importorskip(LIBRARY[part])
+        pytest.importorskip(LIBRARY[part], reason=f"{part} is an optional method: pip install '.[baselines]'")
 
 
 def knobbly(rng, count):
@@ -108,7 +108,7 @@ def test_kiss4_twice_gives_nearly_the_same_pose(bone):
 
 
 def test_the_refined_composition_keeps_the_pose_with_the_lowest_residual(bone):
-    pytest.importorskip("small_gicp")
+    needs("gicp")
     source, T_true = a_pair(bone, 120.0)
     near = se3.exp([2.0, 0, 0, 0, 0.04, 0], bone.mean(axis=0)) @ T_true
     upside_down = se3.exp([0, 0, 0, np.pi, 0, 0], bone.mean(axis=0)) @ T_true
@@ -119,7 +119,7 @@ def test_the_refined_composition_keeps_the_pose_with_the_lowest_residual(bone):
 
 
 def test_the_refined_composition_refuses_when_every_coarse_method_does(bone):
-    pytest.importorskip("small_gicp")
+    needs("gicp")
     result = Refined([Fixed(None), Fixed(None)], PointToPlane()).register(bone[:500], bone)
     assert not result.ok and "library" in result.reason
 

@@ -36,7 +36,7 @@ def test_two_shards_merged_equal_one_run_and_the_same_run_again(pairs, fakes, tm
 
 
 def test_worker_processes_give_the_same_table_in_any_number(pairs, fakes, tmp_path, no_report, request):
-    pytest.importorskip("small_gicp")
+    pytest.importorskip("small_gicp", reason="gicp is an optional method: pip install '.[baselines]'")
     methods = [*fakes("good"), "point_to_plane"]
     two = benchmark.benchmark(pairs, methods, tmp_path / "two", jobs=2, threads=1)
     request.getfixturevalue("in_process")

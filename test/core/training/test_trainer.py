@@ -93,6 +93,28 @@ def test_a_run_can_begin_with_the_weights_of_another_one(settings, anatomy, tmp_
         trainer.train(replace(going_on, model=str(tmp_path / "wider.yaml")), tmp_path / "third", anatomy)
 
 
+def test_a_run_whose_gradients_are_never_finite_ends_with_an_error(settings, anatomy, tmp_path, monkeypatch):
+    compute = trainer.compute_losses
+
+    def spoilt(network, pair, generator):
+        losses, *rest = compute(network, pair, generator)
+        return replace(losses, coarse=losses.coarse * float("nan")), *rest
+
+    monkeypatch.setattr(trainer, "compute_losses", spoilt)
+    with pytest.raises(FloatingPointError, match="10 steps in a row"):
+        trainer.train(replace(settings, pairs=48), tmp_path / "run", anatomy)
+
+
+def test_a_run_goes_on_without_the_weights_that_it_began_with(settings, anatomy, tmp_path):
+    first = trainer.train(replace(settings, pairs=4), tmp_path / "first", anatomy)
+    going_on = replace(settings, initial=str(first))
+    trainer.train(going_on, tmp_path / "second", anatomy, minutes=0.0)
+    first.unlink()
+    trainer.train(going_on, tmp_path / "second", anatomy)
+    entries = json.loads((tmp_path / "second" / "provenance.json").read_text())
+    assert entries[0]["initial"] and entries[1]["initial"] is None
+
+
 def test_workers_make_the_same_pairs_in_the_same_order(settings, anatomy):
     model = trainer.ModelConfig.from_yaml(settings.model)
     alone, helped = (

@@ -15,11 +15,13 @@ if TYPE_CHECKING:
     from gapr_core.registrar import Registrar
     from gapr_core.results import RegistrationResult, RegistrationStatus
     from gapr_core.target import PreparedTarget
+    from gapr_core.tracking import Tracker
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Registrar": "registrar",
+    "Tracker": "tracking",
     "RegistrarConfig": "config",
     "PreparedTarget": "target",
     "RegistrationResult": "results",

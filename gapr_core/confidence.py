@@ -22,8 +22,9 @@ from gapr_core.verification import Candidates
 
 Array = NDArray[np.float64]
 
-DEFAULT_CALIBRATION = Path(__file__).parent / "weights" / "confidence.json"
-NETWORK_CALIBRATION = Path(__file__).parent / "weights" / "confidence_network.json"
+WEIGHTS = Path(__file__).parent / "weights"
+DEFAULT_CALIBRATION = WEIGHTS / "confidence.json"
+CALIBRATIONS = {"network": WEIGHTS / "confidence_network.json", "track": WEIGHTS / "confidence_track.json"}
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ class Calibration:
     def shipped(proposer: str) -> Calibration:
         """The model for an answer whose last hypotheses came from `proposer`.
 
-        The network's few poses say less about rivals than an exhaustive search: they have a model of their own.
+        The network's few poses, and those that a `Tracker` remembers, say less about rivals than an exhaustive search:
+        they have models of their own.
         """
-        return Calibration.load(NETWORK_CALIBRATION if proposer == "network" else DEFAULT_CALIBRATION)
+        return Calibration.load(CALIBRATIONS.get(proposer, DEFAULT_CALIBRATION))
 
     def probability(self, features: dict[str, float]) -> float:
         """Probability, 0 to 1, that the pose is within 4 mm and 5 deg."""

@@ -127,7 +127,7 @@ class Registrar:
                 )
                 clock.lap("refine")
                 result = self._assess(fit, candidates, prepared, target, calibration, most)
-            result = replace(result, details=result.details | {"rounds": number})
+            result = replace(result, details=result.details | {"rounds": number, "proposer": proposer.name})
             clock.lap("assess")
             if result.confidence >= self.config.sure:
                 break

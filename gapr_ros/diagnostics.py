@@ -136,12 +136,12 @@ def input_status(name: str, counters: Counters, source: Input | None, last: Outc
 
 def _of_cloud(last: Outcome | None) -> dict[str, object]:
     names = ("cloud_stamp", "cloud_frame", "points_in", "points_used", "cloud_age_s", "confidence", "tre_mm",
-             "inlier_ratio", "exec_ms")  # fmt: skip
+             "inlier_ratio", "found_by", "exec_ms")  # fmt: skip
     if last is None:
         return dict.fromkeys(names, "")
     stamp = f"{last.header.stamp.sec}.{last.header.stamp.nanosec:09d}"
     values = (stamp, last.cloud_frame, last.points_in, last.points_used, last.age_s, last.confidence_out, last.tre_mm,
-              last.inlier_ratio, last.exec_ms)  # fmt: skip
+              last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
     return dict(zip(names, values, strict=True))
 
 

@@ -29,7 +29,9 @@ class Outcome:
         confidence: of the registration, 0 to 1, whatever was decided later.
         points_in, points_used: of the message; given to registration.
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
-        tre_mm, inlier_ratio, exec_ms: of the registration; wall time of the whole way.
+        tre_mm, inlier_ratio: of the registration.
+        found_by: whose hypotheses decided it: track, network or search.
+        exec_ms: wall time of the whole way.
     """
 
     job: Job
@@ -45,6 +47,7 @@ class Outcome:
     age_s: float | None = None
     tre_mm: float | None = None
     inlier_ratio: float = 0.0
+    found_by: str = ""
     exec_ms: float = 0.0
 
     @property

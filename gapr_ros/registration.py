@@ -91,7 +91,7 @@ class Registration:
         options = {} if seed is None else {"initial": seed}
         result = now.method.register(points_mm, now.model.target, **options)
         outcome.confidence, outcome.inlier_ratio = float(result.confidence), float(result.inlier_ratio)
-        outcome.tre_mm = result.tre_mm
+        outcome.tre_mm, outcome.found_by = result.tre_mm, str(result.details.get("proposer", ""))
         return result
 
     def _initial(self, outcome: Outcome, now: Situation) -> Array | None:

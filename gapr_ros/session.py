@@ -47,6 +47,7 @@ class Session:
         self._log_refusal = RefusalLog(node.get_logger().warning)
         self.model = self.read_model()
         warm_up(self._method, self.model)
+        self._forget_poses()
         self._frames = Frames(node, node.parameters.publish_tf, listen=bool(node.parameters.output_frame))
         self._publishers = Publishers(node, self._frames, node.parameters.model_frame)
         self._registration = Registration(self._frames, self._situation)
@@ -102,6 +103,11 @@ class Session:
 
     def _renew_method(self) -> None:
         self._method = self._method_factory(self._node.parameters)
+
+    def _forget_poses(self) -> None:
+        """Of a method that remembers them, such as a `Tracker`."""
+        if hasattr(self._method, "reset"):
+            self._method.reset()
 
     def _held(self) -> bool:
         return not self._node.parameters.continuous
@@ -183,6 +189,7 @@ class Session:
             outcome.tell()
 
     def _forget(self) -> None:
+        self.worker.run(self._forget_poses)
         self._track.clear()
         self._seed, self._last_stamp_ns = None, 0
         self._frames.forget()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gapr_core.clouds import Surface
 from gapr_core.errors import InvalidPointCloudError
@@ -60,6 +62,22 @@ class Specimen:
         queries = (points - self._centre).astype(np.float32)
         return self._scene.compute_distance(queries).numpy().astype(np.float64)
 
+    def end(self, share: float, upper: bool) -> Specimen:
+        """What a shorter scan holds of it: a share (0 to 1) of its length at one end, closed where it is cut.
+
+        `upper` is the end with the larger coordinate along the axis nearest to the bone's longest direction.
+        """
+        assert self.surface.faces is not None
+        centred = self.surface.points - self._centre
+        axis = np.linalg.eigh(np.cov(centred.T))[1][:, 2]
+        axis *= np.sign(axis[np.abs(axis).argmax()]) * (1.0 if upper else -1.0)
+        along = centred @ axis
+        kept = along >= along.max() - share * np.ptp(along)
+        faces = self.surface.faces[kept[self.surface.faces].all(axis=1)]
+        used, faces = np.unique(faces, return_inverse=True)
+        points, faces = _closed(self.surface.points[used], faces.reshape(-1, 3))
+        return replace(self, surface=Surface(points, faces))
+
     @cached_property
     def _centre(self) -> Array:
         return self.surface.points.mean(axis=0)
@@ -74,3 +92,16 @@ class Specimen:
         vertices = np.ascontiguousarray(self.surface.points - self._centre, dtype=np.float32)
         scene.add_triangles(vertices, np.ascontiguousarray(self.surface.faces, dtype=np.uint32))
         return scene
+
+
+def _closed(points: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Every hole of a mesh filled with triangles from its rim to the rim's middle."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    rim = edges[first[counts == 1]]
+    linked = coo_array((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(len(points), len(points)))
+    hole = connected_components(linked, directed=False)[1][rim[:, 0]]
+    _, hole = np.unique(hole, return_inverse=True)
+    middles = np.array([points[rim[hole == i, 0]].mean(axis=0) for i in range(hole.max(initial=-1) + 1)]).reshape(-1, 3)
+    caps = np.column_stack([rim[:, ::-1], len(points) + hole])
+    return np.vstack([points, middles]), np.vstack([faces, caps])

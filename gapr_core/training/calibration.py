@@ -2,7 +2,8 @@
 
     python -m gapr_core.training.calibration --anatomy ../shared/anatomy --count 150 --records runs/calibration.jsonl
 
-There are two models, for what is known after each round of the `Registrar`: the network alone, and with the search.
+There are three models: for what is known after each round of the `Registrar`, the network alone and with the search,
+and for the next source of a stream, where a `Tracker` looks at what it remembers alone.
 Pairs come from train people only, real and parametric, over all protocols, wrong bones and solids of revolution.
 Finished pairs are kept in the records file, so a stopped run goes on where it was. Each model is a ridge logistic
 regression in which wrong answers count twice and bones that are not the target's eight times: it errs on the side of
@@ -20,6 +21,7 @@ from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +29,16 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from tqdm import tqdm
 
-from gapr_core.confidence import DEFAULT_CALIBRATION, FEATURES, NETWORK_CALIBRATION, Calibration
+from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, FEATURES, Calibration
 from gapr_core.config import RegistrarConfig
-from gapr_core.data import anatomy, protocols
+from gapr_core.data import anatomy, degradation, protocols
 from gapr_core.data import pool as bone_pool
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
+from gapr_core.proposals.base import Proposer
 from gapr_core.registrar import Registrar
+from gapr_core.results import RegistrationResult
+from gapr_core.tracking import Memory
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
@@ -41,9 +46,13 @@ PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
 PROTOCOLS = (
     "paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "sweep", "mixed",
     "wrong", "wrong_sweep", "turned",
+    "short-paper", "short-L1", "short-L2", "short-L3", "short-sweep", "short-mixed", "short-wrong", "short-wrong_sweep",
 )  # fmt: skip
-ROUNDS = {"network": NETWORK_CALIBRATION, "search": DEFAULT_CALIBRATION}
-COUNTS = {"wrong": 8.0, "wrong_sweep": 8.0, "else": 2.0}  # how often a record without a right pose counts, by protocol
+SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
+MODELS = CALIBRATIONS | {"search": DEFAULT_CALIBRATION}
+STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
+FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
+WRONG_BONE, WRONG_POSE = 8.0, 2.0  # how often a record counts where no pose is right, or the answer is not
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
@@ -54,25 +63,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
     parser.add_argument("--split", default="train", help="people to learn from")
     parser.add_argument("--count", type=int, default=150, help="pairs per bone and protocol")
+    parser.add_argument("--bones", type=_names, default=BONES, help="with commas; all when not given")
+    parser.add_argument("--protocols", type=_names, default=PROTOCOLS, help="with commas; all when not given")
     parser.add_argument("--seed", type=int, default=10_000)
     parser.add_argument("--records", type=Path, default=Path("runs/calibration.jsonl"))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder for the models; without it only the records are made")
     args = parser.parse_args(arguments)
-    records = collect(args.anatomy, args.split, args.count, args.seed, args.records, args.jobs)
-    for proposer, path in ROUNDS.items() if args.out else ():
+    tasks = [(str(args.anatomy), args.split, protocol, bone, args.seed + i)
+             for i in range(args.count) for protocol in args.protocols for bone in args.bones]  # fmt: skip
+    records = collect(tasks, args.records, args.jobs)
+    for proposer, path in MODELS.items() if args.out else ():
         model = fit([record[proposer] | {"protocol": record["protocol"]} for record in records if proposer in record])
         card = {"people": f"{args.split} people of {args.anatomy.name}", "hypotheses": proposer}
         (args.out / path.name).write_text(as_json(model, card))
     return 0
 
 
-def collect(folder: Path, split: str, count: int, seed: int, path: Path, jobs: int) -> list[dict[str, Any]]:
-    """Register every pair that the records file does not hold yet; returns all records."""
+def collect(tasks: list[Task], path: Path, jobs: int) -> list[dict[str, Any]]:
+    """Register every pair that the records file does not hold yet; returns all records of the file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     done = {record["name"]: record for record in _read(path)}
-    tasks = [(str(folder), split, protocol, bone, seed + i)
-             for i in range(count) for protocol in PROTOCOLS for bone in BONES]  # fmt: skip
     tasks = [task for task in tasks if "-".join(map(str, task[2:])) not in done]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, path.open("a") as file:
         for record in tqdm(pool.map(_record, tasks), total=len(tasks), unit="pair"):
@@ -83,13 +94,13 @@ def collect(folder: Path, split: str, count: int, seed: int, path: Path, jobs: i
 
 
 def fit(records: list[dict[str, Any]], ridge: float = 10.0) -> Calibration:
-    """Penalised maximum likelihood; what must not be believed counts more than once (`COUNTS`)."""
+    """Penalised maximum likelihood; what must not be believed counts more than once."""
     x = np.array([[r["features"][name] for name in FEATURES] for r in records])
     y = np.array([r["right"] for r in records], dtype=np.float64)
     scales = np.maximum(x.std(axis=0), 1e-9)
     model = Calibration(FEATURES, x.mean(axis=0), scales, np.zeros(0), {})
     terms = model.design(x)
-    counts = np.array([1.0 if r["right"] else COUNTS.get(r.get("protocol", ""), COUNTS["else"]) for r in records])
+    counts = np.array([_count(record) for record in records])
     penalty = np.concatenate([[0.0], np.full(len(FEATURES), 0.3), np.ones(terms.shape[1] - 1 - len(FEATURES))])
 
     def loss(w: Array) -> tuple[float, Array]:
@@ -101,11 +112,21 @@ def fit(records: list[dict[str, Any]], ridge: float = 10.0) -> Calibration:
     return Calibration(FEATURES, model.means, scales, best.x, {"pairs": len(records), "right": float(y.mean())})
 
 
+def _count(record: dict[str, Any]) -> float:
+    if record["right"]:
+        return 1.0
+    return WRONG_BONE if "wrong" in record.get("protocol", "") else WRONG_POSE
+
+
 def as_json(model: Calibration, card: dict[str, Any]) -> str:
     """The model as the file that `Calibration.load` reads."""
     data = {"names": model.names, "card": card | model.card}
     arrays = {key: np.round(getattr(model, key), 6).tolist() for key in ("means", "scales", "weights")}
     return json.dumps(data | arrays, indent=1) + "\n"
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
 
 
 def _read(path: Path) -> Iterator[dict[str, Any]]:
@@ -122,13 +143,15 @@ def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
 @cache
 def _registrars() -> dict[str, Registrar]:
     """The two rounds, as they are when the answer of the first one is not sure."""
+    network, search = Registrar.from_pretrained().proposers
+    return {"network": _without_model([network]), "search": _without_model([network, search])}
+
+
+def _without_model(proposers: list[Proposer]) -> Registrar:
+    """A registrar that goes through all rounds and accepts everything."""
     untrained = Calibration(FEATURES, np.zeros(len(FEATURES)), np.ones(len(FEATURES)), _undecided(), {})
     config = RegistrarConfig(num_threads=1, min_confidence=0.0, sure=2.0)
-    network, search = Registrar.from_pretrained(config).proposers
-    return {
-        "network": Registrar(config, [network], [untrained]),
-        "search": Registrar(config, [network, search], [untrained, untrained]),
-    }
+    return Registrar(config, proposers, [untrained] * len(proposers))
 
 
 def _undecided() -> Array:
@@ -141,6 +164,9 @@ def _record(task: Task) -> dict[str, Any]:
     bones = _bones(folder, split)
     specimen = bones[bone][seed % len(bones[bone])]
     others = [s for group in bones.values() for s in group]
+    record: dict[str, Any] = {"name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone}
+    if protocol.startswith(SHORT):
+        protocol, (specimen, *others) = protocol.removeprefix(SHORT), shortened(specimen, others, seed)
     if protocol == "turned":
         pair = turned_pair(len(BONES) * seed + BONES.index(bone))
     elif protocol == "mixed":
@@ -149,16 +175,48 @@ def _record(task: Task) -> dict[str, Any]:
         pair = wrong_sweep_pair(specimen, others, seed)
     else:
         pair = protocols.make_pair(protocol, specimen, seed, others)
-    record: dict[str, Any] = {
-        "name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone, "person": pair.person
-    }
+    record["person"] = pair.person
     target = _registrars()["search"].prepare(pair.target)
-    for proposer, registrar in _registrars().items():
-        result = registrar.register(pair.source, target)
+    answers = {name: registrar.register(pair.source, target) for name, registrar in _registrars().items()}
+    remembered = answers["network" if crc32(str(record["name"]).encode()) % 2 else "search"]
+    if remembered.ok and remembered.alternatives:
+        moved, memory = moved_on(pair, remembered, seed)
+        answers[memory.name] = _without_model([memory]).register(moved.source, target)
+    for name, result in answers.items():
         if result.ok:
-            features = {name: result.details[name] for name in FEATURES}
-            record[proposer] = {"features": features} | _judge(result, pair)
+            features = {feature: result.details[feature] for feature in FEATURES}
+            record[name] = {"features": features} | _judge(result, moved if name == Memory.name else pair)
     return record
+
+
+def moved_on(pair: protocols.Pair, result: RegistrationResult, seed: int) -> tuple[protocols.Pair, Memory]:
+    """The next source of a stream, and what a `Tracker` remembers of the last one.
+
+    A part of the view is lost at one side, and the source has moved by up to 10 mm and 10 deg about its centroid. In
+    one case of four the best pose is forgotten: the tracker followed a rival.
+    """
+    rng = np.random.default_rng([seed, 17])
+    along = pair.source @ degradation.random_directions(1, rng)[0]
+    seen = pair.source[along <= np.quantile(along, rng.uniform(0.7, 1.0))]
+    source = seen[rng.permutation(len(seen))[: round(rng.uniform(0.7, 1.0) * len(seen))]]
+    turn = np.radians(rng.uniform(0.0, STEP_DEG)) * degradation.random_directions(1, rng)[0]
+    shift = rng.uniform(0.0, STEP_MM) * degradation.random_directions(1, rng)[0]
+    memory = Memory()
+    memory.keep(result.details["best_pose"], result.alternatives)
+    memory.poses = memory.poses @ se3.exp(np.concatenate([shift, turn]), source.mean(axis=0))
+    if rng.random() < FORGOTTEN and len(memory.poses) > 2:
+        memory.poses = memory.poses[1:]
+    return replace(pair, source=source), memory
+
+
+def shortened(specimen: Specimen, others: list[Specimen], seed: int) -> list[Specimen]:
+    """What scans of one end of the bone hold, 15 to 60 % of it; of two other people and two other bones, too."""
+    rng = np.random.default_rng([seed, 29])
+    share, upper = rng.uniform(0.15, 0.6), bool(rng.random() < 0.5)
+    same, other = ([o for o in others if (o.bone == specimen.bone) == is_same] for is_same in (True, False))
+    strangers = [o for o in same if o.person != specimen.person]
+    some = [group[i] for group in (strangers, other) for i in rng.permutation(len(group))[:2]]
+    return [each.end(share, upper) for each in (specimen, *some)]
 
 
 def turned_pair(seed: int) -> protocols.Pair:

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from gapr_core.confidence import DEFAULT_CALIBRATION, FEATURES, Calibration
+from gapr_core.data.pool import parametric_specimen
+from gapr_core.data.protocols import make_pair
 from gapr_core.errors import WeightsError
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.training import calibration
 
 
@@ -57,3 +61,22 @@ def test_a_solid_of_revolution_has_no_right_pose():
     radii = np.linalg.norm(pair.target[:, :2], axis=1)
     order = np.argsort(pair.target[:, 2])
     assert np.abs(np.diff(radii[order])).mean() < 0.2  # the radius depends on the height alone
+
+
+def test_the_next_source_of_a_stream_is_a_part_of_the_view_and_the_memory_is_off_by_a_small_motion():
+    rng = np.random.default_rng(3)
+    pair = make_pair("L2", parametric_specimen("femur", 0), 1)
+    truth, rival = pair.T_target_source, se3.exp(rng.normal(size=6) * 30.0) @ pair.T_target_source
+    result = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, alternatives=(rival, rival @ rival),
+                                details={"best_pose": truth})  # fmt: skip
+    forgotten = 0
+    for seed in range(40):
+        moved, memory = calibration.moved_on(pair, result, seed)
+        assert 0.45 * len(pair.source) < len(moved.source) <= len(pair.source)
+        kept = {tuple(point) for point in pair.source}
+        assert all(tuple(point) in kept for point in moved.source)
+        forgotten += len(memory.poses) == 2
+        best = truth if len(memory.poses) == 3 else rival
+        shift_mm, turn_deg = se3.pose_error(memory.poses[0], best, moved.source)
+        assert shift_mm <= calibration.STEP_MM + 1e-6 and turn_deg <= calibration.STEP_DEG + 1e-6
+    assert 3 <= forgotten <= 18

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
-from gapr_core.confidence import DEFAULT_CALIBRATION, NETWORK_CALIBRATION, Calibration
+from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, Calibration
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, MethodUnavailableError
@@ -72,7 +72,7 @@ def test_the_shipped_network_and_the_search_are_asked_in_this_order():
 
 def test_each_round_has_the_confidence_model_that_was_fitted_for_it():
     network, search = Registrar.from_pretrained(ONE_THREAD).calibrations
-    assert np.array_equal(network.weights, Calibration.load(NETWORK_CALIBRATION).weights)
+    assert np.array_equal(network.weights, Calibration.load(CALIBRATIONS["network"]).weights)
     assert np.array_equal(search.weights, Calibration.load(DEFAULT_CALIBRATION).weights)
     assert not np.array_equal(network.weights, search.weights)
 

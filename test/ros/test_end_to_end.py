@@ -57,6 +57,23 @@ def test_a_partial_cloud_gives_the_true_pose(live, bone, seed):
     assert (np.sqrt(covariance.diagonal()[:3]) < 0.02).all() and (np.sqrt(covariance.diagonal()[3:]) < 0.1).all()
 
 
+def test_the_next_cloud_is_looked_for_where_the_last_one_was_until_a_reset(live, bone):
+    _, client = live
+    T = pose_mm([0.1, 0.2, -0.9], [30.0, 20.0, 90.0])
+    nearby = se3.exp([4.0, -3.0, 2.0, 0.03, 0.02, -0.04]) @ T
+    client.call("reset")
+    clouds = [bones.partial(bone, T, 21), bones.partial(bone, nearby, 22)]
+    assert client.ask(clouds[0], timeout_s=60.0)["found_by"] in ("network", "search")
+    client.poses.clear()
+    assert client.ask(clouds[1], timeout_s=60.0)["found_by"] == "track"
+    wait_until(lambda: client.poses)
+    estimate = wire.core_pose(pose_to_matrix(client.poses[0]))
+    translation_mm, rotation_deg = se3.pose_error(estimate, nearby, clouds[1] * 1000.0)
+    assert translation_mm < 1.0 and rotation_deg < 1.0
+    client.call("reset")
+    assert client.ask(clouds[1], timeout_s=60.0)["found_by"] in ("network", "search")
+
+
 def plane(rng):
     return np.column_stack([rng.uniform(-0.1, 0.1, (2000, 2)), rng.normal(scale=1e-4, size=2000)])
 

@@ -28,8 +28,8 @@ GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 T_TARGET_SOURCE = pose_mm([0.3, -1.1, 0.7], [120.0, -40.0, 300.0])
 REGISTRATION_KEYS = set(
     "state model_path model_points cloud_stamp cloud_frame points_in points_used cloud_age_s confidence tre_mm"
-    " inlier_ratio exec_ms frames_received frames_dropped frames_refused consecutive_refusals last_refusal cloud_qos"
-    " publishers_on_points".split()
+    " inlier_ratio found_by exec_ms frames_received frames_dropped frames_refused consecutive_refusals last_refusal"
+    " cloud_qos publishers_on_points".split()
 )
 
 
@@ -195,6 +195,17 @@ def test_a_seed_reaches_the_method_until_a_pose_is_accepted(live):
     time.sleep(0.2)
     client.ask(GOOD)
     assert method.calls[-1]["initial"] is None
+
+
+def test_a_method_that_remembers_poses_forgets_that_of_the_warm_up_and_with_every_reset(blob_path, client, method):
+    method.forgotten_after = []
+    method.reset = lambda: method.forgotten_after.append(len(method.calls))
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        assert method.forgotten_after == [1]
+        client.ask(GOOD)
+        assert client.call("reset").success
+        wait_until(lambda: method.forgotten_after == [1, 2])
 
 
 @pytest.mark.parametrize("chosen", ["auto", "best_effort"])

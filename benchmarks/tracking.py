@@ -1,0 +1,105 @@
+"""Streams: the `Tracker` against a full registration of every frame, on the same streams in one run.
+
+    python benchmarks/tracking.py --anatomy DIR [--split val] [--count 4] [--bones femur,tibia,pelvis]
+
+Three kinds of stream: the bone moves a little from frame to frame; it also jumps every eighth frame; the bone in view
+is another person's, so that every pose is wrong. Each frame is a small one-sided view.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.console import say
+from gapr_core.data.pool import specimens
+from gapr_core.data.protocols import Pair
+from gapr_core.data.stream import Motion, simulate
+from gapr_core.evaluation.judge import judge
+from gapr_core.tracking import Tracker
+
+KINDS = {"moves": Motion(), "small views, moves": Motion(share=0.12, points=800, noise_mm=1.5, bias_mm=1.0),
+         "moves and jumps": Motion(jump_every=8), "another person's bone": Motion()}  # fmt: skip
+STRANGER = "another person's bone"
+
+
+@dataclass
+class Tally:
+    """What came of the frames of one kind with one method."""
+
+    frames: int = 0
+    right: int = 0
+    accepted: int = 0
+    false_accepts: int = 0
+    confident: int = 0  # false accepts at 0.9 or more
+    tracked: int = 0
+    seconds: tuple[float, ...] = ()
+
+
+def main() -> int:
+    """Run every stream through both, print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--count", type=int, default=4, help="streams per bone and kind")
+    parser.add_argument("--bones", default="femur,tibia,pelvis,thoracic", help="with commas")
+    args = parser.parse_args()
+    full = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+    tracker = Tracker(full)
+    people = {bone: specimens(bone, args.split, 4, args.anatomy) for bone in args.bones.split(",")}
+    tallies = {(kind, name): Tally() for kind in KINDS for name in ("every frame in full", "tracker")}
+    runs = [(kind, bone, i) for kind in KINDS for bone in people for i in range(args.count)]
+    for kind, bone, i in tqdm(runs, "streams"):
+        frames = stream(kind, people[bone], i)
+        target = full.prepare(frames[0].target)
+        tracker.reset()
+        for pair in frames:
+            count(tallies[kind, "every frame in full"], pair, full, target)
+            count(tallies[kind, "tracker"], pair, tracker, target)
+    head = ("stream", "method", "frames", "right %", "accepted %", "false accepts", "of these at >= 0.9",
+            "answered by tracking %", "median s", "mean s")
+    say("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    for (kind, name), tally in tallies.items():
+        say(line(kind, name, tally))
+    return 0
+
+
+def stream(kind: str, people: list, number: int) -> list[Pair]:
+    """The frames of one stream; of a stranger, with the target of somebody else and no truth."""
+    own = people[number % len(people)]
+    frames = simulate(own, 500 + number, KINDS[kind])
+    if kind != STRANGER:
+        return frames
+    other = simulate(people[(number + 1) % len(people)], 500 + number, replace(KINDS[kind], frames=1))[0]
+    return [replace(pair, target=other.target, T_target_source=np.full((4, 4), np.nan)) for pair in frames]
+
+
+def count(tally: Tally, pair: Pair, method: Registrar | Tracker, target) -> None:
+    """Register one frame and add what came of it."""
+    result = method.register(pair.source, target)
+    judged = judge(pair, result)
+    wrong = bool(judged["false_accept"])
+    tally.frames += 1
+    tally.right += bool(judged["right"])
+    tally.accepted += result.ok
+    tally.false_accepts += wrong
+    tally.confident += wrong and result.confidence >= 0.9
+    tally.tracked += result.details.get("proposer") == "track"
+    tally.seconds += (result.seconds,)
+
+
+def line(kind: str, name: str, tally: Tally) -> str:
+    """One row of the table."""
+    right, accepted, tracked = (f"{100.0 * n / tally.frames:.1f}" for n in (tally.right, tally.accepted, tally.tracked))
+    times = [f"{seconds:.3f}" for seconds in (np.median(tally.seconds), np.mean(tally.seconds))]
+    cells = (kind, name, tally.frames, right, accepted, tally.false_accepts, tally.confident, tracked, *times)
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,138 @@
+"""A stream of sources: near the last pose first, anew where that is not sure."""
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig, Tracker
+from gapr_core.data.specimen import Specimen
+from gapr_core.data.stream import Motion, simulate
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+from gapr_core.proposals.base import Proposals
+from gapr_core.tracking import Memory
+
+MOTION = Motion(frames=4, share=0.35, points=2000)
+
+
+@pytest.fixture(scope="module")
+def specimen(femur):
+    return Specimen(femur, "femur", "parametric-3", "parametric")
+
+
+@pytest.fixture(scope="module")
+def frames(specimen):
+    return simulate(specimen, 1, MOTION)
+
+
+@pytest.fixture(scope="module")
+def prepared(registrar, frames):
+    return registrar.prepare(frames[0].target)
+
+
+@pytest.fixture
+def tracker(registrar):
+    return Tracker(registrar)
+
+
+def is_right(result, pair):
+    shift_mm, turn_deg = se3.pose_error(result.T_target_source, pair.T_target_source, pair.source)
+    return shift_mm < 4.0 and turn_deg < 5.0
+
+
+def test_after_the_first_source_only_what_is_remembered_is_asked(tracker, frames, prepared):
+    results = [tracker.register(pair.source, prepared) for pair in frames]
+    assert [r.details["proposer"] == "track" for r in results] == [False, True, True, True]
+    assert all(is_right(r, pair) for r, pair in zip(results, frames, strict=True))
+    assert all(r.confidence >= tracker.registrar.config.sure for r in results[1:])
+
+
+def test_a_jump_is_found_anew(tracker, frames, prepared):
+    tracker.register(frames[0].source, prepared)
+    elsewhere = se3.exp([90.0, -60.0, 40.0, 1.2, -0.8, 2.0])
+    result = tracker.register(se3.apply(elsewhere, frames[1].source), prepared)
+    assert result.details["proposer"] != "track"
+    assert result.ok
+    shift_mm, turn_deg = se3.pose_error(result.T_target_source @ elsewhere, frames[1].T_target_source, frames[1].source)
+    assert shift_mm < 4.0 and turn_deg < 5.0
+
+
+def test_a_wrong_track_is_left(tracker, frames, prepared):
+    """Every remembered pose is wrong: none may be followed."""
+    first = tracker.register(frames[0].source, prepared)
+    tracker._memory.keep(first.alternatives[-1], first.alternatives[:-1])
+    result = tracker.register(frames[1].source, prepared)
+    assert result.ok and is_right(result, frames[1])
+
+
+def test_another_target_and_a_given_pose_start_a_new_track(tracker, frames, prepared, registrar):
+    tracker.register(frames[0].source, prepared)
+    given = tracker.register(frames[1].source, prepared, initial=frames[1].T_target_source)
+    assert given.ok and given.details["proposer"] != "track"
+    other = tracker.register(frames[2].source, registrar.prepare(frames[0].target))
+    assert other.ok and other.details["proposer"] != "track"
+
+
+def test_after_a_reset_nothing_is_remembered(tracker, frames, prepared):
+    tracker.register(frames[0].source, prepared)
+    tracker.reset()
+    assert tracker.register(frames[1].source, prepared).details["proposer"] != "track"
+
+
+def test_every_so_many_sources_one_is_registered_in_full(registrar, frames, prepared):
+    tracker = Tracker(registrar, recheck=2)
+    tracked = [tracker.register(pair.source, prepared).details["proposer"] == "track" for pair in frames]
+    assert tracked == [False, True, False, True]
+    with pytest.raises(ConfigError, match="at least 1"):
+        Tracker(registrar, recheck=0)
+
+
+def test_a_refused_source_does_not_end_the_track(tracker, frames, prepared):
+    tracker.register(frames[0].source, prepared)
+    noise = np.random.default_rng(0).uniform(-60.0, 60.0, (500, 3))
+    assert not tracker.register(noise, prepared).ok
+    assert not tracker.register(np.zeros((5, 3)), prepared).ok
+    assert tracker.register(frames[1].source, prepared).details["proposer"] == "track"
+
+
+def test_a_pose_without_rivals_is_not_followed(frames, prepared):
+    """One pose looked at alone has nothing to be weighed against."""
+
+    class Truth:
+        name = "truth"
+
+        def prepare(self, target):
+            pass
+
+        def propose(self, source, target, rng):
+            return Proposals(frames[0].T_target_source[None], np.ones(1))
+
+    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1), [Truth()]))
+    assert tracker.register(frames[0].source, prepared).ok
+    assert tracker.register(frames[0].source, prepared).details["proposer"] == "truth"
+
+
+def test_the_rivals_move_with_the_source():
+    memory, rng = Memory(), np.random.default_rng(2)
+    poses = [se3.exp(rng.normal(size=6)) for _ in range(3)]
+    memory.keep(poses[0], tuple(poses[1:]))
+    moved = se3.exp(rng.normal(size=6))
+    memory.follow(poses[0] @ moved)
+    np.testing.assert_allclose(memory.poses, [pose @ moved for pose in poses], atol=1e-12)
+
+
+def test_a_stream_is_seeded_and_its_frames_lie_on_the_bone(specimen, frames):
+    again = simulate(specimen, 1, MOTION)
+    for pair, same in zip(frames, again, strict=True):
+        assert np.array_equal(pair.source, same.source) and np.array_equal(pair.target, frames[0].target)
+        on_bone = se3.apply(pair.T_target_source, pair.source)
+        gaps = np.linalg.norm(on_bone[:, None] - pair.target[None, ::8], axis=2).min(axis=1)
+        assert np.median(gaps) < 6.0
+    steps = [se3.rotation_angle_deg(se3.inverse(a.T_target_source) @ b.T_target_source)
+             for a, b in zip(frames, frames[1:], strict=False)]  # fmt: skip
+    assert max(steps) <= MOTION.step_deg + 1e-6
+
+
+def test_a_bone_that_jumps_is_elsewhere(specimen):
+    first, second = simulate(specimen, 1, Motion(frames=2, jump_every=1))
+    away = first.T_target_source @ se3.inverse(second.T_target_source)
+    assert se3.rotation_angle_deg(away) > 10.0

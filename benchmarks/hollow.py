@@ -36,14 +36,24 @@ def main() -> int:
     parser.add_argument("--walls", default="2.5,4", help="thicknesses, mm, with commas")
     args = parser.parse_args()
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
-    head = ("wall", "source", "pairs", "inner wall found", "as shipped: right, accepted, wrong at 0.9 or more",
-            "outer wall only", "both walls always")
+    head = (
+        "wall",
+        "source",
+        "pairs",
+        "inner wall found",
+        "as shipped: right, accepted, wrong at 0.9 or more",
+        "outer wall only",
+        "both walls always",
+    )
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for wall_mm in map(float, args.walls.split(",")):
         for protocol in PROTOCOLS:
-            rows = [measure(registrar, hollowed(people[i % len(people)], wall_mm), protocol, 100 + i)
-                    for bone in BONES for people in [specimens(bone, args.split, 3, args.anatomy)]
-                    for i in tqdm(range(args.count), f"{protocol} {bone}", leave=False)]
+            rows = [
+                measure(registrar, hollowed(people[i % len(people)], wall_mm), protocol, 100 + i)
+                for bone in BONES
+                for people in [specimens(bone, args.split, 3, args.anatomy)]
+                for i in tqdm(range(args.count), f"{protocol} {bone}", leave=False)
+            ]
             lines.append(line(wall_mm, protocol, np.array(rows)))
     say("\n".join(lines))
     return 0

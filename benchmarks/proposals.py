@@ -46,8 +46,11 @@ def main() -> int:
 
     torch.set_num_threads(1)
     registrar = Registrar.from_pretrained(CONFIG)
-    methods = {"network": registrar.proposers[0], "search": registrar.proposers[1],
-               "ransac": NetworkProposer.from_weights(method="ransac")}
+    methods = {
+        "network": registrar.proposers[0],
+        "search": registrar.proposers[1],
+        "ransac": NetworkProposer.from_weights(method="ransac"),
+    }
     rows = [measure(pair, registrar, methods) for pair in tqdm(chosen(args.pairs, args.limit), unit="pair")]
     if args.out:
         args.out.write_text(json.dumps(rows, indent=1) + "\n")
@@ -82,17 +85,35 @@ def one_list(proposer: Proposer, source: PreparedSource, target: PreparedTarget,
     poses = proposer.propose(source, target, np.random.default_rng(0)).poses
     proposed = time.perf_counter()
     if not len(poses):
-        return {"near": None, "raw_paper": 0, "raw": 0, "refined_paper": 0, "right": 0,
-                "propose_s": proposed - start, "total_s": proposed - start}
+        return {
+            "near": None,
+            "raw_paper": 0,
+            "raw": 0,
+            "refined_paper": 0,
+            "right": 0,
+            "propose_s": proposed - start,
+            "total_s": proposed - start,
+        }
     best = verify(poses, source, target, CONFIG.verification, 1).poses[0]
     best = refine_fully(best, source.points, target, CONFIG.refinement, source.neighbours).T
     done = time.perf_counter()
-    first = refine_fully(verify(poses[:1], source, target, CONFIG.verification, 1).poses[0], source.points, target,
-                         CONFIG.refinement, source.neighbours).T
+    first = refine_fully(
+        verify(poses[:1], source, target, CONFIG.verification, 1).poses[0],
+        source.points,
+        target,
+        CONFIG.refinement,
+        source.neighbours,
+    ).T
     near = next((i + 1 for i, T in enumerate(poses) if within(T, pair, NEAR_MM, NEAR_DEG)), None)
-    return {"near": near, "raw_paper": int(paper(poses[0], pair)), "raw": int(within(poses[0], pair, 4.0, 5.0)),
-            "refined_paper": int(paper(first, pair)), "right": int(within(best, pair, 4.0, 5.0)),
-            "propose_s": proposed - start, "total_s": done - start}
+    return {
+        "near": near,
+        "raw_paper": int(paper(poses[0], pair)),
+        "raw": int(within(poses[0], pair, 4.0, 5.0)),
+        "refined_paper": int(paper(first, pair)),
+        "right": int(within(best, pair, 4.0, 5.0)),
+        "propose_s": proposed - start,
+        "total_s": done - start,
+    }
 
 
 def within(T: Any, pair: Pair, mm: float, deg: float) -> bool:
@@ -109,9 +130,21 @@ def paper(T: Any, pair: Pair) -> bool:
 
 def table(rows: list[Row]) -> str:
     """Markdown, one line per protocol."""
-    head = ("protocol", "pairs", "network's first pose: RR paper raw %", "refined %", "RANSAC raw %", "4 mm/5 deg",
-            "near pose among its 32 %", "network alone 4 mm/5 deg %", "search alone %", "rank of the first near pose",
-            "network s to propose (to a refined pose)", "search s", "median of ratios")
+    head = (
+        "protocol",
+        "pairs",
+        "network's first pose: RR paper raw %",
+        "refined %",
+        "RANSAC raw %",
+        "4 mm/5 deg",
+        "near pose among its 32 %",
+        "network alone 4 mm/5 deg %",
+        "search alone %",
+        "rank of the first near pose",
+        "network s to propose (to a refined pose)",
+        "search s",
+        "median of ratios",
+    )
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
     for protocol in protocols:
@@ -126,13 +159,23 @@ def line(protocol: str, rows: list[Row]) -> str:
     share = {key: 100.0 * float(np.mean([r[key] for r in rows])) for key in shares}
     among = 100.0 * float(np.mean([r["network_near"] is not None for r in rows]))
     ranks = [float(np.median([r[f"{m}_near"] or np.inf for r in rows])) for m in ("network", "search")]
-    t = {key: float(np.median([r[key] for r in rows])) for key in (
-        "network_propose_s", "network_total_s", "search_propose_s", "search_total_s")}
+    t = {
+        key: float(np.median([r[key] for r in rows]))
+        for key in ("network_propose_s", "network_total_s", "search_propose_s", "search_total_s")
+    }
     ratios = [float(np.median([r[f"search_{k}"] / r[f"network_{k}"] for r in rows])) for k in ("propose_s", "total_s")]
-    cells = [protocol, str(len(rows)), *(f"{share[k]:.1f}" for k in shown), f"{among:.1f}",
-        f"{share['network_right']:.1f}", f"{share['search_right']:.1f}", f"{ranks[0]:.0f}; search {ranks[1]:.0f}",
+    cells = [
+        protocol,
+        str(len(rows)),
+        *(f"{share[k]:.1f}" for k in shown),
+        f"{among:.1f}",
+        f"{share['network_right']:.1f}",
+        f"{share['search_right']:.1f}",
+        f"{ranks[0]:.0f}; search {ranks[1]:.0f}",
         f"{t['network_propose_s']:.3f} ({t['network_total_s']:.3f})",
-        f"{t['search_propose_s']:.3f} ({t['search_total_s']:.3f})", f"{ratios[0]:.1f} ({ratios[1]:.1f})"]
+        f"{t['search_propose_s']:.3f} ({t['search_total_s']:.3f})",
+        f"{ratios[0]:.1f} ({ratios[1]:.1f})",
+    ]
     return "| " + " | ".join(cells) + " |"
 
 

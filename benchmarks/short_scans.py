@@ -42,8 +42,11 @@ def main() -> int:
         ends = [[[s.end(share, upper) for s in specimens(bone, args.split, 5, args.anatomy)] for upper in (False, True)]
                 for bone in args.bones.split(",")]  # fmt: skip
         for protocol in PROTOCOLS:
-            rows = [measure(registrar, of_bone[i % 2], protocol, i)
-                    for of_bone in ends for i in tqdm(range(args.count), f"{share:g} {protocol}", leave=False)]
+            rows = [
+                measure(registrar, of_bone[i % 2], protocol, i)
+                for of_bone in ends
+                for i in tqdm(range(args.count), f"{share:g} {protocol}", leave=False)
+            ]
             lines.append(line(share, protocol, np.array(rows)))
     say("\n".join(lines))
     return 0

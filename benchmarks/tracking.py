@@ -61,8 +61,18 @@ def main() -> int:
         for pair in frames:
             count(tallies[kind, "every frame in full"], pair, full, target)
             count(tallies[kind, "tracker"], pair, tracker, target)
-    head = ("stream", "method", "frames", "right %", "accepted %", "false accepts", "of these at >= 0.9",
-            "answered by tracking %", "median s", "mean s")
+    head = (
+        "stream",
+        "method",
+        "frames",
+        "right %",
+        "accepted %",
+        "false accepts",
+        "of these at >= 0.9",
+        "answered by tracking %",
+        "median s",
+        "mean s",
+    )
     say("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     for (kind, name), tally in tallies.items():
         say(line(kind, name, tally))

@@ -81,7 +81,10 @@ def refine_many(
 
 
 def refine_fully(
-    T: Array, points: Array, target: PreparedTarget, config: RefinementConfig,
+    T: Array,
+    points: Array,
+    target: PreparedTarget,
+    config: RefinementConfig,
     neighbours: NDArray[np.int64] | None = None,
 ) -> Fit:
     """Refine one pose on all points until it rests; the scale of the weights follows the residuals.

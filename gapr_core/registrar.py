@@ -143,8 +143,13 @@ class Registrar:
         return bool(fit.sigma_mm < BOTH_WALLS * np.exp(result.details["log_sigma"]))
 
     def _assess(
-        self, fit: Fit, candidates: Candidates, source: PreparedSource, target: PreparedTarget,
-        calibration: Calibration, most: float,
+        self,
+        fit: Fit,
+        candidates: Candidates,
+        source: PreparedSource,
+        target: PreparedTarget,
+        calibration: Calibration,
+        most: float,
     ) -> RegistrationResult:
         uncertainty = covariance.estimate(fit, self.config.covariance)
         figures = confidence.measure(fit, candidates, uncertainty, source, target)

@@ -100,7 +100,11 @@ def _describe(points: Array, config: SourceConfig) -> PreparedSource:
         points[neighbours[:, -1]] - points, axis=1
     )
     return PreparedSource(
-        points, frames.axes, frames.flatness_mm, neighbours, _spread_order(points, lonely),
+        points,
+        frames.axes,
+        frames.flatness_mm,
+        neighbours,
+        _spread_order(points, lonely),
         quadrics.spacing(points, tree),
     )
 

@@ -149,9 +149,7 @@ def _outer_shell(points: Array, normals: Array, spacing_mm: float, config: Targe
     return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)
 
 
-def _outer_wall(
-    points: Array, normals: Array, spacing_mm: float, config: TargetConfig
-) -> tuple[Array, Array] | None:
+def _outer_wall(points: Array, normals: Array, spacing_mm: float, config: TargetConfig) -> tuple[Array, Array] | None:
     """Points and outward normals of a hollow bone's outer wall; None for a bone of one surface."""
     found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions)
     if found is None:

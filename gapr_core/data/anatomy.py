@@ -131,8 +131,11 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
     of_bone = {bone or folder.resolve().name: flat} if flat else {b: f for b, f in nested.items() if bone in (None, b)}
     specimens = [Specimen(load(f, units), b, f.stem, "meshes") for b, files in of_bone.items() for f in files]
     if not specimens:
-        raise ConfigError(f"meshes ({' '.join(READERS)})", f"none for {bone or 'any bone'} in {folder}",
-                          "put one mesh per person there, or one sub-folder per bone")
+        raise ConfigError(
+            f"meshes ({' '.join(READERS)})",
+            f"none for {bone or 'any bone'} in {folder}",
+            "put one mesh per person there, or one sub-folder per bone",
+        )
     if split == "all":
         return specimens
     known = splits(folder) if (folder / "splits.json").is_file() else _draw_splits({s.person for s in specimens})

@@ -54,8 +54,12 @@ def bias_along_normals(
 
 
 def scatter_outliers(
-    specimen: Specimen, points: Array, normals: Array, rng: np.random.Generator,
-    nearest_mm: float = 3.0, farthest_mm: float = 15.0,
+    specimen: Specimen,
+    points: Array,
+    normals: Array,
+    rng: np.random.Generator,
+    nearest_mm: float = 3.0,
+    farthest_mm: float = 15.0,
 ) -> Array:
     """Surface points (K, 3) thrown U[3, 15] mm outward or inward, askew, again until 3 mm off the whole surface."""
     outliers, pending = points.copy(), np.arange(len(points))

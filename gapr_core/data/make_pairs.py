@@ -139,8 +139,9 @@ def _pair_entry(job: _Job, others: list[Specimen], out: Path) -> dict[str, Any]:
 def _check_same_recipe(recipe: Recipe, path: Path) -> None:
     wanted = json.loads(json.dumps(asdict(recipe)))
     if path.is_file() and json.loads(path.read_text())["recipe"] != wanted:
-        raise ConfigError("an empty folder or one with pairs of this recipe", f"other pairs in {path.parent}",
-                          "choose another --out")
+        raise ConfigError(
+            "an empty folder or one with pairs of this recipe", f"other pairs in {path.parent}", "choose another --out"
+        )
     if not path.is_file():
         _write_manifest(path, recipe, [], "")
 

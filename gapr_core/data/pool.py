@@ -29,8 +29,12 @@ def parametric_specimen(bone: str, number: int) -> Specimen:
 
 
 def specimens(
-    bone: str, split: str = "all", people: int = 20, anatomy_folder: str | Path | None = None,
-    meshes_folder: str | Path | None = None, units: str = "mm",
+    bone: str,
+    split: str = "all",
+    people: int = 20,
+    anatomy_folder: str | Path | None = None,
+    meshes_folder: str | Path | None = None,
+    units: str = "mm",
 ) -> list[Specimen]:
     """The bones of one type to make pairs from.
 

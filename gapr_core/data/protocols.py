@@ -141,9 +141,7 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
     return _place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)
 
 
-def wrong(
-    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None
-) -> Pair:
+def wrong(specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None) -> Pair:
     """A source that is not of this bone: in turn another bone type, another person's; each as L1, L2, L3 and paper."""
     turn = int(rng.integers(8)) if turn is None else turn
     source_of = _another(specimen, others, turn % 2, rng)
@@ -151,8 +149,13 @@ def wrong(
     degraded_as = ("L1", "L2", "L3", "paper")[turn // 2 % 4]
     stranger, own = (PROTOCOLS[degraded_as](who, rng) for who in (source_of, specimen))
     metadata = {
-        **stranger.metadata, "origin_mm": own.metadata["origin_mm"], "overlap": 0.0, "wrong_kind": kind,
-        "degraded_as": degraded_as, "source_bone": source_of.bone, "source_person": source_of.person,
+        **stranger.metadata,
+        "origin_mm": own.metadata["origin_mm"],
+        "overlap": 0.0,
+        "wrong_kind": kind,
+        "degraded_as": degraded_as,
+        "source_bone": source_of.bone,
+        "source_person": source_of.person,
     }
     return replace(own, source=stranger.source, T_target_source=np.full((4, 4), np.nan), metadata=metadata)
 
@@ -165,7 +168,8 @@ def _another(specimen: Specimen, others: Sequence[Specimen], kind: int, rng: np.
     if not candidates:
         raise ConfigError(
             f"another bone or another person beside {specimen.bone} of {specimen.person}",
-            f"{len(others)} other specimens, none fitting", "name more bones or more people",
+            f"{len(others)} other specimens, none fitting",
+            "name more bones or more people",
         )
     return candidates[rng.integers(len(candidates))]
 
@@ -183,15 +187,24 @@ def _finish_like_the_paper(
 
 
 def _place(
-    specimen: Specimen, source: Array, target: Array, rotation: Array, metadata: dict[str, Any],
+    specimen: Specimen,
+    source: Array,
+    target: Array,
+    rotation: Array,
+    metadata: dict[str, Any],
     rng: np.random.Generator,
 ) -> Pair:
     """Centre both on the target's mean, then move the source by the rotation and +-150 mm along each axis."""
     origin = target.mean(axis=0)
     T_source_target = se3.from_rotation_translation(rotation, rng.uniform(-TRANSLATION_MM, TRANSLATION_MM, 3))
     return Pair(
-        source=se3.apply(T_source_target, source - origin), target=target - origin,
-        T_target_source=se3.inverse(T_source_target), name="", bone=specimen.bone, person=specimen.person, protocol="",
+        source=se3.apply(T_source_target, source - origin),
+        target=target - origin,
+        T_target_source=se3.inverse(T_source_target),
+        name="",
+        bone=specimen.bone,
+        person=specimen.person,
+        protocol="",
         metadata={**metadata, "origin_mm": origin},
     )
 
@@ -233,8 +246,12 @@ def _best_view(
         seen = VIEWS[level.share_of](specimen, points, direction, kept)
         shown = len(seen) / (kept * draws)
         if best is None or shown > best[0]:
-            metadata = {"share": kept, "share_of": level.share_of, "overlap": len(seen) / draws,
-                        "view_direction": direction}
+            metadata = {
+                "share": kept,
+                "share_of": level.share_of,
+                "overlap": len(seen) / draws,
+                "view_direction": direction,
+            }
             best = shown, points[seen], normals[seen], metadata
         if shown >= ENOUGH_SHOWN[level.share_of]:
             break

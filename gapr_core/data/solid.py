@@ -70,9 +70,7 @@ class Solid:
         margin += 2.0 * self.spacing
         first = np.floor((shape.low - margin - self.low) / self.spacing).astype(int).clip(0, self.shape)
         last = np.ceil((shape.high + margin - self.low) / self.spacing + 1).astype(int).clip(0, self.shape)
-        x, y, z = (
-            (self.low[i] + self.spacing * np.arange(first[i], last[i])).astype(np.float32) for i in range(3)
-        )
+        x, y, z = ((self.low[i] + self.spacing * np.arange(first[i], last[i])).astype(np.float32) for i in range(3))
         block = tuple(slice(first[i], last[i]) for i in (2, 1, 0))
         return block, x[None, None, :], y[None, :, None], z[:, None, None]
 
@@ -124,8 +122,10 @@ def ellipsoid(centre: ArrayLike, radii: ArrayLike, axes: ArrayLike | None = None
 
 
 def tube(
-    points: Sequence[ArrayLike] | Array, radii: Sequence[float] | Array,
-    flat: ArrayLike | None = None, flatness: float = 1.0,
+    points: Sequence[ArrayLike] | Array,
+    radii: Sequence[float] | Array,
+    flat: ArrayLike | None = None,
+    flatness: float = 1.0,
 ) -> Shape:
     """A chain of round cones through `points` (K, 3) with `radii` (K,).
 
@@ -228,9 +228,7 @@ def _along(x: Grid, y: Grid, z: Grid, origin: Array, axis: Array) -> Grid:
     return (x - o[0]) * a[0] + (y - o[1]) * a[1] + (z - o[2]) * a[2]
 
 
-def _cone(
-    x: Grid, y: Grid, z: Grid, a: Array, b: Array, ra: float, rb: float, flat: Array, flatness: float
-) -> Grid:
+def _cone(x: Grid, y: Grid, z: Grid, a: Array, b: Array, ra: float, rb: float, flat: Array, flatness: float) -> Grid:
     axis = b - a
     squared = max(float(axis @ axis), 1e-9)
     t = np.clip(_along(x, y, z, a, axis / squared), 0.0, 1.0)

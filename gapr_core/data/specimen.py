@@ -36,7 +36,8 @@ class Specimen:
     def __post_init__(self) -> None:
         if self.surface.faces is None or len(self.surface.faces) == 0:
             raise InvalidPointCloudError(
-                "a mesh with faces", f"a cloud without faces for {self.bone} of {self.person}",
+                "a mesh with faces",
+                f"a cloud without faces for {self.bone} of {self.person}",
                 "give a surface mesh (STL, PLY, OBJ): views and new points are drawn from its faces",
             )
 

@@ -59,7 +59,12 @@ def run(args: Namespace) -> int:
 
 
 def benchmark(
-    pairs: Path, methods: Sequence[str], out: Path, shard: tuple[int, int] = (1, 1), jobs: int = 1, threads: int = 1,
+    pairs: Path,
+    methods: Sequence[str],
+    out: Path,
+    shard: tuple[int, int] = (1, 1),
+    jobs: int = 1,
+    threads: int = 1,
     ours: str | None = None,
 ) -> list[Row]:
     """Run what is not yet in `out`, then write table, plots and report there.

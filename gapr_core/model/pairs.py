@@ -132,8 +132,15 @@ class DensePairs(Pairs):
     """
 
     def __init__(
-        self, points_i: Tensor, normals_i: Tensor, points_j: Tensor, normals_j: Tensor, valid_j: Tensor,
-        c_h: Tensor, c_k: Tensor, reach: Tensor,
+        self,
+        points_i: Tensor,
+        normals_i: Tensor,
+        points_j: Tensor,
+        normals_j: Tensor,
+        valid_j: Tensor,
+        c_h: Tensor,
+        c_k: Tensor,
+        reach: Tensor,
     ) -> None:
         self.p_i, self.n_i = points_i[:, :, None], normals_i[:, :, None]
         self.p_j, self.n_j = points_j[:, None], normals_j[:, None]

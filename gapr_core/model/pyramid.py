@@ -50,7 +50,8 @@ def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Clou
     if len(resolutions[-1]) > 4 * config.superpoints[1]:
         raise InvalidPointCloudError(
             f"at most {4 * config.superpoints[1]} superpoints",
-            f"{len(resolutions[-1])}: a cloud far larger than its target", "check the units of both clouds",
+            f"{len(resolutions[-1])}: a cloud far larger than its target",
+            "check the units of both clouds",
         )
     trees = [cKDTree(p) for p in resolutions]
     radii = [config.radius_voxels * frame.voxel * config.voxel_growth**s for s in range(config.stages)]
@@ -70,8 +71,12 @@ def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Clou
         levels.append(Level(_tensor(p), _tensor(normals), _tensor(certainty), (len(p),), within[s], below, up))
     patches, valid = group_patches(resolutions[config.fine_stage], trees[-1], config.patch_size)
     return Cloud(
-        tuple(levels), torch.from_numpy(patches), torch.from_numpy(valid), config.fine_stage,
-        torch.from_numpy(centre[None]), torch.tensor([frame.scale_mm], dtype=torch.float64),
+        tuple(levels),
+        torch.from_numpy(patches),
+        torch.from_numpy(valid),
+        config.fine_stage,
+        torch.from_numpy(centre[None]),
+        torch.tensor([frame.scale_mm], dtype=torch.float64),
     )
 
 
@@ -132,7 +137,10 @@ def neighborhood(centres: Array, tree: cKDTree, cap: int, radius: float, small_b
     c_h = _mean(near, valid, centres)
     c_k = _mean(near, valid & (distance <= small_ball * radius), centres)
     return Neighborhood(
-        torch.from_numpy(index.astype(np.int64)), torch.from_numpy(valid), _tensor(c_h), _tensor(c_k),
+        torch.from_numpy(index.astype(np.int64)),
+        torch.from_numpy(valid),
+        _tensor(c_h),
+        _tensor(c_k),
         torch.full((len(centres),), radius),
     )
 

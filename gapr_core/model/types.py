@@ -176,8 +176,12 @@ def collate(clouds: list[Cloud]) -> Cloud:
     size = max(c.patches.shape[1] for c in clouds)
     patches = [_pad(c.patches, size) + start for c, start in zip(clouds, starts, strict=True)]
     return Cloud(
-        levels, torch.cat(patches), torch.cat([_pad(c.patches_valid, size) for c in clouds]), fine,
-        torch.cat([c.centre_mm for c in clouds]), torch.cat([c.scale_mm for c in clouds]),
+        levels,
+        torch.cat(patches),
+        torch.cat([_pad(c.patches_valid, size) for c in clouds]),
+        fine,
+        torch.cat([c.centre_mm for c in clouds]),
+        torch.cat([c.scale_mm for c in clouds]),
     )
 
 
@@ -195,8 +199,13 @@ def _join_levels(pyramids: list[tuple[Level, ...]], depth: int) -> Level:
         torch.cat([getattr(level, name) for level in own]) for name in ("points", "normals", "certainty")
     )
     return Level(
-        points, normals, certainty,
-        tuple(n for level in own for n in level.lengths), _join([level.within for level in own], starts), below, up,
+        points,
+        normals,
+        certainty,
+        tuple(n for level in own for n in level.lengths),
+        _join([level.within for level in own], starts),
+        below,
+        up,
     )
 
 

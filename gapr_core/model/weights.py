@@ -33,7 +33,9 @@ def save(
     tensors = {name: t.detach().to("cpu", dtype).contiguous() for name, t in network.state_dict().items()}
     digest = checksum(tensors)
     header = {
-        "format": FORMAT, "config": json.dumps(network.config.to_dict()), "card": json.dumps(card or {}),
+        "format": FORMAT,
+        "config": json.dumps(network.config.to_dict()),
+        "card": json.dumps(card or {}),
         "sha256": digest,
     }
     save_file(tensors, str(path), metadata=header)
@@ -64,8 +66,11 @@ def checksum(tensors: dict[str, Tensor]) -> str:
     digest = hashlib.sha256()
     for name in sorted(tensors):
         digest.update(name.encode())
-        digest.update(tensors[name].contiguous().view(torch.uint8).numpy().tobytes() if tensors[name].dim()
-                      else tensors[name].numpy().tobytes())
+        digest.update(
+            tensors[name].contiguous().view(torch.uint8).numpy().tobytes()
+            if tensors[name].dim()
+            else tensors[name].numpy().tobytes()
+        )
     return digest.hexdigest()
 
 

@@ -145,4 +145,3 @@ def _poses(covariance: Array, p_mean: Array, q_mean: Array) -> Array:
     poses[:, :3, :3] = v @ u.transpose(0, 2, 1)
     poses[:, :3, 3] = q_mean - np.einsum("kij,kj->ki", poses[:, :3, :3], p_mean)
     return poses
-

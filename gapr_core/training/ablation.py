@@ -91,8 +91,14 @@ def run(args: Namespace) -> int:
 
 
 def ablate(
-    plan: Sequence[Variant], config: TrainConfig, out: Path, anatomy: Path | None, recipe: Recipe, seeds: int = 1,
-    jobs: int = 1, minutes: float = math.inf,
+    plan: Sequence[Variant],
+    config: TrainConfig,
+    out: Path,
+    anatomy: Path | None,
+    recipe: Recipe,
+    seeds: int = 1,
+    jobs: int = 1,
+    minutes: float = math.inf,
 ) -> int:
     """Bring the comparison in `out` to its end, or as far as `minutes` suffice.
 

@@ -30,9 +30,7 @@ def save_checkpoint(
     os.replace(new, path)
 
 
-def load_checkpoint(
-    path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer
-) -> dict[str, Any]:
+def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Fill network, averaged network and optimiser; returns the state.
 
     Raises:

@@ -81,7 +81,5 @@ def compute_losses(network: GAPRNet, pair: TrainingPair, generator: torch.Genera
     if len(chosen) == 0:
         return Losses(coarse, coarse.new_zeros(()), early), a
     fine = network.fine_matching(pair.source, pair.target, f_p.fine, f_q.fine, chosen)
-    labels = fine_labels(
-        pair, fine.source_index, fine.target_index, fine.source_valid, fine.target_valid, chosen.pair
-    )
+    labels = fine_labels(pair, fine.source_index, fine.target_index, fine.source_valid, fine.target_valid, chosen.pair)
     return Losses(coarse, assignment_loss(fine.log_z, labels), early), a

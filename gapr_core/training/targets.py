@@ -109,9 +109,13 @@ def join(pairs: list[TrainingPair]) -> TrainingPair:
     which = tuple(next(row for row, cloud in enumerate(distinct) if cloud is p.target) for p in pairs)
     overlaps = [pad_tensor(p.overlaps, (0, m - p.overlaps.shape[2], 0, n - p.overlaps.shape[1])) for p in pairs]
     return TrainingPair(
-        collate([p.source for p in pairs]), collate([p.target for p in pairs]),
-        torch.cat([p.T for p in pairs]), torch.cat(overlaps), torch.cat([p.radius for p in pairs]),
-        collate(distinct), which,
+        collate([p.source for p in pairs]),
+        collate([p.target for p in pairs]),
+        torch.cat([p.T for p in pairs]),
+        torch.cat(overlaps),
+        torch.cat([p.radius for p in pairs]),
+        collate(distinct),
+        which,
     )
 
 

@@ -129,8 +129,11 @@ def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
         return GAPRNet(model)
     network = weights.load(config.initial)[0]
     if replace(network.config, name=model.name) != model:
-        raise ConfigError("initial weights of the network that is trained", f"another in {config.initial}",
-                          "train the network of that file (--model), or begin without it")
+        raise ConfigError(
+            "initial weights of the network that is trained",
+            f"another in {config.initial}",
+            "train the network of that file (--model), or begin without it",
+        )
     return network.train()
 
 
@@ -148,8 +151,13 @@ def micro_batches(
     dataset = TrainingPairs(config, model, anatomy)
     numbers = range(first + rank, config.pairs // config.micro_batch, world)
     loader = DataLoader(
-        dataset, batch_size=None, sampler=list(numbers), num_workers=config.workers, worker_init_fn=one_thread,
-        prefetch_factor=4 if config.workers else None, multiprocessing_context="fork" if config.workers else None,
+        dataset,
+        batch_size=None,
+        sampler=list(numbers),
+        num_workers=config.workers,
+        worker_init_fn=one_thread,
+        prefetch_factor=4 if config.workers else None,
+        multiprocessing_context="fork" if config.workers else None,
     )
     return iter(loader)
 

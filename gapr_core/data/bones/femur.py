@@ -53,8 +53,21 @@ def _shaft(solid: Solid, p: FemurParameters) -> None:
     """An oval shaft that flares at both ends, with the linea aspera as a ridge at its back."""
     width, wide = p.shaft_width_mm / 2.0, p.epicondylar_width_mm / 80.0
     stations = np.array([0.05, 0.09, 0.13, 0.18, 0.25, 0.40, 0.55, 0.70, 0.78, 0.84, 0.88]) * p.length_mm
-    half_width = np.array([33.0 * wide, 31.0 * wide, 26.5 * wide, 21.5 * wide, 1.22 * width, 1.04 * width, width,
-                           1.03 * width, 1.2 * width, 1.42 * width, 1.3 * width])
+    half_width = np.array(
+        [
+            33.0 * wide,
+            31.0 * wide,
+            26.5 * wide,
+            21.5 * wide,
+            1.22 * width,
+            1.04 * width,
+            width,
+            1.03 * width,
+            1.2 * width,
+            1.42 * width,
+            1.3 * width,
+        ]
+    )
     half_depth = p.shaft_roundness * width * np.array([1.5, 1.4, 1.25, 1.12, 1.04, 1.02, 1.0, 0.97, 1.0, 1.08, 1.0])
     ridge = profile(p.length_mm * np.array([0.2, 0.32, 0.66, 0.80]), [0.0, p.linea_aspera_mm, p.linea_aspera_mm, 0.0])
     a, b = profile(stations, half_width), profile(stations, half_depth)

@@ -24,8 +24,13 @@ def add_sacrum(
     middle = _midline(length_mm, curvature, tilt_deg, depth)
     half = (width_mm / 2.0 - 7.0) * HALF_WIDTH
     columns = []
-    for x, radii, set_back in ((-1.0, WING_RADII, 4.0), (-0.5, WING_RADII, 0.0), (0.0, BODY_RADII, 0.0),
-                           (0.5, WING_RADII, 0.0), (1.0, WING_RADII, 4.0)):
+    for x, radii, set_back in (
+        (-1.0, WING_RADII, 4.0),
+        (-0.5, WING_RADII, 0.0),
+        (0.0, BODY_RADII, 0.0),
+        (0.5, WING_RADII, 0.0),
+        (1.0, WING_RADII, 4.0),
+    ):
         row = np.stack([x * half, middle[:, 0] + set_back * abs(x), middle[:, 1]], axis=1)
         columns.append((row, radii * np.interp(half, [0.0, 40.0], [0.85, 1.0])))
     solid.add(sheet(columns, step_mm=3.0), 5.0)
@@ -49,8 +54,10 @@ def _frame(middle: Array) -> tuple[Array, Array]:
     tangent = CubicSpline(np.arange(len(middle)), middle)(np.arange(len(middle)), 1)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     zero = np.zeros(len(middle))
-    return (np.stack([zero, tangent[:, 0], tangent[:, 1]], axis=1),
-            np.stack([zero, -tangent[:, 1], tangent[:, 0]], axis=1))
+    return (
+        np.stack([zero, tangent[:, 0], tangent[:, 1]], axis=1),
+        np.stack([zero, -tangent[:, 1], tangent[:, 0]], axis=1),
+    )
 
 
 def _at(middle: Array, index: float) -> Array:

@@ -104,8 +104,19 @@ class _Chest:
 def _sternum(solid: Solid, chest: _Chest) -> None:
     p = chest.p
     m, total = p.manubrium_length_mm, chest.sternum_mm
-    z = -np.array([2.0, 0.3 * m, 0.65 * m, m, m + 0.3 * p.body_length_mm, m + 0.72 * p.body_length_mm, total - 4.0,
-                   total + 0.35 * p.xiphoid_length_mm, total + p.xiphoid_length_mm])
+    z = -np.array(
+        [
+            2.0,
+            0.3 * m,
+            0.65 * m,
+            m,
+            m + 0.3 * p.body_length_mm,
+            m + 0.72 * p.body_length_mm,
+            total - 4.0,
+            total + 0.35 * p.xiphoid_length_mm,
+            total + p.xiphoid_length_mm,
+        ]
+    )
     wide, body = p.manubrium_width_mm / 2.0, p.body_width_mm / 2.0
     half = np.array([0.78 * wide, wide, 0.72 * wide, 0.82 * body, 0.9 * body, body, 0.72 * body, 8.0, 3.5])
     thick = p.sternum_thickness_mm / 2.0 * np.array([1.15, 1.2, 1.1, 1.0, 0.95, 0.9, 0.85, 0.6, 0.5])

@@ -106,9 +106,12 @@ def _twist_and_bow(surface: Surface, p: TibiaParameters) -> Surface:
     turn = np.radians(p.torsion_deg) * (1.0 - t) ** 1.3  # outward at the ankle: the front turns to lateral (+x)
     x, y = surface.points[:, 0], surface.points[:, 1]
     middle = 4.0 * t * (1.0 - t)
-    moved = np.stack([
-        np.cos(turn) * x - np.sin(turn) * y + p.bow_mm * middle,
-        np.sin(turn) * x + np.cos(turn) * y - p.recurvature_mm * middle,
-        surface.points[:, 2],
-    ], axis=1)
+    moved = np.stack(
+        [
+            np.cos(turn) * x - np.sin(turn) * y + p.bow_mm * middle,
+            np.sin(turn) * x + np.cos(turn) * y - p.recurvature_mm * middle,
+            surface.points[:, 2],
+        ],
+        axis=1,
+    )
     return replace(surface, points=moved)

@@ -16,7 +16,8 @@ def test_the_picture_shows_the_outline_at_scale_with_the_left_side_on_the_right(
 
 
 def test_views_stand_side_by_side():
-    one, two = picture.strip(knob_specimen().surface, ("anterior",)), picture.strip(
-        knob_specimen().surface, ("anterior", "superior")
+    one, two = (
+        picture.strip(knob_specimen().surface, ("anterior",)),
+        picture.strip(knob_specimen().surface, ("anterior", "superior")),
     )
     assert two.shape[1] > one.shape[1] and two.shape[0] == one.shape[0]

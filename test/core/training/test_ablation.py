@@ -19,9 +19,7 @@ from gapr_core.training.config import TrainConfig, default_plan, read_plan, trai
 
 ROOT = Path(__file__).parents[3]
 EXAM = Recipe(("paper", "L2"), ("femur",), 2, 0, "test", 2, "anatomy")
-BUDGET = TrainConfig(
-    bones=("femur",), mix={"paper": 1.0}, pairs=4, batch=2, micro_batch=2, pool=1, validation_pairs=1
-)
+BUDGET = TrainConfig(bones=("femur",), mix={"paper": 1.0}, pairs=4, batch=2, micro_batch=2, pool=1, validation_pairs=1)
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,10 @@
-"""Streams: the `Tracker` against a full registration of every frame, on the same streams in one run.
+"""Streams: every frame by itself, the `Tracker` and the `Accumulator`, on the same streams in one run.
 
     python benchmarks/tracking.py --anatomy DIR [--split val] [--count 4] [--bones femur,tibia,pelvis]
 
-Three kinds of stream: the bone moves a little from frame to frame; it also jumps every eighth frame; the bone in view
-is another person's, so that every pose is wrong. Each frame is a small one-sided view.
+Each frame is a small one-sided view. The bone moves a little from frame to frame, or also jumps every eighth frame; or
+it is another person's, so that every pose is wrong; or it rests, and each frame is a slice of it, as an image of a
+tracked probe is.
 """
 
 from __future__ import annotations
@@ -15,17 +16,23 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from gapr_core import Registrar, RegistrarConfig
+from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 from gapr_core.console import say
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import Pair
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.evaluation.judge import judge
-from gapr_core.tracking import Tracker
 
-KINDS = {"moves": Motion(), "small views, moves": Motion(share=0.12, points=800, noise_mm=1.5, bias_mm=1.0),
-         "moves and jumps": Motion(jump_every=8), "another person's bone": Motion()}  # fmt: skip
-STRANGER = "another person's bone"
+SLICES = Motion(share=0.04, points=200, step_mm=0.0, step_deg=0.0)
+KINDS = {
+    "moves": Motion(),
+    "smaller views, moves": Motion(share=0.12, points=800, noise_mm=1.5, bias_mm=1.0),
+    "moves and jumps": Motion(jump_every=8),
+    "another person's bone": Motion(),
+    "rests, slices": SLICES,
+    "rests, slices of another person's bone": SLICES,
+}
+STRANGER, RESTS, BY_ITSELF = "another person's bone", "rests", "every frame by itself"
 
 
 @dataclass
@@ -50,17 +57,18 @@ def main() -> int:
     parser.add_argument("--bones", default="femur,tibia,pelvis,thoracic", help="with commas")
     args = parser.parse_args()
     full = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
-    tracker = Tracker(full)
+    methods = {BY_ITSELF: full, "tracker": Tracker(full), "accumulator": Accumulator(Tracker(full), 24)}
     people = {bone: specimens(bone, args.split, 4, args.anatomy) for bone in args.bones.split(",")}
-    tallies = {(kind, name): Tally() for kind in KINDS for name in ("every frame in full", "tracker")}
+    tallies = {(kind, name): Tally() for kind in KINDS for name in chosen(kind)}
     runs = [(kind, bone, i) for kind in KINDS for bone in people for i in range(args.count)]
     for kind, bone, i in tqdm(runs, "streams"):
         frames = stream(kind, people[bone], i)
         target = full.prepare(frames[0].target)
-        tracker.reset()
-        for pair in frames:
-            count(tallies[kind, "every frame in full"], pair, full, target)
-            count(tallies[kind, "tracker"], pair, tracker, target)
+        for name in chosen(kind):
+            if name != BY_ITSELF:
+                methods[name].reset()
+            for pair in frames:
+                count(tallies[kind, name], pair, methods[name], target)
     head = (
         "stream",
         "method",
@@ -79,17 +87,22 @@ def main() -> int:
     return 0
 
 
+def chosen(kind: str) -> tuple[str, ...]:
+    """The methods for a kind; an accumulator needs a bone that rests."""
+    return (BY_ITSELF, "accumulator") if kind.startswith(RESTS) else (BY_ITSELF, "tracker")
+
+
 def stream(kind: str, people: list, number: int) -> list[Pair]:
     """The frames of one stream; of a stranger, with the target of somebody else and no truth."""
     own = people[number % len(people)]
     frames = simulate(own, 500 + number, KINDS[kind])
-    if kind != STRANGER:
+    if STRANGER not in kind:
         return frames
     other = simulate(people[(number + 1) % len(people)], 500 + number, replace(KINDS[kind], frames=1))[0]
     return [replace(pair, target=other.target, T_target_source=np.full((4, 4), np.nan)) for pair in frames]
 
 
-def count(tally: Tally, pair: Pair, method: Registrar | Tracker, target) -> None:
+def count(tally: Tally, pair: Pair, method: Registrar | Tracker | Accumulator, target) -> None:
     """Register one frame and add what came of it."""
     result = method.register(pair.source, target)
     judged = judge(pair, result)

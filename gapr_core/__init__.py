@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gapr_core.accumulation import Accumulator
     from gapr_core.clouds import Surface, load
     from gapr_core.config import RegistrarConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
@@ -22,6 +23,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Registrar": "registrar",
     "Tracker": "tracking",
+    "Accumulator": "accumulation",
     "RegistrarConfig": "config",
     "PreparedTarget": "target",
     "RegistrationResult": "results",

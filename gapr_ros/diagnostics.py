@@ -18,7 +18,7 @@ THROTTLE_S = 5.0
 
 @dataclass
 class Counters:
-    """Every cloud that was received is accepted, refused, dropped, or still on its way (two at most).
+    """Every cloud that was received is accepted, refused, dropped, merged into another, or still on its way.
 
     `lost` are those that a publisher sent and that never arrived.
     """
@@ -27,6 +27,7 @@ class Counters:
     dropped: int = 0
     accepted: int = 0
     refused: int = 0
+    merged: int = 0
     lost: int = 0
     consecutive_refusals: int = 0
     last_refusal: str = ""
@@ -38,7 +39,9 @@ class Counters:
         self.last_cloud_at = time.monotonic()
 
     def settle(self, outcome: Outcome) -> None:
-        """A cloud was answered."""
+        """A cloud was answered, and with it those that it pushed out, where they could be used."""
+        self.merged += outcome.merged
+        self.dropped += len(outcome.job.earlier) - outcome.merged
         if outcome.ok:
             self.accepted += 1
             self.consecutive_refusals = 0
@@ -89,7 +92,7 @@ class RefusalLog:
             self._silent += 1
             return
         more = f" ({self._silent} more since the last line)" if self._silent else ""
-        self._write(f"cloud in '{outcome.cloud_frame}' {outcome}{more}")
+        self._write(f"cloud in '{outcome.cloud_header.frame_id}' {outcome}{more}")
         self._reason, self._at, self._silent = outcome.reason, time.monotonic(), 0
 
 
@@ -108,7 +111,8 @@ def registration_status(
     values = {"state": state, "model_path": path, "model_points": points, **_of_cloud(last)}
     values |= {
         "frames_received": counters.received, "frames_dropped": counters.dropped,
-        "frames_accepted": counters.accepted, "frames_refused": counters.refused, "frames_lost": counters.lost,
+        "frames_accepted": counters.accepted, "frames_refused": counters.refused, "frames_merged": counters.merged,
+        "frames_lost": counters.lost,
         "consecutive_refusals": counters.consecutive_refusals, "last_refusal": counters.last_refusal,
         "cloud_qos": source.qos, "publishers_on_points": source.publishers,
     }  # fmt: skip
@@ -140,8 +144,8 @@ def _of_cloud(last: Outcome | None) -> dict[str, object]:
     if last is None:
         return dict.fromkeys(names, "")
     stamp = f"{last.header.stamp.sec}.{last.header.stamp.nanosec:09d}"
-    values = (stamp, last.cloud_frame, last.points_in, last.points_used, last.age_s, last.confidence_out, last.tre_mm,
-              last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
+    values = (stamp, last.cloud_header.frame_id, last.points_in, last.points_used, last.age_s, last.confidence_out,
+              last.tre_mm, last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
     return dict(zip(names, values, strict=True))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
@@ -18,19 +16,6 @@ from msg_adapters import InvalidMessageError, cloud_to_xyz
 
 Array = NDArray[np.float64]
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
-
-
-@dataclass(frozen=True)
-class Intake:
-    """A cloud that can be registered.
-
-    Attributes:
-        points_mm: (N, 3) float64, finite, in the cloud's frame.
-        points_in: how many points the message held.
-    """
-
-    points_mm: Array
-    points_in: int
 
 
 def read_message(data: bytes) -> PointCloud2:
@@ -54,19 +39,26 @@ def check_age(header: Header, now_ns: int, max_age_s: float) -> None:
         raise RefusedError(Reason.STALE, f"the cloud is {age_s:.3g} s old, max_cloud_age is {max_age_s:g} s")
 
 
-def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParameters) -> Intake:
-    """Read, convert, clean and thin a cloud.
+def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParameters) -> Array:
+    """Read, convert, clean and thin a cloud: (N, 3) float64, mm, finite, in the cloud's frame.
+
+    A cloud that is registered together with others (`accumulate`) may have any number of points but none.
 
     Raises:
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
     """
     points = _finite_points(cloud)
     points = _within_range(wire.to_mm(points, parameters.cloud_unit), parameters)
-    if len(points) < parameters.min_points:
-        raise RefusedError(Reason.TOO_FEW_POINTS, f"{len(points)} usable points, min_points is {parameters.min_points}")
+    check_count(len(points), 1 if parameters.accumulate > 1 else parameters.min_points)
     points = thin(points, parameters.max_points, parameters.seed)
     check_unit(points, model_extent_mm, parameters.cloud_unit)
-    return Intake(points, cloud.width * cloud.height)
+    return points
+
+
+def check_count(count: int, least: int) -> None:
+    """Refuse too few points."""
+    if count < least:
+        raise RefusedError(Reason.TOO_FEW_POINTS, f"{count} usable points, min_points is {least}")
 
 
 def check_unit(points_mm: Array, model_extent_mm: float, unit: str) -> None:

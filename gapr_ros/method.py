@@ -8,11 +8,12 @@ from gapr_ros.parameters import NodeParameters
 
 
 def default_method(parameters: NodeParameters) -> Any:
-    """GAPR as it ships: a `Tracker`, or with `track: false` the `Registrar` for every cloud."""
-    from gapr_core import Registrar, RegistrarConfig, Tracker
+    """GAPR as it ships: a `Tracker`, with `track: false` the `Registrar`; an `Accumulator` of either on demand."""
+    from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 
     config = RegistrarConfig(
         min_confidence=parameters.min_confidence, num_threads=parameters.num_threads, seed=parameters.seed
     )
     registrar = Registrar.from_pretrained(config, parameters.device)
-    return Tracker(registrar) if parameters.track else registrar
+    method = Tracker(registrar) if parameters.track else registrar
+    return Accumulator(method, parameters.accumulate) if parameters.accumulate > 1 else method

@@ -48,7 +48,7 @@ class NodeParameters:
     cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "mm"))
     cloud_reliability: str = setting("auto", "auto: reliable, and best effort once a publisher offers only that",
                                      choices=("auto", "reliable", "best_effort"), live=False)  # fmt: skip
-    min_points: int = setting(200, "fewer usable points are refused", low=3)
+    min_points: int = setting(200, "fewer usable points, of all clouds that are registered as one, are refused", low=3)
     max_points: int = setting(200_000, "larger clouds are thinned to this, seeded; 0: never", low=0)
     range_min: float = setting(0.0, "nearer points are left out, m; 0: off", low=0.0)
     range_max: float = setting(0.0, "farther points are left out, m; 0: off", low=0.0)
@@ -59,6 +59,8 @@ class NodeParameters:
     max_jump_rotation: float = setting(0.0, "farther from the last pose is refused, rad; 0: off", low=0.0, high=3.15)
     continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register")
     track: bool = setting(True, "start where the last pose was; false: every cloud by itself", live=False)
+    accumulate: int = setting(1, "clouds registered as one; the bone must rest in their frame", low=1, high=10_000,
+                              live=False)  # fmt: skip
     max_rate: float = setting(0.0, "most registrations a second; 0: as many as possible", low=0.0, high=1000.0)
     timeout: float = setting(5.0, "a registration that took longer is refused, s", low=1e-3)
     publish_tf: bool = setting(True, "send accepted poses to /tf", live=False)

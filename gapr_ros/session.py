@@ -51,7 +51,7 @@ class Session:
         self._frames = Frames(node, node.parameters.publish_tf, listen=bool(node.parameters.output_frame))
         self._publishers = Publishers(node, self._frames, node.parameters.model_frame)
         self._registration = Registration(self._frames, self._situation)
-        self.worker = Worker(self._work, self._held, self._period_s)
+        self.worker = Worker(self._work, self._held, self._period_s, keep=node.parameters.accumulate - 1)
 
     def close(self) -> None:
         """End the worker and give the topics back."""
@@ -183,7 +183,7 @@ class Session:
         self.reset()
         waiting = self.worker.clear()
         if waiting is not None:
-            self._node.counters.dropped += 1
+            self._node.counters.dropped += 1 + len(waiting.earlier)
             outcome = Outcome(waiting)
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.tell()

@@ -30,6 +30,11 @@ def metres_from_mm(length_mm: float) -> float:
     return length_mm / MM_PER_M
 
 
+def moved_mm(T: Array, points_mm: Array) -> Array:
+    """Points in mm moved by a transform of the wire (4, 4), metres."""
+    return points_mm @ T[:3, :3].T + T[:3, 3] * MM_PER_M
+
+
 def wire_pose(T_target_source: Array) -> Array:
     """The core's answer (4, 4), mm, as T_cloud_model in metres."""
     T = se3.inverse(se3.nearest_rigid(T_target_source))
@@ -72,12 +77,6 @@ def wire_covariance(
     R = T_target_source[:3, :3].T
     J = np.block([[R, R @ skew(centre)], [np.zeros((3, 3)), R]])
     return symmetric(J @ floored @ J.T)
-
-
-def rotate_covariance(covariance: Array, R: Array) -> Array:
-    """The covariance of a pose whose parent frame is turned by R (3, 3)."""
-    J = np.kron(np.eye(2), R)
-    return symmetric(J @ covariance @ J.T)
 
 
 def floor_covariance(covariance: Array, translation: float, rotation: float) -> Array:

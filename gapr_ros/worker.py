@@ -23,6 +23,8 @@ class Job:
         received_ns: the node's clock when it arrived, ns.
         waiters: futures of service calls that want its outcome.
         urgent: asked for by a service: neither `continuous` nor `max_rate` holds it back.
+        earlier: clouds that it pushed out of the mailbox and that are registered with it (`accumulate`), oldest first.
+        again: the cloud was processed before.
     """
 
     cloud: bytes
@@ -30,6 +32,8 @@ class Job:
     received_ns: int
     waiters: list[Any] = field(default_factory=list)
     urgent: bool = False
+    earlier: list[bytes] = field(default_factory=list)
+    again: bool = False
 
 
 class Worker:
@@ -39,10 +43,13 @@ class Worker:
         process: what to do with a job, in the worker's thread; must not raise.
         held: asked before a job that is not urgent; true leaves it in the mailbox (`continuous: false`).
         period_s: asked for the least time between the starts of two jobs that are not urgent.
+        keep: how many clouds that were pushed out go with the newest one; 0: they are dropped.
     """
 
-    def __init__(self, process: Callable[[Job], None], held: Callable[[], bool], period_s: Callable[[], float]) -> None:
-        self._process, self._held, self._period_s = process, held, period_s
+    def __init__(
+        self, process: Callable[[Job], None], held: Callable[[], bool], period_s: Callable[[], float], keep: int = 0
+    ) -> None:
+        self._process, self._held, self._period_s, self._keep = process, held, period_s, keep
         self._wake = threading.Condition()
         self._slot: Job | None = None
         self._tasks: deque[Callable[[], None]] = deque()
@@ -53,14 +60,17 @@ class Worker:
         self._thread.start()
 
     def put(self, job: Job) -> int:
-        """Make this the next cloud. Returns how many clouds it pushed out (0 or 1); their waiters wait for it."""
+        """Make this the next cloud. Returns how many are dropped for it; the waiters of the old one wait for it."""
+        pushed_out: list[bytes] = []
         with self._wake:
             old, self._slot = self._slot, job
             if old is not None:
                 job.waiters += old.waiters
                 job.urgent |= old.urgent
+                pushed_out = old.earlier if old.again else [*old.earlier, old.cloud]
+                job.earlier = pushed_out[max(0, len(pushed_out) - self._keep) :]
             self._wake.notify()
-        return int(old is not None)
+        return len(pushed_out) - len(job.earlier)
 
     def ask(self, waiter: Any, epoch: int) -> bool:
         """Process the newest cloud now and tell the waiter. False when there has been no cloud yet.
@@ -69,7 +79,7 @@ class Worker:
         """
         with self._wake:
             if self._slot is None and self._last is not None:
-                self._slot = Job(self._last.cloud, epoch, self._last.received_ns)
+                self._slot = Job(self._last.cloud, epoch, self._last.received_ns, again=True)
             if self._slot is None:
                 return False
             self._slot.urgent = True

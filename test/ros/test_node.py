@@ -112,6 +112,43 @@ def test_the_newest_cloud_wins_and_every_other_is_counted(live):
     np.testing.assert_allclose(method.calls[-1]["source"], (0.01 + GOOD[:300] * 10) * 1000.0, atol=1e-3)
 
 
+def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob_path, client, method):
+    method.sources = []
+    method.collect = method.sources.append
+    type(method).collected = property(lambda self: np.concatenate([np.empty((0, 3)), *self.sources]))
+    with node_in_thread(method, blob_path, accumulate=4) as node:
+        client.wait_for_state("active")
+        assert client.ask(GOOD[:150])["last_refusal"].startswith("too_few_points: 150 usable points, min_points is 200")
+        method.gate.clear()
+        client.send(GOOD[:300])
+        wait_until(lambda: len(method.calls) == 2 and node.counters.received == 2)
+        for i in range(6):
+            client.send(GOOD[:100] * (i + 1) if i != 4 else np.full((100, 3), np.nan))
+            wait_until(lambda i=i: node.counters.received == i + 3)
+        method.gate.set()
+        wait_until(lambda: int(client.values()["frames_accepted"]) == 2)
+        values = client.values()
+    counts = {key: int(values[f"frames_{key}"]) for key in ("received", "accepted", "refused", "merged", "dropped")}
+    assert counts == {"received": 8, "accepted": 2, "refused": 1, "merged": 2, "dropped": 3}
+    sizes = [150, 100, 100]  # too few alone; then those that waited, without the two oldest and the one without points
+    assert [len(source) for source in method.sources] == sizes
+    np.testing.assert_allclose(method.sources[-1], GOOD[:100] * 4 * 1000.0, atol=1e-3)
+    np.testing.assert_allclose(method.calls[-1]["source"], GOOD[:100] * 6 * 1000.0, atol=1e-3)
+    assert int(values["points_used"]) == sum(sizes) + 100
+
+
+def test_a_cloud_that_is_asked_for_again_is_not_collected_twice(blob_path, client, method):
+    method.sources = []
+    method.collect = method.sources.append
+    type(method).collected = property(lambda self: np.concatenate([np.empty((0, 3)), *self.sources]))
+    with node_in_thread(method, blob_path, accumulate=4):
+        client.wait_for_state("active")
+        method.collect(GOOD * 1000.0)
+        client.ask(GOOD)
+        assert client.call("register").success
+    assert [len(call["source"]) for call in method.calls[-2:]] == [len(GOOD), 0]
+
+
 def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
     node, client, method = live
     client.ask(GOOD)
@@ -410,9 +447,10 @@ def test_with_tf_poses_go_to_the_output_frame_and_to_tf_once_for_each_newer_stam
         for stamp_s in (10.0, 10.0, 9.5, 11.0):
             assert client.ask(GOOD, frame="probe", stamp_s=stamp_s)["level"] == 0
         wait_until(lambda: len(client.transforms) == 4)
-        T_cloud_model = se3.inverse(T_TARGET_SOURCE)
-        T_cloud_model[:3, 3] /= 1000.0
-        T_tracker_model = T_tracker_probe @ T_cloud_model
+        in_tracker_mm = se3.apply(T_tracker_probe, GOOD.astype(np.float32)) * 1000.0
+        np.testing.assert_allclose(method.calls[-1]["source"], in_tracker_mm, atol=1e-3)
+        T_tracker_model = se3.inverse(T_TARGET_SOURCE)
+        T_tracker_model[:3, 3] /= 1000.0
         np.testing.assert_allclose(transform_to_matrix(client.transforms[0]), T_tracker_model, atol=1e-12)
         assert [t.header.stamp.sec for t in tf2.sent] == [10, 11]
         assert tf2.sent[0].header.frame_id == "tracker" and tf2.sent[0].child_frame_id == "bone_preop"

@@ -74,10 +74,9 @@ def test_the_wired_covariance_is_symmetric_and_positive_definite_with_its_floors
     assert (wired.diagonal()[:3] >= 0.999e-8).all() and (wired.diagonal()[3:] >= 0.999e-6).all()
 
 
-def test_a_turned_frame_turns_both_blocks():
-    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    R = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    np.testing.assert_allclose(wire.rotate_covariance(covariance, R).diagonal(), [2, 1, 3, 5, 4, 6], atol=1e-12)
+def test_points_in_mm_are_moved_by_a_transform_in_metres():
+    T = se3.from_rotation_translation(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, -0.5])
+    np.testing.assert_allclose(wire.moved_mm(T, np.array([[10.0, 20.0, 30.0]])), [[980.0, 10.0, -470.0]], atol=1e-12)
 
 
 def test_a_covariance_above_its_floors_is_not_touched():

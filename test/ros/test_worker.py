@@ -13,9 +13,9 @@ from gapr_ros.worker import Job, Worker
 class Bench:
     """A worker whose process waits for a gate."""
 
-    def __init__(self, held=False, period_s=0.0):
+    def __init__(self, held=False, period_s=0.0, keep=0):
         self.done, self.gate, self.held, self.period_s = [], threading.Event(), held, period_s
-        self.worker = Worker(self._process, lambda: self.held, lambda: self.period_s)
+        self.worker = Worker(self._process, lambda: self.held, lambda: self.period_s, keep)
 
     def _process(self, job):
         self.gate.wait(10.0)
@@ -39,6 +39,21 @@ def test_the_newest_cloud_wins_and_the_others_are_counted():
     assert bench.names() == [b"0", b"10"]
     assert dropped == 9
     assert bench.worker.stop(5.0)
+
+
+def test_clouds_that_are_to_be_kept_go_with_the_newest_one_and_only_the_oldest_are_dropped():
+    bench = Bench(keep=3)
+    bench.worker.put(job(b"0"))
+    wait_until(lambda: bench.worker._slot is None)
+    dropped = sum(bench.worker.put(job(b"%d" % i)) for i in range(1, 7))
+    bench.gate.set()
+    wait_until(lambda: len(bench.done) == 2)
+    assert bench.names() == [b"0", b"6"] and bench.done[1][0].earlier == [b"3", b"4", b"5"]
+    assert dropped == 2
+    assert bench.worker.ask("waiter", epoch=0)
+    wait_until(lambda: len(bench.done) == 3)
+    assert bench.done[2][0].again and not bench.done[2][0].earlier
+    bench.worker.stop(5.0)
 
 
 def test_those_who_wait_for_a_cloud_wait_for_the_newer_one():

@@ -1,0 +1,83 @@
+"""What a probe collects, registered together."""
+
+import numpy as np
+import pytest
+
+from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
+from gapr_core.data.specimen import Specimen
+from gapr_core.data.stream import Motion, simulate
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+
+STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def frames(femur):
+    return simulate(Specimen(femur, "femur", "parametric-3", "parametric"), 4, STILL)
+
+
+@pytest.fixture(scope="module")
+def prepared(registrar, frames):
+    return registrar.prepare(frames[0].target)
+
+
+def is_right(result, pair):
+    shift_mm, turn_deg = se3.pose_error(result.T_target_source, pair.T_target_source, pair.source)
+    return shift_mm < 4.0 and turn_deg < 5.0
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+def test_pieces_that_say_little_alone_determine_the_pose_together(registrar, frames, prepared, tracked):
+    accumulator = Accumulator(Tracker(registrar) if tracked else registrar, most=20)
+    alone = [registrar.register(pair.source, prepared) for pair in frames]
+    together = [accumulator.register(pair.source, prepared) for pair in frames]
+    assert sum(result.ok for result in alone) <= len(frames) // 2
+    assert all(result.ok and is_right(result, pair) for result, pair in zip(together[2:], frames[2:], strict=True))
+    assert len(accumulator.collected) == sum(len(pair.source) for pair in frames)
+
+
+def test_only_the_newest_sources_are_kept(registrar, frames):
+    accumulator = Accumulator(registrar, most=3)
+    for pair in frames[:5]:
+        accumulator.collect(pair.source)
+    np.testing.assert_array_equal(accumulator.collected, np.concatenate([pair.source for pair in frames[2:5]]))
+    accumulator.reset()
+    assert accumulator.collected.shape == (0, 3)
+    with pytest.raises(ConfigError, match="at least 1"):
+        Accumulator(registrar, most=0)
+
+
+def test_a_stray_source_is_left_out_and_after_three_the_bone_has_moved(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=40)
+    for pair in frames[:-1]:
+        accumulator.collect(pair.source)
+    before = accumulator.register(frames[-1].source, prepared)
+    assert before.ok
+    kept = len(accumulator.collected)
+    off = se3.exp([0.0, 25.0, 10.0, 0.0, 0.0, 0.0])
+    stray = [se3.apply(off, pair.source) for pair in frames[4:7]]
+    refused = accumulator.register(stray[0], prepared)
+    assert not refused.ok and "left out" in refused.reason and refused.confidence == 0.0
+    assert len(accumulator.collected) == kept
+    assert accumulator.register(frames[5].source, prepared).ok, "a good one in between: the stray one was an accident"
+    for source in stray:
+        refused = accumulator.register(source, prepared)
+        assert not refused.ok
+    assert "starts anew" in refused.reason
+    np.testing.assert_array_equal(accumulator.collected, np.concatenate(stray))
+
+
+def test_a_reset_reaches_the_tracker(frames, prepared):
+    class Counting(Tracker):
+        resets = 0
+
+        def reset(self):
+            super().reset()
+            self.resets += 1
+
+    tracker = Counting(Registrar(RegistrarConfig(num_threads=1)))
+    accumulator = Accumulator(tracker, most=2)
+    before = tracker.resets
+    accumulator.reset()
+    assert tracker.resets == before + 1

@@ -129,7 +129,7 @@ class Registrar:
                 result = self._assess(fit, candidates, prepared, target, calibration, most)
             result = replace(result, details=result.details | {"rounds": number, "proposer": proposer.name})
             clock.lap("assess")
-            if result.confidence >= self.config.sure:
+            if result.confidence >= max(self.config.sure, self.config.min_confidence):
                 break
         return result
 

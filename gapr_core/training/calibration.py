@@ -93,7 +93,7 @@ def collect(tasks: list[Task], path: Path, jobs: int) -> list[dict[str, Any]]:
     return list(done.values())
 
 
-def fit(records: list[dict[str, Any]], ridge: float = 10.0) -> Calibration:
+def fit(records: list[dict[str, Any]], ridge: float = 3.0) -> Calibration:
     """Penalised maximum likelihood; what must not be believed counts more than once."""
     x = np.array([[r["features"][name] for name in FEATURES] for r in records])
     y = np.array([r["right"] for r in records], dtype=np.float64)

@@ -77,6 +77,14 @@ def test_a_start_that_is_no_pose_is_refused_with_a_sentence(registrar, pairs, ta
         registrar.register(pairs["L1"].source, target, initial=np.full((4, 4), np.nan))
 
 
+@pytest.mark.parametrize("protocol", ["paper", "L1", "L2"])
+def test_the_same_bone_of_the_other_side_is_refused(registrar, femur, target, protocol):
+    assert femur.faces is not None
+    mirrored = Surface(femur.points * [-1.0, 1.0, 1.0], femur.faces[:, ::-1])
+    pair = make_pair(protocol, Specimen(mirrored, "femur", "parametric-3", "parametric"), seed=2)
+    assert not registrar.register(pair.source, target).ok
+
+
 def test_the_cloud_of_another_bone_is_refused(registrar, target):
     tibia = make_bone("tibia", 8)
     pair = make_pair("L1", Specimen(tibia, "tibia", "parametric-8", "parametric"), seed=1)

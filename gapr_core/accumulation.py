@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.clouds import Surface, finite_points
-from gapr_core.config import RefinementConfig
+from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.errors import ConfigError
+from gapr_core.geometry import sampling
 from gapr_core.refinement import evaluate
 from gapr_core.registrar import Registrar
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -20,17 +20,19 @@ from gapr_core.tracking import Tracker
 
 Array = NDArray[np.float64]
 
-OFF = 2.5  # the newest source lies off the bone when it is so many times farther from it than all together
+OFF = 2.5  # a source lies off the bone when it is so many times farther from it than all together
 MOST_OFF = 3  # so many such sources in a row are not stray any more: the bone has moved
+FEWEST_POINTS = 20  # of a source that can be said to lie off
+MOST_POINTS = SourceConfig().most_points  # that are kept of one source, and looked at of all
 
 
 class Accumulator:
     """Registers each source together with those before it.
 
     Nothing helps more than seeing more of the bone: images of a probe that say nothing alone determine the pose
-    together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. A
-    source that lies off the bone where the others found it is refused and left out; after three of them in a row the
-    bone or its reference has moved, and only these three are kept.
+    together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
+    an accepted pose each new source is looked at by itself; one that lies off the bone is left out, and refused if it
+    is the newest. After three of them in a row the bone or its reference has moved, and only these three are kept.
 
     Args:
         method: registers what is collected.
@@ -45,29 +47,35 @@ class Accumulator:
     def __init__(self, method: Registrar | Tracker, most: int) -> None:
         if most < 1:
             raise ConfigError("at least 1 source to keep", str(most), "1 registers every source by itself")
-        self.method = method
-        self._sources: deque[Array] = deque(maxlen=most)
-        self._off: list[Array] = []
+        self.method, self.most = method, most
+        self._target: PreparedTarget | None = None
+        self.reset()
 
     @property
     def collected(self) -> Array:
         """(N, 3) all points that are kept, mm."""
-        return np.concatenate([np.empty((0, 3)), *self._sources])
+        return _together(self._kept + self._new)
 
     def reset(self) -> None:
         """Forget all sources, and the track of a `Tracker`."""
-        self._sources.clear()
-        self._off.clear()
+        self._kept: list[Array] = []  # looked at, or from before there was a pose
+        self._new: list[Array] = []
+        self._off: list[Array] = []
         if isinstance(self.method, Tracker):
             self.method.reset()
 
     def collect(self, source: ArrayLike) -> None:
         """Keep a source (N, 3), mm, without registering; the oldest one goes when there are too many.
 
+        An empty source, and one that is there already, changes nothing.
+
         Raises:
             InvalidPointCloudError: wrong shape or type.
         """
-        self._sources.append(finite_points(source))
+        points = finite_points(source)
+        points = points[sampling.thin(points, MOST_POINTS)]
+        if len(points) and not _is_among(points, self._kept + self._new):
+            self._new = [*self._new, points][-self.most :]
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target; see `Registrar.prepare`."""
@@ -76,34 +84,77 @@ class Accumulator:
     def register(
         self, source: ArrayLike, target: PreparedTarget, initial: ArrayLike | None = None
     ) -> RegistrationResult:
-        """The pose of all that is collected, this source (N, 3), mm, included; see `Registrar.register`."""
-        self.collect(source)
-        points = self.collected
-        result = self.method.register(points, target, initial)
-        if result.T_target_source is None or not _lies_off(self._sources[-1], points, result.T_target_source, target):
-            if result.ok:
-                self._off.clear()
-            return result
-        return self._leave_out(result)
+        """The pose of all that is collected, this source (N, 3), mm, included; see `Registrar.register`.
 
-    def _leave_out(self, result: RegistrationResult) -> RegistrationResult:
-        self._off.append(self._sources.pop())
-        reason = f"the newest source lies off the bone where {len(self._sources)} before it found it; it is left out"
-        if len(self._off) == MOST_OFF:
-            kept = self._off.copy()
+        Another target than before starts a new collection. A source that cannot be registered is not kept.
+        """
+        if self._target is not None and self._target is not target:
             self.reset()
-            self._sources.extend(kept)
-            reason = f"{MOST_OFF} sources in a row lie off the bone: it has moved, and the collection starts anew"
-        return replace(
-            result, status=RegistrationStatus.LOW_CONFIDENCE, T_target_source=None, covariance=None, tre_mm=None,
-            confidence=0.0, reason=reason,
-        )  # fmt: skip
+        self._target = target
+        before = self._new
+        self.collect(source)
+        try:
+            result = self.method.register(_together(self._last()), target, initial)
+        except Exception:
+            self._new = before
+            raise
+        return self._look_at_new(result, target)
+
+    def _last(self) -> list[Array]:
+        return (self._kept + self._new)[-self.most :]
+
+    def _look_at_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
+        """Keep the new sources that lie on the bone under the pose; without a pose, all."""
+        off: list[Array] = []
+        newest = self._new[-1:]
+        if result.T_target_source is not None:
+            everything = _together(self._last())
+            off = [source for source in self._new if _lies_off(source, everything, result.T_target_source, target)]
+        strangers = [source for source in off if not _is_among(source, self._off)]
+        self._off = [*self._off, *strangers] if off and len(off) == len(self._new) else strangers
+        self._kept = [s for s in self._kept + self._new if not _is_among(s, off)][-self.most :]
+        self._new = []
+        if len(self._off) >= MOST_OFF:
+            return self._begin_anew(result)
+        if newest and _is_among(newest[0], off):
+            count = len(self._kept)
+            return _refused(result, f"the newest source lies off the bone where {count} others found it: left out")
+        return result
+
+    def _begin_anew(self, result: RegistrationResult) -> RegistrationResult:
+        strays = self._off
+        self.reset()
+        self._kept = strays[-self.most :]
+        reason = f"{len(strays)} sources in a row lie off the bone: it has moved, and the collection starts anew"
+        return _refused(result, reason)
 
 
-def _lies_off(newest: Array, points: Array, T: Array, target: PreparedTarget) -> bool:
-    """True when the typical point of `newest` (N, 3) is much farther off the surface than that of all (M, 3)."""
-    if not len(newest):
+def _together(sources: list[Array]) -> Array:
+    return np.concatenate([np.empty((0, 3)), *sources])
+
+
+def _is_among(source: Array, others: list[Array]) -> bool:
+    return any(np.array_equal(source, other) for other in others)
+
+
+def _lies_off(source: Array, points: Array, T: Array, target: PreparedTarget) -> bool:
+    """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3)."""
+    if len(source) < FEWEST_POINTS:
         return False
-    distances = (evaluate(T, each, target, RefinementConfig()).signed_mm for each in (newest, points))
-    of_newest, of_all = (float(np.median(np.nan_to_num(np.abs(d), nan=np.inf))) for d in distances)
-    return of_newest > OFF * max(of_all, RefinementConfig().smallest_sigma_mm)
+    some = points[:: 1 + len(points) // MOST_POINTS]
+    distances = (evaluate(T, each, target, RefinementConfig()).signed_mm for each in (source, some))
+    own, of_all = (float(np.median(np.nan_to_num(np.abs(d), nan=np.inf))) for d in distances)
+    return own > OFF * max(of_all, RefinementConfig().smallest_sigma_mm)
+
+
+def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
+    return replace(
+        result,
+        status=RegistrationStatus.LOW_CONFIDENCE,
+        T_target_source=None,
+        covariance=None,
+        centre_mm=None,
+        tre_mm=None,
+        confidence=0.0,
+        reason=reason,
+    )

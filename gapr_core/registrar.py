@@ -165,12 +165,13 @@ class Registrar:
         if probability < self.config.min_confidence:
             status, reason = _why_not(candidates, uncertainty, probability)
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
-        tre_mm = uncertainty.tre_mm(target.points, fit.moved.mean(axis=0))
+        centre_mm = fit.moved.mean(axis=0)
         return RegistrationResult(
             RegistrationStatus.OK,
             fit.T,
             uncertainty.covariance,
-            tre_mm=tre_mm,
+            tre_mm=uncertainty.tre_mm(target.points, centre_mm),
+            centre_mm=centre_mm,
             **common,  # type: ignore[arg-type]
         )
 

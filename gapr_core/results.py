@@ -35,7 +35,7 @@ class RegistrationResult:
         status: `OK`, or why there is no pose.
         T_target_source: (4, 4) float64 rigid transform, source to target frame, mm; None unless `OK`.
         covariance: (6, 6) float64 of the pose error as x y z (mm) rx ry rz (rad), fixed axes of the target frame,
-            rotation about the transformed source's centroid; None unless `OK`.
+            rotation about `centre_mm`; None unless `OK`.
         confidence: calibrated probability, 0 to 1, that the pose is within 4 mm and 5 deg of the truth.
         tre_mm: predicted target registration error, root-mean-square over the target's points; None unless `OK`.
         inlier_ratio: share of the source points that the pose explains, 0 to 1.
@@ -44,6 +44,8 @@ class RegistrationResult:
         method: name of the method that answered.
         reason: one sentence for people: why it was refused; empty when there is nothing to say.
         details: figures behind the confidence (residuals, overlap, eigenvalues), for logs and research.
+        centre_mm: (3,) mean of the source points that were used, in the target frame; None unless `OK`, and where a
+            method does not say.
     """
 
     status: RegistrationStatus
@@ -57,6 +59,7 @@ class RegistrationResult:
     method: str = "gapr"
     reason: str = ""
     details: dict[str, Any] = field(default_factory=dict)
+    centre_mm: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):

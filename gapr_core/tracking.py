@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.clouds import Surface
+from gapr_core.clouds import Surface, finite_points
 from gapr_core.confidence import Calibration
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
@@ -44,9 +44,15 @@ class Memory:
         """Remember the answer of a full registration: (4, 4) T_target_source, mm, and its distinct alternatives."""
         self.poses = np.stack([pose, *rivals])
 
-    def follow(self, pose: Array) -> None:
-        """The source has moved: the rivals move with it, R_k inv(T_before) T_now."""
-        self.poses = self.poses @ (se3.inverse(self.poses[0]) @ pose)
+    def follow(self, pose: Array, source: Array) -> None:
+        """The source (N, 3), mm, has moved from the remembered pose T_k nearest to `pose`: all others move with it.
+
+        R_k becomes R_k inv(T_k) T_now, and the nearest pose comes first.
+        """
+        gaps = [np.linalg.norm(se3.apply(each, source) - se3.apply(pose, source)) for each in self.poses]
+        nearest = int(np.argmin(gaps))
+        moved = self.poses @ (se3.inverse(self.poses[nearest]) @ pose)
+        self.poses = np.concatenate([moved[nearest : nearest + 1], np.delete(moved, nearest, axis=0)])
 
 
 class Tracker:
@@ -115,17 +121,19 @@ class Tracker:
             result = self._tracking.register(source, target)
         else:
             result = self.registrar.register(source, target, self._memory.poses[0])
-        self._remember(result, target)
+        self._remember(result, finite_points(source), target)
         return result
 
-    def _remember(self, result: RegistrationResult, target: PreparedTarget) -> None:
-        """A refusal changes nothing but the count: the bone may be where it was."""
-        followed = result.details.get("proposer") == Memory.name
+    def _remember(self, result: RegistrationResult, source: Array, target: PreparedTarget) -> None:
+        """A refusal changes no pose: the bone may be where it was."""
+        if "proposer" not in result.details:  # nothing was registered
+            return
+        followed = result.details["proposer"] == Memory.name
         self._tracked = self._tracked + 1 if followed else 0
         if result.T_target_source is None:
             return
         if followed:
-            self._memory.follow(result.T_target_source)
+            self._memory.follow(result.T_target_source, source)
         elif result.alternatives:
             self._target = target
             self._memory.keep(result.T_target_source, result.alternatives)

@@ -18,7 +18,9 @@ THROTTLE_S = 5.0
 
 @dataclass
 class Counters:
-    """Every cloud that was received is accepted, refused, dropped, merged into another, or still on its way.
+    """Every cloud that was received is accepted, refused, dropped, merged with a newer one, or still on its way.
+
+    One that ~/register asks for again is accepted or refused again.
 
     `lost` are those that a publisher sent and that never arrived.
     """
@@ -38,10 +40,13 @@ class Counters:
         self.received += 1
         self.last_cloud_at = time.monotonic()
 
+    def leave(self, merged: bool) -> None:
+        """A cloud that was pushed out is registered with a newer one, or could not be."""
+        self.merged += merged
+        self.dropped += not merged
+
     def settle(self, outcome: Outcome) -> None:
-        """A cloud was answered, and with it those that it pushed out, where they could be used."""
-        self.merged += outcome.merged
-        self.dropped += len(outcome.job.earlier) - outcome.merged
+        """A cloud was answered."""
         if outcome.ok:
             self.accepted += 1
             self.consecutive_refusals = 0
@@ -92,7 +97,7 @@ class RefusalLog:
             self._silent += 1
             return
         more = f" ({self._silent} more since the last line)" if self._silent else ""
-        self._write(f"cloud in '{outcome.cloud_header.frame_id}' {outcome}{more}")
+        self._write(f"cloud in '{outcome.cloud_frame}' {outcome}{more}")
         self._reason, self._at, self._silent = outcome.reason, time.monotonic(), 0
 
 
@@ -144,7 +149,7 @@ def _of_cloud(last: Outcome | None) -> dict[str, object]:
     if last is None:
         return dict.fromkeys(names, "")
     stamp = f"{last.header.stamp.sec}.{last.header.stamp.nanosec:09d}"
-    values = (stamp, last.cloud_header.frame_id, last.points_in, last.points_used, last.age_s, last.confidence_out,
+    values = (stamp, last.cloud_frame, last.points_in, last.points_used, last.age_s, last.confidence_out,
               last.tre_mm, last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
     return dict(zip(names, values, strict=True))
 

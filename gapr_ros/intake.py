@@ -15,6 +15,7 @@ from gapr_ros.refusal import Reason, RefusedError
 from msg_adapters import InvalidMessageError, cloud_to_xyz
 
 Array = NDArray[np.float64]
+BACKWARD_NS = 1_000_000_000  # a stamp this much older than the last one: time went back (a bag in a loop)
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
 
 
@@ -42,7 +43,8 @@ def check_age(header: Header, now_ns: int, max_age_s: float) -> None:
 def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParameters) -> Array:
     """Read, convert, clean and thin a cloud: (N, 3) float64, mm, finite, in the cloud's frame.
 
-    A cloud that is registered together with others (`accumulate`) may have any number of points but none.
+    A cloud that is registered together with others (`accumulate`) may be of any size but empty: `check_together` looks
+    at all of them.
 
     Raises:
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
@@ -51,8 +53,19 @@ def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParamete
     points = _within_range(wire.to_mm(points, parameters.cloud_unit), parameters)
     check_count(len(points), 1 if parameters.accumulate > 1 else parameters.min_points)
     points = thin(points, parameters.max_points, parameters.seed)
-    check_unit(points, model_extent_mm, parameters.cloud_unit)
+    if parameters.accumulate == 1:
+        check_unit(points, model_extent_mm, parameters.cloud_unit)
     return points
+
+
+def check_together(points_mm: Array, model_extent_mm: float, parameters: NodeParameters) -> None:
+    """Number and unit of all points that are registered as one.
+
+    Raises:
+        RefusedError: too_few_points or unit_mismatch.
+    """
+    check_count(len(points_mm), parameters.min_points)
+    check_unit(points_mm, model_extent_mm, parameters.cloud_unit)
 
 
 def check_count(count: int, least: int) -> None:

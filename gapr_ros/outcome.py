@@ -20,7 +20,7 @@ class Outcome:
 
     Attributes:
         job: where the cloud came from and who waits for it.
-        cloud_header: of the cloud as it came.
+        cloud_frame: frame of the cloud.
         header: frame of the pose (`output_frame` or that of the cloud) and stamp of the cloud.
         reason: why there is no pose, or None.
         text: the reason in full, for people.
@@ -28,15 +28,14 @@ class Outcome:
         covariance: (6, 6) of that pose, metres and radians, fixed axes of the frame.
         confidence: of the registration, 0 to 1, whatever was decided later.
         points_in, points_used: of the message; given to registration, those of clouds that are registered with it too.
-        merged: how many clouds that it pushed out were registered with it.
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
         tre_mm, inlier_ratio: of the registration.
-        found_by: whose hypotheses decided it: track, network or search.
+        found_by: how far the registration had to look: track, network or search.
         exec_ms: wall time of the whole way.
     """
 
     job: Job
-    cloud_header: Header = field(default_factory=Header)
+    cloud_frame: str = ""
     header: Header = field(default_factory=Header)
     reason: Reason | None = None
     text: str = ""
@@ -45,7 +44,6 @@ class Outcome:
     confidence: float = 0.0
     points_in: int = 0
     points_used: int = 0
-    merged: int = 0
     age_s: float | None = None
     tre_mm: float | None = None
     inlier_ratio: float = 0.0

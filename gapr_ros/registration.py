@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -53,13 +53,13 @@ class Registration:
 
     Args:
         frames: look-up of transforms.
-        situation: asked at the start of each job; its method satisfies `RegistrationMethod`, and `register` takes
-            `initial` when there is a seed.
+        situation: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
+            when there is a seed, and with `accumulate` there are `collect` and `collected` as `Accumulator` has them.
     """
 
     def __init__(self, frames: Frames, situation: Callable[[], Situation]) -> None:
         self._frames, self._situation = frames, situation
-        self._frame: str | None = None  # of the last cloud; what the method remembers holds in it only
+        self._frame, self._stamp_ns = "", 0  # of the last cloud; what the method remembers holds there only
 
     def process(self, job: Job) -> Outcome:
         """The outcome of one cloud; never raises."""
@@ -75,42 +75,44 @@ class Registration:
         outcome.exec_ms = (time.monotonic() - start) * 1000.0
         return outcome
 
+    def collect(self, job: Job) -> bool:
+        """Keep a cloud to be registered with a newer one; never raises. False when it cannot be used."""
+        try:
+            now = self._situation()
+            points_mm = self._points_mm(Outcome(job), replace(now, parameters=replace(now.parameters, tf_timeout=0.0)))
+            now.method.collect(points_mm)
+        except (RefusedError, InvalidPointCloudError):
+            return False
+        return True
+
     def _run(self, outcome: Outcome, now: Situation, start: float) -> None:
+        points_mm = self._points_mm(outcome, now)
+        outcome.points_used = len(points_mm)
+        if now.parameters.accumulate > 1:
+            _check_together(points_mm, outcome, now)
+        result = self._register(points_mm, outcome, now)
+        _check(result, time.monotonic() - start, now.parameters)
+        _note_pose(outcome, result, points_mm, now.parameters)
+
+    def _points_mm(self, outcome: Outcome, now: Situation) -> Array:
+        """(N, 3) points of a cloud, mm, in the frame of the answer."""
         if outcome.job.epoch != now.epoch:
             raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset")
         cloud = intake.read_message(outcome.job.cloud)
         _note_header(outcome, cloud, now)
-        self._watch_frame(outcome.header.frame_id, now)
-        for earlier in outcome.job.earlier:
-            outcome.merged += self._collect(earlier, outcome.header.frame_id, now)
         intake.check_age(cloud.header, now.now_ns, now.parameters.max_cloud_age)
-        points_mm = self._points_mm(cloud, outcome.cloud_header, outcome.header.frame_id, now)
-        source = _gather(points_mm, outcome, now)
-        result = self._register(source, outcome, now)
-        _check(result, time.monotonic() - start, now.parameters)
-        _note_pose(outcome, result, _registered(source, now), now.parameters)
+        T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
+        points_mm = wire.moved_mm(T_frame_cloud, intake.take_in(cloud, now.model.extent_mm, now.parameters))
+        self._watch(outcome.header, now)
+        return points_mm
 
-    def _watch_frame(self, frame: str, now: Situation) -> None:
-        """Poses and clouds that the method remembers are of one frame."""
-        if self._frame not in (None, frame) and hasattr(now.method, "reset"):
+    def _watch(self, header: Header, now: Situation) -> None:
+        """What the method remembers is of one frame, and of time that goes forward."""
+        stamp_ns = intake.stamp_ns(header)
+        went_back = stamp_ns < self._stamp_ns - intake.BACKWARD_NS
+        if (header.frame_id != self._frame or went_back) and self._stamp_ns and hasattr(now.method, "reset"):
             now.method.reset()
-        self._frame = frame
-
-    def _points_mm(self, cloud: PointCloud2, header: Header, frame: str, now: Situation) -> Array:
-        """(N, 3) points of a cloud, mm, in the frame of the answer."""
-        T_frame_cloud = self._lookup(frame, header, now)
-        return wire.moved_mm(T_frame_cloud, intake.take_in(cloud, now.model.extent_mm, now.parameters))
-
-    def _collect(self, data: bytes, frame: str, now: Situation) -> bool:
-        """Keep a cloud that a newer one pushed out of the mailbox. False when it cannot be used."""
-        try:
-            cloud = intake.read_message(data)
-            if not now.parameters.output_frame and cloud.header.frame_id != frame:
-                return False
-            now.method.collect(self._points_mm(cloud, cloud.header, frame, now))
-        except RefusedError:
-            return False
-        return True
+        self._frame, self._stamp_ns = header.frame_id, stamp_ns
 
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
         seed = self._initial(outcome, now)
@@ -124,34 +126,28 @@ class Registration:
         """The seed as T_target_source, mm, the source being in the frame of the answer."""
         if now.seed is None:
             return None
-        T_seed_cloud = self._lookup(now.seed.frame, outcome.cloud_header, now)
-        T_frame_cloud = self._lookup(outcome.header.frame_id, outcome.cloud_header, now)
+        T_seed_cloud = self._lookup(now.seed.frame, outcome, now)
+        T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         return wire.core_pose(T_frame_cloud @ se3.inverse(T_seed_cloud) @ now.seed.T_frame_model)
 
-    def _lookup(self, frame: str, header: Header, now: Situation) -> Array:
+    def _lookup(self, frame: str, outcome: Outcome, now: Situation) -> Array:
         """T_frame_cloud at the cloud's stamp; no frame is that of the cloud."""
         if not frame:
             return np.eye(4)
-        return self._frames.lookup(frame, header.frame_id, Time.from_msg(header.stamp), now.parameters.tf_timeout)
+        stamp = Time.from_msg(outcome.header.stamp)
+        return self._frames.lookup(frame, outcome.cloud_frame, stamp, now.parameters.tf_timeout)
 
 
-def _gather(points_mm: Array, outcome: Outcome, now: Situation) -> Array:
-    """What the method is given: nothing where it has the cloud already; too few points are kept for the next cloud."""
-    if now.parameters.accumulate == 1:
-        outcome.points_used = len(points_mm)
-        return points_mm
-    if outcome.job.again:
-        points_mm = points_mm[:0]
-    outcome.points_used = len(now.method.collected) + len(points_mm)
-    if outcome.points_used < now.parameters.min_points:
-        now.method.collect(points_mm)
-    intake.check_count(outcome.points_used, now.parameters.min_points)
-    return points_mm
-
-
-def _registered(points_mm: Array, now: Situation) -> Array:
-    """(N, 3) all points of the answer, mm, about whose middle its covariance turns."""
-    return points_mm if now.parameters.accumulate == 1 else now.method.collected
+def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
+    """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
+    together = np.vstack([now.method.collected, points_mm])
+    outcome.points_used = len(together)
+    try:
+        intake.check_together(together, now.model.extent_mm, now.parameters)
+    except RefusedError as refusal:
+        if refusal.reason is Reason.TOO_FEW_POINTS:
+            now.method.collect(points_mm)
+        raise
 
 
 def _note_header(outcome: Outcome, cloud: PointCloud2, now: Situation) -> None:
@@ -160,7 +156,7 @@ def _note_header(outcome: Outcome, cloud: PointCloud2, now: Situation) -> None:
     outcome.points_in = cloud.width * cloud.height
     outcome.header.frame_id = now.parameters.output_frame or cloud.header.frame_id
     outcome.header.stamp = Time(nanoseconds=stamp_ns or outcome.job.received_ns).to_msg()
-    outcome.cloud_header = Header(frame_id=cloud.header.frame_id, stamp=outcome.header.stamp)
+    outcome.cloud_frame = cloud.header.frame_id
     outcome.age_s = (now.now_ns - stamp_ns) * 1e-9 if stamp_ns and now.now_ns else None
 
 
@@ -179,7 +175,9 @@ def _check(result: RegistrationResult, seconds: float, parameters: NodeParameter
 
 
 def _note_pose(outcome: Outcome, result: RegistrationResult, points_mm: Array, parameters: NodeParameters) -> None:
-    assert result.T_target_source is not None and result.covariance is not None
+    T, covariance = result.T_target_source, result.covariance
+    assert T is not None and covariance is not None
+    centre_mm = se3.apply(T, points_mm.mean(axis=0)[None])[0] if result.centre_mm is None else result.centre_mm
     floors = (parameters.covariance_floor_translation, parameters.covariance_floor_rotation)
-    outcome.pose = wire.wire_pose(result.T_target_source)
-    outcome.covariance = wire.wire_covariance(result.covariance, result.T_target_source, points_mm.mean(axis=0), floors)
+    outcome.pose = wire.wire_pose(T)
+    outcome.covariance = wire.wire_covariance(covariance, T, centre_mm, floors)

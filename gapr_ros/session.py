@@ -25,13 +25,12 @@ if TYPE_CHECKING:
     from gapr_ros.register_node import RegisterNode
 
 STOP_TIMEOUT_S = 10.0
-BACKWARD_NS = 1_000_000_000  # a stamp this much older than the last one: time went back (a bag in a loop)
 
 
 class Session:
     """Takes clouds in, has them registered, decides on the outcomes and sends them.
 
-    All methods belong to the executor's thread, except `_work`, `_situation` and `read_model`, which the worker calls.
+    All methods belong to the executor's thread, except those under "the worker's thread".
 
     Raises:
         GaprError: a bone that cannot be read or prepared.
@@ -47,11 +46,11 @@ class Session:
         self._log_refusal = RefusalLog(node.get_logger().warning)
         self.model = self.read_model()
         warm_up(self._method, self.model)
-        self._forget_poses()
+        self._forget_clouds()
         self._frames = Frames(node, node.parameters.publish_tf, listen=bool(node.parameters.output_frame))
         self._publishers = Publishers(node, self._frames, node.parameters.model_frame)
         self._registration = Registration(self._frames, self._situation)
-        self.worker = Worker(self._work, self._held, self._period_s, keep=node.parameters.accumulate - 1)
+        self.worker = Worker(self._work, self._held, self._period_s)
 
     def close(self) -> None:
         """End the worker and give the topics back."""
@@ -70,7 +69,11 @@ class Session:
         if not self.enabled:
             counters.dropped += 1
             return
-        counters.dropped += self.worker.put(Job(data, self._epoch, self._node.now_ns()))
+        accumulates = self._node.parameters.accumulate > 1
+        pushed_out = self.worker.put(
+            Job(data, self._epoch, self._node.now_ns()), leave=self._collect if accumulates else None
+        )
+        counters.dropped += pushed_out and not accumulates
 
     def take_seed(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
@@ -97,6 +100,10 @@ class Session:
     def _work(self, job: Job) -> None:
         self._node.call_soon(partial(self._settle, self._registration.process(job)))
 
+    def _collect(self, job: Job) -> None:
+        """A cloud that a newer one pushed out of the mailbox is registered with it."""
+        self._node.call_soon(partial(self._node.counters.leave, self._registration.collect(job)))
+
     def _situation(self) -> Situation:
         node = self._node
         return Situation(self._method, self.model, node.parameters, self._epoch, self._seed, node.now_ns())
@@ -104,8 +111,8 @@ class Session:
     def _renew_method(self) -> None:
         self._method = self._method_factory(self._node.parameters)
 
-    def _forget_poses(self) -> None:
-        """Of a method that remembers them, such as a `Tracker`."""
+    def _forget_clouds(self) -> None:
+        """Poses and clouds that the method remembers, as `Tracker` and `Accumulator` do."""
         if hasattr(self._method, "reset"):
             self._method.reset()
 
@@ -149,7 +156,7 @@ class Session:
     def _watch_stamps(self, outcome: Outcome) -> None:
         """A bag that starts over without simulated time shows in its stamps only."""
         stamp_ns = intake.stamp_ns(outcome.header)
-        if 0 < stamp_ns < self._last_stamp_ns - BACKWARD_NS:
+        if 0 < stamp_ns < self._last_stamp_ns - intake.BACKWARD_NS:
             self._node.get_logger().warning("stamps went back: the track is cleared")
             self._forget()
         self._last_stamp_ns = stamp_ns or self._last_stamp_ns
@@ -165,6 +172,8 @@ class Session:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
         if self._min_confidence != self._node.parameters.min_confidence:
             self._min_confidence = self._node.parameters.min_confidence
+            if self._node.parameters.accumulate > 1:
+                self._node.get_logger().warning("min_confidence changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)
         self.worker.wake()
 
@@ -183,13 +192,13 @@ class Session:
         self.reset()
         waiting = self.worker.clear()
         if waiting is not None:
-            self._node.counters.dropped += 1 + len(waiting.earlier)
+            self._node.counters.dropped += 1
             outcome = Outcome(waiting)
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.tell()
 
     def _forget(self) -> None:
-        self.worker.run(self._forget_poses)
+        self.worker.run(self._forget_clouds)
         self._track.clear()
         self._seed, self._last_stamp_ns = None, 0
         self._frames.forget()

@@ -49,23 +49,21 @@ def core_pose(T_cloud_model: Array) -> Array:
     return T
 
 
-def wire_covariance(
-    covariance: Array, T_target_source: Array, centroid_mm: Array, floors: tuple[float, float]
-) -> Array:
+def wire_covariance(covariance: Array, T_target_source: Array, centre_mm: Array, floors: tuple[float, float]) -> Array:
     """The core's covariance as that of T_cloud_model in the cloud's frame.
 
     The core's error xi = (v, w) is a twist in the target's frame that acts on the left of T_target_source about the
-    transformed centroid c. To first order exp(xi)^-1 p = p - w x (p - c) - v, so that the model's origin p = 0 and its
+    source's middle c. To first order exp(xi)^-1 p = p - w x (p - c) - v, so that the model's origin p = 0 and its
     axes, seen from the cloud, with R = R_cloud_target, move by
         dt = -R (v + [c]x w),   dr = -R w.
     Both signs cancel in J C J^T.
 
     Args:
-        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed axes of the target frame, about the transformed centroid.
+        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed axes of the target frame, about `centre_mm`.
         T_target_source: (4, 4), mm.
-        centroid_mm: (3,) of the source, in the cloud's frame.
-        floors: smallest standard deviation of a translation (m) and of a rotation (rad), applied at the centroid,
-            where the two are least correlated.
+        centre_mm: (3,) about which the rotation turns, in the target frame: the middle of the source.
+        floors: smallest standard deviation of a translation (m) and of a rotation (rad), applied there, where the two
+            are least correlated.
 
     Returns:
         (6, 6) symmetric positive definite, x y z (m) rx ry rz (rad), fixed axes of the cloud's frame, of the model's
@@ -73,7 +71,7 @@ def wire_covariance(
     """
     metres = np.diag([1.0 / MM_PER_M] * 3 + [1.0] * 3)
     floored = floor_covariance(metres @ covariance @ metres, *floors)
-    centre = se3.apply(T_target_source, centroid_mm[None])[0] / MM_PER_M
+    centre = centre_mm / MM_PER_M
     R = T_target_source[:3, :3].T
     J = np.block([[R, R @ skew(centre)], [np.zeros((3, 3)), R]])
     return symmetric(J @ floored @ J.T)

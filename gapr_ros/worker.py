@@ -1,4 +1,4 @@
-"""One thread and a one-slot mailbox: the newest cloud wins, the others are counted as dropped."""
+"""One thread and a one-slot mailbox: the newest cloud wins; what becomes of the others is the caller's to say."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 log = logging.getLogger(__name__)
@@ -23,8 +24,6 @@ class Job:
         received_ns: the node's clock when it arrived, ns.
         waiters: futures of service calls that want its outcome.
         urgent: asked for by a service: neither `continuous` nor `max_rate` holds it back.
-        earlier: clouds that it pushed out of the mailbox and that are registered with it (`accumulate`), oldest first.
-        again: the cloud was processed before.
     """
 
     cloud: bytes
@@ -32,8 +31,6 @@ class Job:
     received_ns: int
     waiters: list[Any] = field(default_factory=list)
     urgent: bool = False
-    earlier: list[bytes] = field(default_factory=list)
-    again: bool = False
 
 
 class Worker:
@@ -43,13 +40,10 @@ class Worker:
         process: what to do with a job, in the worker's thread; must not raise.
         held: asked before a job that is not urgent; true leaves it in the mailbox (`continuous: false`).
         period_s: asked for the least time between the starts of two jobs that are not urgent.
-        keep: how many clouds that were pushed out go with the newest one; 0: they are dropped.
     """
 
-    def __init__(
-        self, process: Callable[[Job], None], held: Callable[[], bool], period_s: Callable[[], float], keep: int = 0
-    ) -> None:
-        self._process, self._held, self._period_s, self._keep = process, held, period_s, keep
+    def __init__(self, process: Callable[[Job], None], held: Callable[[], bool], period_s: Callable[[], float]) -> None:
+        self._process, self._held, self._period_s = process, held, period_s
         self._wake = threading.Condition()
         self._slot: Job | None = None
         self._tasks: deque[Callable[[], None]] = deque()
@@ -59,18 +53,22 @@ class Worker:
         self._thread = threading.Thread(target=self._loop, name="registration", daemon=True)
         self._thread.start()
 
-    def put(self, job: Job) -> int:
-        """Make this the next cloud. Returns how many are dropped for it; the waiters of the old one wait for it."""
-        pushed_out: list[bytes] = []
+    def put(self, job: Job, leave: Callable[[Job], None] | None = None) -> bool:
+        """Make this the next cloud. True when it pushes one out, whose waiters wait for this one instead.
+
+        Args:
+            job: the cloud.
+            leave: task for a cloud that is pushed out, run before the next one is processed.
+        """
         with self._wake:
             old, self._slot = self._slot, job
             if old is not None:
                 job.waiters += old.waiters
                 job.urgent |= old.urgent
-                pushed_out = old.earlier if old.again else [*old.earlier, old.cloud]
-                job.earlier = pushed_out[max(0, len(pushed_out) - self._keep) :]
+                if leave is not None:
+                    self._tasks.append(partial(leave, old))
             self._wake.notify()
-        return len(pushed_out) - len(job.earlier)
+        return old is not None
 
     def ask(self, waiter: Any, epoch: int) -> bool:
         """Process the newest cloud now and tell the waiter. False when there has been no cloud yet.
@@ -79,7 +77,7 @@ class Worker:
         """
         with self._wake:
             if self._slot is None and self._last is not None:
-                self._slot = Job(self._last.cloud, epoch, self._last.received_ns, again=True)
+                self._slot = Job(self._last.cloud, epoch, self._last.received_ns)
             if self._slot is None:
                 return False
             self._slot.urgent = True

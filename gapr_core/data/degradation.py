@@ -39,6 +39,23 @@ def vary_density(points: Array, scale: float, rng: np.random.Generator, rounds: 
     return points
 
 
+def measured(
+    specimen: Specimen,
+    points: Array,
+    normals: Array,
+    noise_mm: float,
+    bias_mm: float,
+    outlier_share: float,
+    rng: np.random.Generator,
+) -> Array:
+    """Surface points (N, 3) with white noise and smooth bias; a share of them, the last ones then, is thrown off."""
+    outliers = round(outlier_share * len(points))
+    dirty = points + rng.normal(0.0, noise_mm, points.shape)
+    if bias_mm:
+        dirty += bias_along_normals(points, normals, bias_mm, rng)
+    return np.vstack([dirty[outliers:], scatter_outliers(specimen, points[:outliers], normals[:outliers], rng)])
+
+
 def bias_along_normals(
     points: Array, normals: Array, peak_mm: float, rng: np.random.Generator, waves: int = 4
 ) -> Array:

@@ -130,12 +130,7 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
     points, normals, metadata = _best_view(specimen, level, rng)
     chosen = rng.permutation(len(points))[: level.max_points]
     points, normals = points[chosen], normals[chosen]
-    outliers = round(level.outlier_share * len(points))
-    dirty = points + rng.normal(0.0, level.noise_mm, points.shape)
-    if level.bias_mm:
-        dirty += degradation.bias_along_normals(points, normals, level.bias_mm, rng)
-    scattered = degradation.scatter_outliers(specimen, points[:outliers], normals[:outliers], rng)
-    dirty = np.vstack([dirty[outliers:], scattered])
+    dirty = degradation.measured(specimen, points, normals, level.noise_mm, level.bias_mm, level.outlier_share, rng)
     metadata |= {"noise_mm": level.noise_mm, "bias_mm": level.bias_mm, "outlier_share": level.outlier_share}
     rotation = Rotation.random(random_state=rng).as_matrix()  # uniform on SO(3)
     return _place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)

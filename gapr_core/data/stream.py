@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gapr_core.data import degradation
-from gapr_core.data.protocols import TARGET_POINTS, Pair
+from gapr_core.data.protocols import TARGET_POINTS, TRANSLATION_MM, Pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 
@@ -61,7 +61,10 @@ def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> lis
         at = frame / max(motion.frames - 1, 1)
         kept = rng.permutation(_view(specimen, points, axis, towards, at, motion))
         seen = kept[: motion.points]
-        source = se3.apply(pose, _measured(specimen, points[seen], normals[seen], motion, rng) - origin)
+        measured = degradation.measured(
+            specimen, points[seen], normals[seen], motion.noise_mm, motion.bias_mm, motion.outlier_share, rng
+        )
+        source = se3.apply(pose, measured - origin)
         name = f"stream_{specimen.bone}_{specimen.person}_{seed}_{frame:03d}"
         pairs.append(Pair(source, target - origin, se3.inverse(pose), name, specimen.bone, specimen.person, "stream"))
     return pairs
@@ -80,16 +83,9 @@ def _view(
     return seen[nearest[: round(motion.share * len(points))]]
 
 
-def _measured(specimen: Specimen, points: Array, normals: Array, motion: Motion, rng: np.random.Generator) -> Array:
-    dirty = points + rng.normal(0.0, motion.noise_mm, points.shape)
-    dirty += degradation.bias_along_normals(points, normals, motion.bias_mm, rng)
-    stray = round(motion.outlier_share * len(points))
-    return np.vstack([dirty[stray:], degradation.scatter_outliers(specimen, points[:stray], normals[:stray], rng)])
-
-
 def _anywhere(rng: np.random.Generator) -> Array:
     """T_source_target of a bone somewhere in the room."""
-    return se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-150.0, 150.0, 3))
+    return se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-TRANSLATION_MM, TRANSLATION_MM, 3))
 
 
 def _step(motion: Motion, rng: np.random.Generator) -> Array:

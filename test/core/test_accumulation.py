@@ -6,7 +6,7 @@ import pytest
 from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
@@ -48,8 +48,34 @@ def test_only_the_newest_sources_are_kept(registrar, frames):
         Accumulator(registrar, most=0)
 
 
+def test_a_source_that_is_empty_or_there_already_changes_nothing(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=2)
+    for pair in frames[:2]:
+        accumulator.register(pair.source, prepared)
+    kept = accumulator.collected
+    for again in (frames[1].source, frames[0].source, np.empty((0, 3)), np.full((4, 3), np.nan)):
+        accumulator.register(again, prepared)
+        np.testing.assert_array_equal(accumulator.collected, kept)
+
+
+def test_a_source_that_cannot_be_registered_is_not_kept(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=5)
+    accumulator.collect(frames[0].source)
+    far = np.vstack([frames[1].source, [[9e3, 0.0, 0.0]]])
+    with pytest.raises(InvalidPointCloudError):
+        accumulator.register(far, prepared)
+    np.testing.assert_array_equal(accumulator.collected, frames[0].source)
+
+
+def test_another_target_starts_a_new_collection(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=5)
+    accumulator.register(frames[0].source, prepared)
+    accumulator.register(frames[1].source, registrar.prepare(frames[0].target))
+    np.testing.assert_array_equal(accumulator.collected, frames[1].source)
+
+
 def test_a_stray_source_is_left_out_and_after_three_the_bone_has_moved(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=40)
+    accumulator = Accumulator(registrar, most=len(frames))  # full: a stray one must not cost a good one
     for pair in frames[:-1]:
         accumulator.collect(pair.source)
     before = accumulator.register(frames[-1].source, prepared)

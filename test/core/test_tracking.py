@@ -111,13 +111,24 @@ def test_a_pose_without_rivals_is_not_followed(frames, prepared):
     assert tracker.register(frames[0].source, prepared).details["proposer"] == "truth"
 
 
-def test_the_rivals_move_with_the_source():
+@pytest.mark.parametrize("answer", [0, 1, 2])
+def test_the_rivals_move_with_the_source_whichever_of_them_is_followed(answer):
     memory, rng = Memory(), np.random.default_rng(2)
-    poses = [se3.exp(rng.normal(size=6)) for _ in range(3)]
+    poses = [se3.exp(rng.normal(size=6) * [30, 30, 30, 1, 1, 1]) for _ in range(3)]
     memory.keep(poses[0], tuple(poses[1:]))
-    moved = se3.exp(rng.normal(size=6))
-    memory.follow(poses[0] @ moved)
-    np.testing.assert_allclose(memory.poses, [pose @ moved for pose in poses], atol=1e-12)
+    moved = se3.exp([2.0, -1.0, 0.5, 0.02, 0.01, -0.03])
+    memory.follow(poses[answer] @ moved, rng.normal(size=(50, 3)) * 20.0)
+    others = [pose for k, pose in enumerate(poses) if k != answer]
+    np.testing.assert_allclose(memory.poses, [pose @ moved for pose in (poses[answer], *others)], atol=1e-9)
+
+
+def test_sources_that_cannot_be_registered_do_not_put_off_the_next_full_registration(registrar, frames, prepared):
+    tracker = Tracker(registrar, recheck=2)
+    found = []
+    for pair in frames[:3]:
+        found.append(tracker.register(pair.source, prepared).details["proposer"])
+        assert not tracker.register(np.zeros((5, 3)), prepared).ok
+    assert [name == "track" for name in found] == [False, True, False]
 
 
 def test_a_stream_is_seeded_and_its_frames_lie_on_the_bone(specimen, frames):

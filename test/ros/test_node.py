@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from harness import Client, accepted, node_in_thread, pose_mm, wait_until
+from harness import Client, StandIn, accepted, node_in_thread, pose_mm, wait_until
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.parameter import Parameter
@@ -112,10 +112,31 @@ def test_the_newest_cloud_wins_and_every_other_is_counted(live):
     np.testing.assert_allclose(method.calls[-1]["source"], (0.01 + GOOD[:300] * 10) * 1000.0, atol=1e-3)
 
 
-def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob_path, client, method):
-    method.sources = []
-    method.collect = method.sources.append
-    type(method).collected = property(lambda self: np.concatenate([np.empty((0, 3)), *self.sources]))
+class Collecting(StandIn):
+    """A stand-in that keeps clouds as an `Accumulator` does."""
+
+    def __init__(self):
+        super().__init__()
+        self.kept = []
+
+    @property
+    def collected(self):
+        return np.concatenate([np.empty((0, 3)), *self.kept])
+
+    def collect(self, source):
+        self.kept.append(source)
+
+    def register(self, source, target, initial=None):
+        result = super().register(source, target, initial)
+        self.collect(source)
+        return result
+
+    def reset(self):
+        self.kept = []
+
+
+def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob_path, client):
+    method = Collecting()
     with node_in_thread(method, blob_path, accumulate=4) as node:
         client.wait_for_state("active")
         assert client.ask(GOOD[:150])["last_refusal"].startswith("too_few_points: 150 usable points, min_points is 200")
@@ -127,26 +148,43 @@ def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob
             wait_until(lambda i=i: node.counters.received == i + 3)
         method.gate.set()
         wait_until(lambda: int(client.values()["frames_accepted"]) == 2)
+        wait_until(lambda: int(client.values()["frames_merged"]) == 4)
         values = client.values()
     counts = {key: int(values[f"frames_{key}"]) for key in ("received", "accepted", "refused", "merged", "dropped")}
-    assert counts == {"received": 8, "accepted": 2, "refused": 1, "merged": 2, "dropped": 3}
-    sizes = [150, 100, 100]  # too few alone; then those that waited, without the two oldest and the one without points
-    assert [len(source) for source in method.sources] == sizes
-    np.testing.assert_allclose(method.sources[-1], GOOD[:100] * 4 * 1000.0, atol=1e-3)
-    np.testing.assert_allclose(method.calls[-1]["source"], GOOD[:100] * 6 * 1000.0, atol=1e-3)
-    assert int(values["points_used"]) == sum(sizes) + 100
+    assert counts == {"received": 8, "accepted": 2, "refused": 1, "merged": 4, "dropped": 1}
+    assert [len(source) for source in method.kept] == [150, 300, 100, 100, 100, 100, 100]
+    np.testing.assert_allclose(method.kept[-2], GOOD[:100] * 4 * 1000.0, atol=1e-3)
+    np.testing.assert_allclose(method.kept[-1], GOOD[:100] * 6 * 1000.0, atol=1e-3)
+    assert int(values["points_used"]) == 950
 
 
-def test_a_cloud_that_is_asked_for_again_is_not_collected_twice(blob_path, client, method):
-    method.sources = []
-    method.collect = method.sources.append
-    type(method).collected = property(lambda self: np.concatenate([np.empty((0, 3)), *self.sources]))
-    with node_in_thread(method, blob_path, accumulate=4):
+def test_clouds_from_before_a_reset_are_not_merged(blob_path, client):
+    method = Collecting()
+    with node_in_thread(method, blob_path, accumulate=4, continuous=False) as node:
         client.wait_for_state("active")
-        method.collect(GOOD * 1000.0)
-        client.ask(GOOD)
+        for i in range(3):
+            client.send(GOOD * (i + 1))
+            wait_until(lambda i=i: node.counters.received == i + 1)
+        wait_until(lambda: len(method.kept) == 2, what="those that were pushed out")
+        assert client.call("reset").success
+        client.send(GOOD * 9)
+        wait_until(lambda: node.counters.received == 4)
         assert client.call("register").success
-    assert [len(call["source"]) for call in method.calls[-2:]] == [len(GOOD), 0]
+        np.testing.assert_allclose(method.kept, [GOOD * 9 * 1000.0], atol=1e-3)
+
+
+def test_another_frame_and_stamps_that_go_back_start_a_new_collection(blob_path, client):
+    method = Collecting()
+    with node_in_thread(method, blob_path, accumulate=9):
+        client.wait_for_state("active")
+        for count, (frame, stamp_s) in enumerate([("probe", 10.0), ("probe", 11.0)], 1):
+            client.ask(GOOD, frame=frame, stamp_s=stamp_s)
+            assert len(method.kept) == count
+        client.ask(GOOD, frame="other", stamp_s=12.0)
+        assert len(method.kept) == 1
+        client.ask(GOOD, frame="other", stamp_s=13.0)
+        client.ask(GOOD, frame="other", stamp_s=3.0)
+        assert len(method.kept) == 1
 
 
 def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):

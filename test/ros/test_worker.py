@@ -13,9 +13,9 @@ from gapr_ros.worker import Job, Worker
 class Bench:
     """A worker whose process waits for a gate."""
 
-    def __init__(self, held=False, period_s=0.0, keep=0):
+    def __init__(self, held=False, period_s=0.0):
         self.done, self.gate, self.held, self.period_s = [], threading.Event(), held, period_s
-        self.worker = Worker(self._process, lambda: self.held, lambda: self.period_s, keep)
+        self.worker = Worker(self._process, lambda: self.held, lambda: self.period_s)
 
     def _process(self, job):
         self.gate.wait(10.0)
@@ -41,18 +41,16 @@ def test_the_newest_cloud_wins_and_the_others_are_counted():
     assert bench.worker.stop(5.0)
 
 
-def test_clouds_that_are_to_be_kept_go_with_the_newest_one_and_only_the_oldest_are_dropped():
-    bench = Bench(keep=3)
+def test_a_cloud_that_is_pushed_out_is_left_to_a_task_before_the_next_one_is_processed():
+    bench, order = Bench(), []
     bench.worker.put(job(b"0"))
     wait_until(lambda: bench.worker._slot is None)
-    dropped = sum(bench.worker.put(job(b"%d" % i)) for i in range(1, 7))
+    for i in range(1, 5):
+        bench.worker.put(job(b"%d" % i), leave=lambda old: order.append((old.cloud, len(bench.done))))
     bench.gate.set()
     wait_until(lambda: len(bench.done) == 2)
-    assert bench.names() == [b"0", b"6"] and bench.done[1][0].earlier == [b"3", b"4", b"5"]
-    assert dropped == 2
-    assert bench.worker.ask("waiter", epoch=0)
-    wait_until(lambda: len(bench.done) == 3)
-    assert bench.done[2][0].again and not bench.done[2][0].earlier
+    assert bench.names() == [b"0", b"4"]
+    assert order == [(b"1", 1), (b"2", 1), (b"3", 1)]
     bench.worker.stop(5.0)
 
 

@@ -59,7 +59,7 @@ class NodeParameters:
     max_jump_rotation: float = setting(0.0, "farther from the last pose is refused, rad; 0: off", low=0.0, high=3.15)
     continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register")
     track: bool = setting(True, "start where the last pose was; false: every cloud by itself", live=False)
-    accumulate: int = setting(1, "clouds registered as one; the bone must rest in their frame", low=1, high=10_000,
+    accumulate: int = setting(1, "clouds registered as one; the bone must rest in output_frame", low=1, high=10_000,
                               live=False)  # fmt: skip
     max_rate: float = setting(0.0, "most registrations a second; 0: as many as possible", low=0.0, high=1000.0)
     timeout: float = setting(5.0, "a registration that took longer is refused, s", low=1e-3)

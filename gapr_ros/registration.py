@@ -81,7 +81,7 @@ class Registration:
             now = self._situation()
             points_mm = self._points_mm(Outcome(job), replace(now, parameters=replace(now.parameters, tf_timeout=0.0)))
             now.method.collect(points_mm)
-        except (RefusedError, InvalidPointCloudError):
+        except Exception:  # whatever is wrong with it, it is counted as dropped
             return False
         return True
 

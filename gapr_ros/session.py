@@ -154,7 +154,7 @@ class Session:
             outcome.refuse(refusal.reason, refusal.text)
 
     def _watch_stamps(self, outcome: Outcome) -> None:
-        """A bag that starts over without simulated time shows in its stamps only."""
+        """A bag that starts over without simulated time shows in its stamps only, as `Registration` sees too."""
         stamp_ns = intake.stamp_ns(outcome.header)
         if 0 < stamp_ns < self._last_stamp_ns - intake.BACKWARD_NS:
             self._node.get_logger().warning("stamps went back: the track is cleared")
@@ -164,8 +164,9 @@ class Session:
     # --- state ---
 
     def reset(self) -> None:
-        """Forget track and seed; clouds on their way will be refused."""
+        """Forget track, seed and collected clouds; clouds on their way will be refused."""
         self._epoch += 1
+        self.worker.run(self._forget_clouds)
         self._forget()
 
     def parameters_changed(self) -> None:
@@ -198,7 +199,6 @@ class Session:
             outcome.tell()
 
     def _forget(self) -> None:
-        self.worker.run(self._forget_clouds)
         self._track.clear()
         self._seed, self._last_stamp_ns = None, 0
         self._frames.forget()

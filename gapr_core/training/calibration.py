@@ -45,7 +45,7 @@ BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
 PROTOCOLS = (
     "paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "sweep", "mixed",
-    "wrong", "wrong_sweep", "turned",
+    "wrong", "wrong_sweep", "turned", "patch", "wrong_patch",
     "short-paper", "short-L1", "short-L2", "short-L3", "short-sweep", "short-mixed", "short-wrong", "short-wrong_sweep",
 )  # fmt: skip
 SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
@@ -173,6 +173,8 @@ def _record(task: Task) -> dict[str, Any]:
         pair = mixed_pair(specimen, seed)
     elif protocol == "wrong_sweep":
         pair = wrong_sweep_pair(specimen, others, seed)
+    elif protocol in ("patch", "wrong_patch"):
+        pair = patch_pair(specimen, others if protocol == "wrong_patch" else [], seed)
     else:
         pair = protocols.make_pair(protocol, specimen, seed, others)
     record["person"] = pair.person
@@ -250,6 +252,24 @@ def wrong_sweep_pair(specimen: Specimen, others: list[Specimen], seed: int) -> p
     swept = protocols.make_pair("sweep", stranger, seed).source
     nowhere = np.full((4, 4), np.nan)
     return replace(pair, source=swept, T_target_source=nowhere, name=f"wrong_sweep-{seed}", protocol="wrong_sweep")
+
+
+def patch_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:
+    """A one-sided view of 1 to 12 % of the bone, of few points; with `others`, of one of them: no pose is right then.
+
+    Two of three strangers are the same bone of somebody else: on so small a patch it fits nearly as well.
+    """
+    rng = np.random.default_rng([seed, 31])
+    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.01, 0.12), (60.0, 1500.0)))
+    noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
+    level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
+    pair = replace(protocols.one_sided(specimen, rng, level), name=f"patch-{seed}", protocol="patch")
+    if not others:
+        return pair
+    is_same = rng.random() < 0.67
+    strangers = [o for o in others if (o.bone == specimen.bone) == is_same and o.person != specimen.person]
+    seen = protocols.one_sided(strangers[int(rng.integers(len(strangers)))], rng, level).source
+    return replace(pair, source=seen, T_target_source=np.full((4, 4), np.nan), protocol="wrong_patch")
 
 
 def mixed_pair(specimen: Specimen, seed: int) -> protocols.Pair:

@@ -32,6 +32,7 @@ RECALLS = {
     "among": "Recall: any proposal within 20 mm and 15°",
 }
 ALL = "all"  # the protocol that stands for all of them
+LEGEND_LETTERS = 160  # that fit into a line of the picture
 
 
 @dataclass(frozen=True)
@@ -160,9 +161,14 @@ def figure(runs: Sequence[Run]) -> Figure:
     _kinds(top[2], INLIERS, one)
     handles, texts = bottom[0].get_legend_handles_labels()
     if handles:
-        drawn.legend(handles, texts, loc="outside lower center", ncols=min(8, len(texts)), frameon=False)
+        drawn.legend(handles, texts, loc="outside lower center", ncols=_columns(texts), frameon=False)
     drawn.suptitle(_title(runs), x=0.01, ha="left", fontsize=13, fontweight="bold")
     return drawn
+
+
+def _columns(texts: list[str]) -> int:
+    """Of a legend below the axes: as many as fit beside each other."""
+    return max(1, min(8, len(texts), LEGEND_LETTERS // (max(map(len, texts)) + 8)))
 
 
 def _title(runs: Sequence[Run]) -> str:

@@ -161,12 +161,12 @@ def figure(runs: Sequence[Run]) -> Figure:
     _kinds(top[2], INLIERS, one)
     handles, texts = bottom[0].get_legend_handles_labels()
     if handles:
-        drawn.legend(handles, texts, loc="outside lower center", ncols=_columns(texts), frameon=False)
+        drawn.legend(handles, texts, loc="outside lower center", ncols=_legend_columns(texts), frameon=False)
     drawn.suptitle(_title(runs), x=0.01, ha="left", fontsize=13, fontweight="bold")
     return drawn
 
 
-def _columns(texts: list[str]) -> int:
+def _legend_columns(texts: list[str]) -> int:
     """Of a legend below the axes: as many as fit beside each other."""
     return max(1, min(8, len(texts), LEGEND_LETTERS // (max(map(len, texts)) + 8)))
 

@@ -122,18 +122,21 @@ def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
     """A network to train: with the weights of `config.initial`, or random ones.
 
     Raises:
-        ConfigError: `config.initial` is of another network.
+        ConfigError: the tensors of `config.initial` are not those of this network; other settings may differ.
         WeightsError: it cannot be read.
     """
+    network = GAPRNet(model)
     if not config.initial:
-        return GAPRNet(model)
-    network = weights.load(config.initial)[0]
-    if replace(network.config, name=model.name) != model:
+        return network
+    given = weights.load(config.initial)[0].state_dict()
+    own = network.state_dict()
+    if {name: tensor.shape for name, tensor in given.items()} != {name: tensor.shape for name, tensor in own.items()}:
         raise ConfigError(
             "initial weights of the network that is trained",
             f"another in {config.initial}",
             "train the network of that file (--model), or begin without it",
         )
+    network.load_state_dict(given)
     return network.train()
 
 

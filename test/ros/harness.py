@@ -57,8 +57,8 @@ def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str 
 def context() -> Context:
     """An rclpy context in this process's domain.
 
-    Nodes of earlier tests live on in cycles of references inside rclpy until they are collected. A service that several of
-    them are half way into or out of is never ready: rmw_fastrtps wants as many ends for requests as for responses.
+    Nodes of earlier tests live on in cycles of references inside rclpy until they are collected. A service of which one
+    of them still holds half is never ready: rmw_fastrtps wants as many ends for requests as for responses.
     """
     gc.collect()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

@@ -140,10 +140,15 @@ class Replay:
             time.sleep(min(left_s, LARGEST_STEP_S))
 
     def _drain(self) -> None:
-        """Let reliable messages arrive before the publishers go."""
-        for publisher in self._publishers.values():
-            if self._node.context.ok():
-                publisher.wait_for_all_acked(Duration(seconds=DRAIN_S))
+        """Let reliable messages arrive before the publishers go.
+
+        By asking again and again: rclpy holds on to the interpreter lock while it waits, which stops all other threads.
+        """
+        deadline = time.monotonic() + DRAIN_S
+        waiting = list(self._publishers.values())
+        while waiting and self._node.context.ok() and time.monotonic() < deadline:
+            waiting = [publisher for publisher in waiting if not publisher.wait_for_all_acked(Duration())]
+            time.sleep(0.01)
 
 
 def parse_arguments(args: Sequence[str]) -> tuple[Path, ReplayOptions]:

@@ -110,6 +110,29 @@ class CovarianceConfig:
 
 
 @dataclass(frozen=True)
+class SmoothBiasConfig:
+    """The smooth bias that an accepted pose is freed from (`gapr_core.smooth_bias`).
+
+    Attributes:
+        correlation_mm: l of its correlation exp(-d^2 / 2 l^2).
+        centres: points that span it.
+        sizes_mm: standard deviations among which the residuals choose.
+        evidence: log likelihood ratio against no bias from which it is believed; infinity leaves every pose as it is.
+        smallest_share: of the information of the best determined field; fields with less do not say how large it is.
+        iterations: of the pose.
+        fewest_points: inliers without which it is not looked for.
+    """
+
+    correlation_mm: float = 20.0
+    centres: int = 80
+    sizes_mm: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0)
+    evidence: float = 2.0
+    smallest_share: float = 0.15
+    iterations: int = 3
+    fewest_points: int = 200
+
+
+@dataclass(frozen=True)
 class RegistrarConfig:
     """Everything a `Registrar` can be told.
 
@@ -126,6 +149,7 @@ class RegistrarConfig:
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
+    smooth_bias: SmoothBiasConfig = field(default_factory=SmoothBiasConfig)
     min_confidence: float = 0.5
     sure: float = 0.95
     num_threads: int = 0

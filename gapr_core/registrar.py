@@ -23,6 +23,7 @@ from gapr_core.proposals.base import Proposer
 from gapr_core.proposals.search import NormalAlignedSearch
 from gapr_core.refinement import Fit, evaluate, refine_fully
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.smooth_bias import compensate
 from gapr_core.source import PreparedSource, Unusable
 from gapr_core.target import PreparedTarget
 from gapr_core.verification import Candidates, verify
@@ -165,10 +166,14 @@ class Registrar:
         if probability < self.config.min_confidence:
             status, reason = _why_not(candidates, uncertainty, probability)
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
-        centre_mm = fit.moved.mean(axis=0)
+        settled = compensate(
+            fit, source.points, target, self.config.smooth_bias, self.config.refinement, source.neighbours
+        )
+        uncertainty = covariance.estimate(settled, self.config.covariance)
+        centre_mm = settled.moved.mean(axis=0)
         return RegistrationResult(
             RegistrationStatus.OK,
-            fit.T,
+            settled.T,
             uncertainty.covariance,
             tre_mm=uncertainty.tre_mm(target.points, centre_mm),
             centre_mm=centre_mm,

@@ -62,7 +62,7 @@ class ModelConfig:
     repositioning: str = "svd"
     fine_scores: str = "cosine"
     norm: str = "group"
-    centred_features: bool = True
+    centred_features: bool = False
     mlp_projections: bool = False
     pair_width: int = 32
     stages: int = 4

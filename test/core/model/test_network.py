@@ -39,7 +39,7 @@ ABLATIONS = {
     "ours_world",
     "ours_weights",
     "ours_dot",
-    "ours_uncentred",
+    "ours",
 }
 
 

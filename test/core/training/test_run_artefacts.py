@@ -132,6 +132,6 @@ def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused
     del begun["train"]["share"], begun["model"]["centred_features"]
     (tmp_path / "config.json").write_text(json.dumps(begun))
     trainer.settle(tmp_path, replace(TrainConfig(), model="new/best.yaml"), ModelConfig(), 0)
-    for config, model in ((TrainConfig(share=3), ModelConfig()), (TrainConfig(), ModelConfig(centred_features=False))):
+    for config, model in ((TrainConfig(share=3), ModelConfig()), (TrainConfig(), ModelConfig(centred_features=True))):
         with pytest.raises(ConfigError, match="begun"):
             trainer.settle(tmp_path, config, model, 0)

@@ -1,0 +1,118 @@
+"""The pose when a smooth misfit is reckoned with: soft tissue, a warped scan, a probe that is calibrated badly.
+
+Such a bias moves whole regions along their normals. Plain least squares takes each of their points for a witness of its
+own, and lets the regions pull the pose along. Here the bias is a nuisance: a Gaussian process over the surface with
+correlation exp(-d^2 / 2 l^2), and the pose is that of generalised least squares, which leans on what varies faster than
+the bias can. How large the bias is, and whether there is one, the residuals say themselves by restricted maximum
+likelihood, in which the pose is integrated out (Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from gapr_core.config import RefinementConfig, SmoothBiasConfig
+from gapr_core.geometry import sampling, se3
+from gapr_core.refinement import Fit, evaluate, patch_trust
+from gapr_core.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
+POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # keeps the information of an unobserved motion invertible
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Weighted inner products of residuals y, motions J (N, 6) and fields F (N, m) of unit variance.
+
+    Attributes:
+        JJ, JF, FF, Jy, Fy: J^T W J and so on; W is the inverse variance of the points.
+    """
+
+    JJ: Array
+    JF: Array
+    FF: Array
+    Jy: Array
+    Fy: Array
+
+    @classmethod
+    def of(cls, fit: Fit, fields: Array) -> NormalEquations:
+        """Those of a fit; points without weight count for nothing."""
+        W = fit.weights[:, None] / fit.sigma_mm**2
+        J, y = fit.jacobian, np.nan_to_num(fit.signed_mm)
+        WJ, WF = W * J, W * fields
+        return cls(J.T @ WJ + POSE_PRIOR, WJ.T @ fields, fields.T @ WF, WJ.T @ y, WF.T @ y)
+
+    def size_mm(self, config: SmoothBiasConfig) -> float:
+        """Standard deviation of the bias: its posterior root mean square over `config.sizes_mm`; 0 without evidence.
+
+        Only the fields that the points determine best have a say. The others are rough, and what the surface's model
+        leaves at edges would pass for a bias.
+        """
+        free = np.linalg.solve(self.JJ, np.column_stack([self.JF, self.Jy]))  # what a motion takes up
+        information, directions = np.linalg.eigh(self.FF - self.JF.T @ free[:, :-1])
+        score = directions.T @ (self.Fy - self.JF.T @ free[:, -1])
+        smooth = information > config.smallest_share * information[-1]
+        variances = np.square(config.sizes_mm)[:, None]
+        gain = 1.0 + variances * information[smooth]
+        log_likelihood = 0.5 * (variances * score[smooth] ** 2 / gain - np.log(gain)).sum(axis=1)  # 0 without a bias
+        if log_likelihood.max() < config.evidence:
+            return 0.0
+        posterior = np.exp(log_likelihood - log_likelihood.max())
+        return float(np.sqrt((posterior @ variances[:, 0]) / posterior.sum()))
+
+    def step(self, size_mm: float) -> Array:
+        """(6,) x y z (mm) rx ry rz (rad): the motion that fits best beside a bias of this size."""
+        A = self.FF + np.eye(len(self.FF)) / size_mm**2
+        taken = np.linalg.solve(A, np.column_stack([self.JF.T, self.Fy]))
+        return np.asarray(-np.linalg.solve(self.JJ - self.JF @ taken[:, :-1], self.Jy - self.JF @ taken[:, -1]))
+
+
+def compensate(
+    fit: Fit,
+    points: Array,
+    target: PreparedTarget,
+    config: SmoothBiasConfig,
+    refinement: RefinementConfig,
+    neighbours: NDArray[np.int64],
+) -> Fit:
+    """The fit moved to where it belongs if its residuals show a smooth bias; as it is if they do not.
+
+    Args:
+        fit: from `refine_fully`.
+        points: (N, 3) source points, mm.
+        target: the prepared target.
+        config: of the bias.
+        refinement: as `fit` was refined with.
+        neighbours: (N, k) of each point, as `refine_fully` takes them.
+    """
+    if np.count_nonzero(fit.weights) < config.fewest_points:
+        return fit
+    fields = _fields(fit, config)
+    for _ in range(config.iterations):
+        equations = NormalEquations.of(fit, fields)
+        size_mm = equations.size_mm(config)
+        if size_mm == 0.0:
+            break
+        T = se3.exp(equations.step(size_mm), fit.moved.mean(axis=0)) @ fit.T
+        fit = evaluate(se3.nearest_rigid(T), points, target, refinement)
+        fit = replace(fit, weights=fit.weights * patch_trust(fit, neighbours, refinement))
+    return fit
+
+
+def _fields(fit: Fit, config: SmoothBiasConfig) -> Array:
+    """(N, m) whose products are the correlation of the bias between points, from m of the inliers (Nystrom)."""
+    inliers = fit.moved[fit.weights > 0.0]
+    centres = inliers[sampling.thin(inliers, min(config.centres, len(inliers)))]
+    root = np.linalg.cholesky(_correlation(centres, centres, config) + PIVOT * np.eye(len(centres)))
+    return np.asarray(solve_triangular(root, _correlation(centres, fit.moved, config), lower=True).T)
+
+
+def _correlation(a: Array, b: Array, config: SmoothBiasConfig) -> Array:
+    squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
+    return np.asarray(np.exp(-0.5 * np.maximum(squares, 0.0) / config.correlation_mm**2))

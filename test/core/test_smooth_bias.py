@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gapr_core.config import RefinementConfig, SmoothBiasConfig
+from gapr_core.data.degradation import bias_along_normals
+from gapr_core.geometry import se3
+from gapr_core.refinement import refine_fully
+from gapr_core.smooth_bias import NormalEquations, compensate
+
+REFINEMENT, CONFIG = RefinementConfig(), SmoothBiasConfig()
+
+
+def view(femur, seed, bias_mm, noise_mm=0.4):
+    """2500 points of one side, with noise and a smooth bias; the neighbours that refinement wants with them."""
+    rng = np.random.default_rng(seed)
+    points, normals = femur.sample(16_000, rng)
+    seen = np.flatnonzero(normals @ [0.0, 1.0, 0.0] > 0.2)[:2500]
+    source = points[seen] + rng.normal(0.0, noise_mm, (len(seen), 3))
+    if bias_mm:
+        source += bias_along_normals(points[seen], normals[seen], bias_mm, rng)
+    return source, cKDTree(source).query(source, k=30)[1]
+
+
+def error_mm(T, source):
+    return float(np.sqrt(((se3.apply(T, source) - source) ** 2).sum(axis=1).mean()))
+
+
+def test_a_smooth_bias_costs_less_when_it_is_reckoned_with(femur, target):
+    plain, freed = [], []
+    for seed in range(6):
+        source, neighbours = view(femur, seed, bias_mm=1.5)
+        fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
+        plain.append(error_mm(fit.T, source))
+        freed.append(error_mm(compensate(fit, source, target, CONFIG, REFINEMENT, neighbours).T, source))
+    assert np.mean(np.square(freed)) < 0.7 * np.mean(np.square(plain))
+
+
+def test_without_a_bias_the_pose_stays_bit_by_bit(femur, target):
+    for seed in range(4):
+        source, neighbours = view(femur, seed, bias_mm=0.0)
+        fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
+        assert compensate(fit, source, target, CONFIG, REFINEMENT, neighbours) is fit
+
+
+def test_too_few_points_and_infinite_evidence_leave_the_pose(femur, target):
+    source, neighbours = view(femur, 0, bias_mm=1.5)
+    fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
+    for config in (SmoothBiasConfig(evidence=np.inf), SmoothBiasConfig(fewest_points=10_000)):
+        assert compensate(fit, source, target, config, REFINEMENT, neighbours) is fit
+
+
+@pytest.mark.parametrize("size_mm", [0.0, 0.2, 0.8])
+def test_the_size_of_a_bias_is_found_and_a_motion_beside_it(size_mm):
+    """Linear problem with fields and motions drawn at random: the estimate is right on average."""
+    rng = np.random.default_rng(3)
+    count, sizes, motions, expected = 1500, [], [], np.array([0.3, -0.2, 0.1, 0.02, 0.0, -0.01])
+    for _ in range(12):
+        J, fields = rng.normal(size=(count, 6)), rng.normal(size=(count, 20)) / np.sqrt(20.0)
+        y = -J @ expected + fields @ rng.normal(0.0, size_mm or 1e-9, 20) + rng.normal(0.0, 0.5, count)
+        WJ, WF = J / 0.25, fields / 0.25
+        equations = NormalEquations(J.T @ WJ, J.T @ WF, fields.T @ WF, WJ.T @ y, WF.T @ y)
+        sizes.append(equations.size_mm(CONFIG))
+        motions.append(equations.step(max(sizes[-1], 0.05)))
+    assert np.mean(sizes) == pytest.approx(size_mm, rel=0.25, abs=0.02)
+    assert np.mean(motions, axis=0) == pytest.approx(expected, abs=0.02)

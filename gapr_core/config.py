@@ -121,6 +121,8 @@ class SmoothBiasConfig:
         smallest_share: of the information of the best determined field; fields with less do not say how large it is.
         iterations: of the pose.
         fewest_points: inliers without which it is not looked for.
+        largest_move: squared Mahalanobis distance, under the covariance of the pose as it was, from which a move is not
+            made; the default is 99.9 % of chi square with six degrees of freedom.
     """
 
     correlation_mm: float = 20.0
@@ -130,6 +132,7 @@ class SmoothBiasConfig:
     smallest_share: float = 0.15
     iterations: int = 3
     fewest_points: int = 200
+    largest_move: float = 22.5
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,13 @@ class Registrar:
             status, reason = _why_not(candidates, uncertainty, probability)
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
         settled = compensate(
-            fit, source.points, target, self.config.smooth_bias, self.config.refinement, source.neighbours
+            fit,
+            source.points,
+            target,
+            self.config.smooth_bias,
+            self.config.refinement,
+            source.neighbours,
+            uncertainty.covariance,
         )
         uncertainty = covariance.estimate(settled, self.config.covariance)
         centre_mm = settled.moved.mean(axis=0)

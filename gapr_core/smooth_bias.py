@@ -17,6 +17,7 @@ from scipy.linalg import solve_triangular
 
 from gapr_core.config import RefinementConfig, SmoothBiasConfig
 from gapr_core.geometry import sampling, se3
+from gapr_core.metrics.uncertainty import error_twist, nees
 from gapr_core.refinement import Fit, evaluate, patch_trust
 from gapr_core.target import PreparedTarget
 
@@ -80,8 +81,11 @@ def compensate(
     config: SmoothBiasConfig,
     refinement: RefinementConfig,
     neighbours: NDArray[np.int64],
+    covariance: Array,
 ) -> Fit:
     """The fit moved to where it belongs if its residuals show a smooth bias; as it is if they do not.
+
+    A move that the covariance of the fit all but rules out is not made: what was judged is not left that far behind.
 
     Args:
         fit: from `refine_fully`.
@@ -90,7 +94,9 @@ def compensate(
         config: of the bias.
         refinement: as `fit` was refined with.
         neighbours: (N, k) of each point, as `refine_fully` takes them.
+        covariance: (6, 6) of `fit`, as `gapr_core.covariance.estimate` gives it.
     """
+    start = fit
     if np.count_nonzero(fit.weights) < config.fewest_points:
         return fit
     fields = _fields(fit, config)
@@ -102,15 +108,17 @@ def compensate(
         T = se3.exp(equations.step(size_mm), fit.moved.mean(axis=0)) @ fit.T
         fit = evaluate(se3.nearest_rigid(T), points, target, refinement)
         fit = replace(fit, weights=fit.weights * patch_trust(fit, neighbours, refinement))
-    return fit
+    move = error_twist(fit.T, start.T, points)
+    return fit if nees(move, covariance) < config.largest_move else start
 
 
 def _fields(fit: Fit, config: SmoothBiasConfig) -> Array:
     """(N, m) whose products are the correlation of the bias between points, from m of the inliers (Nystrom)."""
-    inliers = fit.moved[fit.weights > 0.0]
+    points = fit.moved - fit.moved.mean(axis=0)  # far from the origin the squares below would lose digits
+    inliers = points[fit.weights > 0.0]
     centres = inliers[sampling.thin(inliers, min(config.centres, len(inliers)))]
     root = np.linalg.cholesky(_correlation(centres, centres, config) + PIVOT * np.eye(len(centres)))
-    return np.asarray(solve_triangular(root, _correlation(centres, fit.moved, config), lower=True).T)
+    return np.asarray(solve_triangular(root, _correlation(centres, points, config), lower=True).T)
 
 
 def _correlation(a: Array, b: Array, config: SmoothBiasConfig) -> Array:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from gapr_core.config import CovarianceConfig
 from gapr_core.refinement import Fit
@@ -19,6 +20,7 @@ from gapr_core.refinement import Fit
 Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
+POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # keeps the information of an unobserved motion invertible
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class PoseUncertainty:
 def estimate(fit: Fit, config: CovarianceConfig) -> PoseUncertainty:
     """Covariance of a fit from its residuals; always symmetric and positive definite."""
     J, w = fit.jacobian, fit.weights
-    H = (J * w[:, None]).T @ J + np.diag([1e-6] * 3 + [1e-3] * 3)
+    H = (J * w[:, None]).T @ J + POSE_PRIOR
     noise = fit.sigma_mm**2 * (J * (w**2)[:, None]).T @ J
     smooth_mm = smooth_misfit_mm(fit, config.smooth_neighbours)
     bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_mm)
@@ -93,8 +95,12 @@ def _correlated(fit: Fit, config: CovarianceConfig) -> Array:
     some = inlier[:: max(1, len(inlier) // config.correlation_points)]
     weighted = fit.jacobian[some] * fit.weights[some, None] * (len(inlier) / len(some))
     points = fit.moved[some]
-    squares = ((points[:, None] - points[None]) ** 2).sum(axis=2)
-    return np.asarray(weighted.T @ np.exp(-0.5 * squares / config.correlation_mm**2) @ weighted)
+    return np.asarray(weighted.T @ smooth_correlation(points, points, config.correlation_mm) @ weighted)
+
+
+def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:
+    """(N, M) exp(-d^2 / 2 l^2) between points (N, 3) and (M, 3): how alike a smooth bias is in both."""
+    return np.asarray(np.exp(-0.5 * cdist(a, b, "sqeuclidean") / length_mm**2))
 
 
 def _largest_axis(block: Array) -> Array:

@@ -109,8 +109,7 @@ def refine_fully(
         fit = evaluate(poses[0], points, target, config)
         if number >= config.free_rounds and np.abs(step).max() < config.rest_mm:
             break
-    fit = evaluate(se3.nearest_rigid(fit.T), points, target, config)
-    return replace(fit, weights=fit.weights * patch_trust(fit, neighbours, config))
+    return evaluate_with_patches(fit.T, points, target, config, neighbours)
 
 
 def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
@@ -122,6 +121,14 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
     square = (np.nan_to_num(signed, nan=np.inf) ** 2 + aside**2) / limit_mm**2
     weights = np.clip(1.0 - square, 0.0, 1.0) ** 2 * sigma_mm**2 / (sigma_mm**2 + target.elements[elements, 12])
     return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
+
+
+def evaluate_with_patches(
+    T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, neighbours: NDArray[np.int64]
+) -> Fit:
+    """`evaluate` of a pose, made exactly rigid, with the patches' trust in the weights."""
+    fit = evaluate(se3.nearest_rigid(T), points, target, config)
+    return replace(fit, weights=fit.weights * patch_trust(fit, neighbours, config))
 
 
 def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfig) -> Array:

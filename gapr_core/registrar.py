@@ -116,6 +116,7 @@ class Registrar:
     ) -> RegistrationResult:
         """Ask one proposer after the other until an answer is sure; `most` limits the confidence."""
         result = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="nothing was proposed")
+        fit: Fit | None = None
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(self.config.seed)
             poses = np.concatenate([poses, proposer.propose(prepared, target, rng).poses])
@@ -132,7 +133,27 @@ class Registrar:
             clock.lap("assess")
             if result.confidence >= max(self.config.sure, self.config.min_confidence):
                 break
+        if fit is not None and result.covariance is not None:
+            result = self._freed_from_bias(result, fit, result.covariance, prepared, target)
+            clock.lap("refine")
         return result
+
+    def _freed_from_bias(
+        self, result: RegistrationResult, fit: Fit, known: Array, source: PreparedSource, target: PreparedTarget
+    ) -> RegistrationResult:
+        """An accepted answer, of covariance `known`, with its pose and what follows from it freed of smooth bias."""
+        config = self.config
+        freed = compensate(fit, known, source, target, config.smooth_bias, config.refinement)
+        if freed is fit:
+            return result
+        uncertainty, centre_mm = covariance.estimate(freed, config.covariance), freed.moved.mean(axis=0)
+        return replace(
+            result,
+            T_target_source=freed.T,
+            covariance=uncertainty.covariance,
+            tre_mm=uncertainty.tre_mm(target.points, centre_mm),
+            centre_mm=centre_mm,
+        )
 
     def _follows_both_walls(
         self, prepared: PreparedSource, both_walls: PreparedTarget, result: RegistrationResult
@@ -166,20 +187,10 @@ class Registrar:
         if probability < self.config.min_confidence:
             status, reason = _why_not(candidates, uncertainty, probability)
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
-        settled = compensate(
-            fit,
-            source.points,
-            target,
-            self.config.smooth_bias,
-            self.config.refinement,
-            source.neighbours,
-            uncertainty.covariance,
-        )
-        uncertainty = covariance.estimate(settled, self.config.covariance)
-        centre_mm = settled.moved.mean(axis=0)
+        centre_mm = fit.moved.mean(axis=0)
         return RegistrationResult(
             RegistrationStatus.OK,
-            settled.T,
+            fit.T,
             uncertainty.covariance,
             tre_mm=uncertainty.tre_mm(target.points, centre_mm),
             centre_mm=centre_mm,

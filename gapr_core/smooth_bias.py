@@ -9,22 +9,23 @@ likelihood, in which the pose is integrated out (Patterson and Thompson 1971; Ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from gapr_core.config import RefinementConfig, SmoothBiasConfig
+from gapr_core.covariance import POSE_PRIOR, smooth_correlation
 from gapr_core.geometry import sampling, se3
 from gapr_core.metrics.uncertainty import error_twist, nees
-from gapr_core.refinement import Fit, evaluate, patch_trust
+from gapr_core.refinement import Fit, evaluate_with_patches
+from gapr_core.source import PreparedSource
 from gapr_core.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
-POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # keeps the information of an unobserved motion invertible
 
 
 @dataclass(frozen=True)
@@ -76,51 +77,42 @@ class NormalEquations:
 
 def compensate(
     fit: Fit,
-    points: Array,
+    covariance: Array,
+    source: PreparedSource,
     target: PreparedTarget,
     config: SmoothBiasConfig,
     refinement: RefinementConfig,
-    neighbours: NDArray[np.int64],
-    covariance: Array,
 ) -> Fit:
-    """The fit moved to where it belongs if its residuals show a smooth bias; as it is if they do not.
+    """The fit moved to where it belongs if its residuals show a smooth bias; `fit` itself if they do not.
 
     A move that the covariance of the fit all but rules out is not made: what was judged is not left that far behind.
 
     Args:
         fit: from `refine_fully`.
-        points: (N, 3) source points, mm.
-        target: the prepared target.
+        covariance: (6, 6) of `fit`, as `gapr_core.covariance.estimate` gives it.
+        source, target: what was refined, and on what.
         config: of the bias.
         refinement: as `fit` was refined with.
-        neighbours: (N, k) of each point, as `refine_fully` takes them.
-        covariance: (6, 6) of `fit`, as `gapr_core.covariance.estimate` gives it.
     """
-    start = fit
     if np.count_nonzero(fit.weights) < config.fewest_points:
         return fit
-    fields = _fields(fit, config)
+    fields, freed = _fields(fit, config), fit
     for _ in range(config.iterations):
-        equations = NormalEquations.of(fit, fields)
+        equations = NormalEquations.of(freed, fields)
         size_mm = equations.size_mm(config)
         if size_mm == 0.0:
             break
-        T = se3.exp(equations.step(size_mm), fit.moved.mean(axis=0)) @ fit.T
-        fit = evaluate(se3.nearest_rigid(T), points, target, refinement)
-        fit = replace(fit, weights=fit.weights * patch_trust(fit, neighbours, refinement))
-    move = error_twist(fit.T, start.T, points)
-    return fit if nees(move, covariance) < config.largest_move else start
+        T = se3.exp(equations.step(size_mm), freed.moved.mean(axis=0)) @ freed.T
+        freed = evaluate_with_patches(T, source.points, target, refinement, source.neighbours)
+    is_plausible = nees(error_twist(freed.T, fit.T, source.points), covariance) < config.largest_move
+    return freed if is_plausible else fit
 
 
 def _fields(fit: Fit, config: SmoothBiasConfig) -> Array:
     """(N, m) whose products are the correlation of the bias between points, from m of the inliers (Nystrom)."""
-    points = fit.moved - fit.moved.mean(axis=0)  # far from the origin the squares below would lose digits
-    inliers = points[fit.weights > 0.0]
+    inliers = fit.moved[fit.weights > 0.0]
     centres = inliers[sampling.thin(inliers, min(config.centres, len(inliers)))]
-    root = np.linalg.cholesky(_correlation(centres, centres, config) + PIVOT * np.eye(len(centres)))
-    return np.asarray(solve_triangular(root, _correlation(centres, points, config), lower=True).T)
-
-
-def _correlation(a: Array, b: Array, config: SmoothBiasConfig) -> Array:
-    squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
-    return np.asarray(np.exp(-0.5 * np.maximum(squares, 0.0) / config.correlation_mm**2))
+    among = smooth_correlation(centres, centres, config.correlation_mm)
+    to_points = smooth_correlation(centres, fit.moved, config.correlation_mm)
+    root = np.linalg.cholesky(among + PIVOT * np.eye(len(centres)))
+    return np.asarray(solve_triangular(root, to_points, lower=True).T)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
+from gapr_core import source as sources
 from gapr_core.config import CovarianceConfig, RefinementConfig, SmoothBiasConfig
 from gapr_core.covariance import estimate
 from gapr_core.data.degradation import bias_along_normals
@@ -12,55 +12,52 @@ from gapr_core.smooth_bias import NormalEquations, compensate
 REFINEMENT, CONFIG = RefinementConfig(), SmoothBiasConfig()
 
 
-def view(femur, seed, bias_mm, noise_mm=0.4):
-    """2500 points of one side, with noise and a smooth bias; the neighbours that refinement wants with them."""
+def view(femur, target, seed, bias_mm, noise_mm=0.4):
+    """2500 points of one side, with noise and a smooth bias, and how they lie when refined from the truth."""
     rng = np.random.default_rng(seed)
     points, normals = femur.sample(16_000, rng)
     seen = np.flatnonzero(normals @ [0.0, 1.0, 0.0] > 0.2)[:2500]
     source = points[seen] + rng.normal(0.0, noise_mm, (len(seen), 3))
     if bias_mm:
         source += bias_along_normals(points[seen], normals[seen], bias_mm, rng)
-    return source, cKDTree(source).query(source, k=30)[1]
+    prepared = sources.prepare(source)
+    return prepared, refine_fully(np.eye(4), prepared.points, target, REFINEMENT, prepared.neighbours)
 
 
-def freed_from_bias(fit, source, target, neighbours, config=CONFIG):
+def freed_from_bias(fit, source, target, config=CONFIG):
     known = estimate(fit, CovarianceConfig()).covariance
-    return compensate(fit, source, target, config, REFINEMENT, neighbours, known)
+    return compensate(fit, known, source, target, config, REFINEMENT)
 
 
 def error_mm(T, source):
-    return float(np.sqrt(((se3.apply(T, source) - source) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt(((se3.apply(T, source.points) - source.points) ** 2).sum(axis=1).mean()))
 
 
 def test_a_smooth_bias_costs_less_when_it_is_reckoned_with(femur, target):
     plain, freed = [], []
     for seed in range(6):
-        source, neighbours = view(femur, seed, bias_mm=1.5)
-        fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
+        source, fit = view(femur, target, seed, bias_mm=1.5)
         plain.append(error_mm(fit.T, source))
-        freed.append(error_mm(freed_from_bias(fit, source, target, neighbours).T, source))
+        freed.append(error_mm(freed_from_bias(fit, source, target).T, source))
     assert np.mean(np.square(freed)) < 0.7 * np.mean(np.square(plain))
 
 
 def test_without_a_bias_the_pose_stays_bit_by_bit(femur, target):
     for seed in range(4):
-        source, neighbours = view(femur, seed, bias_mm=0.0)
-        fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
-        assert freed_from_bias(fit, source, target, neighbours) is fit
+        source, fit = view(femur, target, seed, bias_mm=0.0)
+        assert freed_from_bias(fit, source, target) is fit
 
 
 def test_too_few_points_and_infinite_evidence_leave_the_pose(femur, target):
-    source, neighbours = view(femur, 0, bias_mm=1.5)
-    fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
+    source, fit = view(femur, target, 0, bias_mm=1.5)
     for config in (SmoothBiasConfig(evidence=np.inf), SmoothBiasConfig(fewest_points=10_000)):
-        assert freed_from_bias(fit, source, target, neighbours, config) is fit
+        assert freed_from_bias(fit, source, target, config) is fit
 
 
 def test_a_move_that_the_covariance_rules_out_is_not_made(femur, target):
-    source, neighbours = view(femur, 0, bias_mm=1.5)
-    fit = refine_fully(np.eye(4), source, target, REFINEMENT, neighbours)
-    assert freed_from_bias(fit, source, target, neighbours) is not fit
-    assert compensate(fit, source, target, CONFIG, REFINEMENT, neighbours, np.eye(6) * 1e-8) is fit
+    source, fit = view(femur, target, 0, bias_mm=1.5)
+    assert freed_from_bias(fit, source, target) is not fit
+    assert compensate(fit, np.eye(6) * 1e-8, source, target, CONFIG, REFINEMENT) is fit
 
 
 @pytest.mark.parametrize("size_mm", [0.0, 0.2, 0.8])

@@ -1,0 +1,139 @@
+"""Models as other scanners and segmentations would give them: recall, refusals and false accepts.
+
+    python benchmarks/scanners.py --anatomy DIR [--split val] [--count 8] [--models "as given,voxels of 3 mm"]
+
+The source is drawn from the model itself, as in every list of pairs, or from the bone before it was scanned, as in an
+operation: then what the scan changed is one more misfit, which no protocol has. Wrong sources are of the same bone of
+another person, seen as at L2.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from tqdm import tqdm
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.clouds import Surface
+from gapr_core.console import say
+from gapr_core.data.pool import specimens
+from gapr_core.data.protocols import TARGET_POINTS, make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.evaluation.judge import judge
+
+Mesh = o3d.geometry.TriangleMesh
+
+PROTOCOLS = ("paper", "L1", "L2", "L3", "wrong")
+BONES = ("femur", "tibia", "pelvis", "thoracic")
+PEOPLE = 8  # parametric ones, where a bone has no others
+ANOTHER_PERSON_AT_L2 = 3  # of the eight kinds of `wrong`
+VOXELS_AT_ONCE = 1 << 20
+
+
+def of_mesh(change: Callable[[Mesh], Mesh]) -> Callable[[Surface], Surface]:
+    """What changes an Open3D mesh, for a surface."""
+
+    def scan(surface: Surface) -> Surface:
+        points, faces = o3d.utility.Vector3dVector(surface.points), o3d.utility.Vector3iVector(surface.faces)
+        mesh = change(Mesh(points, faces))
+        return Surface(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
+
+    return scan
+
+
+def of_voxels(*size_mm: float) -> Callable[[Surface], Surface]:
+    """The surface of the voxels (x, y, z) whose centres are inside, terraces and all (marching cubes of the mask)."""
+    size = np.array(size_mm)
+
+    def scan(mesh: Mesh) -> Mesh:
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+        low, high = mesh.get_min_bound() - 1.5 * size, mesh.get_max_bound() + 1.5 * size
+        shape = np.ceil((high - low) / size).astype(int)[::-1]
+        centres = low + np.indices(shape).reshape(3, -1).T[:, ::-1] * size
+        parts = np.array_split(centres.astype(np.float32), len(centres) // VOXELS_AT_ONCE + 1)
+        mask = np.concatenate([scene.compute_occupancy(part).numpy() for part in parts]).reshape(shape)
+        made = o3d.t.geometry.TriangleMesh.create_isosurfaces(o3d.core.Tensor(mask.astype(np.float32)), [0.5])
+        terraces = made.to_legacy()
+        terraces.vertices = o3d.utility.Vector3dVector(low + np.asarray(terraces.vertices) * size)
+        return terraces
+
+    return of_mesh(scan)
+
+
+def of_size(factor: float) -> Callable[[Surface], Surface]:
+    """The surface of a smaller or a larger person."""
+    return lambda surface: Surface(surface.points * factor, surface.faces)
+
+
+OTHER_PEOPLE: dict[str, Callable[[Surface], Surface]] = {
+    "as given": of_size(1.0),
+    "0.75 of the size": of_size(0.75),
+    "1.2 of the size": of_size(1.2),
+}
+OTHER_SCANNERS: dict[str, Callable[[Surface], Surface]] = {
+    "voxels of 0.8 x 0.8 x 3 mm": of_voxels(0.8, 0.8, 3.0),
+    "voxels of 1.5 mm": of_voxels(1.5, 1.5, 1.5),
+    "voxels of 3 mm": of_voxels(3.0, 3.0, 3.0),
+    "1000 triangles": of_mesh(lambda mesh: mesh.simplify_quadric_decimation(1000)),
+    "smoothed (10 rounds of Laplace)": of_mesh(lambda mesh: mesh.filter_smooth_laplacian(10)),
+}
+
+
+def main() -> int:
+    """Register every pair, print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--bones", default=",".join(BONES), help="with commas")
+    parser.add_argument("--count", type=int, default=8, help="pairs per bone, model and protocol")
+    parser.add_argument("--models", default=",".join(OTHER_PEOPLE | OTHER_SCANNERS), help="with commas")
+    args = parser.parse_args()
+    registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+    people = {bone: specimens(bone, args.split, PEOPLE, args.anatomy) for bone in args.bones.split(",")}
+    head = ("model", "source of", *(f"{protocol}: right % (accepted)" for protocol in PROTOCOLS[:-1]),
+            "wrong: accepted", "false accepts", "of these at >= 0.9")  # fmt: skip
+    say("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
+    for name in args.models.split(","):
+        for source_of in ("the model", "the bone") if name in OTHER_SCANNERS else ("the model",):
+            rows = []
+            for bone, known in people.items():
+                scanned = [replace(s, surface=(OTHER_PEOPLE | OTHER_SCANNERS)[name](s.surface)) for s in known]
+                seen = known if source_of == "the bone" else scanned
+                numbers = tqdm(range(args.count), f"{name}, {bone}", leave=False)
+                rows += [measure(registrar, scanned, seen, number) for number in numbers]
+            say(line(name, source_of, np.array(rows)))
+    return 0
+
+
+def measure(registrar: Registrar, scanned: list[Specimen], seen: list[Specimen], number: int) -> list[list[bool]]:
+    """One bone's model, for each protocol: right, accepted, false accept, false accept at 0.9 or more."""
+    who = number % len(scanned)
+    cloud, _ = scanned[who].sample(TARGET_POINTS, np.random.default_rng(number))
+    target, answers = registrar.prepare(cloud), []
+    for protocol in PROTOCOLS:
+        pair = make_pair(protocol, seen[who], 500 + number, seen, ANOTHER_PERSON_AT_L2)
+        T_scan_source = pair.T_target_source.copy()
+        T_scan_source[:3, 3] += pair.metadata["origin_mm"]
+        result = registrar.register(pair.source, target)
+        judged = judge(replace(pair, target=cloud, T_target_source=T_scan_source), result)
+        wrong = bool(judged["false_accept"])
+        answers.append([bool(judged["right"]), result.ok, wrong, wrong and result.confidence >= 0.9])
+    return answers
+
+
+def line(name: str, source_of: str, answers: np.ndarray) -> str:
+    """One row of the table from (pairs, protocols, 4) answers."""
+    right, accepted, *_ = answers.sum(axis=0).T
+    cells = [f"{100.0 * r / len(answers):.1f} ({a})" for r, a in zip(right[:-1], accepted[:-1], strict=True)]
+    counts = [f"{accepted[-1]} of {len(answers)}", *answers[:, :, 2:].sum(axis=(0, 1))]
+    return "| " + " | ".join(map(str, [name, source_of, *cells, *counts])) + " |"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

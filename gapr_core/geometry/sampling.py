@@ -11,33 +11,34 @@ Array = NDArray[np.float64]
 
 def voxel_indices(points: Array, voxel_mm: float) -> NDArray[np.int64]:
     """Indices of one point of (N, 3) per occupied voxel: the one nearest to the mean of its voxel's points; sorted."""
-    cells = np.floor((points - points.min(axis=0)) / voxel_mm).astype(np.int64)
-    size = cells.max(axis=0) + 1
-    _, voxel, counts = np.unique(
-        (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_inverse=True, return_counts=True
-    )
+    _, voxel, counts = np.unique(_cells(points, voxel_mm), return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(voxel, weights=axis) for axis in points.T], axis=1) / counts[:, None]
     order = np.lexsort((np.linalg.norm(points - means[voxel], axis=1), voxel))
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     return np.sort(order[first])
 
 
+def _cells(points: Array, voxel_mm: float) -> NDArray[np.int64]:
+    """(N,) numbers of the voxels that points (N, 3) are in."""
+    x, y, z = np.floor((points - points.min(axis=0)) / voxel_mm).astype(np.int64).T
+    return np.asarray((x * (y.max() + 1) + y) * (z.max() + 1) + z)
+
+
 def thin(points: Array, most: int) -> NDArray[np.int64]:
     """Indices of at most `most` of (N, 3) points, evenly spread: the finest voxel grid that keeps that many."""
     if len(points) <= most:
         return np.arange(len(points))
-    low, high = 0.0, float(np.ptp(points, axis=0).max()) + 1e-9
-    keep = np.arange(most)
+    low, high, kept = 0.0, float(np.ptp(points, axis=0).max()) + 1e-9, 0
     for _ in range(12):  # bisection on the voxel size
         middle = 0.5 * (low + high) if low else high / 16.0
-        candidate = voxel_indices(points, middle)
-        if len(candidate) > most:
+        occupied = len(np.unique(_cells(points, middle)))
+        if occupied > most:
             low = middle
         else:
-            high, keep = middle, candidate
-            if len(keep) > 0.97 * most:
+            high, kept = middle, occupied
+            if kept > 0.97 * most:
                 break
-    return keep
+    return voxel_indices(points, high) if kept else np.arange(most)
 
 
 def farthest_points(points: Array, count: int, start: int = 0) -> NDArray[np.int64]:

@@ -55,7 +55,7 @@ setup(
     extras_require={
         "bags": BAGS,
         "ros": [*ROS_WHEELS, *BAGS],
-        "baselines": ["kiss-matcher", "pycpd", "small_gicp"],
+        "baselines": BASELINES,
         "test": TEST,
         "dev": [*TEST, "mypy", "pre-commit", "types-PyYAML"],
     },

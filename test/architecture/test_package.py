@@ -43,6 +43,11 @@ def test_every_entry_point_leads_to_something_that_can_be_called():
         assert callable(loaded) or (callable(loaded.add_arguments) and callable(loaded.run))
 
 
+def test_kiss_matcher_is_not_asked_for_on_a_python_that_it_has_no_wheel_for():
+    asked = re.findall(r'"(kiss-matcher[^"]*)"', (ROOT / "setup.py").read_text())
+    assert asked == ["kiss-matcher; python_version < '3.13'"]
+
+
 def test_every_folder_of_code_is_a_package_and_gets_installed():
     folders = {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
     assert len(folders) > 5

@@ -83,6 +83,7 @@ OTHER_SCANNERS: dict[str, Callable[[Surface], Surface]] = {
     "1000 triangles": of_mesh(lambda mesh: mesh.simplify_quadric_decimation(1000)),
     "smoothed (10 rounds of Laplace)": of_mesh(lambda mesh: mesh.filter_smooth_laplacian(10)),
 }
+MODELS = OTHER_PEOPLE | OTHER_SCANNERS
 
 
 def main() -> int:
@@ -92,7 +93,7 @@ def main() -> int:
     parser.add_argument("--split", default="val")
     parser.add_argument("--bones", default=",".join(BONES), help="with commas")
     parser.add_argument("--count", type=int, default=8, help="pairs per bone, model and protocol")
-    parser.add_argument("--models", default=",".join(OTHER_PEOPLE | OTHER_SCANNERS), help="with commas")
+    parser.add_argument("--models", default=",".join(MODELS), help="with commas")
     args = parser.parse_args()
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     people = {bone: specimens(bone, args.split, PEOPLE, args.anatomy) for bone in args.bones.split(",")}
@@ -100,13 +101,14 @@ def main() -> int:
             "wrong: accepted", "false accepts", "of these at >= 0.9")  # fmt: skip
     say("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
     for name in args.models.split(","):
-        for source_of in ("the model", "the bone") if name in OTHER_SCANNERS else ("the model",):
-            rows = []
-            for bone, known in people.items():
-                scanned = [replace(s, surface=(OTHER_PEOPLE | OTHER_SCANNERS)[name](s.surface)) for s in known]
-                seen = known if source_of == "the bone" else scanned
-                numbers = tqdm(range(args.count), f"{name}, {bone}", leave=False)
-                rows += [measure(registrar, scanned, seen, number) for number in numbers]
+        scans = {bone: [replace(s, surface=MODELS[name](s.surface)) for s in known] for bone, known in people.items()}
+        sources = {"the model": scans, "the bone": people} if name in OTHER_SCANNERS else {"the model": scans}
+        for source_of, seen in sources.items():
+            rows = [
+                measure(registrar, scans[bone], seen[bone], number)
+                for bone in scans
+                for number in tqdm(range(args.count), f"{name}, {bone}", leave=False)
+            ]
             say(line(name, source_of, np.array(rows)))
     return 0
 

@@ -61,12 +61,8 @@ def main() -> int:
 
 def hollowed(specimen: Specimen, wall_mm: float) -> Specimen:
     """The same bone with an inner wall: its vertices moved inwards along their normals."""
-    import open3d as o3d
-
-    points, faces = specimen.surface.points, specimen.surface.faces
-    assert faces is not None
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(points), o3d.utility.Vector3iVector(faces))
-    normals = np.asarray(mesh.compute_vertex_normals().vertex_normals)
+    points, faces = specimen.surface.points, specimen.surface.triangles
+    normals = np.asarray(specimen.surface.to_open3d().compute_vertex_normals().vertex_normals)
     volume = np.einsum("ij,ij->i", points[faces[:, 0]], np.cross(points[faces[:, 1]], points[faces[:, 2]])).sum()
     inner = points - wall_mm * np.sign(volume) * normals
     both = Surface(np.vstack([points, inner]), np.vstack([faces, faces[:, ::-1] + len(points)]))

@@ -39,9 +39,7 @@ def of_mesh(change: Callable[[Mesh], Mesh]) -> Callable[[Surface], Surface]:
     """What changes an Open3D mesh, for a surface."""
 
     def scan(surface: Surface) -> Surface:
-        points, faces = o3d.utility.Vector3dVector(surface.points), o3d.utility.Vector3iVector(surface.faces)
-        mesh = change(Mesh(points, faces))
-        return Surface(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
+        return Surface.from_open3d(change(surface.to_open3d()))
 
     return scan
 

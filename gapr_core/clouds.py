@@ -34,6 +34,33 @@ class Surface:
     faces: NDArray[np.int64] | None = None
     normals: Array | None = None
 
+    @classmethod
+    def from_open3d(cls, mesh: Any) -> Surface:
+        """Vertices, taken for mm, and triangles of an `open3d.geometry.TriangleMesh`."""
+        return cls(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
+
+    def to_open3d(self) -> Any:
+        """The mesh as an `open3d.geometry.TriangleMesh`, mm.
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
+        import open3d as o3d
+
+        points, faces = o3d.utility.Vector3dVector(self.points), o3d.utility.Vector3iVector(self.triangles)
+        return o3d.geometry.TriangleMesh(points, faces)
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """(F, 3) the faces of a mesh.
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
+        if self.faces is None:
+            raise InvalidPointCloudError("a triangle mesh", "a cloud without faces", "give a mesh")
+        return self.faces
+
     @property
     def extent_mm(self) -> float:
         """Diagonal of the axis-aligned bounding box, mm."""
@@ -44,6 +71,12 @@ class Surface:
         """(F,) triangle areas, mm^2."""
         return 0.5 * np.asarray(np.linalg.norm(self._face_crosses(), axis=1))
 
+    def mirrored(self) -> Surface:
+        """The mesh of the other side of the body: x negated, faces turned so that normals stay outward."""
+        mirror = np.array([-1.0, 1.0, 1.0])
+        normals = None if self.normals is None else self.normals * mirror
+        return Surface(self.points * mirror, self.triangles[:, ::-1].copy(), normals)
+
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Points drawn anew from the faces, uniform in area.
 
@@ -53,8 +86,6 @@ class Surface:
         Raises:
             InvalidPointCloudError: for a cloud without faces.
         """
-        if self.faces is None:
-            raise InvalidPointCloudError("a mesh to draw points from", "a cloud without faces", "give a triangle mesh")
         crosses = self._face_crosses()
         areas = np.linalg.norm(crosses, axis=1)
         face = rng.choice(len(areas), size=count, p=areas / areas.sum())
@@ -64,8 +95,8 @@ class Surface:
         return a + u * (b - a) + v * (c - a), crosses[face] / areas[face, None]
 
     def _corners(self, face: NDArray[np.int64] | slice = slice(None)) -> tuple[Array, Array, Array]:
-        assert self.faces is not None
-        return tuple(self.points[self.faces[face, i]] for i in range(3))  # type: ignore[return-value]
+        faces = self.triangles
+        return tuple(self.points[faces[face, i]] for i in range(3))  # type: ignore[return-value]
 
     def _face_crosses(self) -> Array:
         a, b, c = self._corners()
@@ -210,7 +241,7 @@ def _read_open3d(path: Path) -> Surface:
         mesh = o3d.geometry.TriangleMesh() if path.suffix.lower() == ".pcd" else o3d.io.read_triangle_mesh(str(path))
         if mesh.has_triangles():
             mesh.remove_duplicated_vertices()  # STL repeats every vertex in each face
-            return Surface(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
+            return Surface.from_open3d(mesh)
         cloud = o3d.io.read_point_cloud(str(path)) if path.suffix.lower() == ".pcd" else mesh
         points = np.asarray(cloud.points if hasattr(cloud, "points") else cloud.vertices).copy()
         return Surface(points, None, np.asarray(cloud.normals).copy() if _has_normals(cloud) else None)

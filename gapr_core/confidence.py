@@ -1,7 +1,7 @@
-"""How probable it is that a pose is right: named figures of the fit, one calibrated logistic model.
+"""How probable it is that a pose is right: named figures of the fit, weighed by a few small networks.
 
-The model's coefficients are fitted on train people over all protocols, right and wrong pairs alike, by
-`gapr_core.training.calibration`; the file names the data and the fit.
+They are trained on train people over all protocols, right and wrong pairs alike, by `gapr_core.training.calibration`;
+the file names the data and the fit. They run in NumPy: a `Registrar` of the search alone needs no torch.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from gapr_core.covariance import PoseUncertainty
 from gapr_core.errors import WeightsError
@@ -25,23 +26,24 @@ Array = NDArray[np.float64]
 WEIGHTS = Path(__file__).parent / "weights"
 DEFAULT_CALIBRATION = WEIGHTS / "confidence.json"
 CALIBRATIONS = {"network": WEIGHTS / "confidence_network.json", "track": WEIGHTS / "confidence_track.json"}
+LARGEST_SCALES = 4.0  # from the mean of a feature: what lies farther out counts as that far
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibration:
-    """A logistic model over standardised features and their products.
+    """The mean logit of several small multilayer perceptrons over standardised features.
 
     Attributes:
         names: the features, in the order of `means`, `scales`.
         means: (F,) and scales (F,) of the training set.
-        weights: (1 + F + F (F + 1) / 2,) constant, linear and product terms.
+        layers: weights (members, inputs, outputs) and biases (members, outputs) of each layer, SiLU between them.
         card: where it comes from.
     """
 
     names: tuple[str, ...]
     means: Array
     scales: Array
-    weights: Array
+    layers: tuple[tuple[Array, Array], ...]
     card: dict[str, object]
 
     @staticmethod
@@ -57,8 +59,15 @@ class Calibration:
         data = json.loads(path.read_text())
         if tuple(data["names"]) != FEATURES:
             raise WeightsError(f"a model of {FEATURES}", f"one of {data['names']}", "calibrate again")
-        means, scales, weights = (np.asarray(data[key], dtype=np.float64) for key in ("means", "scales", "weights"))
-        return Calibration(FEATURES, means, scales, weights, data["card"])
+        layers = tuple((np.array(weights), np.array(biases)) for weights, biases in data["layers"])
+        return Calibration(FEATURES, np.array(data["means"]), np.array(data["scales"]), layers, data["card"])
+
+    @staticmethod
+    def undecided() -> Calibration:
+        """A model that gives every pose a probability of 0.5: for what comes before the training."""
+        count = len(FEATURES)
+        layer = np.zeros((1, count, 1)), np.zeros((1, 1))
+        return Calibration(FEATURES, np.zeros(count), np.ones(count), (layer,), {})
 
     @staticmethod
     def shipped(proposer: str) -> Calibration:
@@ -71,14 +80,21 @@ class Calibration:
 
     def probability(self, features: dict[str, float]) -> float:
         """Probability, 0 to 1, that the pose is within 4 mm and 5 deg."""
-        logit = self.design(np.array([[features[name] for name in self.names]])) @ self.weights
-        return float(1.0 / (1.0 + np.exp(-np.clip(logit[0], -30.0, 30.0))))
+        logit = float(self.logits(np.array([[features[name] for name in self.names]]))[0])
+        return float(expit(np.clip(logit, -30.0, 30.0)))
 
-    def design(self, features: Array) -> Array:
-        """(N, 1 + F + F (F + 1) / 2) terms of (N, F) features; far outliers are pulled in to 4 scales."""
-        z = np.clip((features - self.means) / self.scales, -4.0, 4.0)
-        i, j = np.triu_indices(z.shape[1])
-        return np.hstack([np.ones((len(z), 1)), z, z[:, i] * z[:, j]])
+    def logits(self, features: Array) -> Array:
+        """(N,) log odds of (N, F) features; far outliers are pulled in to 4 scales."""
+        x = self.standardised(features)[None]
+        for number, (weights, biases) in enumerate(self.layers):
+            x = x @ weights + biases[:, None]
+            if number < len(self.layers) - 1:
+                x = x * expit(x)  # SiLU
+        return np.asarray(x[..., 0].mean(axis=0))
+
+    def standardised(self, features: Array) -> Array:
+        """(N, F) features in scales from their means, at most 4."""
+        return np.clip((features - self.means) / self.scales, -LARGEST_SCALES, LARGEST_SCALES)
 
 
 def measure(
@@ -92,6 +108,7 @@ def measure(
         "log_sigma": float(np.log(fit.sigma_mm)),
         "log_excess": float(np.log(fit.sigma_mm / max(source.noise_mm, 0.1))),
         "smooth_misfit": uncertainty.smooth_mm,
+        "short_misfit": uncertainty.short_mm,
         "inlier_ratio": float(inlier.mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
         "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
@@ -107,6 +124,6 @@ def measure(
 
 
 FEATURES = (
-    "log_sigma", "log_excess", "smooth_misfit", "inlier_ratio", "residual", "margin", "support", "log_shift_sd",
-    "log_turn_sd", "normal_agreement", "log_points", "extent",
+    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "residual", "margin", "support",
+    "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent",
 )  # fmt: skip

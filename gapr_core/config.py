@@ -107,6 +107,7 @@ class CovarianceConfig:
     correlation_mm: float = 25.0
     correlation_points: int = 400
     smooth_neighbours: int = 30
+    short_neighbours: int = 12
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ class PoseUncertainty:
     Attributes:
         covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
         bias_mm: standard deviation of the smooth bias that the covariance reckons with.
-        smooth_mm: the smooth misfit that the residuals show (see `smooth_misfit_mm`).
+        smooth_mm: the smooth misfit that the residuals show (see `smooth_misfits_mm`).
+        short_mm: the same at a shorter range, which also holds what is rougher: another bone's surface.
         weakest_turn: (3,) unit axis, target frame, about which the rotation is least certain.
         weakest_shift: (3,) unit direction, target frame, along which the position is least certain.
     """
@@ -38,6 +39,7 @@ class PoseUncertainty:
     covariance: Array
     bias_mm: float
     smooth_mm: float
+    short_mm: float
     weakest_turn: Array
     weakest_shift: Array
 
@@ -67,24 +69,33 @@ def estimate(fit: Fit, config: CovarianceConfig) -> PoseUncertainty:
     J, w = fit.jacobian, fit.weights
     H = (J * w[:, None]).T @ J + POSE_PRIOR
     noise = fit.sigma_mm**2 * (J * (w**2)[:, None]).T @ J
-    smooth_mm = smooth_misfit_mm(fit, config.smooth_neighbours)
+    smooth_mm, short_mm = smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
     bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_mm)
     H_inverse = np.linalg.inv(H)
     covariance = H_inverse @ (noise + bias_mm**2 * _correlated(fit, config)) @ H_inverse
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
-    return PoseUncertainty(
-        covariance, float(bias_mm), smooth_mm, _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
-    )
+    weakest = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
+    return PoseUncertainty(covariance, float(bias_mm), smooth_mm, short_mm, *weakest)
 
 
-def smooth_misfit_mm(fit: Fit, neighbours: int) -> float:
-    """Root mean square of the locally averaged residuals of the inliers, less what noise leaves in an average."""
+def smooth_misfits_mm(fit: Fit, neighbours: tuple[int, ...]) -> tuple[float, ...]:
+    """Root mean square of the inliers' locally averaged residuals, less what noise leaves in an average.
+
+    Args:
+        fit: the residuals.
+        neighbours: of how many points an average is taken; a figure for each count.
+    """
     inlier = fit.weights > 0.0
-    if inlier.sum() <= neighbours:
-        return fit.sigma_mm
     points, signed = fit.moved[inlier], fit.signed_mm[inlier]
-    averages = signed[cKDTree(points).query(points, k=neighbours)[1]].mean(axis=1)
-    return float(np.sqrt(max((averages**2).mean() - signed.var() / neighbours, 0.0)))
+    if len(points) <= min(neighbours):
+        return (fit.sigma_mm,) * len(neighbours)
+    nearest = cKDTree(points).query(points, k=min(max(neighbours), len(points)))[1]
+
+    def misfit_mm(count: int) -> float:
+        averages = signed[nearest[:, :count]].mean(axis=1)
+        return float(np.sqrt(max((averages**2).mean() - signed.var() / count, 0.0)))
+
+    return tuple(misfit_mm(count) if len(points) > count else fit.sigma_mm for count in neighbours)
 
 
 def _correlated(fit: Fit, config: CovarianceConfig) -> Array:

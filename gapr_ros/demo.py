@@ -114,9 +114,7 @@ def write_stl(surface: Surface, path: Path) -> None:
     """A mesh as binary STL."""
     import open3d as o3d
 
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(surface.points), o3d.utility.Vector3iVector(surface.faces)
-    )
+    mesh = surface.to_open3d()
     mesh.compute_triangle_normals()
     if not o3d.io.write_triangle_mesh(str(path), mesh):
         raise DemoError(f"{path} could not be written")

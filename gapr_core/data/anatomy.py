@@ -160,10 +160,5 @@ def _of_split(specimens: list[Specimen], split: str, people: dict[str, list[str]
 
 
 def mirrored(specimen: Specimen) -> Specimen:
-    """The other side of the body: x negated, faces turned so that normals stay outward; the same person."""
-    surface = specimen.surface
-    assert surface.faces is not None
-    mirror = np.array([-1.0, 1.0, 1.0])
-    normals = None if surface.normals is None else surface.normals * mirror
-    flipped = Surface(surface.points * mirror, surface.faces[:, ::-1].copy(), normals)
-    return Specimen(flipped, specimen.bone, specimen.person, specimen.cohort)
+    """The bone of the other side of the same person's body."""
+    return Specimen(specimen.surface.mirrored(), specimen.bone, specimen.person, specimen.cohort)

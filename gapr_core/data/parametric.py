@@ -6,7 +6,6 @@ Frame of every bone: x to the person's left, y backwards, z up.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
@@ -79,10 +78,7 @@ def _finish(surface: Surface, rng: np.random.Generator, faces: int = 14_000) -> 
 
 
 def _either_side(left: Surface, rng: np.random.Generator) -> Surface:
-    if rng.random() < 0.5:
-        return left
-    assert left.faces is not None
-    return replace(left, points=left.points * [-1.0, 1.0, 1.0], faces=left.faces[:, ::-1].copy())
+    return left if rng.random() < 0.5 else left.mirrored()
 
 
 BONES: dict[str, Callable[[np.random.Generator], Surface]] = {

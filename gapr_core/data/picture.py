@@ -24,11 +24,10 @@ def shade(surface: Surface, view: str, mm_per_pixel: float = 0.7, margin_mm: flo
 
     eye, up = (np.asarray(v, dtype=np.float64) for v in VIEWS[view])
     right = np.cross(up, eye)
-    assert surface.faces is not None
     scene = o3d.t.geometry.RaycastingScene()
     centre = surface.points.mean(axis=0)
     vertices = (surface.points - centre).astype(np.float32)
-    scene.add_triangles(vertices, surface.faces.astype(np.uint32))
+    scene.add_triangles(vertices, surface.triangles.astype(np.uint32))
     hit = scene.cast_rays(_rays(vertices, eye, up, right, mm_per_pixel, margin_mm))
     normals = hit["primitive_normals"].numpy()
     normals *= np.sign(np.sum(normals * eye, axis=-1, keepdims=True))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,8 +62,9 @@ class Solid:
         labels, counts, _ = mesh.cluster_connected_triangles()
         mesh.remove_triangles_by_mask(np.asarray(labels) != int(np.argmax(counts)))
         mesh.remove_unreferenced_vertices()
-        surface = Surface(self.low + (np.asarray(mesh.vertices) - 1.0) * self.spacing, _faces(mesh))
-        return surface if volume_mm3(surface) > 0.0 else Surface(surface.points, _faces(mesh)[:, ::-1].copy())
+        in_voxels = Surface.from_open3d(mesh)
+        surface = Surface(self.low + (in_voxels.points - 1.0) * self.spacing, in_voxels.triangles)
+        return surface if volume_mm3(surface) > 0.0 else Surface(surface.points, surface.triangles[:, ::-1].copy())
 
     def _block(self, shape: Shape, margin: float) -> tuple[tuple[slice, ...], Grid, Grid, Grid]:
         margin += 2.0 * self.spacing
@@ -77,12 +77,8 @@ class Solid:
 
 def simplify(surface: Surface, faces: int) -> Surface:
     """About `faces` triangles by quadric decimation (Garland and Heckbert 1997); unchanged where that opens it."""
-    import open3d as o3d
-
-    points, triangles = o3d.utility.Vector3dVector(surface.points), o3d.utility.Vector3iVector(surface.faces)
-    mesh = o3d.geometry.TriangleMesh(points, triangles).simplify_quadric_decimation(faces)
-    coarse = Surface(np.asarray(mesh.vertices).copy(), _faces(mesh))
-    return coarse if is_closed(_faces(mesh)) else surface
+    coarse = Surface.from_open3d(surface.to_open3d().simplify_quadric_decimation(faces))
+    return coarse if is_closed(coarse.triangles) else surface
 
 
 def is_closed(faces: NDArray[np.integer]) -> bool:
@@ -96,8 +92,7 @@ def is_closed(faces: NDArray[np.integer]) -> bool:
 
 def volume_mm3(surface: Surface) -> float:
     """Signed volume of a closed mesh by the divergence theorem; positive when the faces are wound outward."""
-    assert surface.faces is not None
-    a, b, c = (surface.points[surface.faces[:, i]] - surface.points.mean(axis=0) for i in range(3))
+    a, b, c = (surface.points[surface.triangles[:, i]] - surface.points.mean(axis=0) for i in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
@@ -244,7 +239,3 @@ def _smooth_min(first: Grid, second: Grid, blend: float) -> Grid:
         return np.minimum(first, second)
     overlap = np.maximum(blend - np.abs(first - second), 0.0) / blend
     return (np.minimum(first, second) - overlap**2 * blend * 0.25).astype(np.float32)
-
-
-def _faces(mesh: Any) -> NDArray[np.int64]:
-    return np.asarray(mesh.triangles).astype(np.int64)

@@ -68,13 +68,12 @@ class Specimen:
 
         `upper` is the end with the larger coordinate along the axis nearest to the bone's longest direction.
         """
-        assert self.surface.faces is not None
-        centred = self.surface.points - self._centre
+        triangles, centred = self.surface.triangles, self.surface.points - self._centre
         axis = np.linalg.eigh(np.cov(centred.T))[1][:, 2]
         axis *= np.sign(axis[np.abs(axis).argmax()]) * (1.0 if upper else -1.0)
         along = centred @ axis
         kept = along >= along.max() - share * np.ptp(along)
-        faces = self.surface.faces[kept[self.surface.faces].all(axis=1)]
+        faces = triangles[kept[triangles].all(axis=1)]
         used, faces = np.unique(faces, return_inverse=True)
         points, faces = _closed(self.surface.points[used], faces.reshape(-1, 3))
         return replace(self, surface=Surface(points, faces))
@@ -88,10 +87,9 @@ class Specimen:
         """Open3D RaycastingScene, centred so that its float32 is fine enough."""
         import open3d as o3d
 
-        assert self.surface.faces is not None
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         vertices = np.ascontiguousarray(self.surface.points - self._centre, dtype=np.float32)
-        scene.add_triangles(vertices, np.ascontiguousarray(self.surface.faces, dtype=np.uint32))
+        scene.add_triangles(vertices, np.ascontiguousarray(self.surface.triangles, dtype=np.uint32))
         return scene
 
 

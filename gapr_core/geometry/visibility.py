@@ -122,6 +122,8 @@ def outer_layer(
     if outer.sum() < quadrics.FEWEST_NEIGHBOURS:
         return None
     for _ in range(3):
+        if outer.mean() > 1.0 - HOLLOW_FROM:  # it only grows
+            return None
         _grow(outer, votes, points, spacing_mm)
     return None if outer.mean() > 1.0 - HOLLOW_FROM else (outer, votes)
 

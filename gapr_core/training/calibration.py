@@ -5,9 +5,7 @@
 There are three models: for what is known after each round of the `Registrar`, the network alone and with the search,
 and for the next source of a stream, where a `Tracker` looks at what it remembers alone.
 Pairs come from train people only, real and parametric, over all protocols, wrong bones and solids of revolution.
-Finished pairs are kept in the records file, so a stopped run goes on where it was. Each model is a ridge logistic
-regression in which wrong answers count twice and bones that are not the target's eight times: it errs on the side of
-doubt.
+Finished pairs are kept in the records file, so a stopped run goes on where it was; `confidence_fit` makes the models.
 """
 
 from __future__ import annotations
@@ -25,8 +23,6 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import expit
 from tqdm import tqdm
 
 from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, FEATURES, Calibration
@@ -39,6 +35,7 @@ from gapr_core.proposals.base import Proposer
 from gapr_core.registrar import Registrar
 from gapr_core.results import RegistrationResult
 from gapr_core.tracking import Memory
+from gapr_core.training.confidence_fit import as_json, fit
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
@@ -52,7 +49,6 @@ SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
 MODELS = CALIBRATIONS | {"search": DEFAULT_CALIBRATION}
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
-WRONG_BONE, WRONG_POSE = 8.0, 2.0  # how often a record counts where no pose is right, or the answer is not
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
 Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
@@ -93,38 +89,6 @@ def collect(tasks: list[Task], path: Path, jobs: int) -> list[dict[str, Any]]:
     return list(done.values())
 
 
-def fit(records: list[dict[str, Any]], ridge: float = 3.0) -> Calibration:
-    """Penalised maximum likelihood; what must not be believed counts more than once."""
-    x = np.array([[r["features"][name] for name in FEATURES] for r in records])
-    y = np.array([r["right"] for r in records], dtype=np.float64)
-    scales = np.maximum(x.std(axis=0), 1e-9)
-    model = Calibration(FEATURES, x.mean(axis=0), scales, np.zeros(0), {})
-    terms = model.design(x)
-    counts = np.array([_count(record) for record in records])
-    penalty = np.concatenate([[0.0], np.full(len(FEATURES), 0.3), np.ones(terms.shape[1] - 1 - len(FEATURES))])
-
-    def loss(w: Array) -> tuple[float, Array]:
-        logit = terms @ w
-        value = counts @ (np.logaddexp(0.0, logit) - y * logit) + 0.5 * ridge * (penalty * w**2).sum()
-        return float(value), terms.T @ (counts * (expit(logit) - y)) + ridge * penalty * w
-
-    best = minimize(loss, np.zeros(terms.shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 2000})
-    return Calibration(FEATURES, model.means, scales, best.x, {"pairs": len(records), "right": float(y.mean())})
-
-
-def _count(record: dict[str, Any]) -> float:
-    if record["right"]:
-        return 1.0
-    return WRONG_BONE if "wrong" in record.get("protocol", "") else WRONG_POSE
-
-
-def as_json(model: Calibration, card: dict[str, Any]) -> str:
-    """The model as the file that `Calibration.load` reads."""
-    data = {"names": model.names, "card": card | model.card}
-    arrays = {key: np.round(getattr(model, key), 6).tolist() for key in ("means", "scales", "weights")}
-    return json.dumps(data | arrays, indent=1) + "\n"
-
-
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
@@ -149,13 +113,8 @@ def _registrars() -> dict[str, Registrar]:
 
 def _without_model(proposers: list[Proposer]) -> Registrar:
     """A registrar that goes through all rounds and accepts everything."""
-    untrained = Calibration(FEATURES, np.zeros(len(FEATURES)), np.ones(len(FEATURES)), _undecided(), {})
     config = RegistrarConfig(num_threads=1, min_confidence=0.0, sure=2.0)
-    return Registrar(config, proposers, [untrained] * len(proposers))
-
-
-def _undecided() -> Array:
-    return np.zeros(1 + len(FEATURES) + len(FEATURES) * (len(FEATURES) + 1) // 2)
+    return Registrar(config, proposers, [Calibration.undecided()] * len(proposers))
 
 
 def _record(task: Task) -> dict[str, Any]:

@@ -42,7 +42,4 @@ class ShapeModel:
 def vary(surface: Surface, rng: np.random.Generator) -> Surface:
     """The same bone as somebody else's: up to 10 % larger or smaller, other waves and texture, left or right."""
     changed = deform(replace(surface, points=surface.points * rng.uniform(0.9, 1.1)), rng)
-    if rng.random() < 0.5:
-        return changed
-    assert changed.faces is not None
-    return replace(changed, points=changed.points * [-1.0, 1.0, 1.0], faces=changed.faces[:, ::-1].copy())
+    return changed if rng.random() < 0.5 else changed.mirrored()

@@ -158,6 +158,22 @@ def test_points_are_drawn_uniformly_in_area_on_the_faces():
     assert on_floor.mean() == pytest.approx(share, abs=0.01)
 
 
+def test_a_mesh_goes_to_open3d_and_comes_back():
+    again = Surface.from_open3d(Surface(VERTICES, FACES).to_open3d())
+    assert np.array_equal(again.points, VERTICES) and np.array_equal(again.faces, FACES)
+    with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
+        Surface(VERTICES).to_open3d()
+
+
+def test_a_mirrored_mesh_is_still_wound_outward():
+    from gapr_core.data.solid import volume_mm3
+
+    mesh = Surface(VERTICES, FACES, VERTICES)
+    assert volume_mm3(mesh.mirrored()) == pytest.approx(volume_mm3(mesh)) and volume_mm3(mesh) > 0.0
+    assert np.array_equal(mesh.mirrored().normals, mesh.mirrored().points)
+    assert np.array_equal(mesh.mirrored().mirrored().points, mesh.points)
+
+
 def test_a_cloud_has_no_faces_to_draw_from():
     with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
         Surface(VERTICES).sample(5, np.random.default_rng(0))

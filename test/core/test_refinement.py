@@ -137,6 +137,27 @@ def test_a_smooth_bias_widens_the_covariance(fit):
     assert np.linalg.eigvalsh(large - small).min() > -1e-9
 
 
+def test_the_misfit_at_short_range_shows_ripples_that_longer_averages_do_not():
+    """A sheet of points, 1 mm apart, whose residuals are noise and a wave of 0.3 mm."""
+    rng = np.random.default_rng(0)
+    sheet = np.stack(np.meshgrid(np.arange(60.0), np.arange(60.0), [0.0]), axis=-1).reshape(-1, 3)
+    misfits = {}
+    for length_mm in (8.0, 60.0):
+        wave = 0.3 * np.sqrt(2.0) * np.sin(2.0 * np.pi * sheet[:, 0] / length_mm)
+        signed = wave + rng.normal(0.0, 0.5, len(sheet))
+        ones, up, first = np.ones(len(sheet)), np.tile([0.0, 0.0, 1.0], (len(sheet), 1)), np.zeros(len(sheet), np.int64)
+        of_sheet = refinement.Fit(np.eye(4), 0.5, signed, ones, up, first, sheet)
+        misfits[length_mm] = covariance.smooth_misfits_mm(of_sheet, (30, 12))
+    assert misfits[60.0] == pytest.approx((0.3, 0.3), abs=0.03)  # the noise is taken away
+    assert misfits[8.0][0] < 0.7 * misfits[8.0][1] < 0.3
+    few = replace(of_sheet, weights=np.r_[np.ones(20), np.zeros(len(sheet) - 20)])
+    assert (
+        covariance.smooth_misfits_mm(few, (30, 12))[0] == few.sigma_mm != covariance.smooth_misfits_mm(few, (30, 12))[1]
+    )
+    none = replace(of_sheet, weights=np.zeros(len(sheet)))
+    assert covariance.smooth_misfits_mm(none, (30, 12)) == (0.5, 0.5)
+
+
 def test_the_weakest_turn_of_a_shaft_is_about_its_axis():
     from gapr_core import Registrar
 

@@ -72,9 +72,9 @@ def test_the_shipped_network_and_the_search_are_asked_in_this_order():
 
 def test_each_round_has_the_confidence_model_that_was_fitted_for_it():
     network, search = Registrar.from_pretrained(ONE_THREAD).calibrations
-    assert np.array_equal(network.weights, Calibration.load(CALIBRATIONS["network"]).weights)
-    assert np.array_equal(search.weights, Calibration.load(DEFAULT_CALIBRATION).weights)
-    assert not np.array_equal(network.weights, search.weights)
+    for model, path in ((network, CALIBRATIONS["network"]), (search, DEFAULT_CALIBRATION)):
+        assert np.array_equal(model.means, Calibration.load(path).means)
+    assert not np.array_equal(network.means, search.means)
 
 
 def test_the_network_alone_finds_a_one_sided_view(pair):

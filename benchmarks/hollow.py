@@ -20,6 +20,7 @@ from gapr_core.clouds import Surface
 from gapr_core.console import say
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
+from gapr_core.data.solid import volume_mm3
 from gapr_core.data.specimen import Specimen
 from gapr_core.evaluation.judge import judge
 
@@ -63,8 +64,7 @@ def hollowed(specimen: Specimen, wall_mm: float) -> Specimen:
     """The same bone with an inner wall: its vertices moved inwards along their normals."""
     points, faces = specimen.surface.points, specimen.surface.triangles
     normals = np.asarray(specimen.surface.to_open3d().compute_vertex_normals().vertex_normals)
-    volume = np.einsum("ij,ij->i", points[faces[:, 0]], np.cross(points[faces[:, 1]], points[faces[:, 2]])).sum()
-    inner = points - wall_mm * np.sign(volume) * normals
+    inner = points - wall_mm * np.sign(volume_mm3(specimen.surface)) * normals
     both = Surface(np.vstack([points, inner]), np.vstack([faces, faces[:, ::-1] + len(points)]))
     return replace(specimen, surface=both)
 

@@ -36,11 +36,11 @@ class Surface:
 
     @classmethod
     def from_open3d(cls, mesh: Any) -> Surface:
-        """Vertices, taken for mm, and triangles of an `open3d.geometry.TriangleMesh`."""
+        """Vertices and triangles of an `open3d.geometry.TriangleMesh`, in its unit; normals stay behind."""
         return cls(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
 
     def to_open3d(self) -> Any:
-        """The mesh as an `open3d.geometry.TriangleMesh`, mm.
+        """The mesh as an `open3d.geometry.TriangleMesh`, mm, without normals.
 
         Raises:
             InvalidPointCloudError: for a cloud without faces.
@@ -72,7 +72,11 @@ class Surface:
         return 0.5 * np.asarray(np.linalg.norm(self._face_crosses(), axis=1))
 
     def mirrored(self) -> Surface:
-        """The mesh of the other side of the body: x negated, faces turned so that normals stay outward."""
+        """The mesh of the other side of the body: x negated, faces turned so that normals stay outward.
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
         mirror = np.array([-1.0, 1.0, 1.0])
         normals = None if self.normals is None else self.normals * mirror
         return Surface(self.points * mirror, self.triangles[:, ::-1].copy(), normals)

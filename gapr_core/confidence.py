@@ -51,7 +51,7 @@ class Calibration:
         """Read the model.
 
         Raises:
-            WeightsError: no such file, or one made for other features.
+            WeightsError: no such file, one made for other features, or a damaged one.
         """
         path = Path(path)
         if not path.is_file():
@@ -59,7 +59,9 @@ class Calibration:
         data = json.loads(path.read_text())
         if tuple(data["names"]) != FEATURES:
             raise WeightsError(f"a model of {FEATURES}", f"one of {data['names']}", "calibrate again")
-        layers = tuple((np.array(weights), np.array(biases)) for weights, biases in data["layers"])
+        layers = tuple((np.array(weights), np.array(biases)) for weights, biases in data.get("layers", ()))
+        if not layers or layers[0][0].shape[1] != len(FEATURES) or layers[-1][0].shape[2] != 1:
+            raise WeightsError("layers from the features to one figure", f"others in {path}", "calibrate again")
         return Calibration(FEATURES, np.array(data["means"]), np.array(data["scales"]), layers, data["card"])
 
     @staticmethod

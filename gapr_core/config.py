@@ -100,7 +100,16 @@ class RefinementConfig:
 
 @dataclass(frozen=True)
 class CovarianceConfig:
-    """The smooth bias that the covariance reckons with."""
+    """The smooth bias that the covariance reckons with.
+
+    Attributes:
+        bias_floor_mm, bias_gain: its standard deviation is the floor and so many times the misfit of the residuals.
+        correlation_mm: l of its correlation exp(-d^2 / 2 l^2).
+        correlation_points: of the inliers, for the sums over all pairs of points.
+        smooth_neighbours: of how many points the averages are taken that show the misfit.
+        short_neighbours: the same for the misfit at short range, which the confidence alone uses. The confidence models
+            that ship were fitted with these two counts.
+    """
 
     bias_floor_mm: float = 0.03
     bias_gain: float = 1.75

@@ -184,7 +184,7 @@ class Registrar:
             "alternatives": tuple(candidates.poses[1:]),
             "details": figures | {"best_pose": fit.T, "bias_mm": uncertainty.bias_mm},
         }
-        if probability < self.config.min_confidence:
+        if not probability >= self.config.min_confidence:  # nor where it is no number
             status, reason = _why_not(candidates, uncertainty, probability)
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
         centre_mm = fit.moved.mean(axis=0)

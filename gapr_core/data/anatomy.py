@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -161,4 +161,4 @@ def _of_split(specimens: list[Specimen], split: str, people: dict[str, list[str]
 
 def mirrored(specimen: Specimen) -> Specimen:
     """The bone of the other side of the same person's body."""
-    return Specimen(specimen.surface.mirrored(), specimen.bone, specimen.person, specimen.cohort)
+    return replace(specimen, surface=specimen.surface.mirrored())

@@ -130,8 +130,6 @@ def outer_layer(
 
 def _grow(outer: NDArray[np.bool_], outward: Array, points: Array, spacing_mm: float) -> None:
     """Add, in place, the points that lie on the surface elements of those already in the mask."""
-    if outer.all():
-        return
     inside = np.flatnonzero(outer)
     tree = cKDTree(points[inside])
     neighbours = tree.query(points[inside], k=quadrics.FEWEST_NEIGHBOURS)[1]

@@ -27,26 +27,31 @@ from tqdm import tqdm
 
 from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, FEATURES, Calibration
 from gapr_core.config import RegistrarConfig
+from gapr_core.console import say
 from gapr_core.data import anatomy, degradation, protocols
 from gapr_core.data import pool as bone_pool
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_core.proposals.base import Proposer
+from gapr_core.proposals.network import NetworkProposer
+from gapr_core.proposals.search import NormalAlignedSearch
 from gapr_core.registrar import Registrar
 from gapr_core.results import RegistrationResult
 from gapr_core.tracking import Memory
-from gapr_core.training.confidence_fit import as_json, fit
+from gapr_core.training.confidence_fit import as_json, fit, held_out, summary
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
 PROTOCOLS = (
     "paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "sweep", "mixed",
-    "wrong", "wrong_sweep", "turned", "patch", "wrong_patch",
+    "wrong", "wrong_person", "wrong_sweep", "turned", "patch", "wrong_patch",
     "short-paper", "short-L1", "short-L2", "short-L3", "short-sweep", "short-mixed", "short-wrong", "short-wrong_sweep",
 )  # fmt: skip
 SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
 MODELS = CALIBRATIONS | {"search": DEFAULT_CALIBRATION}
+TWINS = ({"llp26_2008_0054", "llp26_2008_0032", "llp26_2008_0103"}, {"jhu_25", "jhu_15"})  # alike to 1 or 2 mm, not 7
+ANOTHER_PERSON = (3, 5)  # of the eight kinds of `wrong`: somebody else's bone seen as at L2, as at L3
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
@@ -65,21 +70,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--records", type=Path, default=Path("runs/calibration.jsonl"))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder for the models; without it only the records are made")
+    parser.add_argument("--cross-validate", action="store_true", help="say how they do on people they have not seen")
     args = parser.parse_args(arguments)
     tasks = [(str(args.anatomy), args.split, protocol, bone, args.seed + i)
              for i in range(args.count) for protocol in args.protocols for bone in args.bones]  # fmt: skip
     records = collect(tasks, args.records, args.jobs)
-    for proposer, path in MODELS.items() if args.out else ():
-        model = fit([record[proposer] | {"protocol": record["protocol"]} for record in records if proposer in record])
-        card = {"people": f"{args.split} people of {args.anatomy.name}", "hypotheses": proposer}
-        (args.out / path.name).write_text(as_json(model, card))
+    for proposer, path in MODELS.items():
+        answers = [record | record[proposer] for record in records if proposer in record]
+        if args.out:
+            card = {"people": f"{args.split} people of {args.anatomy.name}", "hypotheses": proposer}
+            (args.out / path.name).write_text(as_json(fit(answers), card))
+        if args.cross_validate:
+            say(f"{proposer}: {summary(answers, held_out(answers))}")
     return 0
 
 
 def collect(tasks: list[Task], path: Path, jobs: int) -> list[dict[str, Any]]:
-    """Register every pair that the records file does not hold yet; returns all records of the file."""
+    """Register every pair that the records file does not hold yet, or with other figures; returns all of the others."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    done = {record["name"]: record for record in _read(path)}
+    done = {record["name"]: record for record in _read(path) if _has_all_features(record)}
     tasks = [task for task in tasks if "-".join(map(str, task[2:])) not in done]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, path.open("a") as file:
         for record in tqdm(pool.map(_record, tasks), total=len(tasks), unit="pair"):
@@ -98,6 +107,10 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
         yield from (json.loads(line) for line in path.read_text().splitlines() if line.endswith("}"))
 
 
+def _has_all_features(record: dict[str, Any]) -> bool:
+    return all(set(FEATURES) <= record[proposer]["features"].keys() for proposer in MODELS if proposer in record)
+
+
 @cache
 def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
     parametric = {bone: bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE) for bone in BONES}
@@ -107,7 +120,7 @@ def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
 @cache
 def _registrars() -> dict[str, Registrar]:
     """The two rounds, as they are when the answer of the first one is not sure."""
-    network, search = Registrar.from_pretrained().proposers
+    network, search = NetworkProposer.from_weights(), NormalAlignedSearch(RegistrarConfig().search, num_threads=1)
     return {"network": _without_model([network]), "search": _without_model([network, search])}
 
 
@@ -130,6 +143,8 @@ def _record(task: Task) -> dict[str, Any]:
         pair = turned_pair(len(BONES) * seed + BONES.index(bone))
     elif protocol == "mixed":
         pair = mixed_pair(specimen, seed)
+    elif protocol == "wrong_person":
+        pair = wrong_person_pair(specimen, others, seed)
     elif protocol == "wrong_sweep":
         pair = wrong_sweep_pair(specimen, others, seed)
     elif protocol in ("patch", "wrong_patch"):
@@ -198,6 +213,15 @@ def turned_pair(seed: int) -> protocols.Pair:
     return protocols.Pair(
         source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
     )
+
+
+def wrong_person_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:
+    """The same bone of somebody else, seen as at L2 or L3: the hardest to refuse. No pose is right."""
+    alike = {person for group in TWINS if specimen.person in group for person in group}
+    strangers = [o for o in others if o.bone == specimen.bone and o.person not in alike]
+    turn = ANOTHER_PERSON[int(np.random.default_rng([seed, 37]).integers(2))]
+    pair = protocols.make_pair("wrong", specimen, seed, strangers, turn)
+    return replace(pair, name=f"wrong_person-{seed}", protocol="wrong_person")
 
 
 def wrong_sweep_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:

@@ -170,8 +170,10 @@ def test_a_mirrored_mesh_is_still_wound_outward():
 
     mesh = Surface(VERTICES, FACES, VERTICES)
     assert volume_mm3(mesh.mirrored()) == pytest.approx(volume_mm3(mesh)) and volume_mm3(mesh) > 0.0
+    assert np.array_equal(mesh.mirrored().points, VERTICES * [-1.0, 1.0, 1.0])
     assert np.array_equal(mesh.mirrored().normals, mesh.mirrored().points)
-    assert np.array_equal(mesh.mirrored().mirrored().points, mesh.points)
+    with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
+        Surface(VERTICES).mirrored()
 
 
 def test_a_cloud_has_no_faces_to_draw_from():

@@ -50,11 +50,7 @@ def test_every_bone_is_one_closed_outward_surface_of_an_adults_size(bones, name)
 
 @pytest.mark.parametrize("name", list(SIZES_MM))
 def test_every_bone_is_one_piece(bones, name):
-    import open3d as o3d
-
-    surface = bones[name]
-    points, faces = o3d.utility.Vector3dVector(surface.points), o3d.utility.Vector3iVector(surface.faces)
-    labels, _, _ = o3d.geometry.TriangleMesh(points, faces).cluster_connected_triangles()
+    labels, _, _ = bones[name].to_open3d().cluster_connected_triangles()
     assert set(np.asarray(labels)) == {0}
 
 

@@ -14,16 +14,12 @@ def tibia():
 
 @pytest.mark.parametrize("upper", [False, True])
 def test_an_end_of_a_bone_is_that_share_of_its_length_on_that_side_and_closed(tibia, upper):
-    import open3d as o3d
 
     end = tibia.end(0.3, upper)
     whole, cut = tibia.surface.points[:, 2], end.surface.points[:, 2]
     assert np.ptp(cut) == pytest.approx(0.3 * np.ptp(whole), rel=0.1)
     assert (cut.max() == whole.max(), cut.min() == whole.min()) == (upper, not upper)
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(end.surface.points), o3d.utility.Vector3iVector(end.surface.faces)
-    )
-    assert mesh.is_edge_manifold(allow_boundary_edges=False)
+    assert end.surface.to_open3d().is_edge_manifold(allow_boundary_edges=False)
     assert (end.bone, end.person) == (tibia.bone, tibia.person)
 
 

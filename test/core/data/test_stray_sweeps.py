@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from shapes import ball_specimen, knob_specimen
 
@@ -25,3 +27,15 @@ def test_a_patch_is_small_and_with_others_it_is_one_of_theirs():
     gaps = own.distance(se3.apply(patch.T_target_source, patch.source) + patch.metadata["origin_mm"])
     assert np.median(gaps) < 2.0
     assert not np.array_equal(patch.source[:20], wrong.source[:20])
+
+
+def test_somebody_elses_bone_is_of_the_same_kind_but_of_nobody_who_is_nearly_the_same():
+    own, twin, stranger = (
+        replace(parametric_specimen("femur", i), person=person)
+        for i, person in enumerate(("llp26_2008_0054", "llp26_2008_0032", "llp26_2008_2041"))
+    )
+    others = [own, twin, stranger, parametric_specimen("tibia", 0)]
+    pairs = [calibration.wrong_person_pair(own, others, seed) for seed in range(6)]
+    assert {pair.metadata["source_person"] for pair in pairs} == {"llp26_2008_2041"}
+    assert {pair.metadata["degraded_as"] for pair in pairs} == {"L2", "L3"}
+    assert not any(pair.has_truth for pair in pairs) and {pair.protocol for pair in pairs} == {"wrong_person"}

@@ -1,12 +1,13 @@
 """Who is asked, and how often: the network first, the search only where a doubt remains."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
-from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, Calibration
+from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, FEATURES, Calibration
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, MethodUnavailableError
@@ -75,6 +76,13 @@ def test_each_round_has_the_confidence_model_that_was_fitted_for_it():
     for model, path in ((network, CALIBRATIONS["network"]), (search, DEFAULT_CALIBRATION)):
         assert np.array_equal(model.means, Calibration.load(path).means)
     assert not np.array_equal(network.means, search.means)
+
+
+def test_a_confidence_that_is_no_number_is_a_refusal(pair):
+    broken = replace(Calibration.undecided(), scales=np.full(len(FEATURES), np.nan))
+    registrar = Registrar(ONE_THREAD, [Fixed("network", pair.T_target_source[None])], [broken])
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert not result.ok and result.T_target_source is None
 
 
 def test_the_network_alone_finds_a_one_sided_view(pair):

@@ -22,7 +22,7 @@ from gapr_core import Registrar, RegistrarConfig
 from gapr_core.clouds import Surface
 from gapr_core.console import say
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import TARGET_POINTS, make_pair
+from gapr_core.data.protocols import ANOTHER_PERSON, TARGET_POINTS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.evaluation.judge import judge
 
@@ -31,7 +31,6 @@ Mesh = o3d.geometry.TriangleMesh
 PROTOCOLS = ("paper", "L1", "L2", "L3", "wrong")
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PEOPLE = 8  # parametric ones, where a bone has no others
-ANOTHER_PERSON_AT_L2 = 3  # of the eight kinds of `wrong`
 VOXELS_AT_ONCE = 1 << 20
 
 
@@ -117,7 +116,7 @@ def measure(registrar: Registrar, scanned: list[Specimen], seen: list[Specimen],
     cloud, _ = scanned[who].sample(TARGET_POINTS, np.random.default_rng(number))
     target, answers = registrar.prepare(cloud), []
     for protocol in PROTOCOLS:
-        pair = make_pair(protocol, seen[who], 500 + number, seen, ANOTHER_PERSON_AT_L2)
+        pair = make_pair(protocol, seen[who], 500 + number, seen, ANOTHER_PERSON["L2"])
         T_scan_source = pair.T_target_source.copy()
         T_scan_source[:3, 3] += pair.metadata["origin_mm"]
         result = registrar.register(pair.source, target)

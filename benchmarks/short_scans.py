@@ -17,12 +17,11 @@ from tqdm import tqdm
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.console import say
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import make_pair
+from gapr_core.data.protocols import ANOTHER_PERSON, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.evaluation.judge import judge
 
 PROTOCOLS = ("paper", "L1", "L2", "L3", "sweep", "wrong")
-ANOTHER_PERSON = (1, 3, 5, 7)  # of the eight kinds of `wrong`: the same bone, seen as at L1, L2, L3 and paper
 
 
 def main() -> int:
@@ -54,7 +53,7 @@ def main() -> int:
 
 def measure(registrar: Registrar, people: list[Specimen], protocol: str, number: int) -> list[bool]:
     """Whether the answer is right, its best pose is, it is a refusal, a false accept, and one at 0.9 or more."""
-    turn = ANOTHER_PERSON[number // 2 % 4]
+    turn = list(ANOTHER_PERSON.values())[number // 2 % 4]
     pair = make_pair(protocol, people[number // 2 % len(people)], 300 + number, people, turn)
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     judged = judge(pair, result)

@@ -56,13 +56,19 @@ class Calibration:
         path = Path(path)
         if not path.is_file():
             raise WeightsError("a confidence model", f"no file {path}", "reinstall the package")
-        data = json.loads(path.read_text())
-        if tuple(data["names"]) != FEATURES:
-            raise WeightsError(f"a model of {FEATURES}", f"one of {data['names']}", "calibrate again")
-        layers = tuple((np.array(weights), np.array(biases)) for weights, biases in data.get("layers", ()))
-        if not layers or layers[0][0].shape[1] != len(FEATURES) or layers[-1][0].shape[2] != 1:
-            raise WeightsError("layers from the features to one figure", f"others in {path}", "calibrate again")
-        return Calibration(FEATURES, np.array(data["means"]), np.array(data["scales"]), layers, data["card"])
+        try:
+            data = json.loads(path.read_text())
+            names, card = tuple(data["names"]), data["card"]
+            means, scales = np.array(data["means"]), np.array(data["scales"])
+            layers = tuple((np.array(weights), np.array(biases)) for weights, biases in data["layers"])
+            model = Calibration(names, means, scales, layers, card)
+            if layers[-1][0].shape[2:] != (1,) or model.logits(np.zeros((1, len(names)))).shape != (1,):
+                raise ValueError("its layers do not lead to one figure")
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise WeightsError("a whole confidence model", f"{path}: {error!r}", "calibrate again") from error
+        if names != FEATURES:
+            raise WeightsError(f"a model of {FEATURES}", f"one of {names}", "calibrate again")
+        return model
 
     @staticmethod
     def undecided() -> Calibration:

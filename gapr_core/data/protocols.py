@@ -24,6 +24,12 @@ from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 TARGET_POINTS = 8192
+ANOTHER_PERSON = {
+    "L1": 1,
+    "L2": 3,
+    "L3": 5,
+    "paper": 7,
+}  # of the turns of `wrong`: somebody else's, as which level
 TRANSLATION_MM = 150.0
 
 

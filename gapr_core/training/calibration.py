@@ -51,7 +51,6 @@ PROTOCOLS = (
 SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
 MODELS = CALIBRATIONS | {"search": DEFAULT_CALIBRATION}
 TWINS = ({"llp26_2008_0054", "llp26_2008_0032", "llp26_2008_0103"}, {"jhu_25", "jhu_15"})  # alike to 1 or 2 mm, not 7
-ANOTHER_PERSON = (3, 5)  # of the eight kinds of `wrong`: somebody else's bone seen as at L2, as at L3
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
@@ -219,8 +218,8 @@ def wrong_person_pair(specimen: Specimen, others: list[Specimen], seed: int) -> 
     """The same bone of somebody else, seen as at L2 or L3: the hardest to refuse. No pose is right."""
     alike = {person for group in TWINS if specimen.person in group for person in group}
     strangers = [o for o in others if o.bone == specimen.bone and o.person not in alike]
-    turn = ANOTHER_PERSON[int(np.random.default_rng([seed, 37]).integers(2))]
-    pair = protocols.make_pair("wrong", specimen, seed, strangers, turn)
+    seen_as = ("L2", "L3")[int(np.random.default_rng([seed, 37]).integers(2))]
+    pair = protocols.make_pair("wrong", specimen, seed, strangers, protocols.ANOTHER_PERSON[seen_as])
     return replace(pair, name=f"wrong_person-{seed}", protocol="wrong_person")
 
 

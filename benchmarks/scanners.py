@@ -10,75 +10,36 @@ another person, seen as at L2.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.clouds import Surface
 from gapr_core.console import say
+from gapr_core.data import scans
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import ANOTHER_PERSON, TARGET_POINTS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.evaluation.judge import judge
 
-Mesh = o3d.geometry.TriangleMesh
-
 PROTOCOLS = ("paper", "L1", "L2", "L3", "wrong")
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PEOPLE = 8  # parametric ones, where a bone has no others
-VOXELS_AT_ONCE = 1 << 20
 
 
-def of_mesh(change: Callable[[Mesh], Mesh]) -> Callable[[Surface], Surface]:
-    """What changes an Open3D mesh, for a surface."""
-
-    def scan(surface: Surface) -> Surface:
-        return Surface.from_open3d(change(surface.to_open3d()))
-
-    return scan
-
-
-def of_voxels(*size_mm: float) -> Callable[[Surface], Surface]:
-    """The surface of the voxels (x, y, z) whose centres are inside, terraces and all (marching cubes of the mask)."""
-    size = np.array(size_mm)
-
-    def scan(mesh: Mesh) -> Mesh:
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-        low, high = mesh.get_min_bound() - 1.5 * size, mesh.get_max_bound() + 1.5 * size
-        shape = np.ceil((high - low) / size).astype(int)[::-1]
-        centres = low + np.indices(shape).reshape(3, -1).T[:, ::-1] * size
-        parts = np.array_split(centres.astype(np.float32), len(centres) // VOXELS_AT_ONCE + 1)
-        mask = np.concatenate([scene.compute_occupancy(part).numpy() for part in parts]).reshape(shape)
-        made = o3d.t.geometry.TriangleMesh.create_isosurfaces(o3d.core.Tensor(mask.astype(np.float32)), [0.5])
-        terraces = made.to_legacy()
-        terraces.vertices = o3d.utility.Vector3dVector(low + np.asarray(terraces.vertices) * size)
-        return terraces
-
-    return of_mesh(scan)
-
-
-def of_size(factor: float) -> Callable[[Surface], Surface]:
-    """The surface of a smaller or a larger person."""
-    return lambda surface: Surface(surface.points * factor, surface.faces)
-
-
-OTHER_PEOPLE: dict[str, Callable[[Surface], Surface]] = {
-    "as given": of_size(1.0),
-    "0.75 of the size": of_size(0.75),
-    "1.2 of the size": of_size(1.2),
+OTHER_PEOPLE: dict[str, scans.Scan] = {
+    "as given": scans.of_size(1.0),
+    "0.75 of the size": scans.of_size(0.75),
+    "1.2 of the size": scans.of_size(1.2),
 }
-OTHER_SCANNERS: dict[str, Callable[[Surface], Surface]] = {
-    "voxels of 0.8 x 0.8 x 3 mm": of_voxels(0.8, 0.8, 3.0),
-    "voxels of 1.5 mm": of_voxels(1.5, 1.5, 1.5),
-    "voxels of 3 mm": of_voxels(3.0, 3.0, 3.0),
-    "1000 triangles": of_mesh(lambda mesh: mesh.simplify_quadric_decimation(1000)),
-    "smoothed (10 rounds of Laplace)": of_mesh(lambda mesh: mesh.filter_smooth_laplacian(10)),
+OTHER_SCANNERS: dict[str, scans.Scan] = {
+    "voxels of 0.8 x 0.8 x 3 mm": scans.of_voxels(0.8, 0.8, 3.0),
+    "voxels of 1.5 mm": scans.of_voxels(1.5, 1.5, 1.5),
+    "voxels of 3 mm": scans.of_voxels(3.0, 3.0, 3.0),
+    "1000 triangles": scans.of_triangles(1000),
+    "smoothed (10 rounds of Laplace)": scans.smoothed(10),
 }
 MODELS = OTHER_PEOPLE | OTHER_SCANNERS
 

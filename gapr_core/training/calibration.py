@@ -4,7 +4,7 @@
 
 There are three models: for what is known after each round of the `Registrar`, the network alone and with the search,
 and for the next source of a stream, where a `Tracker` looks at what it remembers alone.
-Pairs come from train people only, real and parametric, over all protocols, wrong bones and solids of revolution.
+Pairs come from train people only, real, parametric and drawn, over all protocols and more (see `calibration_pairs`).
 Finished pairs are kept in the records file, so a stopped run goes on where it was; `confidence_fit` makes the models.
 """
 
@@ -28,9 +28,7 @@ from tqdm import tqdm
 from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, FEATURES, Calibration
 from gapr_core.config import RegistrarConfig
 from gapr_core.console import say
-from gapr_core.data import anatomy, degradation, protocols
-from gapr_core.data import pool as bone_pool
-from gapr_core.data.specimen import Specimen
+from gapr_core.data import degradation, protocols
 from gapr_core.geometry import se3
 from gapr_core.proposals.base import Proposer
 from gapr_core.proposals.network import NetworkProposer
@@ -38,23 +36,14 @@ from gapr_core.proposals.search import NormalAlignedSearch
 from gapr_core.registrar import Registrar
 from gapr_core.results import RegistrationResult
 from gapr_core.tracking import Memory
+from gapr_core.training.calibration_pairs import BONES, PROTOCOLS, Task, pair_of
 from gapr_core.training.confidence_fit import as_json, fit, held_out, summary
 
 Array = NDArray[np.float64]
-BONES = ("femur", "tibia", "pelvis", "thoracic")
-PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
-PROTOCOLS = (
-    "paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "sweep", "mixed",
-    "wrong", "wrong_person", "wrong_sweep", "turned", "patch", "wrong_patch",
-    "short-paper", "short-L1", "short-L2", "short-L3", "short-sweep", "short-mixed", "short-wrong", "short-wrong_sweep",
-)  # fmt: skip
-SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
 MODELS = CALIBRATIONS | {"search": DEFAULT_CALIBRATION}
-TWINS = ({"llp26_2008_0054", "llp26_2008_0032", "llp26_2008_0103"}, {"jhu_25", "jhu_15"})  # alike to 1 or 2 mm, not 7
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0
-Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -111,12 +100,6 @@ def _has_all_features(record: dict[str, Any]) -> bool:
 
 
 @cache
-def _bones(folder: str, split: str) -> dict[str, list[Specimen]]:
-    parametric = {bone: bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE) for bone in BONES}
-    return {bone: anatomy.surfaces(folder, bone, split) + parametric[bone] for bone in BONES}
-
-
-@cache
 def _registrars() -> dict[str, Registrar]:
     """The two rounds, as they are when the answer of the first one is not sure."""
     network, search = NetworkProposer.from_weights(), NormalAlignedSearch(RegistrarConfig().search, num_threads=1)
@@ -131,25 +114,9 @@ def _without_model(proposers: list[Proposer]) -> Registrar:
 
 def _record(task: Task) -> dict[str, Any]:
     """One pair registered, judged, and its figures kept."""
-    folder, split, protocol, bone, seed = task
-    bones = _bones(folder, split)
-    specimen = bones[bone][seed % len(bones[bone])]
-    others = [s for group in bones.values() for s in group]
+    *_, protocol, bone, seed = task
+    pair = pair_of(task)
     record: dict[str, Any] = {"name": f"{protocol}-{bone}-{seed}", "protocol": protocol, "bone": bone}
-    if protocol.startswith(SHORT):
-        protocol, (specimen, *others) = protocol.removeprefix(SHORT), shortened(specimen, others, seed)
-    if protocol == "turned":
-        pair = turned_pair(len(BONES) * seed + BONES.index(bone))
-    elif protocol == "mixed":
-        pair = mixed_pair(specimen, seed)
-    elif protocol == "wrong_person":
-        pair = wrong_person_pair(specimen, others, seed)
-    elif protocol == "wrong_sweep":
-        pair = wrong_sweep_pair(specimen, others, seed)
-    elif protocol in ("patch", "wrong_patch"):
-        pair = patch_pair(specimen, others if protocol == "wrong_patch" else [], seed)
-    else:
-        pair = protocols.make_pair(protocol, specimen, seed, others)
     record["person"] = pair.person
     target = _registrars()["search"].prepare(pair.target)
     answers = {name: registrar.register(pair.source, target) for name, registrar in _registrars().items()}
@@ -182,94 +149,6 @@ def moved_on(pair: protocols.Pair, result: RegistrationResult, seed: int) -> tup
     if rng.random() < FORGOTTEN and len(memory.poses) > 2:
         memory.poses = memory.poses[1:]
     return replace(pair, source=source), memory
-
-
-def shortened(specimen: Specimen, others: list[Specimen], seed: int) -> list[Specimen]:
-    """What scans of one end of the bone hold, 15 to 60 % of it; of two other people and two other bones, too."""
-    rng = np.random.default_rng([seed, 29])
-    share, upper = rng.uniform(0.15, 0.6), bool(rng.random() < 0.5)
-    same, other = ([o for o in others if (o.bone == specimen.bone) == is_same] for is_same in (True, False))
-    strangers = [o for o in same if o.person != specimen.person]
-    some = [group[i] for group in (strangers, other) for i in rng.permutation(len(group))[:2]]
-    return [each.end(share, upper) for each in (specimen, *some)]
-
-
-def turned_pair(seed: int) -> protocols.Pair:
-    """A solid of revolution, seen from one side: the spin about its axis cannot be known, so no pose is right."""
-    rng = np.random.default_rng([seed, 7])
-    length, radius, waist = rng.uniform(40.0, 300.0), rng.uniform(8.0, 35.0), rng.uniform(0.0, 0.4)
-    phase = rng.uniform(0.0, 2.0 * np.pi)
-
-    def draw(count: int) -> Array:
-        z, angle = rng.uniform(-0.5, 0.5, count), rng.uniform(0.0, 2.0 * np.pi, count)
-        r = radius * np.sqrt(1.0 - (1.98 * z) ** 2) * (1.0 - waist * np.cos(7.0 * z + phase))
-        return np.stack([r * np.cos(angle), r * np.sin(angle), length * z], axis=1)
-
-    seen = draw(6000)
-    seen = seen[(seen[:, 0] > 0.0) & (np.abs(seen[:, 2]) < rng.uniform(0.2, 0.5) * length)]
-    source = seen + rng.normal(0.0, rng.uniform(0.1, 1.5), seen.shape)
-    nowhere = np.full((4, 4), np.nan)
-    return protocols.Pair(
-        source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
-    )
-
-
-def wrong_person_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:
-    """The same bone of somebody else, seen as at L2 or L3: the hardest to refuse. No pose is right."""
-    alike = {person for group in TWINS if specimen.person in group for person in group}
-    strangers = [o for o in others if o.bone == specimen.bone and o.person not in alike]
-    seen_as = ("L2", "L3")[int(np.random.default_rng([seed, 37]).integers(2))]
-    pair = protocols.make_pair("wrong", specimen, seed, strangers, protocols.ANOTHER_PERSON[seen_as])
-    return replace(pair, name=f"wrong_person-{seed}", protocol="wrong_person")
-
-
-def wrong_sweep_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:
-    """A probe's sweep along another bone, or along the same bone of somebody else; no pose is right."""
-    rng = np.random.default_rng([seed, 13])
-    same_bone = rng.random() < 0.5
-    same, other = ([o for o in others if (o.bone == specimen.bone) == is_same] for is_same in (True, False))
-    strangers = [o for o in same if o.person != specimen.person] if same_bone else other
-    stranger = strangers[int(rng.integers(len(strangers)))]
-    pair = protocols.make_pair("sweep", specimen, seed)
-    swept = protocols.make_pair("sweep", stranger, seed).source
-    nowhere = np.full((4, 4), np.nan)
-    return replace(pair, source=swept, T_target_source=nowhere, name=f"wrong_sweep-{seed}", protocol="wrong_sweep")
-
-
-def patch_pair(specimen: Specimen, others: list[Specimen], seed: int) -> protocols.Pair:
-    """A one-sided view of 1 to 12 % of the bone, of few points; with `others`, of one of them: no pose is right then.
-
-    Two of three strangers are the same bone of somebody else: on so small a patch it fits nearly as well.
-    """
-    rng = np.random.default_rng([seed, 31])
-    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.01, 0.12), (60.0, 1500.0)))
-    noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
-    level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
-    pair = replace(protocols.one_sided(specimen, rng, level), name=f"patch-{seed}", protocol="patch")
-    if not others:
-        return pair
-    is_same = rng.random() < 0.67
-    strangers = [o for o in others if (o.bone == specimen.bone) == is_same and o.person != specimen.person]
-    seen = protocols.one_sided(strangers[int(rng.integers(len(strangers)))], rng, level).source
-    return replace(pair, source=seen, T_target_source=np.full((4, 4), np.nan), protocol="wrong_patch")
-
-
-def mixed_pair(specimen: Specimen, seed: int) -> protocols.Pair:
-    """Between and beyond the protocols: from clean points of the target itself to tiny, noisy, biased, dirty views."""
-    rng = np.random.default_rng([seed, 11])
-    share = rng.uniform(0.1, 0.9)
-    if rng.random() < 0.25:
-        target, _ = specimen.sample(protocols.TARGET_POINTS, rng)
-        distance = ((target - target[rng.integers(len(target))]) ** 2).sum(axis=1)
-        source = target[distance <= np.quantile(distance, share)]
-        source = source[rng.permutation(len(source))[: rng.integers(300, 6000)]]
-        return protocols.Pair(source, target, np.eye(4), f"mixed-{seed}", specimen.bone, specimen.person, "mixed")
-    noise_mm, bias_mm, outliers = (rng.uniform(0.0, most) * (rng.random() < 0.7) for most in (2.0, 1.5, 0.25))
-    share_of = str(rng.choice(["seen", "region"]))
-    points = int(np.exp(rng.uniform(np.log(300), np.log(6000))))
-    level = protocols.Level((share, share), share_of, noise_mm, bias_mm, outliers, points)
-    pair = protocols.one_sided(specimen, rng, level)
-    return replace(pair, name=f"mixed-{seed}", protocol="mixed")
 
 
 def _judge(result: Any, pair: protocols.Pair) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from gapr_core.data.protocols import make_pair
 from gapr_core.errors import WeightsError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_core.training import calibration, confidence_fit
+from gapr_core.training import calibration, calibration_pairs, confidence_fit
 from gapr_core.training.confidence_fit import as_json, fit
 
 
@@ -124,7 +124,7 @@ def test_figures_far_outside_the_training_range_do_not_run_away():
 
 
 def test_a_solid_of_revolution_has_no_right_pose():
-    pair = calibration.turned_pair(5)
+    pair = calibration_pairs.turned_pair(5)
     assert not pair.has_truth
     radii = np.linalg.norm(pair.target[:, :2], axis=1)
     order = np.argsort(pair.target[:, 2])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.clouds import Surface, finite_points
+from gapr_core.clouds import EXTENT_LIMITS_MM, Surface, check_extent, finite_points
 from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling
@@ -19,6 +20,7 @@ from gapr_core.target import PreparedTarget
 from gapr_core.tracking import Tracker
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 OFF = 2.5  # a source lies off the bone when it is so many times farther from it than all together
 MOST_OFF = 3  # so many such sources in a row are not stray any more: the bone has moved
@@ -67,15 +69,23 @@ class Accumulator:
     def collect(self, source: ArrayLike) -> None:
         """Keep a source (N, 3), mm, without registering; the oldest one goes when there are too many.
 
-        An empty source, and one that is there already, changes nothing.
+        An empty source, and one that is there already, changes nothing. One that is metres away from those that are
+        kept cannot be of the same bone in the same frame: the collection starts anew with it.
 
         Raises:
-            InvalidPointCloudError: wrong shape or type.
+            InvalidPointCloudError: wrong shape or type, or points that are metres apart.
         """
         points = finite_points(source)
         points = points[sampling.thin(points, MOST_POINTS)]
-        if len(points) and not _is_among(points, self._kept + self._new):
-            self._new = [*self._new, points][-self.most :]
+        if not len(points) or _is_among(points, self._kept + self._new):
+            return
+        if _extent_mm(points) > EXTENT_LIMITS_MM[1]:
+            check_extent(_extent_mm(points), "mm", "the source")
+        apart_mm = _extent_mm(np.concatenate([self.collected, points]))
+        if apart_mm > EXTENT_LIMITS_MM[1]:
+            log.warning("the sources are %.0f mm apart, are they in one frame? The collection starts anew", apart_mm)
+            self.reset()
+        self._new = [*self._new, points][-self.most :]
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target; see `Registrar.prepare`."""
@@ -96,7 +106,7 @@ class Accumulator:
         try:
             result = self.method.register(_together(self._last()), target, initial)
         except Exception:
-            self._new = before
+            self._new = [points for points in self._new if _is_among(points, before)]
             raise
         return self._look_at_new(result, target)
 
@@ -131,6 +141,10 @@ class Accumulator:
 
 def _together(sources: list[Array]) -> Array:
     return np.concatenate([np.empty((0, 3)), *sources])
+
+
+def _extent_mm(points: Array) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _is_among(source: Array, others: list[Array]) -> bool:

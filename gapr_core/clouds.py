@@ -123,6 +123,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm") -> Surface
         name, surface = str(source), _read(Path(source))
     else:
         name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
+    if surface.faces is not None and len(surface.faces):
+        _check_faces(surface, name)
     surface = _drop_non_finite(surface, name)
     scale = _mm_per_unit(surface, units, name)
     return Surface(surface.points * scale, surface.faces, surface.normals)
@@ -154,7 +156,7 @@ def check_extent(extent_mm: float, unit: str, name: str) -> None:
     if low <= extent_mm <= high:
         return
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
-    hint = f"it looks like {other}: pass units={other!r}" if other else "check the file and its unit"
+    hint = f"it looks like {other}: pass units={other!r}, or mm" if other else "check the file and its unit"
     raise InvalidPointCloudError(
         f"a bone or a piece of one, {low:g} to {high:g} mm across", f"{name} of {extent_mm:.3g} mm read as {unit}", hint
     )
@@ -198,13 +200,21 @@ def _read(path: Path) -> Surface:
         raise _unreadable(path, str(error)) from error
     if len(surface.points) == 0:
         raise _unreadable(path, "no points in it")
-    if surface.faces is not None and len(surface.faces) and not _in_range(surface.faces, len(surface.points)):
-        raise _unreadable(path, f"faces that point beyond its {len(surface.points)} vertices")
     return surface
 
 
-def _in_range(faces: NDArray[np.int64], count: int) -> bool:
-    return bool(faces.min() >= 0 and faces.max() < count)
+def _check_faces(surface: Surface, name: str) -> None:
+    """Triangles, of vertices that there are, with some area."""
+    faces, count = np.asarray(surface.faces), len(surface.points)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        given = f"faces of shape {faces.shape} and type {faces.dtype} in {name}"
+        raise InvalidPointCloudError("triangles as (F, 3) integers", given, "triangulate the mesh")
+    if faces.min() < 0 or faces.max() >= count:
+        raise InvalidPointCloudError(
+            f"faces of its {count} vertices", f"some that point beyond them in {name}", "export it again"
+        )
+    if not surface.face_areas_mm2.any():
+        raise InvalidPointCloudError("faces with an area", f"none with any in {name}", "export it again")
 
 
 def _unreadable(path: Path, why: str) -> InvalidPointCloudError:

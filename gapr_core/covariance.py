@@ -3,6 +3,7 @@
 The weighted least-squares pose reacts to residuals e by H^-1 J^T W e. With independent noise of variance s^2 and a
 smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), its covariance is the sandwich
 H^-1 J^T W (s^2 I + b^2 K) W J H^-1 (White 1980; Censi 2007 for the noise alone). A Hessian alone is over-confident.
+A weak prior is in H and in the noise: a motion of which nothing was observed has the prior's variance, not none.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from gapr_core.config import CovarianceConfig
+from gapr_core.metrics.uncertainty import predicted_rmse_mm
 from gapr_core.refinement import Fit
 
 Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
-POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # keeps the information of an unobserved motion invertible
+POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +57,14 @@ class PoseUncertainty:
 
     def tre_mm(self, points: Array, centroid: Array) -> float:
         """Predicted root-mean-square error over (M, 3) target points: the trace of J Sigma J^T (Fitzpatrick 1998)."""
-        arm = points - centroid
-        J = np.zeros((len(points), 3, 6))
-        J[:, :, :3] = np.eye(3)
-        J[:, 0, 4], J[:, 0, 5] = arm[:, 2], -arm[:, 1]
-        J[:, 1, 3], J[:, 1, 5] = -arm[:, 2], arm[:, 0]
-        J[:, 2, 3], J[:, 2, 4] = arm[:, 1], -arm[:, 0]
-        return float(np.sqrt(np.einsum("nia,ab,nib->n", J, self.covariance, J).mean()))
+        return predicted_rmse_mm(self.covariance, points, centroid)
 
 
 def estimate(fit: Fit, config: CovarianceConfig) -> PoseUncertainty:
     """Covariance of a fit from its residuals; always symmetric and positive definite."""
     J, w = fit.jacobian, fit.weights
     H = (J * w[:, None]).T @ J + POSE_PRIOR
-    noise = fit.sigma_mm**2 * (J * (w**2)[:, None]).T @ J
+    noise = fit.sigma_mm**2 * ((J * (w**2)[:, None]).T @ J + POSE_PRIOR)
     smooth_mm, short_mm = smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
     bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_mm)
     H_inverse = np.linalg.inv(H)

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core import confidence, covariance
+from gapr_core import confidence, covariance, doubts
 from gapr_core import source as sources
 from gapr_core import target as targets
 from gapr_core.clouds import Surface
 from gapr_core.confidence import Calibration
 from gapr_core.config import RegistrarConfig
-from gapr_core.covariance import PoseUncertainty
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.proposals.base import Proposer
@@ -30,8 +29,6 @@ from gapr_core.verification import Candidates, verify
 
 Array = NDArray[np.float64]
 
-LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations beyond which a direction counts as not observed
-EQUAL_MARGIN = 0.015  # a second pose whose residual is larger by less than this share explains the source as well
 BOTH_WALLS = 0.82  # a source follows both walls of a hollow bone when they leave less than this share of its residuals
 UNFAMILIAR = 0.85  # such a source, which no probe gives, is not what the confidence was fitted on: it is at most this
 DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says that the pose may be another one
@@ -176,7 +173,10 @@ class Registrar:
         uncertainty = covariance.estimate(fit, self.config.covariance)
         figures = confidence.measure(fit, candidates, uncertainty, source, target)
         probability = min(calibration.probability(figures), most)
-        if _is_matched(candidates) or _is_loose(uncertainty):
+        pushed = probability >= self.config.min_confidence and doubts.can_be_pushed(
+            fit, source, target, self.config.verification, self.config.num_threads
+        )
+        if pushed or doubts.is_matched(candidates) or doubts.is_loose(uncertainty):
             probability = min(probability, DOUBT)
         common = {
             "confidence": probability,
@@ -185,7 +185,7 @@ class Registrar:
             "details": figures | {"best_pose": fit.T, "bias_mm": uncertainty.bias_mm},
         }
         if not probability >= self.config.min_confidence:  # nor where it is no number
-            status, reason = _why_not(candidates, uncertainty, probability)
+            status, reason = doubts.why_not(candidates, uncertainty, probability, pushed)
             return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
         centre_mm = fit.moved.mean(axis=0)
         return RegistrationResult(
@@ -209,37 +209,6 @@ def _network(device: str) -> Proposer:
 
 def _search(config: RegistrarConfig) -> NormalAlignedSearch:
     return NormalAlignedSearch(config.search, config.num_threads)
-
-
-def _is_matched(candidates: Candidates) -> bool:
-    """True when a distinct pose explains the source as well as the best one."""
-    scores = candidates.scores
-    return len(scores) > 1 and bool(scores[1] < (1.0 + EQUAL_MARGIN) * scores[0])
-
-
-def _is_loose(uncertainty: PoseUncertainty) -> bool:
-    """True when a direction of motion is not observed: a spin about a shaft, a slide along it."""
-    return uncertainty.largest_turn_deg > LARGEST_TURN_DEG or uncertainty.largest_shift_mm > LARGEST_SHIFT_MM
-
-
-def _why_not(
-    candidates: Candidates, uncertainty: PoseUncertainty, probability: float
-) -> tuple[RegistrationStatus, str]:
-    """Status and sentence of a refusal."""
-    if _is_loose(uncertainty):
-        return RegistrationStatus.DEGENERATE, (
-            f"the turn about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
-            f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
-        )
-    if _is_matched(candidates):
-        apart = se3.rotation_angle_deg(se3.inverse(candidates.poses[0]) @ candidates.poses[1])
-        return RegistrationStatus.AMBIGUOUS, f"another pose, turned by {apart:.0f} deg, explains the source as well"
-    reason = f"the best pose found is right with a probability of {probability:.2f} only"
-    return RegistrationStatus.LOW_CONFIDENCE, reason
-
-
-def _named(axis: Array) -> str:
-    return "({:.2f}, {:.2f}, {:.2f})".format(*axis)
 
 
 def _rigid(pose: ArrayLike) -> Array:

@@ -43,7 +43,8 @@ class RegistrationResult:
         stage_ms: wall time of each stage, ms.
         method: name of the method that answered.
         reason: one sentence for people: why it was refused; empty when there is nothing to say.
-        details: figures behind the confidence (residuals, overlap, eigenvalues), for logs and research.
+        details: figures behind the confidence (`gapr_core.confidence.FEATURES`), `best_pose`, `proposer`, for logs and
+            research.
         centre_mm: (3,) mean of the source points that were used, in the target frame; None unless `OK`, and where a
             method does not say.
     """

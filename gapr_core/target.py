@@ -50,7 +50,7 @@ class PreparedTarget:
     surface: Surface
     elements: Array
     both_walls: PreparedTarget | None = None
-    cache: dict[str, Any] = dataclasses.field(default_factory=dict)
+    cache: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def faces(self) -> NDArray[np.int64] | None:

@@ -128,10 +128,10 @@ class Tracker:
         """A refusal changes no pose: the bone may be where it was."""
         if "proposer" not in result.details:  # nothing was registered
             return
+        if result.T_target_source is None:  # after a full registration the next source gets one as well
+            return
         followed = result.details["proposer"] == Memory.name
         self._tracked = self._tracked + 1 if followed else 0
-        if result.T_target_source is None:
-            return
         if followed:
             self._memory.follow(result.T_target_source, source)
         elif result.alternatives:

@@ -29,7 +29,6 @@ from gapr_ros.bags import Bag, BagError, open_bag, recorded_qos
 CLOCK_HZ = 40.0
 DISCOVERY_S = 1.0
 SETTLE_S = 0.5  # a listener that we know of knows us a little later
-MUTUAL_S = 1.0  # a listener that we have discovered may not have discovered us yet
 DRAIN_S = 5.0
 LARGEST_STEP_S = 0.1  # of one sleep, so that Ctrl-C is heard
 
@@ -97,8 +96,7 @@ class Replay:
     def _wait_for_listeners(self) -> None:
         """Volatile messages that go out before a listener was discovered are lost."""
         deadline = time.monotonic() + self._options.wait_s
-        publishers = self._publishers.values()
-        while not all(p.get_subscription_count() for p in publishers):
+        while not self._has_listeners():
             if time.monotonic() > deadline:
                 return
             time.sleep(0.02)

@@ -9,6 +9,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
+from gapr_core.clouds import EXTENT_LIMITS_MM
 from gapr_ros import wire
 from gapr_ros.parameters import NodeParameters
 from gapr_ros.refusal import Reason, RefusedError
@@ -55,6 +56,7 @@ def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParamete
     points = thin(points, parameters.max_points, parameters.seed)
     if parameters.accumulate == 1:
         check_unit(points, model_extent_mm, parameters.cloud_unit)
+    check_spread(points, parameters.cloud_unit)
     return points
 
 
@@ -72,6 +74,14 @@ def check_count(count: int, least: int) -> None:
     """Refuse too few points."""
     if count < least:
         raise RefusedError(Reason.TOO_FEW_POINTS, f"{count} usable points, min_points is {least}")
+
+
+def check_spread(points_mm: Array, unit: str) -> None:
+    """Refuse a cloud with points that are metres apart, be it a few strays: no bone is so long."""
+    extent_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    if extent_mm > EXTENT_LIMITS_MM[1]:
+        size = f"{extent_mm:.3g} mm across read as {unit}, {EXTENT_LIMITS_MM[1]:g} mm are the most"
+        raise RefusedError(Reason.UNIT_MISMATCH, f"points too far apart: {size}; set range_max, or cloud_unit")
 
 
 def check_unit(points_mm: Array, model_extent_mm: float, unit: str) -> None:

@@ -67,8 +67,9 @@ class NodeParameters:
     device: str = setting("auto", "where a network runs", choices=("auto", "cpu", "cuda"), live=False)
     num_threads: int = setting(0, "threads of a registration; 0: all cores", low=0, high=1024, live=False)
     seed: int = setting(0, "of every random choice", low=0, high=2**31 - 1, live=False)
-    autostart: bool = setting(True, "configure and activate without a lifecycle manager", live=False)
-    diagnostics_period: float = setting(1.0, "time between two diagnostics, s", low=0.01, high=3600.0, live=False)
+    autostart: bool = setting(True, "configure and activate without a lifecycle manager; read when the node starts",
+                              live=False)  # fmt: skip
+    diagnostics_period: float = setting(1.0, "time between two diagnostics, s", low=0.01, high=3600.0)
     covariance_floor_translation: float = setting(1e-4, "smallest standard deviation of a translation, m", low=1e-9)
     covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation, rad", low=1e-9)
 

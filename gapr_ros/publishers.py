@@ -17,7 +17,7 @@ from gapr_ros.outcome import Outcome
 from msg_adapters import covariance_to_list, matrix_to_pose, matrix_to_transform, xyz_to_cloud
 
 if TYPE_CHECKING:
-    from rclpy.lifecycle import LifecycleNode
+    from rclpy.lifecycle import LifecycleNode, LifecyclePublisher
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -27,7 +27,7 @@ class Publishers:
 
     def __init__(self, node: LifecycleNode, frames: Frames, model_frame: str) -> None:
         self._node, self._frames, self._model_frame = node, frames, model_frame
-        self._pose = node.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED)
+        self._pose = self._advertise_pose()
         self._transform = node.create_lifecycle_publisher(TransformStamped, "~/transform", 10)
         self._confidence = node.create_lifecycle_publisher(Float64, "~/confidence", 10)
         self._model = node.create_lifecycle_publisher(PointCloud2, "~/model", LATCHED)
@@ -50,10 +50,20 @@ class Publishers:
         self._send_transform(outcome)
         self._send_aligned(outcome, model)
 
+    def withdraw_pose(self) -> None:
+        """No late listener gets the last pose any more: the topic is given up and taken anew."""
+        old, self._pose = self._pose, self._advertise_pose()
+        if old.is_activated:
+            self._pose.on_activate(None)
+        self._node.destroy_lifecycle_publisher(old)
+
     def close(self) -> None:
         """Give the topics back."""
         for publisher in (self._pose, self._transform, self._confidence, self._model, self._aligned):
             self._node.destroy_lifecycle_publisher(publisher)
+
+    def _advertise_pose(self) -> LifecyclePublisher:
+        return self._node.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED)
 
     def _send_transform(self, outcome: Outcome) -> None:
         transform = TransformStamped(header=outcome.header, child_frame_id=self._model_frame)

@@ -57,7 +57,9 @@ class RegisterNode(LifecycleNode):
         self._watch_clock()
         self._forward_logs()
         self.reporter, self._offered = Reporter(self), Services(self)
-        self.create_timer(self.parameters.diagnostics_period, self.reporter.send, clock=_steady_clock())
+        self._diagnosing = self.create_timer(
+            self.parameters.diagnostics_period, self.reporter.send, clock=_steady_clock()
+        )
         if self.parameters.autostart:
             self.call_soon(self._autostart)
 
@@ -172,6 +174,7 @@ class RegisterNode(LifecycleNode):
     @guarded
     def _on_changed(self, changes: list[Parameter]) -> None:
         self.parameters = parameters.read(self)
+        self._diagnosing.timer_period_ns = int(self.parameters.diagnostics_period * 1e9)
         if self.session is not None:
             self.session.parameters_changed()
 

@@ -126,7 +126,11 @@ class Registration:
         """The seed as T_target_source, mm, the source being in the frame of the answer."""
         if now.seed is None:
             return None
-        T_seed_cloud = self._lookup(now.seed.frame, outcome, now)
+        try:
+            T_seed_cloud = self._lookup(now.seed.frame, outcome, now)
+        except RefusedError as refusal:
+            text = f"the initialpose is in {now.seed.frame}: {refusal.text}; send another one, or call ~/reset"
+            raise RefusedError(refusal.reason, text) from refusal
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         return wire.core_pose(T_frame_cloud @ se3.inverse(T_seed_cloud) @ now.seed.T_frame_model)
 

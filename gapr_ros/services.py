@@ -58,13 +58,13 @@ class Services:
         if not session.enabled:
             raise NotNowError("the node is disabled: call ~/set_enabled")
         if not session.register_newest(waiter):
-            raise NotNowError("no cloud has come yet")
+            raise NotNowError("no cloud has come yet, or none since the last reset")
         outcome = await waiter
         return outcome.ok, str(outcome)
 
     @answering
     async def reset(self, _: Trigger.Request) -> tuple[bool, str]:
-        """Forget the track and the seed."""
+        """Forget the track, the seed, all clouds so far and the latched pose."""
         self._session().reset()
         return True, "the track is forgotten; clouds on their way will be refused"
 
@@ -97,6 +97,7 @@ class Services:
     def _load(self, session: Session, waiter: Future) -> None:
         """In the worker's thread."""
         try:
+            self._must_be_there(session)
             model: Model | Exception = session.read_model()
         except Exception as error:
             model = error
@@ -104,7 +105,13 @@ class Services:
 
     def _swap(self, session: Session, model: Model | Exception, waiter: Future) -> None:
         try:
-            if isinstance(model, Model) and self._node.session is session:
+            self._must_be_there(session)
+            if isinstance(model, Model):
                 session.replace_model(model)
-        finally:
-            waiter.set_result(model)
+        except Exception as error:
+            model = error
+        waiter.set_result(model)
+
+    def _must_be_there(self, session: Session) -> None:
+        if self._node.session is not session:
+            raise NotNowError("the node was cleaned up meanwhile")

@@ -39,7 +39,7 @@ class Session:
     def __init__(self, node: RegisterNode, method_factory: Callable[[NodeParameters], Any]) -> None:
         self._node, self._method_factory = node, method_factory
         self._method = method_factory(node.parameters)
-        self._min_confidence = node.parameters.min_confidence
+        self._min_confidence, self._reading = node.parameters.min_confidence, _reading(node.parameters)
         self.enabled = True
         self.last_outcome: Outcome | None = None
         self._track, self._epoch, self._seed, self._last_stamp_ns = Track(), 0, None, 0
@@ -82,13 +82,16 @@ class Session:
         except InvalidMessageError as error:
             self._node.get_logger().warning(f"initialpose is ignored: {error}")
             return
-        self.reset()
+        self._begin_anew()
         self._seed = Seed(T_frame_model, message.header.frame_id)
         if message.header.frame_id:
             self._frames.listen()
 
     def register_newest(self, waiter: Any) -> bool:
-        """Register the newest cloud now; its outcome becomes the waiter's result. False when none has come."""
+        """Register the newest cloud now; its outcome becomes the waiter's result.
+
+        False when none has come, or none since the last reset.
+        """
         return self.worker.ask(waiter, self._epoch)
 
     # --- the worker's thread ---
@@ -164,13 +167,16 @@ class Session:
     # --- state ---
 
     def reset(self) -> None:
-        """Forget track, seed and collected clouds; clouds on their way will be refused."""
-        self._epoch += 1
-        self.worker.run(self._forget_clouds)
-        self._forget()
+        """Forget track, seed, all clouds so far and the pose that late listeners get."""
+        self._begin_anew()
+        self.worker.outdate(self._epoch)
+        self._publishers.withdraw_pose()
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
+        if self._reading != (reading := _reading(self._node.parameters)):
+            self._reading = reading
+            self.worker.run(self._forget_clouds)
         if self._min_confidence != self._node.parameters.min_confidence:
             self._min_confidence = self._node.parameters.min_confidence
             if self._node.parameters.accumulate > 1:
@@ -179,9 +185,10 @@ class Session:
         self.worker.wake()
 
     def replace_model(self, model: Model) -> None:
-        """Swap the bone, between two clouds."""
+        """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self.model = model
-        self.reset()
+        self._begin_anew()
+        self._publishers.withdraw_pose()
         self.send_model()
 
     def send_model(self) -> None:
@@ -190,7 +197,7 @@ class Session:
 
     def stop_waiting(self, why: str) -> None:
         """Drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way."""
-        self.reset()
+        self._begin_anew()
         waiting = self.worker.clear()
         if waiting is not None:
             self._node.counters.dropped += 1
@@ -198,7 +205,18 @@ class Session:
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.tell()
 
+    def _begin_anew(self) -> None:
+        """Forget track, seed and collected clouds; clouds on their way will be refused."""
+        self._epoch += 1
+        self.worker.run(self._forget_clouds)
+        self._forget()
+
     def _forget(self) -> None:
         self._track.clear()
         self._seed, self._last_stamp_ns = None, 0
         self._frames.forget()
+
+
+def _reading(parameters: NodeParameters) -> tuple[Any, ...]:
+    """How clouds are read: what was collected under other settings cannot be registered with what comes."""
+    return parameters.cloud_unit, parameters.range_min, parameters.range_max

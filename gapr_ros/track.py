@@ -57,6 +57,7 @@ class Track:
             return
         why = jump(self._accepted, T_frame_model, centre_m, parameters)
         if why:
+            self.miss()
             raise RefusedError(Reason.JUMP, f"{why}; call ~/reset if the bone really moved")
 
     def _count(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:

@@ -48,6 +48,7 @@ class Worker:
         self._slot: Job | None = None
         self._tasks: deque[Callable[[], None]] = deque()
         self._last: Job | None = None
+        self._oldest = 0
         self._last_start = float("-inf")
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="registration", daemon=True)
@@ -71,19 +72,25 @@ class Worker:
         return old is not None
 
     def ask(self, waiter: Any, epoch: int) -> bool:
-        """Process the newest cloud now and tell the waiter. False when there has been no cloud yet.
+        """Process the newest cloud now, as of this epoch, and tell the waiter. False when there is none.
 
-        A cloud that was processed before is processed once more.
+        A cloud that was processed before is processed once more; one that is outdated is not.
         """
         with self._wake:
-            if self._slot is None and self._last is not None:
-                self._slot = Job(self._last.cloud, epoch, self._last.received_ns)
-            if self._slot is None:
+            newest = self._slot or self._last
+            if newest is None or newest.epoch < self._oldest:
                 return False
-            self._slot.urgent = True
+            if self._slot is None:
+                self._slot = Job(newest.cloud, epoch, newest.received_ns)
+            self._slot.epoch, self._slot.urgent = epoch, True
             self._slot.waiters.append(waiter)
             self._wake.notify()
         return True
+
+    def outdate(self, epoch: int) -> None:
+        """Clouds from before this epoch cannot be asked for any more."""
+        with self._wake:
+            self._oldest = epoch
 
     def run(self, task: Callable[[], None]) -> None:
         """Run a task that must not raise, before the next cloud."""
@@ -103,7 +110,7 @@ class Worker:
         return waiting
 
     def stop(self, timeout_s: float) -> bool:
-        """End the thread after what it is doing. False when that takes longer than `timeout_s`."""
+        """End the thread after what it is doing and the tasks. False when that takes longer than `timeout_s`."""
         with self._wake:
             self._stopping = True
             self._wake.notify()
@@ -119,7 +126,7 @@ class Worker:
 
     def _next(self) -> Callable[[], None] | None:
         with self._wake:
-            while not self._stopping:
+            while self._tasks or not self._stopping:
                 if self._tasks:
                     return self._tasks.popleft()
                 wait_s = self._wait_s()

@@ -65,11 +65,10 @@ def checksum(tensors: dict[str, Tensor]) -> str:
     """sha256 over names and bytes, in the order of the names."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
+        tensor = tensors[name].cpu()
         digest.update(name.encode())
         digest.update(
-            tensors[name].contiguous().view(torch.uint8).numpy().tobytes()
-            if tensors[name].dim()
-            else tensors[name].numpy().tobytes()
+            tensor.contiguous().view(torch.uint8).numpy().tobytes() if tensor.dim() else tensor.numpy().tobytes()
         )
     return digest.hexdigest()
 

@@ -29,7 +29,8 @@ class NetworkProposer:
         network: in evaluation mode, on any device.
         method: `local_to_global`, or `ransac` as the paper says.
         count: most poses for one pair.
-        weights_name: what the target's share of the work is kept under, beside the configuration's name.
+        weights_name: what the target's share of the work is kept under, beside the device, so that networks of the
+            same weights share it; without a name it is the network's alone.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class NetworkProposer:
             raise ConfigError(f"method one of {', '.join(METHODS)}", repr(method), "choose one of these")
         self.network, self.method, self.count = network.eval(), method, count
         self.name = "network"
-        self._key = f"network {weights_name or id(network)}"
+        self._key = "network", weights_name or network  # the network itself: an id may come again
 
     @classmethod
     def from_weights(cls, path: str | Path = SHIPPED, device: str = "cpu", **options: Any) -> NetworkProposer:
@@ -51,7 +52,8 @@ class NetworkProposer:
         """
         from gapr_core.model import weights
 
-        return cls(weights.load(path, _available(device))[0], weights_name=str(path), **options)
+        network = weights.load(path, _available(device))[0]
+        return cls(network, weights_name=weights.checksum(dict(network.state_dict())), **options)
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """Distinct poses, best first; none where the source is too small or too large for the network."""
@@ -70,13 +72,14 @@ class NetworkProposer:
         """The target's share: its pyramid and its features, computed once and kept with it."""
         import torch
 
-        if self._key not in target.cache:
+        key = *self._key, str(self._device)
+        if key not in target.cache:
             frame = target_frame(target.points, self.network.config)
             cloud = build_cloud(target.points, frame, self.network.config)
             with torch.inference_mode():
                 features = self.network.backbone(cloud.to(self._device))
-            target.cache[self._key] = frame, cloud, features
-        return target.cache[self._key]
+            target.cache[key] = frame, cloud, features
+        return target.cache[key]
 
     def match(self, source: Cloud, target: Cloud, features: Features) -> Correspondences:
         """Correspondences in mm, from clouds on the CPU."""

@@ -14,18 +14,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.clouds import Surface
 from gapr_core.data import anatomy, protocols, scans
 from gapr_core.data import pool as bone_pool
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry import se3
 from gapr_core.training.dataset import People
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 PARAMETRIC_PEOPLE = 9  # for each bone, beside the people of the folder
+BOX_FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]]
+)  # fmt: skip
 DRAWN_PEOPLE, DRAWN_SEED = 40, 9  # and new ones from their shape models
 OF_THE_LISTS = (
     "paper", "incomplete", "L1", "L2", "L3", "L2-region", "L3-region", "sweep", "mixed",
-    "wrong", "wrong_person", "wrong_sweep", "turned", "patch", "wrong_patch",
+    "wrong", "wrong_person", "wrong_sweep", "turned", "box", "patch", "wrong_patch",
 )  # fmt: skip
 SHORT = "short-"  # before a protocol: the scan holds one end of the bone only
 SCANNED = "scanned-"  # before a protocol: the target's points are of the bone as another scanner gives it
@@ -46,6 +52,8 @@ def pair_of(task: Task) -> protocols.Pair:
     others = without_twins(specimen, [s for group in bones.values() for s in group])
     if protocol == "turned":
         return turned_pair(len(BONES) * seed + BONES.index(bone))
+    if protocol == "box":
+        return box_pair(len(BONES) * seed + BONES.index(bone))
     if protocol.startswith(SHORT):
         return _pair(protocol.removeprefix(SHORT), *shortened(specimen, others, seed), seed=seed)
     if protocol.startswith(SCANNED):
@@ -121,6 +129,21 @@ def turned_pair(seed: int) -> protocols.Pair:
     return protocols.Pair(
         source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
     )
+
+
+def box_pair(seed: int) -> protocols.Pair:
+    """A side or a corner of a box, smooth or of voxels: flat, straight, and alike in four poses: none is right."""
+    rng = np.random.default_rng([seed, 43])
+    sides_mm, turn = np.exp(rng.uniform(np.log(20.0), np.log(250.0), 3)), se3.random_rotation(rng)
+    corners = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * sides_mm @ turn.T
+    box = Specimen(Surface(corners, BOX_FACES), "box", "none")
+    if rng.random() < 0.5:
+        box = replace(box, surface=scans.drawn(rng)(box.surface))
+    noise_mm, bias_mm, outliers = rng.uniform(0.05, 1.0), rng.uniform(0.0, 1.0) * (rng.random() < 0.5), 0.0
+    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.02, 0.4), (300.0, 4000.0)))
+    level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
+    pair = protocols.one_sided(box, rng, level)
+    return replace(pair, T_target_source=np.full((4, 4), np.nan), name=f"box-{seed}", protocol="box", bone="none")
 
 
 def wrong_person_pair(specimen: Specimen, others: Sequence[Specimen], seed: int) -> protocols.Pair:

@@ -100,7 +100,7 @@ def _counts(records: list[dict[str, Any]]) -> Array:
 
 
 def _count_of_wrong(protocol: str) -> float:
-    if protocol == "wrong_person":
+    if protocol.endswith("wrong_person"):
         return WRONG_PERSON
     return WRONG_BONE if "wrong" in protocol else WRONG_POSE
 

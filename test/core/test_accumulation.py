@@ -67,6 +67,18 @@ def test_a_source_that_cannot_be_registered_is_not_kept(registrar, frames, prepa
     np.testing.assert_array_equal(accumulator.collected, frames[0].source)
 
 
+def test_sources_that_are_metres_apart_are_not_kept_together(registrar, frames, prepared, caplog):
+    accumulator = Accumulator(registrar, most=5)
+    own, other = (pair.source for pair in frames[:2])
+    with pytest.raises(InvalidPointCloudError, match="2500 mm"):
+        accumulator.collect(np.vstack([other, [[9e3, 0.0, 0.0]]]))
+    accumulator.collect(own + [5e3, 0.0, 0.0])
+    assert not caplog.text
+    assert accumulator.register(own, prepared).status == registrar.register(own, prepared).status
+    np.testing.assert_array_equal(accumulator.collected, own)
+    assert "starts anew" in caplog.text
+
+
 def test_another_target_starts_a_new_collection(registrar, frames, prepared):
     accumulator = Accumulator(registrar, most=5)
     accumulator.register(frames[0].source, prepared)

@@ -83,3 +83,43 @@ def test_wrong_usage_is_bad_input_not_a_refusal(capsys):
 def test_a_folder_without_pairs_is_bad_input(tmp_path, capsys):
     assert cli.main(["evaluate", "--pairs", str(tmp_path), "--out", str(tmp_path / "o.json")]) == 1
     assert "NAME.npz" in capsys.readouterr().err
+
+
+def test_evaluate_answers_a_pair_again_that_is_another_one_now(tmp_path, pair):
+    folder, out = tmp_path / "pairs", tmp_path / "poses.json"
+    folder.mkdir()
+    np.savez(folder / "a.npz", source=pair.source, target=pair.target)
+    assert cli.main(["evaluate", "--pairs", str(folder), "--out", str(out)]) == 0
+    before = json.loads(out.read_text())["a"]["transform"]
+    np.savez(folder / "a.npz", source=pair.source + [50.0, 0.0, 0.0], target=pair.target)
+    assert cli.main(["evaluate", "--pairs", str(folder), "--out", str(out)]) == 0
+    after = json.loads(out.read_text())["a"]["transform"]
+    expected = np.array(before) @ se3.exp([-50.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(after, expected, atol=0.5)
+
+
+@pytest.mark.parametrize("text", ["", "no json", "[1, 2]", '{"a": 3}'])
+def test_evaluate_does_not_write_over_what_is_not_its_own(tmp_path, pair, capsys, text):
+    (tmp_path / "pairs").mkdir()
+    np.savez(tmp_path / "pairs" / "a.npz", source=pair.source, target=pair.target)
+    (tmp_path / "poses.json").write_text(text)
+    command = ["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "poses.json")]
+    assert cli.main(command) == 1
+    assert (tmp_path / "poses.json").read_text() == text
+    assert "poses.json" in capsys.readouterr().err
+
+
+def test_evaluate_refuses_every_kind_of_damaged_pair_and_goes_on(tmp_path, pair):
+    folder, out = tmp_path / "pairs", tmp_path / "poses.json"
+    folder.mkdir()
+    np.savez(folder / "whole.npz", source=pair.source, target=pair.target)
+    whole = (folder / "whole.npz").read_bytes()
+    (folder / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (folder / "bent.npz").write_bytes(whole[:2000] + bytes(100) + whole[2100:])
+    (folder / "empty.npz").write_bytes(b"")
+    with (folder / "single.npz").open("wb") as file:
+        np.save(file, pair.source)
+    assert cli.main(["evaluate", "--pairs", str(folder), "--out", str(out), "--limit", "9"]) == 0
+    answers = json.loads(out.read_text())
+    assert answers.pop("whole")["status"] == "OK"
+    assert {answer["status"] for answer in answers.values()} == {"INVALID_INPUT"} and len(answers) == 4

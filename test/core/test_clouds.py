@@ -179,3 +179,14 @@ def test_a_mirrored_mesh_is_still_wound_outward():
 def test_a_cloud_has_no_faces_to_draw_from():
     with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
         Surface(VERTICES).sample(5, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("faces", "text"), [
+    (FACES.ravel(), "triangles"), (np.tile([[0, 1, 2, 3]], (2, 1)), "triangles"),
+    (FACES + 100, "beyond"), (np.zeros((4, 3), dtype=np.int64), "area"),
+])  # fmt: skip
+def test_faces_that_make_no_surface_are_refused(tmp_path, faces, text):
+    np.savez(tmp_path / "a.npz", points=VERTICES, faces=faces)
+    for source in (tmp_path / "a.npz", Surface(VERTICES, faces)):
+        with pytest.raises(InvalidPointCloudError, match=text):
+            clouds.load(source)

@@ -94,6 +94,15 @@ def test_a_refused_source_does_not_end_the_track(tracker, frames, prepared):
     assert tracker.register(frames[1].source, prepared).details["proposer"] == "track"
 
 
+def test_after_a_refused_full_registration_the_next_one_is_full_as_well(registrar, frames, prepared):
+    tracker = Tracker(registrar, recheck=2)
+    noise = np.random.default_rng(0).uniform(-60.0, 60.0, (500, 3))
+    sources = [frames[0].source, frames[1].source, noise, frames[2].source, frames[3].source]
+    results = [tracker.register(source, prepared) for source in sources]
+    assert [r.details["proposer"] == "track" for r in results] == [False, True, False, False, True]
+    assert [r.ok for r in results] == [True, True, False, True, True]
+
+
 def test_a_pose_without_rivals_is_not_followed(frames, prepared):
     """One pose looked at alone has nothing to be weighed against."""
 

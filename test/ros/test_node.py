@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 
 import numpy as np
@@ -17,7 +18,7 @@ from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from gapr_core.geometry import se3
 from gapr_ros import frames
@@ -88,6 +89,41 @@ def test_a_late_listener_gets_the_last_pose(live):
     late.close()
 
 
+@pytest.mark.parametrize("service", ["reset", "reload_model"])
+def test_a_late_listener_does_not_get_a_pose_from_before_a_reset_or_of_another_bone(live, service):
+    node, client, method = live
+    client.ask(GOOD)
+    wait_until(lambda: client.poses)
+    assert client.call(service).success
+    late = Client()
+    wait_until(lambda: late.models and late.node.count_publishers("/register_node/pose"))
+    time.sleep(0.5)
+    assert not late.poses
+    client.poses.clear()
+    client.ask(GOOD)
+    wait_until(lambda: late.poses and client.poses, what="the new pose, by old and new listeners")
+    late.close()
+
+
+def test_a_disabled_node_keeps_its_last_pose_for_late_listeners(live):
+    node, client, method = live
+    client.ask(GOOD)
+    assert client.call("set_enabled", SetBool.Request(data=False)).success
+    late = Client()
+    wait_until(lambda: late.poses)
+    late.close()
+
+
+def test_diagnostics_come_as_often_as_asked_for_while_running(live):
+    node, client, method = live
+    wait_until(lambda: len(client.diagnostics) > 3)
+    assert node.set_parameters([Parameter("diagnostics_period", value=30.0)])[0].successful
+    time.sleep(0.3)
+    count = len(client.diagnostics)
+    time.sleep(0.5)
+    assert len(client.diagnostics) == count
+
+
 def test_diagnostics_have_every_key_and_come_when_idle(live):
     node, client, method = live
     client.ask(GOOD)
@@ -149,12 +185,12 @@ def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob
         method.gate.set()
         wait_until(lambda: int(client.values()["frames_accepted"]) == 2)
         wait_until(lambda: int(client.values()["frames_merged"]) == 4)
-        values = client.values()
+        values, kept = client.values(), list(method.kept)
     counts = {key: int(values[f"frames_{key}"]) for key in ("received", "accepted", "refused", "merged", "dropped")}
     assert counts == {"received": 8, "accepted": 2, "refused": 1, "merged": 4, "dropped": 1}
-    assert [len(source) for source in method.kept] == [150, 300, 100, 100, 100, 100, 100]
-    np.testing.assert_allclose(method.kept[-2], GOOD[:100] * 4 * 1000.0, atol=1e-3)
-    np.testing.assert_allclose(method.kept[-1], GOOD[:100] * 6 * 1000.0, atol=1e-3)
+    assert [len(source) for source in kept] == [150, 300, 100, 100, 100, 100, 100]
+    np.testing.assert_allclose(kept[-2], GOOD[:100] * 4 * 1000.0, atol=1e-3)
+    np.testing.assert_allclose(kept[-1], GOOD[:100] * 6 * 1000.0, atol=1e-3)
     assert int(values["points_used"]) == 950
 
 
@@ -206,7 +242,7 @@ def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(
     with node_in_thread(method, blob_path, continuous=False) as node:
         client.wait_for_state("active")
         nothing = client.call("register")
-        assert not nothing.success and nothing.message == "no cloud has come yet"
+        assert not nothing.success and nothing.message.startswith("no cloud has come yet")
         for i in range(3):
             client.send(GOOD)
             wait_until(lambda i=i: node.counters.received == i + 1)
@@ -220,6 +256,60 @@ def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(
         answer = client.call("register")
         assert not answer.success and answer.message.startswith("refused: empty_cloud")
         assert node.counters.dropped == 2
+
+
+def test_a_cloud_from_before_a_reset_is_not_registered_on_request(blob_path, client, method):
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 1)
+        assert client.call("register").success
+        assert client.call("register").success, "once more, on the same cloud"
+        assert client.call("reset").success
+        answer = client.call("register")
+        assert not answer.success and answer.message == "no cloud has come yet, or none since the last reset"
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 2)
+        assert client.call("register").success
+
+
+def test_a_waiting_cloud_is_registered_with_a_seed_that_came_after_it(blob_path, client, method):
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 1 and client.seeds.get_subscription_count())
+        seed = PoseWithCovarianceStamped(header=Header(frame_id="probe"))
+        client.seeds.publish(seed)
+        wait_until(lambda: node.session._seed)
+        assert client.call("register").success
+        np.testing.assert_allclose(method.calls[-1]["initial"], np.eye(4), atol=1e-12)
+
+
+def test_a_reload_that_a_cleanup_overtakes_is_answered(live):
+    node, client, method = live
+    method.gate.clear()
+    client.send(GOOD)
+    wait_until(lambda: len(method.calls) > 1)
+    reload_model = client.ready(Trigger, "/register_node/reload_model").call_async(Trigger.Request())
+    wait_until(lambda: node.session.worker._tasks)
+    threading.Timer(0.3, method.gate.set).start()
+    change = client.ready(ChangeState, "/register_node/change_state")
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+        done = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        wait_until(done.done, 20.0)
+    wait_until(reload_model.done, 10.0, "the answer of reload_model")
+    assert not reload_model.result().success and "cleaned up" in reload_model.result().message
+
+
+def test_other_settings_of_how_clouds_are_read_forget_what_was_collected(blob_path, client):
+    method = Collecting()
+    with node_in_thread(method, blob_path, accumulate=9) as node:
+        client.wait_for_state("active")
+        client.ask(GOOD)
+        assert len(method.kept) == 1
+        assert node.set_parameters([Parameter("range_max", value=3.0)])[0].successful
+        client.ask(GOOD * 2)
+        np.testing.assert_allclose(method.kept, [GOOD * 2 * 1000.0], atol=1e-3)
 
 
 def test_reload_keeps_the_old_bone_until_the_new_one_is_ready(live, tmp_path, blob_path):

@@ -6,9 +6,11 @@ import time
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import StandIn, accepted, node_in_thread, pose_mm, wait_until
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -198,6 +200,34 @@ def test_a_jump_beyond_the_limit_is_refused_until_a_reset(live):
     client.confidences.clear()
     method.answer = accepted(pose_mm([0, 0, 0], [30.0, 0, 0]))
     expect_refusal(live, GOOD, Reason.JUMP, "moved 0.03 m, max_jump_translation is 0.01 m; call ~/reset")
+    client.call("reset")
+    expect_good(live)
+
+
+def test_a_jump_ends_the_row_of_good_poses(live):
+    node, client, method = live
+    expect_good(live)
+    node.set_parameters_atomically([Parameter("max_jump_translation", value=0.01),
+                                    Parameter("require_consecutive", value=2)])  # fmt: skip
+    client.poses.clear()
+    client.confidences.clear()
+    for position_mm, reason in ((0.0, None), (30.0, Reason.JUMP), (0.0, Reason.LOW_CONFIDENCE), (0.0, None)):
+        method.answer = accepted(pose_mm([0, 0, 0], [position_mm, 0, 0]))
+        values = client.ask(GOOD)
+        assert values["last_refusal"].startswith(reason or "") and (values["level"] == 0) == (reason is None)
+
+
+def test_a_single_point_metres_away_is_refused_with_its_mend(live):
+    expect_refusal(live, np.vstack([GOOD, [[3.0, 0.0, 0.0]]]), Reason.UNIT_MISMATCH, "set range_max")
+
+
+def test_a_seed_in_a_frame_that_nobody_knows_is_named(live):
+    node, client, method = live
+    seed = PoseWithCovarianceStamped(header=Header(frame_id="map"))
+    wait_until(client.seeds.get_subscription_count)
+    client.seeds.publish(seed)
+    wait_until(lambda: node.session._seed)
+    expect_refusal(live, GOOD, Reason.TF_MISSING, "the initialpose is in map")
     client.call("reset")
     expect_good(live)
 

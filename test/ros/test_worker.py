@@ -128,3 +128,37 @@ def test_stop_says_when_the_work_does_not_end():
     assert not bench.worker.stop(0.05)
     bench.gate.set()
     assert bench.worker.stop(5.0)
+
+
+def test_an_outdated_cloud_cannot_be_asked_for_again():
+    bench = Bench(held=True)
+    bench.gate.set()
+    bench.worker.put(job(b"1"))
+    assert bench.worker.ask("waiter", epoch=0)
+    wait_until(lambda: bench.names() == [b"1"])
+    bench.worker.outdate(1)
+    assert not bench.worker.ask("again", epoch=1)
+    bench.worker.put(Job(b"2", epoch=1, received_ns=0))
+    assert bench.worker.ask("again", epoch=1)
+    wait_until(lambda: bench.names() == [b"1", b"2"])
+    bench.worker.stop(5.0)
+
+
+def test_a_waiting_cloud_is_asked_for_as_of_now():
+    bench = Bench(held=True)
+    bench.gate.set()
+    bench.worker.put(job(b"1"))
+    assert bench.worker.ask("waiter", epoch=3)
+    wait_until(lambda: bench.names() == [b"1"])
+    assert bench.done[0][0].epoch == 3
+    bench.worker.stop(5.0)
+
+
+def test_tasks_are_done_before_the_thread_ends():
+    bench, order = Bench(), []
+    bench.worker.put(job(b"busy"))
+    wait_until(lambda: bench.worker._slot is None)
+    bench.worker.run(lambda: order.append("task"))
+    threading.Timer(0.1, bench.gate.set).start()
+    assert bench.worker.stop(5.0)
+    assert order == ["task"]

@@ -36,7 +36,7 @@ def test_the_share_of_the_target_is_computed_once(toy, pair, monkeypatch):
     target = targets.prepare(toy.bone(3000))
     one = proposer(toy)
     first = one.propose(pair[0], target, np.random.default_rng(0))
-    assert len([k for k in target.cache if k.startswith("network")]) == 1
+    assert len(target.cache) == 1
     calls = []
     forward = type(one.network.backbone).forward
     monkeypatch.setattr(
@@ -68,3 +68,19 @@ def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
 def test_an_unknown_method_is_refused(toy):
     with pytest.raises(ConfigError):
         proposer(toy, method="guess")
+
+
+def test_networks_of_the_same_weights_share_the_work_on_a_target_and_others_do_not(toy, pair, tmp_path):
+    path = tmp_path / "w.safetensors"
+    weights.save(proposer(toy).network, path)
+    target = targets.prepare(toy.bone(3000))
+    for _ in range(2):
+        NetworkProposer.from_weights(path).prepare(target)
+    assert len(target.cache) == 1
+    torch.manual_seed(1)
+    weights.save(GAPRNet(toy.small_config()), path)  # the same file, other weights
+    NetworkProposer.from_weights(path).prepare(target)
+    assert len(target.cache) == 2
+    for _ in range(2):
+        proposer(toy).prepare(target)  # without a name every network is its own
+    assert len(target.cache) == 4

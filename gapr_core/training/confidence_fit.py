@@ -1,7 +1,7 @@
 """Fit a confidence model to records of answers: a few small networks, trained by weighted cross-entropy.
 
-Wrong answers count twice, those about bones that are not the target's five times: the fit errs on the side of doubt. Of
-the protocol `wrong_person` there are so many that once is enough.
+Wrong answers count twice, those about bones that are not the target's six times: the fit errs on the side of doubt. Of
+the protocol `wrong_person` there are so many that one and a half times is enough.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from gapr_core.metrics.confidence import SURE, auroc, false_accepts
 Array = NDArray[np.float64]
 Layer = tuple[nn.Parameter, nn.Parameter]  # weights (members, inputs, outputs) and biases (members, 1, outputs)
 
-WRONG_BONE, WRONG_PERSON, WRONG_POSE = 5.0, 1.0, 2.0  # how often an answer counts that is not right
-HIDDEN = 32  # units of each of two hidden layers
+WRONG_BONE, WRONG_PERSON, WRONG_POSE = 6.0, 1.5, 2.0  # how often an answer counts that is not right
+HIDDEN = 64  # units of each of two hidden layers
 SEED = 0
 SMALLEST_SCALE = 1e-3  # of a feature that is the same in all records
 BATCH, LEARNING_RATE, DECAY, DROPOUT = 256, 3e-3, 0.1, 0.1

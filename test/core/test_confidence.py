@@ -89,7 +89,7 @@ def test_the_summary_counts_what_is_accepted_wrongly():
     line = confidence_fit.summary(records, np.array([3.0, 0.1, 4.0, 0.5]))
     assert "4 pairs, 2 right" in line and "false accepts 2 (1 at 0.9)" in line
     assert "accepted 100.0 % (50.0 % at 0.9), AUROC 0.2500" in line
-    loss = np.log1p(np.exp([-3.0, -0.1, 4.0, 0.5])) @ [1.0, 1.0, 5.0, 2.0] / 9.0
+    loss = np.log1p(np.exp([-3.0, -0.1, 4.0, 0.5])) @ [1.0, 1.0, 6.0, 2.0] / 10.0
     assert f"loss {loss:.4f}" in line
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.clouds import EXTENT_LIMITS_MM, Surface, check_extent, finite_points
 from gapr_core.config import RefinementConfig, SourceConfig
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
 from gapr_core.refinement import evaluate
 from gapr_core.registrar import Registrar
@@ -69,11 +69,11 @@ class Accumulator:
     def collect(self, source: ArrayLike) -> None:
         """Keep a source (N, 3), mm, without registering; the oldest one goes when there are too many.
 
-        An empty source, and one that is there already, changes nothing. One that is metres away from those that are
-        kept cannot be of the same bone in the same frame: the collection starts anew with it.
+        An empty source, and one that is there already, changes nothing. One that is metres away from the others cannot
+        be of the same bone in the same frame: it is left out, and the third in a row starts the collection anew.
 
         Raises:
-            InvalidPointCloudError: wrong shape or type, or points that are metres apart.
+            InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
         """
         points = finite_points(source)
         points = points[sampling.thin(points, MOST_POINTS)]
@@ -83,9 +83,17 @@ class Accumulator:
             check_extent(_extent_mm(points), "mm", "the source")
         apart_mm = _extent_mm(np.concatenate([self.collected, points]))
         if apart_mm > EXTENT_LIMITS_MM[1]:
-            log.warning("the sources are %.0f mm apart, are they in one frame? The collection starts anew", apart_mm)
-            self.reset()
+            self._leave_out(points, f"one that makes them {apart_mm:.0f} mm across")
         self._new = [*self._new, points][-self.most :]
+
+    def _leave_out(self, points: Array, given: str) -> None:
+        """Raises, but for the third in a row, before which the collection is forgotten."""
+        self._off = [*self._off, points]
+        if len(self._off) < MOST_OFF:
+            mend = f"look at the transforms; {MOST_OFF} in a row start the collection anew"
+            raise InvalidPointCloudError("a source near the others, in one frame", given, mend)
+        log.warning("%d sources in a row are metres away from the others: the collection starts anew", MOST_OFF)
+        self.reset()
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target; see `Registrar.prepare`."""

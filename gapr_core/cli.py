@@ -126,14 +126,22 @@ def evaluate(args: argparse.Namespace) -> int:
         raise ConfigError("a folder with NAME.npz files", str(args.pairs), "check the path")
     answers = _answers_so_far(args.out)
     method = _method(args.method)
-    made_of = {file: {"method": args.method, "sha256": sha256(file.read_bytes()).hexdigest()} for file in files}
-    waiting = [file for file in files[: args.limit] if not made_of[file].items() <= answers.get(file.stem, {}).items()]
+    made_of = {file: {"method": args.method, "sha256": _digest(file)} for file in files[: args.limit]}
+    waiting = [file for file, made in made_of.items() if not made.items() <= answers.get(file.stem, {}).items()]
     for file in waiting[:1]:
         _answer(file, method)  # compiled code loads with the first call, whose time is not the method's
     for file in tqdm(waiting, unit="pair", disable=None):
         answers[file.stem] = _answer(file, method) | made_of[file]
         _write(args.out, answers)
     return OK
+
+
+def _digest(file: Path) -> str:
+    """What tells a pair from another one of the same name; empty when it cannot be read."""
+    try:
+        return sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return ""
 
 
 def _answers_so_far(path: Path) -> dict[str, Any]:
@@ -144,7 +152,7 @@ def _answers_so_far(path: Path) -> dict[str, Any]:
         answers = json.loads(path.read_text())
         if not all(isinstance(answer, dict) for answer in answers.values()):
             raise ValueError("no answers in it")
-    except (ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError) as error:
         mend = "name another file with --out, or remove it"
         raise ConfigError("a file that `gapr evaluate` has written", f"{path} ({error})", mend) from error
     return dict(answers)

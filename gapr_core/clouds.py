@@ -156,9 +156,13 @@ def check_extent(extent_mm: float, unit: str, name: str) -> None:
     if low <= extent_mm <= high:
         return
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
-    hint = f"it looks like {other}: pass units={other!r}, or mm" if other else "check the file and its unit"
+    hint = (
+        f"it looks like {other}: pass units={other!r}, or convert to {unit}" if other else "check the file and its unit"
+    )
     raise InvalidPointCloudError(
-        f"a bone or a piece of one, {low:g} to {high:g} mm across", f"{name} of {extent_mm:.3g} mm read as {unit}", hint
+        f"a bone or a piece of one, {low:g} to {high:g} mm across",
+        f"{name} of {extent_mm:.3g} mm read as {unit}",
+        hint,
     )
 
 

@@ -72,8 +72,8 @@ def why_not(
 def _as_good(score: float) -> float:
     """Mean square, mm^2, below which another pose explains the source as well as one of this mean square.
 
-    Noise decides between poses that differ by a small share. Where there is little noise it is the target's own
-    roughness: terraces of voxels, or what a smooth element leaves of an edge.
+    Above 2 mm of noise a small share is chance. Below it is the target's own roughness that decides between such poses:
+    terraces of voxels, or what a smooth element leaves of an edge.
     """
     return max((1.0 + EQUAL_SHARE) * score, score + EQUAL_MM**2)
 

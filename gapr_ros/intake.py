@@ -76,6 +76,12 @@ def check_count(count: int, least: int) -> None:
         raise RefusedError(Reason.TOO_FEW_POINTS, f"{count} usable points, min_points is {least}")
 
 
+def is_one_bone(points_mm: Array, model_extent_mm: float) -> bool:
+    """False for points that lie too far apart, whatever their unit is."""
+    most_mm = min(EXTENT_LIMITS_MM[1], MOST_SHARE * model_extent_mm)
+    return float(np.linalg.norm(np.ptp(points_mm, axis=0))) <= most_mm
+
+
 def check_spread(points_mm: Array, unit: str) -> None:
     """Refuse a cloud with points that are metres apart, be it a few strays: no bone is so long."""
     extent_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))

@@ -174,7 +174,9 @@ class RegisterNode(LifecycleNode):
     @guarded
     def _on_changed(self, changes: list[Parameter]) -> None:
         self.parameters = parameters.read(self)
-        self._diagnosing.timer_period_ns = int(self.parameters.diagnostics_period * 1e9)
+        if any(change.name == "diagnostics_period" for change in changes):
+            self._diagnosing.timer_period_ns = int(self.parameters.diagnostics_period * 1e9)
+            self._diagnosing.reset()
         if self.session is not None:
             self.session.parameters_changed()
 

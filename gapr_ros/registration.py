@@ -145,6 +145,8 @@ class Registration:
 def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
     """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
     together = np.vstack([now.method.collected, points_mm])
+    if not intake.is_one_bone(together, now.model.extent_mm):
+        together = points_mm  # the method leaves this cloud out, or starts anew with it
     outcome.points_used = len(together)
     try:
         intake.check_together(together, now.model.extent_mm, now.parameters)

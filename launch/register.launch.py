@@ -6,6 +6,7 @@ ros2 launch gapr_ros register.launch.py model_path:=/path/to/bone.stl points:=/c
 
 from typing import Any
 
+import yaml
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
@@ -19,7 +20,7 @@ ARGUMENTS = {
     "points": ("points", "topic of the clouds"),
     "initialpose": ("initialpose", "topic of optional seeds"),
     "output_frame": ("", "frame of the poses; empty: that of the clouds"),
-    "use_sim_time": ("", "true: take time from /clock"),
+    "use_sim_time": ("", "true: node and RViz take time from /clock; RViz does not read params_file"),
     "params_file": ("", "parameter file; what is given here as an argument, and not empty, wins"),
     "rviz": ("false", "show clouds and bone"),
 }
@@ -29,8 +30,12 @@ TEXTS = ("model_path", "model_unit", "output_frame")
 def given(context: LaunchContext) -> dict[str, Any]:
     """The parameters that the arguments name; the empty ones leave what the file says."""
     values = {name: context.launch_configurations[name] for name in (*TEXTS, "use_sim_time")}
-    as_parameter = {"use_sim_time": lambda text: text.lower() in ("true", "1")}
-    return {name: as_parameter.get(name, str)(text) for name, text in values.items() if text}
+    chosen: dict[str, Any] = {name: text for name, text in values.items() if text}
+    if "use_sim_time" in chosen:
+        chosen["use_sim_time"] = yaml.safe_load(chosen["use_sim_time"])
+        if not isinstance(chosen["use_sim_time"], bool):
+            raise ValueError(f"use_sim_time must be true or false, got {values['use_sim_time']!r}")
+    return chosen
 
 
 def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:

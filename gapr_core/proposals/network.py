@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ class NetworkProposer:
         from gapr_core.model import weights
 
         network = weights.load(path, _available(device))[0]
-        return cls(network, weights_name=weights.checksum(dict(network.state_dict())), **options)
+        name = f"{weights.checksum(dict(network.state_dict()))} {json.dumps(network.config.to_dict())}"
+        return cls(network, weights_name=name, **options)
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """Distinct poses, best first; none where the source is too small or too large for the network."""

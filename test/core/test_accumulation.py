@@ -72,11 +72,26 @@ def test_sources_that_are_metres_apart_are_not_kept_together(registrar, frames, 
     own, other = (pair.source for pair in frames[:2])
     with pytest.raises(InvalidPointCloudError, match="2500 mm"):
         accumulator.collect(np.vstack([other, [[9e3, 0.0, 0.0]]]))
-    accumulator.collect(own + [5e3, 0.0, 0.0])
+    accumulator.collect(own)
+    for _ in range(2):
+        with pytest.raises(InvalidPointCloudError, match="near the others"):
+            accumulator.register(own + [5e3, 0.0, 0.0], prepared)
+        np.testing.assert_array_equal(accumulator.collected, own)
     assert not caplog.text
-    assert accumulator.register(own, prepared).status == registrar.register(own, prepared).status
-    np.testing.assert_array_equal(accumulator.collected, own)
+    moved = own + [5e3, 0.0, 0.0]
+    assert accumulator.register(moved, prepared).status == registrar.register(moved, prepared).status
+    np.testing.assert_array_equal(accumulator.collected, moved)
     assert "starts anew" in caplog.text
+
+
+def test_a_single_source_that_is_metres_away_does_not_end_a_collection(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=5)
+    own, other, third = (pair.source for pair in frames[:3])
+    for source in (own, other, third):
+        with pytest.raises(InvalidPointCloudError, match="near the others"):
+            accumulator.register(own, prepared)
+            accumulator.register(source - [0.0, 4e3, 0.0], prepared)
+    np.testing.assert_array_equal(accumulator.collected, own)
 
 
 def test_another_target_starts_a_new_collection(registrar, frames, prepared):

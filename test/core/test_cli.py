@@ -117,9 +117,11 @@ def test_evaluate_refuses_every_kind_of_damaged_pair_and_goes_on(tmp_path, pair)
     (folder / "cut.npz").write_bytes(whole[: len(whole) // 2])
     (folder / "bent.npz").write_bytes(whole[:2000] + bytes(100) + whole[2100:])
     (folder / "empty.npz").write_bytes(b"")
+    (folder / "folder.npz").mkdir()
+    (folder / "gone.npz").symlink_to(folder / "nowhere")
     with (folder / "single.npz").open("wb") as file:
         np.save(file, pair.source)
     assert cli.main(["evaluate", "--pairs", str(folder), "--out", str(out), "--limit", "9"]) == 0
     answers = json.loads(out.read_text())
     assert answers.pop("whole")["status"] == "OK"
-    assert {answer["status"] for answer in answers.values()} == {"INVALID_INPUT"} and len(answers) == 4
+    assert {answer["status"] for answer in answers.values()} == {"INVALID_INPUT"} and len(answers) == 6

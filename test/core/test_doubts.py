@@ -117,6 +117,7 @@ def candidates(*scores):
 
 
 @pytest.mark.parametrize(("scores", "matched"), [((4.0, 4.05), True), ((4.0, 4.2), False), ((0.01, 0.07), True),
-                                                 ((0.01, 0.08), False), ((1.0,), False)])  # fmt: skip
+                                                 ((0.01, 0.08), False), ((1.0,), False), ((16.0, 16.2), True),
+                                                 ((16.0, 16.3), False)])  # fmt: skip
 def test_a_rival_is_as_good_within_a_share_or_within_the_roughness(scores, matched):
     assert doubts.is_matched(candidates(*scores)) is matched

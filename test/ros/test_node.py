@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 import time
 
 import numpy as np
@@ -20,7 +19,9 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from gapr_core import Accumulator
 from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros import frames
 from gapr_ros.refusal import Reason, RefusedError
 from msg_adapters import cloud_to_xyz, list_to_covariance, pose_to_matrix, transform_to_matrix, xyz_to_cloud
@@ -122,6 +123,8 @@ def test_diagnostics_come_as_often_as_asked_for_while_running(live):
     count = len(client.diagnostics)
     time.sleep(0.5)
     assert len(client.diagnostics) == count
+    assert node.set_parameters([Parameter("diagnostics_period", value=0.05)])[0].successful
+    wait_until(lambda: len(client.diagnostics) > count + 3)
 
 
 def test_diagnostics_have_every_key_and_come_when_idle(live):
@@ -209,6 +212,18 @@ def test_clouds_from_before_a_reset_are_not_merged(blob_path, client):
         np.testing.assert_allclose(method.kept, [GOOD * 9 * 1000.0], atol=1e-3)
 
 
+def test_clouds_that_are_metres_away_are_left_out_until_they_are_three_in_a_row(blob_path, client, method):
+    method.answer = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="for the test")
+    accumulator = Accumulator(method, most=9)
+    with node_in_thread(accumulator, blob_path, accumulate=9):
+        client.wait_for_state("active")
+        for cloud, refusal in ((GOOD, "low_confidence"), (GOOD + 5.0, "unit_mismatch"), (GOOD * 1.1, "low_confidence"),
+                               (GOOD + 5.0, "unit_mismatch"), (GOOD + 5.1, "unit_mismatch"),
+                               (GOOD + 5.2, "low_confidence")):  # fmt: skip
+            assert client.ask(cloud)["last_refusal"].startswith(refusal)
+        np.testing.assert_allclose(accumulator.collected, (GOOD + 5.2) * 1000.0, atol=1e-2)
+
+
 def test_another_frame_and_stamps_that_go_back_start_a_new_collection(blob_path, client):
     method = Collecting()
     with node_in_thread(method, blob_path, accumulate=9):
@@ -292,11 +307,12 @@ def test_a_reload_that_a_cleanup_overtakes_is_answered(live):
     wait_until(lambda: len(method.calls) > 1)
     reload_model = client.ready(Trigger, "/register_node/reload_model").call_async(Trigger.Request())
     wait_until(lambda: node.session.worker._tasks)
-    threading.Timer(0.3, method.gate.set).start()
     change = client.ready(ChangeState, "/register_node/change_state")
     for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
         done = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
-        wait_until(done.done, 20.0)
+        wait_until(lambda: node.session is None or done.done(), 20.0)  # noqa: B023
+    method.gate.set()
+    wait_until(done.done, 20.0)
     wait_until(reload_model.done, 10.0, "the answer of reload_model")
     assert not reload_model.result().success and "cleaned up" in reload_model.result().message
 

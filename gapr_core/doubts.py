@@ -61,7 +61,7 @@ def why_not(
             f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
         )
     if pushed:
-        return RegistrationStatus.DEGENERATE, "a pose a few mm aside explains the source as well: it is flat"
+        return RegistrationStatus.DEGENERATE, "a pose a few mm aside is as good: what is seen is flat or straight"
     if is_matched(candidates):
         apart = se3.rotation_angle_deg(se3.inverse(candidates.poses[0]) @ candidates.poses[1])
         return RegistrationStatus.AMBIGUOUS, f"another pose, turned by {apart:.0f} deg, explains the source as well"

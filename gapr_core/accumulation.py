@@ -79,9 +79,9 @@ class Accumulator:
         points = points[sampling.thin(points, MOST_POINTS)]
         if not len(points) or _is_among(points, self._kept + self._new):
             return
-        if _extent_mm(points) > EXTENT_LIMITS_MM[1]:
-            check_extent(_extent_mm(points), "mm", "the source")
-        apart_mm = _extent_mm(np.concatenate([self.collected, points]))
+        if (extent_mm := Surface(points).extent_mm) > EXTENT_LIMITS_MM[1]:
+            check_extent(extent_mm, "mm", "the source")
+        apart_mm = Surface(np.concatenate([self.collected, points])).extent_mm
         if apart_mm > EXTENT_LIMITS_MM[1]:
             self._leave_out(points, f"one that makes them {apart_mm:.0f} mm across")
         self._new = [*self._new, points][-self.most :]
@@ -149,10 +149,6 @@ class Accumulator:
 
 def _together(sources: list[Array]) -> Array:
     return np.concatenate([np.empty((0, 3)), *sources])
-
-
-def _extent_mm(points: Array) -> float:
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _is_among(source: Array, others: list[Array]) -> bool:

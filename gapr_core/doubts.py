@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gapr_core.config import VerificationConfig
 from gapr_core.covariance import PoseUncertainty
 from gapr_core.geometry import se3
+from gapr_core.metrics.uncertainty import motion_jacobians
 from gapr_core.refinement import Fit, refine_many
 from gapr_core.results import RegistrationStatus
 from gapr_core.source import PreparedSource
@@ -84,13 +85,8 @@ def _weakest_motions(fit: Fit) -> Array:
     arm_mm = max(_rms_mm(fit.moved - fit.moved.mean(axis=0)), 1.0)
     scale = np.array([1.0] * 3 + [1.0 / arm_mm] * 3)
     motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:WEAKEST] * scale
-    moves = (_moves(fit, motion) for motion in motions)
-    return motions / np.array([[max(_rms_mm(move), 1e-6)] for move in moves])
-
-
-def _moves(fit: Fit, twist: Array) -> Array:
-    """(N, 3) displacements of the moved source by a small twist about its centroid."""
-    return twist[:3] + np.cross(twist[3:], fit.moved - fit.moved.mean(axis=0))
+    moves = motion_jacobians(fit.moved, fit.moved.mean(axis=0)) @ motions.T
+    return motions / np.array([[max(_rms_mm(move), 1e-6)] for move in moves.transpose(2, 0, 1)])
 
 
 def _rms_mm(vectors: Array) -> float:

@@ -9,7 +9,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from gapr_core.clouds import EXTENT_LIMITS_MM
+from gapr_core.clouds import EXTENT_LIMITS_MM, Surface
 from gapr_ros import wire
 from gapr_ros.parameters import NodeParameters
 from gapr_ros.refusal import Reason, RefusedError
@@ -79,12 +79,12 @@ def check_count(count: int, least: int) -> None:
 def is_one_bone(points_mm: Array, model_extent_mm: float) -> bool:
     """False for points that lie too far apart, whatever their unit is."""
     most_mm = min(EXTENT_LIMITS_MM[1], MOST_SHARE * model_extent_mm)
-    return float(np.linalg.norm(np.ptp(points_mm, axis=0))) <= most_mm
+    return Surface(points_mm).extent_mm <= most_mm
 
 
 def check_spread(points_mm: Array, unit: str) -> None:
     """Refuse a cloud with points that are metres apart, be it a few strays: no bone is so long."""
-    extent_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    extent_mm = Surface(points_mm).extent_mm
     if extent_mm > EXTENT_LIMITS_MM[1]:
         size = f"{extent_mm:.3g} mm across read as {unit}, {EXTENT_LIMITS_MM[1]:g} mm are the most"
         raise RefusedError(Reason.UNIT_MISMATCH, f"points too far apart: {size}; set range_max, or cloud_unit")

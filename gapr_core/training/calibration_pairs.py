@@ -47,13 +47,11 @@ Task = tuple[str, str, str, str, int]  # folder, split, protocol, bone, seed
 def pair_of(task: Task) -> protocols.Pair:
     """The pair of a task; the same task always gives the same pair."""
     folder, split, protocol, bone, seed = task
+    if protocol in NO_BONES:
+        return NO_BONES[protocol](len(BONES) * seed + BONES.index(bone))
     bones = _bones(folder, split)
     specimen = bones[bone][seed % len(bones[bone])]
     others = without_twins(specimen, [s for group in bones.values() for s in group])
-    if protocol == "turned":
-        return turned_pair(len(BONES) * seed + BONES.index(bone))
-    if protocol == "box":
-        return box_pair(len(BONES) * seed + BONES.index(bone))
     if protocol.startswith(SHORT):
         return _pair(protocol.removeprefix(SHORT), *shortened(specimen, others, seed), seed=seed)
     if protocol.startswith(SCANNED):
@@ -201,3 +199,6 @@ def mixed_pair(specimen: Specimen, seed: int) -> protocols.Pair:
     level = protocols.Level((share, share), share_of, noise_mm, bias_mm, outliers, points)
     pair = protocols.one_sided(specimen, rng, level)
     return replace(pair, name=f"mixed-{seed}", protocol="mixed")
+
+
+NO_BONES = {"turned": turned_pair, "box": box_pair}  # shapes of which no pose can be known

@@ -1,9 +1,12 @@
 """One bone of the project's own for the tests of the core."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
+from gapr_core.data import anatomy
 from gapr_core.data.parametric import make_bone
 
 
@@ -25,3 +28,11 @@ def femur_cloud(femur):
 @pytest.fixture(scope="session")
 def target(registrar, femur_cloud):
     return registrar.prepare(femur_cloud)
+
+
+@pytest.fixture(scope="session")
+def anatomy_folder() -> Path:
+    folder = anatomy.default_folder()
+    if not folder.is_dir():
+        pytest.skip(f"the real bones do not ship and {folder} is absent: set {anatomy.ENVIRONMENT_VARIABLE}")
+    return folder

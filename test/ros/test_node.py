@@ -310,7 +310,7 @@ def test_a_reload_that_a_cleanup_overtakes_is_answered(live):
     change = client.ready(ChangeState, "/register_node/change_state")
     for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
         done = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
-        wait_until(lambda: node.session is None or done.done(), 20.0)  # noqa: B023
+        wait_until(lambda done=done: node.session is None or done.done(), 20.0)
     method.gate.set()
     wait_until(done.done, 20.0)
     wait_until(reload_model.done, 10.0, "the answer of reload_model")

@@ -1,7 +1,6 @@
 """What the confidence models learn from."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,15 +52,12 @@ def test_twins_are_no_wrong_answer_to_each_other():
     assert pairs.without_twins(stranger, [own, twin, stranger]) == [own, twin, stranger]
 
 
-def test_the_bones_are_of_the_people_of_the_split_and_of_new_ones_from_their_shape_models(monkeypatch):
-    folder = anatomy.default_folder()
-    if not folder.is_dir():
-        pytest.skip("the real bones do not ship")
+def test_the_bones_are_of_the_people_of_the_split_and_of_new_ones_from_their_shape_models(anatomy_folder, monkeypatch):
     monkeypatch.setattr(pairs, "PARAMETRIC_PEOPLE", 1)
     monkeypatch.setattr(pairs, "DRAWN_PEOPLE", 2)
     monkeypatch.setattr(pairs, "BONES", ("femur", "pelvis"))
-    bones = pairs._bones.__wrapped__(str(folder), "train")
-    known = set(anatomy.splits(Path(folder))["train"])
+    bones = pairs._bones.__wrapped__(str(anatomy_folder), "train")
+    known = set(anatomy.splits(anatomy_folder)["train"])
     for bone, specimens in bones.items():
         assert {s.bone for s in specimens} == {bone}
         drawn = [s for s in specimens if s.cohort == "drawn"]

@@ -7,7 +7,7 @@ READY := .venv/.ready-$(ROS)
 DEV   := .venv/.ready-dev
 export MPLBACKEND := Agg
 
-.PHONY: help demo test slow lint format build clean
+.PHONY: help demo test slow mutants faults fuzz soak lint docs format build clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -16,14 +16,29 @@ help:  ## this list
 demo: $(READY)  ## a partial cloud from a bag, through the ROS 2 node, to a pose with a confidence; report in demo_output/
 	$(BIN)/gapr demo $(ARGS)
 
-test: $(READY)  ## the test suite, under five minutes on two cores; ARGS="-k node" chooses
+test: $(READY)  ## the test suite, under ten minutes on two cores; ARGS="-k node" chooses
 	$(BIN)/python -m pytest -n 2 $(ARGS)
 
 slow: $(READY)  ## the tests that take longer
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
+mutants: $(DEV)  ## change one operator of a formula at a time: does a test notice? ARGS="--files rules" chooses
+	$(BIN)/python scripts/mutants.py $(ARGS)
+
+faults: $(READY)  ## a table of faults on real processes of the node
+	$(BIN)/python test/ros/faults.py $(ARGS)
+
+fuzz: $(READY)  ## 100 000 mutated PointCloud2 through the node's reader; ARGS="--seed 2" for others
+	$(BIN)/python test/ros/fuzz.py $(ARGS)
+
+soak: $(READY)  ## a long bag at 10 Hz: every cloud is answered or counted; ARGS="--frames 36000" is an hour
+	$(BIN)/python test/ros/soak.py $(ARGS)
+
 lint: $(DEV)  ## ruff, mypy and the import contracts, on every file
 	PATH="$(CURDIR)/$(BIN):$$PATH" pre-commit run --all-files
+
+docs: $(DEV)  ## the site in build/site; fails on a warning
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 format: $(DEV)  ## let ruff format the code
 	$(BIN)/ruff check --fix . ; $(BIN)/ruff format .

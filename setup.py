@@ -7,14 +7,20 @@ from setuptools import find_packages, setup
 
 PACKAGE = "gapr_ros"
 
-CORE = ["matplotlib", "numba", "numpy", "open3d>=0.18", "plotly>=5.20", "plyfile", "rich", "scipy>=1.10", "tqdm", "vtk"]
+CORE = ["numba", "numpy", "plyfile", "pyyaml", "scipy>=1.10", "tqdm"]  # what a registration by the search needs
 NETWORK = ["safetensors", "torch>=2.4,<2.14"]
-BASELINES = ["kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
+DATA = ["open3d>=0.18"]  # rays and distances of simulated bones
+REPORTS = ["matplotlib", "pillow", "plotly>=5.20", "rich"]
+BASELINES = [*DATA, "kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
+MEDICAL = ["SimpleITK>=2.3", "highdicom>=0.24", "scikit-image>=0.22"]
 BAGS = ["rosbags>=0.10"]
 ROS_WHEELS = ["ros-jazzy-rclpy", "ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-common-interfaces"]
 TEST = [
+    *MEDICAL,
     "colcon-common-extensions",
     "hypothesis",
+    "nibabel",  # writes NIfTI headers as TotalSegmentator does
+    "pyigtl",
     "import-linter",
     "psutil",
     "pytest>=7.4",
@@ -22,7 +28,9 @@ TEST = [
     "pytest-xdist",
     "ruff",
     "setuptools<80",  # later ones no longer have the commands that colcon calls
+    "vtk",  # writes the files that the project's own readers are held against
 ]
+DOCS = ["mkdocs-material>=9.5", "mkdocstrings[python]>=0.26"]
 
 
 def files(folder, *patterns):
@@ -33,7 +41,7 @@ def files(folder, *patterns):
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version="0.2.0",
     description="Partial-to-full registration of bones with a calibrated confidence: library, command line, ROS 2 node",
     long_description=Path("README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
@@ -42,7 +50,7 @@ setup(
     maintainer_email="maintainers@gapr.invalid",
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=["gapr_core*", "msg_adapters*", "gapr_ros*"]),
-    package_data={"gapr_core": ["weights/*.safetensors", "weights/*.json", "weights/*.md", "evaluation/templates/*"]},
+    package_data={"gapr_core": ["weights/*.safetensors", "weights/*.json", "weights/*.md", "pages/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -50,28 +58,29 @@ setup(
         files("config/model", "*.yaml"),
         files("launch", "*.launch.py"),
         files("rviz", "*.rviz"),
+        files("deploy", "*"),
     ],
-    install_requires=[*CORE, *NETWORK, "pyyaml"],
+    install_requires=CORE,
     extras_require={
+        "network": NETWORK,
+        "data": DATA,
+        "reports": [*REPORTS, *DATA],
+        "training": [*NETWORK, *DATA, *REPORTS],
         "bags": BAGS,
-        "ros": [*ROS_WHEELS, *BAGS],
+        "medical": MEDICAL,
+        "ros": [*ROS_WHEELS, *BAGS, *NETWORK, *DATA, *REPORTS],
         "baselines": BASELINES,
         "test": TEST,
-        "dev": [*TEST, "mypy", "pre-commit", "types-PyYAML"],
+        "docs": DOCS,
+        "dev": [*TEST, *DOCS, "cosmic-ray", "mypy", "pre-commit", "types-PyYAML"],
     },
     zip_safe=False,
     entry_points={
         "console_scripts": [
             "gapr = gapr_core.cli:main",
             "register_node = gapr_ros.register_node:main",
-            "bag_replay = gapr_ros.bag_replay:main",
+            "bag_replay = gapr_ros.bags.replay:main",
         ],
-        "gapr.commands": [
-            "ablate = gapr_core.training.ablation",
-            "benchmark = gapr_core.evaluation.benchmark",
-            "demo = gapr_ros.demo",
-            "make-pairs = gapr_core.data.make_pairs",
-            "train = gapr_core.training.cli",
-        ],
+        "gapr.commands": ["demo = gapr_ros.demo.cli"],
     },
 )

@@ -1,9 +1,9 @@
-"""Hollow bones: the outer wall alone against both walls as the target, on the same pairs in one run.
+"""Hollow bones: the outer cortex alone against both cortices as the target, on the same pairs in one run.
 
     python benchmarks/hollow.py --anatomy DIR [--split val] [--count 6] [--walls 2.5,4]
 
-Each bone gets an inner wall, its own surface moved inwards. Sources are one-sided views of the outer wall (L1 to L3),
-or pieces of both walls (paper, incomplete).
+Each bone gets an inner cortex, its own surface moved inwards. Sources are one-sided views of the outer cortex (L1 to
+L3), or pieces of both cortices (paper, incomplete).
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.clouds import Surface
-from gapr_core.console import say
+from gapr_core.benchmark.judge import judge
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.solid import volume_mm3
 from gapr_core.data.specimen import Specimen
-from gapr_core.evaluation.judge import judge
+from gapr_core.pages import markdown
+from gapr_core.runtime.console import say
+from gapr_core.surface import Surface
 
 PROTOCOLS = ("paper", "incomplete", "L1", "L2", "L3")
 BONES = ("femur", "tibia", "pelvis")
@@ -41,12 +42,12 @@ def main() -> int:
         "wall",
         "source",
         "pairs",
-        "inner wall found",
+        "inner cortex found",
         "as shipped: right, accepted, wrong at 0.9 or more",
-        "outer wall only",
-        "both walls always",
+        "outer cortex only",
+        "both cortices always",
     )
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = [markdown.head(head)]
     for wall_mm in map(float, args.walls.split(",")):
         for protocol in PROTOCOLS:
             rows = [
@@ -61,7 +62,7 @@ def main() -> int:
 
 
 def hollowed(specimen: Specimen, wall_mm: float) -> Specimen:
-    """The same bone with an inner wall: its vertices moved inwards along their normals."""
+    """The same bone with an inner cortex: its vertices moved inwards along their normals."""
     points, faces = specimen.surface.points, specimen.surface.triangles
     normals = np.asarray(specimen.surface.to_open3d().compute_vertex_normals().vertex_normals)
     inner = points - wall_mm * np.sign(volume_mm3(specimen.surface)) * normals
@@ -70,15 +71,15 @@ def hollowed(specimen: Specimen, wall_mm: float) -> Specimen:
 
 
 def measure(registrar: Registrar, specimen: Specimen, protocol: str, seed: int) -> list[float]:
-    """Whether an inner wall was found, then right, accepted, wrong at 0.9 or more: shipped, outer only, both only."""
+    """Whether an inner cortex was found, then right, accepted, wrong at 0.9 or more: shipped, outer only, both only."""
     pair = make_pair(protocol, specimen, seed)
     target = registrar.prepare(pair.target)
-    both = target.both_walls or target
-    row = [float(target.both_walls is not None)]
-    for given in (target, replace(target, both_walls=None), both):
+    both = target.both_cortices or target
+    row = [float(target.both_cortices is not None)]
+    for given in (target, replace(target, both_cortices=None), both):
         result = registrar.register(pair.source, given)
         judged = judge(pair, result)
-        row += [judged["right"], result.ok, judged["false_accept"] and result.confidence >= 0.9]
+        row += [judged.right, result.ok, judged.false_accept and result.confidence >= 0.9]
     return row
 
 
@@ -86,7 +87,7 @@ def line(wall_mm: float, protocol: str, rows: np.ndarray) -> str:
     """One row of the table."""
     found, *counts = rows.sum(axis=0).astype(int)
     cells = [", ".join(map(str, counts[i : i + 3])) for i in (0, 3, 6)]
-    return f"| {wall_mm:g} mm | {protocol} | {len(rows)} | {found} | " + " | ".join(cells) + " |"
+    return markdown.row([f"{wall_mm:g} mm", protocol, len(rows), found, *cells])
 
 
 if __name__ == "__main__":

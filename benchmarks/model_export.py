@@ -4,7 +4,7 @@ nice python benchmarks/model_export.py [--out DIR] [--compile]
 
 Writes DIR/backbone.pt2 and DIR/aggregation.pt2, and what ONNX can hold as .onnx, where the packages onnx and onnxscript
 are installed; with onnxruntime, that is run, too. `--compile` compiles the exported programs, which takes minutes. A
-line for each attempt: seconds, largest difference from the network, CPU time of a call beside the network's, or the
+line for each attempt: seconds, largest difference from the network, CPU time of a call and the network's, or the
 error.
 """
 
@@ -58,7 +58,7 @@ def report(name: str, seconds: float, part: Flat, call: Callable[..., Sequence[A
     apart = max(float((a.float() - b.float()).abs().max()) for a, b in zip(found, expected, strict=True))
     times = [(cpu_ms(part, part.example), cpu_ms(call, part.example)) for _ in range(repeats)]
     ours, theirs = (min(column) for column in zip(*times, strict=True))
-    print(f"{name}: made in {seconds:.0f} s, differs by {apart:.1e} at most, {theirs:.1f} ms beside {ours:.1f} ms")
+    print(f"{name}: made in {seconds:.0f} s, differs by {apart:.1e} at most, {theirs:.1f} ms, network {ours:.1f} ms")
 
 
 def cpu_ms(call: Callable[..., Any], arguments: Sequence[Tensor]) -> float:

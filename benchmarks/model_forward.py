@@ -1,4 +1,4 @@
-"""Time of one forward pass on one CPU thread, beside a fixed matrix product and naive forms of the hot operators.
+"""Time of one forward pass on one CPU thread, with a fixed matrix product and naive forms of the hot operators.
 
 nice python benchmarks/model_forward.py [--pairs 3] [--repeats 40] [--superpoints 90 110] [--model YAML] [--json FILE]
 
@@ -185,18 +185,18 @@ def measure(config: ModelConfig, count: int, repeats: int) -> dict[str, Any]:
     }
 
 
-def table(figures: dict[str, Any]) -> str:
-    """The figures as markdown."""
-    points, superpoints = figures["points"], figures["superpoints"]
+def table(numbers: dict[str, Any]) -> str:
+    """The numbers as Markdown."""
+    points, superpoints = numbers["points"], numbers["superpoints"]
     lines = [
-        f"{figures['parameters'] / 1e6:.2f} M parameters, torch {figures['torch']}, one thread; mean over "
-        f"{figures['pairs']} pairs, {figures['repeats']} repetitions; source of {points['source']:.0f} points and "
+        f"{numbers['parameters'] / 1e6:.2f} M parameters, torch {numbers['torch']}, one thread; mean over "
+        f"{numbers['pairs']} pairs, {numbers['repeats']} repetitions; source of {points['source']:.0f} points and "
         f"{superpoints['source']:.0f} superpoints, target of {points['target']:.0f} and {superpoints['target']:.0f}",
         "",
         "| CPU time | minimum, ms | median, ms | over the reference | over the forward pass |",
         "|---|---|---|---|---|",
     ]
-    for name, row in figures["times"].items():
+    for name, row in numbers["times"].items():
         lines.append(
             f"| {name} | {row['min_ms']:.1f} | {row['median_ms']:.1f} | {row['over_reference']:.2f} "
             f"| {row['over_forward']:.2f} |"
@@ -205,13 +205,13 @@ def table(figures: dict[str, Any]) -> str:
         [
             *lines,
             "",
-            "Largest items: " + ", ".join(f"{name} {share}" for name, share in figures["largest_items"].items()),
+            "Largest items: " + ", ".join(f"{name} {share}" for name, share in numbers["largest_items"].items()),
         ]
     )
 
 
 def main() -> int:
-    """Print the figures, and write them where asked."""
+    """Print the numbers, and write them where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, help="yaml of config/model; default: the defaults")
     parser.add_argument("--superpoints", type=int, nargs=2, default=(90, 110), help="of the target, from and to")
@@ -220,10 +220,10 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     config = ModelConfig.from_yaml(args.model) if args.model else ModelConfig()
-    figures = measure(replace(config, superpoints=tuple(args.superpoints)), args.pairs, args.repeats)
-    print(table(figures))
+    numbers = measure(replace(config, superpoints=tuple(args.superpoints)), args.pairs, args.repeats)
+    print(table(numbers))
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        args.json.write_text(json.dumps(numbers, indent=1) + "\n")
     return 0
 
 

@@ -2,9 +2,9 @@
 
 nice python benchmarks/model_invariance.py [--models YAML ...] [--weights FILE ...] [--motions 20] [--json FILE]
 
-Motions are uniform on SO(3) with translations up to 150 mm. The pyramid is built anew from the moved clouds, so its
+Motions are uniform on SO(3) with translations up to 150 mm. The pyramid is rebuilt from the moved clouds, so its
 own dependence on the frame counts, too. Features: |f' - f| over |f|, per point. Scores: largest change of the
-dual-normalised correlation, eq. (7), over the largest entry. Beside them the share of the chosen patch pairs that stay,
+dual-normalised correlation, eq. (7), over the largest entry. Also the share of the chosen patch pairs that stay,
 and, as a yardstick, how far the features of two different superpoints of a bone are apart: |f_a - f_b| over |f_a|.
 """
 
@@ -97,8 +97,8 @@ def random_motion(rng: np.random.Generator) -> np.ndarray:
     return se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-150, 150, 3))
 
 
-def table(figures: dict[str, dict[str, Any]], motions: int) -> str:
-    """The figures as markdown."""
+def table(numbers: dict[str, dict[str, Any]], motions: int) -> str:
+    """The numbers as Markdown."""
     lines = [
         f"{len(BONES)} bones, {motions} motions each; median / largest over all points and motions.",
         "",
@@ -106,7 +106,7 @@ def table(figures: dict[str, dict[str, Any]], motions: int) -> str:
         "| other voxels |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name, row in figures.items():
+    for name, row in numbers.items():
         fine, coarse, scores = (
             f"{row[f'{k}_median']:.1e} / {row[f'{k}_largest']:.1e}" for k in ("fine", "superpoints", "scores")
         )
@@ -118,7 +118,7 @@ def table(figures: dict[str, dict[str, Any]], motions: int) -> str:
 
 
 def main() -> int:
-    """Print the table, and write the figures where asked."""
+    """Print the table, and write the numbers where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--models", type=Path, nargs="*", default=[], help="yamls of config/model, untrained, seed 0")
     parser.add_argument("--weights", type=Path, nargs="*", default=[], help="trained networks")
@@ -132,10 +132,10 @@ def main() -> int:
         networks[f"{path.stem}, untrained"] = GAPRNet(ModelConfig.from_yaml(path)).eval()
     for path in args.weights:
         networks[f"{path.stem}, trained"] = weights.load(path)[0]
-    figures = {name: measure(network, args.motions, name) for name, network in networks.items()}
-    print(table(figures, args.motions))
+    numbers = {name: measure(network, args.motions, name) for name, network in networks.items()}
+    print(table(numbers, args.motions))
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        args.json.write_text(json.dumps(numbers, indent=1) + "\n")
     return 0
 
 

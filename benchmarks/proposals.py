@@ -1,4 +1,4 @@
-"""What the network's hypotheses are worth, beside those of the search, on the same pairs in one run.
+"""What the network's hypotheses are worth against those of the search, on the same pairs in one run.
 
     python benchmarks/proposals.py --pairs DIR [--limit N] [--out proposals.json]
 
@@ -18,17 +18,18 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
-from gapr_core import source as sources
-from gapr_core.console import say
 from gapr_core.data.pair_files import load_pair
 from gapr_core.data.protocols import Pair
 from gapr_core.geometry import se3
-from gapr_core.proposals.base import Proposer
-from gapr_core.proposals.network import NetworkProposer
-from gapr_core.refinement import refine_fully
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
-from gapr_core.verification import verify
+from gapr_core.pages import markdown
+from gapr_core.registration import source as sources
+from gapr_core.registration.proposals.base import Proposer
+from gapr_core.registration.proposals.network import NetworkProposer
+from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import verify
+from gapr_core.runtime.console import say
 
 CONFIG = RegistrarConfig(num_threads=1)
 NEAR_MM, NEAR_DEG = 20.0, 15.0  # from here refinement finds the truth
@@ -104,28 +105,26 @@ def one_list(proposer: Proposer, source: PreparedSource, target: PreparedTarget,
         CONFIG.refinement,
         source.neighbours,
     ).T
-    near = next((i + 1 for i, T in enumerate(poses) if within(T, pair, NEAR_MM, NEAR_DEG)), None)
+    near = next((i + 1 for i, T in enumerate(poses) if error(T, pair).within(NEAR_MM, NEAR_DEG)), None)
     return {
         "near": near,
         "raw_paper": int(paper(poses[0], pair)),
-        "raw": int(within(poses[0], pair, 4.0, 5.0)),
+        "raw": int(error(poses[0], pair).is_right),
         "refined_paper": int(paper(first, pair)),
-        "right": int(within(best, pair, 4.0, 5.0)),
+        "right": int(error(best, pair).is_right),
         "propose_s": proposed - start,
         "total_s": done - start,
     }
 
 
-def within(T: Any, pair: Pair, mm: float, deg: float) -> bool:
-    """Is the pose that near to the truth?"""
-    rte, rre = se3.pose_error(T, pair.T_target_source, pair.source)
-    return bool(rte < mm and rre < deg)
+def error(T: Any, pair: Pair) -> se3.PoseError:
+    """Error of a pose against the truth."""
+    return se3.pose_error(T, pair.T_target_source, pair.source)
 
 
 def paper(T: Any, pair: Pair) -> bool:
     """The paper's limit: RMSE below 0.02 half extents of the target."""
-    half_extent = float(np.linalg.norm(pair.target - pair.target.mean(axis=0), axis=1).max())
-    return metrics.within_paper_limit(metrics.rmse_mm(T, pair.T_target_source, pair.source), half_extent)
+    return metrics.within_paper_limit(metrics.rmse_mm(T, pair.T_target_source, pair.source), pair.target)
 
 
 def table(rows: list[Row]) -> str:
@@ -145,7 +144,7 @@ def table(rows: list[Row]) -> str:
         "search s",
         "median of ratios",
     )
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = [markdown.head(head)]
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
     for protocol in protocols:
         lines.append(line(protocol, [row for row in rows if row["protocol"] == protocol]))
@@ -176,7 +175,7 @@ def line(protocol: str, rows: list[Row]) -> str:
         f"{t['search_propose_s']:.3f} ({t['search_total_s']:.3f})",
         f"{ratios[0]:.1f} ({ratios[1]:.1f})",
     ]
-    return "| " + " | ".join(cells) + " |"
+    return markdown.row(cells)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 The source is drawn from the model itself, as in every list of pairs, or from the bone before it was scanned, as in an
 operation: then what the scan changed is one more misfit, which no protocol has. Wrong sources are of the same bone of
-another person, seen as at L2.
+another subject, seen as at L2.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.console import say
+from gapr_core.benchmark.judge import judge
 from gapr_core.data import scans
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import ANOTHER_PERSON, TARGET_POINTS, make_pair
 from gapr_core.data.specimen import Specimen
-from gapr_core.evaluation.judge import judge
+from gapr_core.pages import markdown
+from gapr_core.runtime.console import say
 
 PROTOCOLS = ("paper", "L1", "L2", "L3", "wrong")
 BONES = ("femur", "tibia", "pelvis", "thoracic")
@@ -57,7 +58,7 @@ def main() -> int:
     people = {bone: specimens(bone, args.split, PEOPLE, args.anatomy) for bone in args.bones.split(",")}
     head = ("model", "source of", *(f"{protocol}: right % (accepted)" for protocol in PROTOCOLS[:-1]),
             "wrong: accepted", "false accepts", "of these at >= 0.9")  # fmt: skip
-    say("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
+    say(markdown.head(head))
     for name in args.models.split(","):
         scans = {bone: [replace(s, surface=MODELS[name](s.surface)) for s in known] for bone, known in people.items()}
         sources = {"the model": scans, "the bone": people} if name in OTHER_SCANNERS else {"the model": scans}
@@ -82,8 +83,8 @@ def measure(registrar: Registrar, scanned: list[Specimen], seen: list[Specimen],
         T_scan_source[:3, 3] += pair.metadata["origin_mm"]
         result = registrar.register(pair.source, target)
         judged = judge(replace(pair, target=cloud, T_target_source=T_scan_source), result)
-        wrong = bool(judged["false_accept"])
-        answers.append([bool(judged["right"]), result.ok, wrong, wrong and result.confidence >= 0.9])
+        wrong = bool(judged.false_accept)
+        answers.append([bool(judged.right), result.ok, wrong, wrong and result.confidence >= 0.9])
     return answers
 
 
@@ -92,7 +93,7 @@ def line(name: str, source_of: str, answers: np.ndarray) -> str:
     right, accepted, *_ = answers.sum(axis=0).T
     cells = [f"{100.0 * r / len(answers):.1f} ({a})" for r, a in zip(right[:-1], accepted[:-1], strict=True)]
     counts = [f"{accepted[-1]} of {len(answers)}", *answers[:, :, 2:].sum(axis=(0, 1))]
-    return "| " + " | ".join(map(str, [name, source_of, *cells, *counts])) + " |"
+    return markdown.row([name, source_of, *cells, *counts])
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python benchmarks/short_scans.py --anatomy DIR [--split val] [--count 12] [--shares 0.4,0.2]
 
 Target and source are of the same end of the bone, cut off and closed; wrong sources are of the same end of another
-person's bone.
+subject's bone.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.console import say
+from gapr_core.benchmark.judge import judge
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import ANOTHER_PERSON, make_pair
 from gapr_core.data.specimen import Specimen
-from gapr_core.evaluation.judge import judge
+from gapr_core.pages import markdown
+from gapr_core.runtime.console import say
 
 PROTOCOLS = ("paper", "L1", "L2", "L3", "sweep", "wrong")
 
@@ -36,7 +37,7 @@ def main() -> int:
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     head = ("share of the bone", "protocol", "pairs", "recall 4 mm/5 deg %", "best pose right %", "refused",
             "false accepts", "of these at >= 0.9")  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = [markdown.head(head)]
     for share in map(float, args.shares.split(",")):
         ends = [[[s.end(share, upper) for s in specimens(bone, args.split, 5, args.anatomy)] for upper in (False, True)]
                 for bone in args.bones.split(",")]  # fmt: skip
@@ -57,15 +58,15 @@ def measure(registrar: Registrar, people: list[Specimen], protocol: str, number:
     pair = make_pair(protocol, people[number // 2 % len(people)], 300 + number, people, turn)
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     judged = judge(pair, result)
-    wrong = bool(judged["false_accept"])
-    return [bool(judged["right"]), bool(judged["best_right"]), not result.ok, wrong, wrong and result.confidence >= 0.9]
+    wrong = bool(judged.false_accept)
+    return [bool(judged.right), bool(judged.best_right), not result.ok, wrong, wrong and result.confidence >= 0.9]
 
 
 def line(share: float, protocol: str, rows: np.ndarray) -> str:
     """One row of the table."""
     right, best, *counts = rows.sum(axis=0)
     shares = ["-", "-"] if protocol == "wrong" else [f"{100.0 * n / len(rows):.1f}" for n in (right, best)]
-    return "| " + " | ".join(map(str, [f"{share:g}", protocol, len(rows), *shares, *counts])) + " |"
+    return markdown.row([f"{share:g}", protocol, len(rows), *shares, *counts])
 
 
 if __name__ == "__main__":

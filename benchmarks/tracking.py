@@ -3,7 +3,7 @@
     python benchmarks/tracking.py --anatomy DIR [--split val] [--count 4] [--bones femur,tibia,pelvis]
 
 Each frame is a small one-sided view. The bone moves a little from frame to frame, or also jumps every eighth frame; or
-it is another person's, so that every pose is wrong; or it rests, and each frame is a slice of it, as an image of a
+it is another subject's, so that every pose is wrong; or it rests, and each frame is a slice of it, as an image of a
 tracked probe is.
 """
 
@@ -17,22 +17,23 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
-from gapr_core.console import say
+from gapr_core.benchmark.judge import judge
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import Pair
 from gapr_core.data.stream import Motion, simulate
-from gapr_core.evaluation.judge import judge
+from gapr_core.pages import markdown
+from gapr_core.runtime.console import say
 
 SLICES = Motion(share=0.04, points=200, step_mm=0.0, step_deg=0.0)
 KINDS = {
     "moves": Motion(),
     "smaller views, moves": Motion(share=0.12, points=800, noise_mm=1.5, bias_mm=1.0),
     "moves and jumps": Motion(jump_every=8),
-    "another person's bone": Motion(),
+    "another subject's bone": Motion(),
     "rests, slices": SLICES,
-    "rests, slices of another person's bone": SLICES,
+    "rests, slices of another subject's bone": SLICES,
 }
-STRANGER, RESTS, BY_ITSELF = "another person's bone", "rests", "every frame by itself"
+ANOTHER_SUBJECT, RESTS, BY_ITSELF = "another subject's bone", "rests", "every frame by itself"
 
 
 @dataclass
@@ -81,7 +82,7 @@ def main() -> int:
         "median s",
         "mean s",
     )
-    say("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    say(markdown.head(head))
     for (kind, name), tally in tallies.items():
         say(line(kind, name, tally))
     return 0
@@ -93,10 +94,10 @@ def chosen(kind: str) -> tuple[str, ...]:
 
 
 def stream(kind: str, people: list, number: int) -> list[Pair]:
-    """The frames of one stream; of a stranger, with the target of somebody else and no truth."""
+    """The frames of one stream; of another subject, whose bone is not the target, so without a truth."""
     own = people[number % len(people)]
     frames = simulate(own, 500 + number, KINDS[kind])
-    if STRANGER not in kind:
+    if ANOTHER_SUBJECT not in kind:
         return frames
     other = simulate(people[(number + 1) % len(people)], 500 + number, replace(KINDS[kind], frames=1))[0]
     return [replace(pair, target=other.target, T_target_source=np.full((4, 4), np.nan)) for pair in frames]
@@ -106,13 +107,13 @@ def count(tally: Tally, pair: Pair, method: Registrar | Tracker | Accumulator, t
     """Register one frame and add what came of it."""
     result = method.register(pair.source, target)
     judged = judge(pair, result)
-    wrong = bool(judged["false_accept"])
+    wrong = bool(judged.false_accept)
     tally.frames += 1
-    tally.right += bool(judged["right"])
+    tally.right += bool(judged.right)
     tally.accepted += result.ok
     tally.false_accepts += wrong
     tally.confident += wrong and result.confidence >= 0.9
-    tally.tracked += result.details.get("proposer") == "track"
+    tally.tracked += result.proposer == "track"
     tally.seconds += (result.seconds,)
 
 
@@ -121,7 +122,7 @@ def line(kind: str, name: str, tally: Tally) -> str:
     right, accepted, tracked = (f"{100.0 * n / tally.frames:.1f}" for n in (tally.right, tally.accepted, tally.tracked))
     times = [f"{seconds:.3f}" for seconds in (np.median(tally.seconds), np.mean(tally.seconds))]
     cells = (kind, name, tally.frames, right, accepted, tally.false_accepts, tally.confident, tracked, *times)
-    return "| " + " | ".join(map(str, cells)) + " |"
+    return markdown.row(cells)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.clouds import Surface
-from gapr_core.console import say
 from gapr_core.data import scans
 from gapr_core.geometry import se3
+from gapr_core.pages import markdown
+from gapr_core.runtime.console import say
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ def main() -> int:
     args = parser.parse_args()
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     head = ("shape", "model", "believed", "of these at >= 0.9", "ambiguous", "degenerate", "otherwise refused")
-    say("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
+    say(markdown.head(head))
     for shape, surface in SHAPES.items():
         for model, scan in MODELS.items():
             target = registrar.prepare(scan(surface))
@@ -97,7 +98,7 @@ def main() -> int:
             sure = sum(answer.ok and answer.confidence >= 0.9 for answer in answers)
             ok, ambiguous, degenerate = (status.count(name) for name in ("OK", "AMBIGUOUS", "DEGENERATE"))
             row = shape, model, f"{ok} of {len(answers)}", sure, ambiguous, degenerate
-            say("| " + " | ".join(map(str, (*row, len(answers) - ok - ambiguous - degenerate))) + " |")
+            say(markdown.row((*row, len(answers) - ok - ambiguous - degenerate)))
     return 0
 
 

@@ -3,13 +3,12 @@
 python examples/overfit_two_bones.py [--steps 200] [--model config/model/best.yaml]
 
 Sixteen views of two parametric bones, seen again and again: this shows that the network can learn, not that it
-generalises; for that there is `gapr train`.
+generalises. For that use `gapr train`.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,8 +66,8 @@ def run(config: ModelConfig, steps: int, batch: int = 4) -> list[tuple[float, fl
     return history
 
 
-def main() -> int:
-    """Print the ratios; exit 1 if the coarse one did not go up by 0.2."""
+def main() -> None:
+    """Print the ratios before and after."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--model", type=Path)
@@ -77,8 +76,7 @@ def main() -> int:
     history = run(replace(config, superpoints=(40, 60)), args.steps)
     (coarse_0, fine_0), (coarse, fine) = history[0], history[-1]
     print(f"coarse inliers {coarse_0:.2f} -> {coarse:.2f}, fine inliers {fine_0:.2f} -> {fine:.2f}")
-    return 0 if coarse > coarse_0 + 0.2 else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

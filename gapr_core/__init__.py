@@ -9,26 +9,27 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gapr_core.accumulation import Accumulator
-    from gapr_core.clouds import Surface, load
+    from gapr_core.clouds import load
     from gapr_core.config import RegistrarConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
-    from gapr_core.registrar import Registrar
+    from gapr_core.registration.accumulation import Accumulator
+    from gapr_core.registration.registrar import Registrar
+    from gapr_core.registration.target import PreparedTarget
+    from gapr_core.registration.tracking import Tracker
     from gapr_core.results import RegistrationResult, RegistrationStatus
-    from gapr_core.target import PreparedTarget
-    from gapr_core.tracking import Tracker
+    from gapr_core.surface import Surface
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
-    "Registrar": "registrar",
-    "Tracker": "tracking",
-    "Accumulator": "accumulation",
+    "Registrar": "registration.registrar",
+    "Tracker": "registration.tracking",
+    "Accumulator": "registration.accumulation",
     "RegistrarConfig": "config",
-    "PreparedTarget": "target",
+    "PreparedTarget": "registration.target",
     "RegistrationResult": "results",
     "RegistrationStatus": "results",
-    "Surface": "clouds",
+    "Surface": "surface",
     "load": "clouds",
     "GaprError": "errors",
     "InvalidPointCloudError": "errors",

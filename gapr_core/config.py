@@ -1,208 +1,241 @@
-"""Every setting of the library, in one place: frozen dataclasses whose defaults are the defaults."""
+"""Every setting of the registration with its default, unit, range and help: `gapr settings` lists them.
+
+From Python: `RegistrarConfig(min_confidence=0.8)`. From a file: `gapr register --config FILE.yaml`. From the command
+line: `--set refinement.iterations=5`. A value out of range raises `ConfigError`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, field
 
-from gapr_core.errors import ConfigError
-
-T = TypeVar("T")
+from gapr_core.runtime.settings import Settings, setting
 
 
 @dataclass(frozen=True)
-class TargetConfig:
-    """How the target is prepared.
+class TargetConfig(Settings):
+    """How the target is prepared."""
 
-    Attributes:
-        most_points, fewest_points: of its outer shell.
-        normal_neighbours, quadric_neighbours: points that give a normal, and a surface element.
-        misfit_neighbours, misfit_gain: a surface element's variance is the mean square distance of so many neighbours
-            to it times the gain.
-        view_directions: from which it is asked what can be seen.
-        anchors: points where the search places the source.
-        field_reach_mm: of the grid around it.
-    """
-
-    most_points: int = 10_000
-    fewest_points: int = 200
-    normal_neighbours: int = 12
-    quadric_neighbours: int = 16
-    misfit_neighbours: int = 10
-    misfit_gain: float = 0.5
-    view_directions: int = 96
-    anchors: int = 1200
-    field_reach_mm: float = 12.0
+    most_points: int = setting(10_000, "points of the outer shell", low=200, high=1_000_000)
+    fewest_points: int = setting(200, "fewer distinct points are refused", low=50)
+    normal_neighbours: int = setting(12, "points that give a normal", low=4, high=200)
+    quadric_neighbours: int = setting(16, "points that give a surface element", low=10, high=200)
+    misfit_neighbours: int = setting(10, "neighbours whose distance to an element is its misfit", low=1, high=200)
+    misfit_gain: float = setting(0.5, "variance of an element over its mean square misfit", low=0.0, high=100.0)
+    view_directions: int = setting(96, "directions from which the target is looked at to find its outside", low=6)
+    anchors: int = setting(1200, "points where the search places the source", low=10)
+    field_reach_mm: float = setting(12.0, "reach of the distance field around the target", low=3, high=100, unit="mm")
 
 
 @dataclass(frozen=True)
-class SourceConfig:
+class SourceConfig(Settings):
     """How a source is cleaned and thinned."""
 
-    fewest_points: int = 30
-    most_points: int = 6000
-    normal_neighbours: int = 30
-    smallest_extent_mm: float = 10.0
-    smallest_width_mm: float = 2.0
+    fewest_points: int = setting(6, "fewer usable points are refused: as many as a pose has unknowns", low=6)
+    most_points: int = setting(6000, "more points are thinned evenly", low=100, high=1_000_000)
+    normal_neighbours: int = setting(30, "points that give a normal", low=4, high=200)
+    smallest_width_mm: float = setting(2.0, "a narrower cloud is refused: a line", low=0, high=1000, unit="mm")
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class SearchConfig(Settings):
     """The weight-free search: reference points x anchors x spins, scored on the distance field."""
 
-    references: int = 14
-    spins: int = 36
-    probes: int = 32
-    first_probes: int = 8
-    first_limit_mm: float = 7.0
-    keep: int = 1500
+    references: int = setting(14, "points of the source that are laid on anchors", low=1, high=1000)
+    spins: int = setting(36, "turns about the normal", low=1, high=360)
+    probes: int = setting(32, "points of the source that score a pose", low=3, high=1000)
+    first_probes: int = setting(8, "probes after which a bad pose is given up", low=1, high=1000)
+    first_limit_mm: float = setting(7.0, "mean distance of these probes that is bad", low=0, high=100, unit="mm")
+    keep: int = setting(1500, "poses that go to verification", low=1, high=100_000)
 
 
 @dataclass(frozen=True)
-class VerificationConfig:
-    """Which proposals are refined further, and when two poses are the same."""
+class VerificationConfig(Settings):
+    """Which proposals are refined further, and when two poses are the same. Limits are (from, to, iterations)."""
 
-    coarse_points: int = 192
-    coarse_limits_mm: tuple[float, float, int] = (10.0, 5.0, 6)  # from, to, iterations
-    middle_points: int = 300
-    middle_poses: int = 200
-    middle_limits_mm: tuple[float, float, int] = (6.0, 4.0, 10)
-    final_poses: int = 8
-    final_limits_mm: tuple[float, float, int] = (5.0, 4.0, 8)
-    same_pose_mm: float = 4.0
-
-
-@dataclass(frozen=True)
-class RefinementConfig:
-    """The last, robust point-to-surface refinement.
-
-    Attributes:
-        rounds, iterations, rest_mm: Gauss-Newton until the points move less than `rest_mm`.
-        tukey_scale: end of Tukey's weight in standard deviations; `clean_tukey_scale` where less than `clean_share` of
-            the residuals are beyond three of them (the normal distribution has 0.3 %).
-        patch_scale: end of Tukey's weight for the mean residual of a point and its neighbours, in robust standard
-            deviations of these means; from round `free_rounds` on.
-        smallest_sigma_mm, largest_sigma_mm: limits of the robust standard deviation.
-    """
-
-    rounds: int = 12
-    iterations: int = 3
-    tukey_scale: float = 3.0
-    clean_tukey_scale: float = 5.0
-    clean_share: float = 0.015
-    rest_mm: float = 1e-3
-    free_rounds: int = 2
-    patch_scale: float = 6.0
-    smallest_sigma_mm: float = 0.15
-    largest_sigma_mm: float = 3.0
+    coarse_points: int = setting(192, "points of the coarse step", low=10)
+    coarse_limits_mm: tuple[float, float, int] = setting((10.0, 5.0, 6), "Tukey scales of it", low=0.1, unit="mm")
+    middle_points: int = setting(300, "points of the middle step", low=10)
+    middle_poses: int = setting(200, "poses that reach it", low=1)
+    middle_limits_mm: tuple[float, float, int] = setting((6.0, 4.0, 10), "Tukey scales of it", low=0.1, unit="mm")
+    final_poses: int = setting(8, "distinct poses that are compared in the end", low=1, high=1000)
+    final_limits_mm: tuple[float, float, int] = setting((5.0, 4.0, 8), "Tukey scales of that", low=0.1, unit="mm")
+    same_pose_mm: float = setting(4.0, "poses nearer to each other (rms over the source) are one", low=0.1, unit="mm")
 
 
 @dataclass(frozen=True)
-class CovarianceConfig:
-    """The smooth bias that the covariance reckons with.
+class RefinementConfig(Settings):
+    """The last, robust point-to-surface refinement: Gauss-Newton until the points rest."""
 
-    Attributes:
-        bias_floor_mm, bias_gain: its standard deviation is the floor and so many times the misfit of the residuals.
-        correlation_mm: l of its correlation exp(-d^2 / 2 l^2).
-        correlation_points: of the inliers, for the sums over all pairs of points.
-        smooth_neighbours: of how many points the averages are taken that show the misfit.
-        short_neighbours: the same for the misfit at short range, which the confidence alone uses. The confidence models
-            that ship were fitted with these two counts.
-    """
-
-    bias_floor_mm: float = 0.03
-    bias_gain: float = 1.75
-    correlation_mm: float = 25.0
-    correlation_points: int = 400
-    smooth_neighbours: int = 30
-    short_neighbours: int = 12
+    rounds: int = setting(12, "most rounds; each has its own scale", low=1, high=1000)
+    iterations: int = setting(3, "Gauss-Newton steps of a round", low=1, high=1000)
+    tukey_scale: float = setting(3.0, "end of Tukey's weight, in standard deviations", low=1, high=100)
+    clean_tukey_scale: float = setting(5.0, "the same where almost nothing lies beyond 3 of them", low=1, high=100)
+    clean_share: float = setting(0.015, "share beyond 3 standard deviations that is almost nothing", low=0, high=1)
+    rest_mm: float = setting(1e-3, "points that move less are at rest", low=1e-9, high=1.0, unit="mm")
+    free_rounds: int = setting(2, "first rounds in which no patch is distrusted", low=0, high=1000)
+    patch_scale: float = setting(6.0, "end of Tukey's weight for a patch's mean residual, in its deviations", low=1)
+    smallest_sigma_mm: float = setting(0.15, "least standard deviation of the residuals", low=1e-9, high=10, unit="mm")
+    largest_sigma_mm: float = setting(3.0, "largest standard deviation of the residuals", low=1e-9, high=50, unit="mm")
 
 
 @dataclass(frozen=True)
-class SmoothBiasConfig:
-    """The smooth bias that an accepted pose is freed from (`gapr_core.smooth_bias`).
+class CovarianceConfig(Settings):
+    """The errors of a source that the covariance allows for; `SensorConfig` says what is usual for a sensor."""
 
-    Attributes:
-        correlation_mm: l of its correlation exp(-d^2 / 2 l^2).
-        centres: points that span it.
-        sizes_mm: standard deviations among which the residuals choose.
-        evidence: log likelihood ratio against no bias from which it is believed; infinity leaves every pose as it is.
-        smallest_share: of the information of the best determined field; fields with less do not say how large it is.
-        iterations: of the pose.
-        fewest_points: inliers without which it is not looked for.
-        largest_move: squared Mahalanobis distance, under the covariance of the pose as it was, from which a move is not
-            made; the default is 99.9 % of chi square with six degrees of freedom.
-    """
+    correlation_mm: float = setting(
+        20.0, "l of the bias's correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm"
+    )
+    centres: int = setting(80, "points that span the bias", low=1, high=10_000)
+    sizes_mm: tuple[float, ...] = setting(
+        (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0),
+        "standard deviations of the bias to choose from", low=1e-3, high=100, unit="mm",
+    )  # fmt: skip
+    smallest_share: float = setting(0.03, "information of a field over the largest, to have a say", low=0, high=1)
+    bias_gain: float = setting(2.5, "bias over what the residuals of a robust fit show of it", low=0, high=100)
+    no_bias_mm: float = setting(0.035, "bias that residuals without any show on average", low=0, high=10, unit="mm")
+    bias_spread: float = setting(1.5, "log standard deviation of the bias before the residuals", low=0.01, high=10)
+    long_share: float = setting(0.5, "of the bias that all points share, over its size", low=0, high=10)
+    noise_points: float = setting(4.0, "points that the usual noise of the sensor is worth", low=0, high=1000)
+    smooth_neighbours: int = setting(30, "points of an average that shows the smooth misfit", low=2, high=1000)
+    short_neighbours: int = setting(12, "the same at short range, for the confidence alone", low=2, high=1000)
 
-    correlation_mm: float = 20.0
-    centres: int = 80
-    sizes_mm: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0)
-    evidence: float = 2.0
-    smallest_share: float = 0.15
-    iterations: int = 3
-    fewest_points: int = 200
-    largest_move: float = 22.5
+
+SENSOR_KINDS = ("unknown", "pointer", "ultrasound", "depth_camera", "laser")
 
 
 @dataclass(frozen=True)
-class RegistrarConfig:
-    """Everything a `Registrar` can be told.
+class SensorConfig(Settings):
+    """What measured the source; where a value is None, what is usual for the kind is taken."""
 
-    Attributes:
-        min_confidence: answers below it are refused.
-        sure: an answer at or above it is final; below it the next proposer is asked as well.
-        num_threads: of search, verification and refinement; 0 for all cores.
-        seed: of whatever is drawn at random.
-    """
+    kind: str = setting("unknown", "what measured the source", choices=SENSOR_KINDS)
+    standoff_mm: float | None = setting(
+        None, "distance of the points outside of the bone, subtracted", low=-10, high=10, unit="mm"
+    )
+    noise_mm: float | None = setting(None, "standard deviation of a point", low=1e-3, high=10, unit="mm")
+    bias_mm: float | None = setting(None, "standard deviation of the smooth bias", low=1e-3, high=10, unit="mm")
+    scale: float | None = setting(None, "standard deviation of the relative error of size", low=0, high=0.2)
+
+
+@dataclass(frozen=True)
+class SmoothBiasConfig(Settings):
+    """The smooth bias that an accepted pose is corrected for (`gapr_core.registration.smooth_bias`)."""
+
+    correlation_mm: float = setting(20.0, "l of its correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm")
+    centres: int = setting(80, "points that span it", low=1, high=10_000)
+    sizes_mm: tuple[float, ...] = setting(
+        (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0),
+        "standard deviations to choose from", low=1e-3, high=100, unit="mm",
+    )  # fmt: skip
+    evidence: float = setting(2.0, "log likelihood ratio from which a bias is believed; infinity: never", low=0)
+    smallest_share: float = setting(0.15, "information of a field over the largest, to have a say", low=0, high=1)
+    iterations: int = setting(3, "steps of the pose", low=1, high=100)
+    fewest_points: int = setting(200, "inliers without which no bias is looked for", low=10)
+    largest_move: float = setting(22.5, "largest squared Mahalanobis distance of a move (chi square: 99.9 %)", low=0)
+
+
+@dataclass(frozen=True)
+class RulesConfig(Settings):
+    """When a pose may as well be another one, and is refused whatever its probability."""
+
+    largest_turn_deg: float = setting(6.0, "standard deviation of a rotation that is not observed", low=0, unit="deg")
+    largest_shift_mm: float = setting(5.0, "standard deviation of a shift that is not observed", low=0, unit="mm")
+    equal_share: float = setting(0.015, "a rival whose mean square is larger by less is as good", low=0, high=1)
+    equal_mm: float = setting(0.25, "the same as a length, whose square is added", low=0, high=10, unit="mm")
+
+
+@dataclass(frozen=True)
+class CorticesConfig(Settings):
+    """Sources that follow the inner and the outer cortex of a hollow bone."""
+
+    share: float = setting(0.82, "of its residuals that both cortices leave to such a source", low=0, high=1)
+    largest_confidence: float = setting(0.85, "the confidence was not fitted on such sources", low=0, high=1)
+
+
+@dataclass(frozen=True)
+class AccumulationConfig(Settings):
+    """Which sources an `Accumulator` keeps."""
+
+    off: float = setting(2.5, "a source so many times farther from the bone than all together lies off it", low=1)
+    most_off: int = setting(3, "after so many of them in a row the bone has moved", low=1, high=1000)
+    fewest_points: int = setting(20, "of a source that can be said to lie off", low=3)
+    most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
+
+
+@dataclass(frozen=True)
+class EvidenceConfig(Settings):
+    """How the frames of a stream are combined (`gapr_core.registration.evidence`)."""
+
+    correlation: float = setting(0.5, "of two frames: 0 independent, 1 the same again", low=0, high=1)
+    memory: float = setting(10.0, "frames after which a frame's weight has fallen to 1/e", low=0.1)
+    agree_mm: float = setting(15.0, "largest motion between frames (rms) that continues a track", low=0, unit="mm")
+
+
+@dataclass(frozen=True)
+class GuidanceConfig(Settings):
+    """What a further look at the bone is assumed to give."""
+
+    patch_mm: float = setting(30.0, "diameter of what a look shows", low=1, high=1000, unit="mm")
+    patches: int = setting(250, "places that are compared", low=1, high=100_000)
+    points: int = setting(60, "points of a look", low=1, high=100_000)
+    noise_mm: float = setting(0.5, "least white noise of a point", low=1e-3, high=100, unit="mm")
+    bias_mm: float = setting(0.7, "least bias that the points of a look share", low=0, high=100, unit="mm")
+    seen_mm: float = setting(6.0, "a target point with a source point this near counts as seen", low=0, unit="mm")
+
+
+@dataclass(frozen=True)
+class ClutterConfig(Settings):
+    """Clouds of a camera that saw more than bone: regions propose, lines of sight decide. Limits as above."""
+
+    radii_mm: tuple[float, ...] = setting((30.0, 45.0), "radii of the regions that propose", low=5, unit="mm")
+    seeds: tuple[int, ...] = setting((24, 12), "regions of each radius in a round", low=1, high=1000)
+    rounds: int = setting(2, "rounds of other regions, until an answer is sure", low=1, high=100)
+    references: int = setting(4, "points of a region that are laid on anchors", low=1, high=1000)
+    probes: int = setting(32, "points of a region that score a pose", low=3, high=1000)
+    first_limit_mm: float = setting(5.0, "mean distance of the first probes that is bad", low=0, high=100, unit="mm")
+    keep: int = setting(300, "poses that a region proposes", low=1, high=100_000)
+    region_points: int = setting(64, "points of a region that refine its poses", low=10)
+    region_limits_mm: tuple[float, float, int] = setting((8.0, 4.0, 4), "Tukey scales of it", low=0.1, unit="mm")
+    coarse_points: int = setting(500, "target points of the coarse step", low=10)
+    coarse_on_mm: float = setting(5.0, "in it: off the measured surface, yet explained", low=0.01, unit="mm")
+    coarse_front_mm: float = setting(6.0, "in it: in front of what was measured, so impossible", low=0.01, unit="mm")
+    middle_poses: int = setting(1000, "poses that reach the middle step", low=1)
+    middle_reach_mm: float = setting(60.0, "around its region a pose is refined", low=5, unit="mm")
+    middle_points: int = setting(300, "points of the middle step", low=10)
+    middle_limits_mm: tuple[float, float, int] = setting((8.0, 2.5, 8), "Tukey scales of it", low=0.1, unit="mm")
+    middle_target_points: int = setting(1500, "target points of it", low=10)
+    middle_on_mm: float = setting(2.5, "as coarse_on_mm", low=0.01, unit="mm")
+    final_poses: int = setting(200, "poses that reach the final step", low=1)
+    final_points: int = setting(1200, "points of the final step", low=10)
+    final_limits_mm: tuple[float, float, int] = setting((5.0, 2.0, 8), "Tukey scales of it", low=0.1, unit="mm")
+    final_target_points: int = setting(4000, "target points of it", low=10)
+    on_mm: float = setting(0.6, "as coarse_on_mm", low=0.01, unit="mm")
+    front_mm: float = setting(3.0, "as coarse_front_mm, in the middle and the final step", low=0.01, unit="mm")
+    same_pose_mm: float = setting(4.0, "closer poses are the same", low=0, unit="mm")
+    kept_poses: int = setting(8, "poses that are kept", low=2)
+    part_mm: float = setting(2.5, "a point this near to the bone may be explained by it", low=0.1, unit="mm")
+
+
+@dataclass(frozen=True)
+class RegistrarConfig(Settings):
+    """Every setting of a `Registrar`."""
 
     target: TargetConfig = field(default_factory=TargetConfig)
     source: SourceConfig = field(default_factory=SourceConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    clutter: ClutterConfig = field(default_factory=ClutterConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
     smooth_bias: SmoothBiasConfig = field(default_factory=SmoothBiasConfig)
-    min_confidence: float = 0.5
-    sure: float = 0.95
-    num_threads: int = 0
-    seed: int = 0
-
-
-def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
-    """A dataclass from nested mappings; what is absent keeps its default.
-
-    Raises:
-        ConfigError: for a name that the dataclass does not have or a value of another kind.
-    """
-    known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
-    for name in values:
-        if name not in known:
-            raise ConfigError(f"one of {', '.join(known)}", repr(name), f"correct the name in {cls.__name__}")
-    defaults = cls()
-    return cls(**{name: _convert(getattr(defaults, name), value, name) for name, value in values.items()})
-
-
-def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The settings of a nested dataclass as one mapping with dotted names (for ROS parameters)."""
-    flat: dict[str, Any] = {}
-    for name, value in vars(config).items():
-        flat |= flatten(value, f"{prefix}{name}.") if is_dataclass(value) else {f"{prefix}{name}": value}
-    return flat
-
-
-def as_dict(config: Any) -> dict[str, Any]:
-    """A nested dataclass as nested dictionaries; `from_dict` reads it back."""
-    return asdict(config)
-
-
-def _convert(default: Any, value: Any, name: str) -> Any:
-    if is_dataclass(default):
-        return from_dict(type(default), value)
-    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(default, tuple) and isinstance(value, list):
-        value = tuple(value)
-    if default is not None and type(value) is not type(default):
-        raise ConfigError(f"{name} of type {type(default).__name__}", repr(value), "correct the value")
-    return value
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    rules: RulesConfig = field(default_factory=RulesConfig)
+    cortices: CorticesConfig = field(default_factory=CorticesConfig)
+    accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
+    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    guide: bool = setting(False, "say in every answer where to look next")
+    min_confidence: float = setting(0.5, "answers below are refused", low=0, high=1)
+    max_tre_mm: float = setting(0.0, "answers whose tre95_mm exceeds it are refused; 0: off", low=0, unit="mm")
+    sure: float = setting(0.95, "an answer at or above it is final; above 1 every proposer is asked", low=0, high=2)
+    num_threads: int = setting(0, "of search, verification and refinement; 0: all cores", low=0, high=1024)
+    seed: int = setting(0, "of whatever is drawn at random", low=0, high=2**31 - 1)

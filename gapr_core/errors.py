@@ -2,14 +2,14 @@
 
 
 class GaprError(ValueError):
-    """Base of every error that the caller can mend; one sentence each: expected, given, how to mend."""
+    """Base of every error that the caller can fix; one sentence each: expected, given, how to fix it."""
 
-    def __init__(self, expected: str, given: str, mend: str) -> None:
-        super().__init__(f"expected {expected}; got {given}; {mend}")
-        self.expected, self.given, self.mend = expected, given, mend
+    def __init__(self, expected: str, given: str, how_to_fix: str) -> None:
+        super().__init__(f"expected {expected}; got {given}; {how_to_fix}")
+        self.expected, self.given, self.how_to_fix = expected, given, how_to_fix
 
     def __reduce__(self) -> tuple:
-        return type(self), (self.expected, self.given, self.mend)
+        return type(self), (self.expected, self.given, self.how_to_fix)
 
 
 class InvalidPointCloudError(GaprError):
@@ -25,4 +25,4 @@ class WeightsError(GaprError):
 
 
 class MethodUnavailableError(GaprError):
-    """A method whose optional library is not installed; `mend` is the install line."""
+    """A method whose optional library is not installed; `how_to_fix` is the install line."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,9 +22,97 @@ class RegistrationStatus(str, Enum):
     DEGENERATE = "DEGENERATE"  # a direction of motion is not observed (spin about a shaft, slide along it)
     LOW_CONFIDENCE = "LOW_CONFIDENCE"  # the best pose found is probably not right
     TOO_FEW_POINTS = "TOO_FEW_POINTS"  # fewer usable source points than a pose needs
+    IMPRECISE = "IMPRECISE"  # probably right, but the error bound over the bone exceeds `max_tre_mm`
+    CLUTTER = "CLUTTER"  # most of the source is not the bone, and what is does not determine a pose
 
     def __str__(self) -> str:
         return self.value
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why there is no pose.
+
+    Attributes:
+        status: every one but `OK`.
+        reason: one sentence for users.
+    """
+
+    status: RegistrationStatus
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One distinct pose that was refined and compared.
+
+    Attributes:
+        T_target_source: (4, 4) rigid transform, source to target frame, mm.
+        probability: 0 to 1 that this pose is the right one. That of the best is calibrated; a rival's follows from how
+            much worse it explains the source, and is never larger than the best one's.
+    """
+
+    T_target_source: Array
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """How every used source point lies on the target under the best hypothesis.
+
+    Attributes:
+        points: (N, 3) the source points that were used, source frame, mm.
+        distance_mm: (N,) signed distance to the surface, positive outside; NaN where no surface is near.
+        inlier: (N,) bool, the points that count for the pose.
+    """
+
+    points: Array
+    distance_mm: Array
+    inlier: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A patch of the bone where another look would help.
+
+    Attributes:
+        centre: (3,) mm, target frame.
+        normal: (3,) unit, outward, target frame.
+        tre95_mm: 95 % bound of the error over the bone to expect after the look, if the best hypothesis is right.
+        rivals_excluded: share, 0 to 1, of the rivals' probability that the look would take.
+        gain_mm: by how much the look lowers the bound, rivals included.
+    """
+
+    centre: Array
+    normal: Array
+    tre95_mm: float
+    rivals_excluded: float
+    gain_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Guidance:
+    """Where to look next.
+
+    Attributes:
+        points: (M, 3) mm, the target's points, target frame.
+        gain_mm: (M,) what a look there would gain; 0 where the source has been.
+        now_mm: the bound of the error over the bone today, rivals included.
+        patches: ranked, the best first.
+    """
+
+    points: Array
+    gain_mm: Array
+    now_mm: float
+    patches: tuple[Patch, ...]
+
+    def __str__(self) -> str:
+        best = self.patches[0]
+        where = "({:.0f}, {:.0f}, {:.0f})".format(*best.centre)
+        return (
+            f"look at {where} mm on the target: the error bound over the bone falls from {self.now_mm:.1f} "
+            f"to {self.now_mm - best.gain_mm:.1f} mm, {100 * best.rivals_excluded:.0f} % of the rivals are excluded"
+        )
 
 
 @dataclass(frozen=True)
@@ -37,16 +125,21 @@ class RegistrationResult:
         covariance: (6, 6) float64 of the pose error as x y z (mm) rx ry rz (rad), fixed axes of the target frame,
             rotation about `centre_mm`; None unless `OK`.
         confidence: calibrated probability, 0 to 1, that the pose is within 4 mm and 5 deg of the truth.
-        tre_mm: predicted target registration error, root-mean-square over the target's points; None unless `OK`.
-        inlier_ratio: share of the source points that the pose explains, 0 to 1.
-        alternatives: the next best distinct poses, (4, 4) each, best first; with refusals too, to look at, not to use.
+        tre_mm: expected target registration error, root mean square over the target's points; None unless `OK`.
+        tre95_mm: its 95 % bound; None unless `OK`.
+        inlier_ratio: share of the source points that the best hypothesis explains, 0 to 1.
+        hypotheses: distinct refined poses, best first; on refusals too, to look at, not to use.
+        guidance: where on the target another look would help most; None unless `RegistrarConfig.guide` asks for it.
         stage_ms: wall time of each stage, ms.
         method: name of the method that answered.
-        reason: one sentence for people: why it was refused; empty when there is nothing to say.
-        details: figures behind the confidence (`gapr_core.confidence.FEATURES`), `best_pose`, `proposer`, for logs and
-            research.
+        reason: one sentence for users: why it was refused; empty when there is nothing to say.
         centre_mm: (3,) mean of the source points that were used, in the target frame; None unless `OK`, and where a
             method does not say.
+        proposer: name of the last proposer that was asked; empty where nothing was registered.
+        rounds: how many proposers were asked.
+        features: what the confidence is computed from, by name.
+        contributions: log odds that each feature adds to the confidence, by name: above 0 it speaks for the pose.
+        residuals: of every used point under the best hypothesis; None where a method does not say.
     """
 
     status: RegistrationStatus
@@ -54,13 +147,19 @@ class RegistrationResult:
     covariance: Array | None = None
     confidence: float = 0.0
     tre_mm: float | None = None
+    tre95_mm: float | None = None
     inlier_ratio: float = 0.0
-    alternatives: tuple[Array, ...] = ()
-    stage_ms: dict[str, float] = field(default_factory=dict)
+    hypotheses: tuple[Hypothesis, ...] = ()
+    guidance: Guidance | None = None
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
     method: str = "gapr"
     reason: str = ""
-    details: dict[str, Any] = field(default_factory=dict)
     centre_mm: Array | None = None
+    proposer: str = ""
+    rounds: int = 0
+    features: Mapping[str, float] = field(default_factory=dict)
+    contributions: Mapping[str, float] = field(default_factory=dict)
+    residuals: Residuals | None = None
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):
@@ -70,6 +169,16 @@ class RegistrationResult:
     def ok(self) -> bool:
         """True when there is a pose."""
         return self.status is RegistrationStatus.OK
+
+    @property
+    def best(self) -> Array | None:
+        """(4, 4) T_target_source of the best hypothesis, accepted or not; None where there is none."""
+        return self.hypotheses[0].T_target_source if self.hypotheses else self.T_target_source
+
+    @property
+    def alternatives(self) -> tuple[Array, ...]:
+        """All hypotheses but the best, (4, 4) each; kept for one version, read `hypotheses` instead."""
+        return tuple(hypothesis.T_target_source for hypothesis in self.hypotheses[1:])
 
     @property
     def seconds(self) -> float:
@@ -90,5 +199,7 @@ class RegistrationResult:
         head = f"{self.status}  confidence {self.confidence:.2f}"
         if self.ok and self.tre_mm is not None:
             head += f"  TRE {self.tre_mm:.1f} mm"
+        if self.ok and self.tre95_mm is not None:
+            head += f" (95 %: {self.tre95_mm:.1f} mm)"
         head += f"  inliers {self.inlier_ratio:.2f}  {sum(self.stage_ms.values()):.0f} ms"
         return f"{head}  ({self.reason})" if self.reason else head

@@ -1,15 +1,20 @@
 """Parameters of register_node: one frozen dataclass is the one source for defaults, ranges, help and the YAML file.
 
-`python -m gapr_ros.parameters > config/register_node.yaml` writes the file anew.
+`python -m gapr_ros.parameters > config/register_node.yaml` writes the file.
 """
 
 from __future__ import annotations
 
 import difflib
 import sys
+from array import array
 from collections.abc import Iterable, Mapping
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import Field, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
+
+from gapr_core.config import SENSOR_KINDS
+from gapr_core.runtime.settings import Settings, range_text, setting, why_not
+from msg_adapters import INPUTS
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor
@@ -17,15 +22,10 @@ if TYPE_CHECKING:
     from rclpy.parameter import Parameter
 
 NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")  # declared by rclpy itself
-LARGE = 1e9
-ROS_TYPES = {float: "double", int: "integer", str: "string", bool: "bool"}
-
-
-def setting(default: Any, text: str, *, low: float | None = None, high: float = LARGE, choices: Iterable[str] = (),
-            live: bool = True) -> Any:  # fmt: skip
-    """A parameter: default, help, range or choices, and whether it may change while the node is configured."""
-    return field(default=default, metadata={"text": text, "low": low, "high": high, "choices": tuple(choices),
-                                            "live": live})  # fmt: skip
+LARGE = 1e9  # end of a range that has none: rclpy wants one
+ROS_TYPES = {float: "double", int: "integer", str: "string", bool: "bool", tuple: "double_array"}
+TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
+Triple = tuple[float, float, float]
 
 
 class ParameterError(ValueError):
@@ -33,8 +33,11 @@ class ParameterError(ValueError):
 
 
 @dataclass(frozen=True)
-class NodeParameters:
-    """Everything register_node can be told. Lengths in metres, times in seconds, angles in radians."""
+class NodeParameters(Settings):
+    """All parameters of register_node. Lengths in metres, times in seconds, angles in radians.
+
+    `live=False`: read when configuring.
+    """
 
     model_path: str = setting("", "file of the pre-operative bone: PLY PCD STL OBJ VTK VTP NPY NPZ")
     model_unit: str = setting("auto", "unit of that file; auto guesses from the extent and warns",
@@ -44,34 +47,57 @@ class NodeParameters:
                               choices=("as_is", "lps_to_ras"))  # fmt: skip
     model_frame: str = setting("bone_preop", "frame of the pre-operative bone, child of every pose", live=False)
     output_frame: str = setting("", "frame of the poses; empty: the frame of the cloud", live=False)
-    tf_timeout: float = setting(0.1, "longest wait for a transform into output_frame, s", low=0.0, high=60.0)
+    tf_timeout: float = setting(0.1, "longest wait for a transform into output_frame", unit="s", low=0.0, high=60.0)
+    cloud_type: str = setting("PointCloud2", "message type of the clouds", choices=tuple(INPUTS), live=False)
     cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "mm"))
     cloud_reliability: str = setting("auto", "auto: reliable, and best effort once a publisher offers only that",
                                      choices=("auto", "reliable", "best_effort"), live=False)  # fmt: skip
     min_points: int = setting(200, "fewer usable points, of all clouds that are registered as one, are refused", low=3)
     max_points: int = setting(200_000, "larger clouds are thinned to this, seeded; 0: never", low=0)
-    range_min: float = setting(0.0, "nearer points are left out, m; 0: off", low=0.0)
-    range_max: float = setting(0.0, "farther points are left out, m; 0: off", low=0.0)
-    max_cloud_age: float = setting(0.0, "older clouds are refused, s; 0: off", low=0.0)
+    range_min: float = setting(0.0, "nearer points are left out; 0: off", unit="m", low=0.0)
+    range_max: float = setting(0.0, "farther points are left out; 0: off", unit="m", low=0.0)
+    max_cloud_age: float = setting(0.0, "older clouds are refused; 0: off", unit="s", low=0.0)
+    max_future: float = setting(0.5, "clouds stamped farther ahead of the clock are refused; 0: off", unit="s", low=0.0)
+    crop_frame: str = setting("", "frame of the box that clouds are cropped to; empty: that of the cloud", live=False)
+    crop_min: Triple = setting((0.0, 0.0, 0.0), "its lowest corner; the same as crop_max: no box", unit="m")
+    crop_max: Triple = setting((0.0, 0.0, 0.0), "its highest corner", unit="m")
+    crop_to_track: float = setting(0.0, "after a good pose, points farther from the bone there are left out; 0: off",
+                                   unit="m", low=0.0)  # fmt: skip
+    viewpoint: str = setting("none", "where the camera is: none (not known), origin (of the cloud's frame), or a frame",
+                             live=False)  # fmt: skip
+    sensor: str = setting("unknown", "what measures the clouds; says what errors to expect",
+                          choices=SENSOR_KINDS, live=False)  # fmt: skip
+    standoff: float = setting(0.0, "how far outside of the bone the points lie; 0: what is usual for the sensor",
+                              unit="m", low=-0.01, high=0.01, live=False)  # fmt: skip
     min_confidence: float = setting(0.5, "poses below are refused", low=0.0, high=1.0)
+    max_tre: float = setting(0.0, "poses whose 95 % bound of the error over the bone is larger are refused; 0: off",
+                             unit="m", low=0.0)  # fmt: skip
     require_consecutive: int = setting(1, "a pose goes out after this many good ones in a row", low=1, high=1000)
-    max_jump_translation: float = setting(0.0, "farther from the last pose is refused, m; 0: off", low=0.0)
-    max_jump_rotation: float = setting(0.0, "farther from the last pose is refused, rad; 0: off", low=0.0, high=3.15)
+    max_jump_translation: float = setting(0.0, "farther from the last pose is refused; 0: off", unit="m", low=0.0)
+    max_jump_rotation: float = setting(
+        0.0, "farther from the last pose is refused; 0: off", unit="rad", low=0.0, high=3.15
+    )
     continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register")
     track: bool = setting(True, "start where the last pose was; false: every cloud by itself", live=False)
-    accumulate: int = setting(1, "clouds registered as one; the bone must rest in output_frame", low=1, high=10_000,
-                              live=False)  # fmt: skip
+    accumulate: int = setting(0, "clouds registered as one; the bone must rest in output_frame; 0: as the sensor needs",
+                              low=0, high=10_000, live=False)  # fmt: skip
     max_rate: float = setting(0.0, "most registrations a second; 0: as many as possible", low=0.0, high=1000.0)
-    timeout: float = setting(5.0, "a registration that took longer is refused, s", low=1e-3)
+    timeout: float = setting(5.0, "a registration that took longer is refused", unit="s", low=1e-3)
     publish_tf: bool = setting(True, "send accepted poses to /tf", live=False)
+    publish_hypotheses: bool = setting(False, "send poses that are not believed to ~/hypotheses, to look at")
+    guide: bool = setting(False, "work out where to look next, for ~/guidance and ~/next_view; takes time", live=False)
+    settings_file: str = setting("", "YAML file of the library's settings, as `gapr --config` takes; these here win",
+                                 live=False)  # fmt: skip
     device: str = setting("auto", "where a network runs", choices=("auto", "cpu", "cuda"), live=False)
     num_threads: int = setting(0, "threads of a registration; 0: all cores", low=0, high=1024, live=False)
     seed: int = setting(0, "of every random choice", low=0, high=2**31 - 1, live=False)
     autostart: bool = setting(True, "configure and activate without a lifecycle manager; read when the node starts",
                               live=False)  # fmt: skip
-    diagnostics_period: float = setting(1.0, "time between two diagnostics, s", low=0.01, high=3600.0)
-    covariance_floor_translation: float = setting(1e-4, "smallest standard deviation of a translation, m", low=1e-9)
-    covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation, rad", low=1e-9)
+    diagnostics_period: float = setting(1.0, "time between two diagnostics", unit="s", low=0.01, high=3600.0)
+    covariance_floor_translation: float = setting(
+        1e-4, "smallest standard deviation of a translation", unit="m", low=1e-9
+    )
+    covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation", unit="rad", low=1e-9)
 
 
 FIELDS: Mapping[str, Field] = {f.name: f for f in fields(NodeParameters)}
@@ -86,13 +112,37 @@ def declare(node: Node) -> NodeParameters:
     given = node._parameter_overrides  # rclpy has no public accessor for what came from files and the command line
     for name, setting_field in FIELDS.items():
         _check_override(setting_field, given.get(name))
-        node.declare_parameter(name, setting_field.default, descriptor(setting_field))
+        default = setting_field.default
+        node.declare_parameter(name, list(default) if type(default) is tuple else default, descriptor(setting_field))
     return read(node)
 
 
 def read(node: Node) -> NodeParameters:
-    """What the node's parameters say now."""
-    return NodeParameters(**{name: node.get_parameter(name).value for name in FIELDS})
+    """What the node's parameters say now, `accumulate` as the sensor needs it where it was left open."""
+    given = NodeParameters(**{name: plain(node.get_parameter(name).value) for name in FIELDS})
+    return given if given.accumulate else replace(given, accumulate=_together(given))
+
+
+def plain(value: Any) -> Any:
+    """A parameter's value as the dataclass holds it: arrays as tuples."""
+    return tuple(value) if isinstance(value, list | array) else value
+
+
+def remarks(parameters: NodeParameters) -> list[str]:
+    """One sentence for each thing that was decided for the user, or that they may not expect."""
+    sensor, sentences = parameters.sensor, []
+    if sensor in TOGETHER and parameters.accumulate > 1:
+        sentences.append(f"sensor {sensor}: the last {parameters.accumulate} clouds are registered as one")
+    elif sensor in TOGETHER and not parameters.output_frame:
+        why = "output_frame is empty: name the frame of the reference that is fixed to the bone"
+        sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
+    if parameters.viewpoint != "none" and parameters.accumulate > 1:
+        sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
+    return sentences
+
+
+def _together(parameters: NodeParameters) -> int:
+    return TOGETHER.get(parameters.sensor, 1) if parameters.output_frame else 1
 
 
 def unknown_names(node: Node) -> list[str]:
@@ -112,7 +162,7 @@ def check_change(parameters: Iterable[Parameter], configured: bool) -> str:
         setting_field = FIELDS.get(parameter.name)
         if setting_field is None:
             continue
-        if configured and not setting_field.metadata["live"]:
+        if configured and not setting_field.metadata.get("live", True):
             return f"{parameter.name} is read when configuring: deactivate, clean up, set it, then configure again"
         why = problem(setting_field, parameter.value)
         if why:
@@ -122,28 +172,33 @@ def check_change(parameters: Iterable[Parameter], configured: bool) -> str:
 
 def problem(setting_field: Field, value: Any) -> str:
     """What is wrong with a value, and what to write instead; empty when nothing is."""
-    name, default, metadata = setting_field.name, setting_field.default, setting_field.metadata
+    name, default = setting_field.name, setting_field.default
+    value = plain(value)
+    if type(default) is tuple and not _is_triple(value):
+        return f"parameter '{name}' must be three doubles, got {value!r}: write [0.0, 0.0, 0.1]"
     if type(value) is not type(default):
         kind = ROS_TYPES[type(default)]
         return f"parameter '{name}' must be of type {kind}, got {value!r}: write {_example(default, value)}"
-    if metadata["choices"] and value not in metadata["choices"]:
-        return f"parameter '{name}' must be one of {', '.join(metadata['choices'])}, got '{value}'"
-    if metadata["low"] is not None and not metadata["low"] <= value <= metadata["high"]:
-        return f"parameter '{name}' must be within {metadata['low']:g} to {metadata['high']:g}, got {value!r}"
-    return ""
+    why = why_not(setting_field, value)
+    limits = range_text(setting_field)
+    wanted = f"within {limits}" if " to " in limits else limits or why
+    return f"parameter '{name}' must be {wanted}, got {value!r}" if why else ""
 
 
 def descriptor(setting_field: Field) -> ParameterDescriptor:
     """Help and range for `ros2 param describe`."""
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-    metadata, choices = setting_field.metadata, setting_field.metadata["choices"]
+    metadata, choices, default = setting_field.metadata, setting_field.metadata["choices"], setting_field.default
     message = ParameterDescriptor(description=metadata["text"])
-    message.additional_constraints = f"one of: {', '.join(choices)}" if choices else ""
-    if metadata["low"] is not None and isinstance(setting_field.default, float):
-        message.floating_point_range = [FloatingPointRange(from_value=metadata["low"], to_value=metadata["high"])]
-    elif metadata["low"] is not None:
-        message.integer_range = [IntegerRange(from_value=int(metadata["low"]), to_value=int(metadata["high"]))]
+    message.additional_constraints = f"one of: {', '.join(choices)}" if choices else range_text(setting_field)
+    if metadata["low"] is None or isinstance(default, tuple):
+        return message
+    low, high = metadata["low"], LARGE if metadata["high"] is None else metadata["high"]
+    if isinstance(default, float):
+        message.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    else:
+        message.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return message
 
 
@@ -163,6 +218,10 @@ def _check_override(setting_field: Field, given: Parameter | None) -> None:
         raise ParameterError(why)
 
 
+def _is_triple(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) == 3 and all(type(number) is float for number in value)
+
+
 def _example(default: Any, value: Any) -> str:
     if isinstance(default, float) and type(value) is int:
         return f"{value}.0"
@@ -174,6 +233,8 @@ def _example(default: Any, value: Any) -> str:
 def _yaml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_number, value))}]"
     return f'"{value}"' if isinstance(value, str) else _number(value)
 
 
@@ -185,10 +246,8 @@ def _number(value: float) -> str:
 
 def _help(setting_field: Field) -> str:
     metadata = setting_field.metadata
-    if metadata["choices"]:
-        return f"{metadata['text']} [{' | '.join(choice for choice in metadata['choices'])}]"
-    bounded = metadata["low"] is not None and metadata["high"] < LARGE
-    return metadata["text"] + (f" [{metadata['low']:g} .. {metadata['high']:g}]" if bounded else "")
+    limits = " | ".join(metadata["choices"]) or range_text(setting_field)
+    return f"{metadata['text']} [{limits}]" if limits else metadata["text"]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Starts register_node and, on request, RViz.
+"""Starts register_node and, on request, RViz. Every parameter of the node is an argument.
 
 ros2 launch gapr_ros register.launch.py model_path:=/path/to/bone.stl points:=/camera/points rviz:=true
 """
@@ -14,28 +14,38 @@ from launch.substitutions import PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from gapr_ros.parameters import FIELDS
+
 ARGUMENTS = {
-    "model_path": ("", "file of the pre-operative bone"),
-    "model_unit": ("", "mm, m, or auto: guess and warn"),
     "points": ("points", "topic of the clouds"),
     "initialpose": ("initialpose", "topic of optional seeds"),
-    "output_frame": ("", "frame of the poses; empty: that of the clouds"),
+    "namespace": ("", "of the node, its topics and its services"),
     "use_sim_time": ("", "true: node and RViz take time from /clock; RViz does not read params_file"),
     "params_file": ("", "parameter file; what is given here as an argument, and not empty, wins"),
     "rviz": ("false", "show clouds and bone"),
 }
-TEXTS = ("model_path", "model_unit", "output_frame")
 
 
 def given(context: LaunchContext) -> dict[str, Any]:
     """The parameters that the arguments name; the empty ones leave what the file says."""
-    values = {name: context.launch_configurations[name] for name in (*TEXTS, "use_sim_time")}
-    chosen: dict[str, Any] = {name: text for name, text in values.items() if text}
-    if "use_sim_time" in chosen:
-        chosen["use_sim_time"] = yaml.safe_load(chosen["use_sim_time"])
-        if not isinstance(chosen["use_sim_time"], bool):
-            raise ValueError(f"use_sim_time must be true or false, got {values['use_sim_time']!r}")
-    return chosen
+    texts = {name: context.launch_configurations[name] for name in (*FIELDS, "use_sim_time")}
+    return {name: _value(name, text) for name, text in texts.items() if text}
+
+
+def _value(name: str, text: str) -> Any:
+    """An argument as the parameter's type wants it: 1 is no double, 007 is a text where a text is wanted."""
+    if name == "use_sim_time":
+        value = yaml.safe_load(text)
+        if not isinstance(value, bool):
+            raise ValueError(f"use_sim_time must be true or false, got {text!r}")
+        return value
+    default = FIELDS[name].default
+    if isinstance(default, str):
+        return text
+    value = yaml.safe_load(text)
+    if isinstance(default, tuple):
+        return [float(number) for number in value]
+    return float(value) if isinstance(default, float) else value
 
 
 def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
@@ -46,6 +56,7 @@ def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
         package="gapr_ros",
         executable="register_node",
         name="register_node",
+        namespace=chosen["namespace"],
         output="screen",
         emulate_tty=True,
         parameters=[chosen["params_file"], parameters],
@@ -67,5 +78,9 @@ def generate_launch_description() -> LaunchDescription:
     declared = [
         DeclareLaunchArgument(name, default_value=defaults if name == "params_file" else value, description=text)
         for name, (value, text) in ARGUMENTS.items()
+    ]
+    declared += [
+        DeclareLaunchArgument(name, default_value="", description=f"{setting.metadata['text']}; empty: as in the file")
+        for name, setting in FIELDS.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=nodes, args=[share])])

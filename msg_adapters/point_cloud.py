@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from msg_adapters.errors import InvalidMessageError
+from msg_adapters.inputs import Input
 
 DTYPES: dict[int, str] = {
     PointField.INT8: "i1",
@@ -23,6 +25,7 @@ DTYPES: dict[int, str] = {
     PointField.FLOAT32: "f4",
     PointField.FLOAT64: "f8",
 }
+LARGEST_STEP = 2**31 - 1  # bytes of a point; NumPy counts them in a C int
 CODES = {code: kind for kind, code in DTYPES.items()}
 
 
@@ -58,6 +61,18 @@ def cloud_to_xyz(
     return xyz if keep.all() else xyz[keep]
 
 
+def cloud_to_field(cloud: PointCloud2, name: str) -> NDArray[Any]:
+    """(N,) one more field of every point, row by row, in its own dtype: `distance`, `intensity`.
+
+    Raises:
+        InvalidMessageError: for a layout that contradicts itself, or without exactly one such field.
+    """
+    dtype = _dtype_of(cloud, [_single_field(cloud, name)])
+    if not cloud.width * cloud.height:
+        return np.empty(0, dtype[name])
+    return _view(cloud, dtype)[name].flatten()
+
+
 def xyz_to_cloud(
     points: ArrayLike, header: Header | None = None, *, fields: Mapping[str, ArrayLike] | None = None
 ) -> PointCloud2:
@@ -88,28 +103,38 @@ def xyz_to_cloud(
 
 
 def _coordinate_dtype(cloud: PointCloud2) -> np.dtype[Any]:
-    fields = {name: _coordinate_field(cloud, name) for name in "xyz"}
+    fields = [_single_field(cloud, name) for name in "xyz"]
+    for field in fields:
+        if field.datatype not in (PointField.FLOAT32, PointField.FLOAT64):
+            kind = DTYPES.get(field.datatype, f"unknown ({field.datatype})")
+            raise InvalidMessageError(f"field {field.name} must be FLOAT32 or FLOAT64, got {kind}")
+    return _dtype_of(cloud, fields)
+
+
+def _dtype_of(cloud: PointCloud2, fields: Sequence[PointField]) -> np.dtype[Any]:
+    """Of records that hold these fields alone, at their places."""
+    if cloud.point_step > LARGEST_STEP:
+        raise InvalidMessageError(f"point_step must be at most {LARGEST_STEP}, got {cloud.point_step}")
+    unknown = next((field for field in fields if field.datatype not in DTYPES), None)
+    if unknown is not None:
+        raise InvalidMessageError(f"field {unknown.name} has the unknown type {unknown.datatype}")
     order = ">" if cloud.is_bigendian else "<"
-    formats = [order + DTYPES[field.datatype] for field in fields.values()]
-    offsets = [field.offset for field in fields.values()]
-    for name, code, offset in zip(fields, formats, offsets, strict=True):
+    names, offsets = [field.name for field in fields], [field.offset for field in fields]
+    formats = [order + DTYPES[field.datatype] for field in fields]
+    for name, code, offset in zip(names, formats, offsets, strict=True):
         if offset + np.dtype(code).itemsize > cloud.point_step:
             raise InvalidMessageError(f"field {name} ends beyond point_step {cloud.point_step}")
-    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
 
 
-def _coordinate_field(cloud: PointCloud2, name: str) -> PointField:
+def _single_field(cloud: PointCloud2, name: str) -> PointField:
     found = [field for field in cloud.fields if field.name == name]
     if len(found) != 1:
         names = ", ".join(field.name for field in cloud.fields) or "none"
         raise InvalidMessageError(f"need exactly one field {name}, the cloud has: {names}")
-    field = found[0]
-    if field.datatype not in (PointField.FLOAT32, PointField.FLOAT64):
-        kind = DTYPES.get(field.datatype, f"unknown ({field.datatype})")
-        raise InvalidMessageError(f"field {name} must be FLOAT32 or FLOAT64, got {kind}")
-    if field.count != 1:
-        raise InvalidMessageError(f"field {name} must have count 1, got {field.count}")
-    return field
+    if found[0].count != 1:
+        raise InvalidMessageError(f"field {name} must have count 1, got {found[0].count}")
+    return found[0]
 
 
 def _view(cloud: PointCloud2, dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -156,3 +181,6 @@ def _describe(dtype: np.dtype[Any]) -> list[PointField]:
         PointField(name=name, offset=entry[1], datatype=CODES[entry[0].str[1:]], count=1)
         for name, entry in dtype.fields.items()
     ]
+
+
+INPUT = Input(PointCloud2, partial(cloud_to_xyz, drop_zeros=True), lambda cloud: cloud.width * cloud.height)

@@ -73,10 +73,10 @@ install_torch() {
 install_project() {
   if [ -n "${ROS_DISTRO:-}" ]; then
     say "installing GAPR and its libraries; ROS is the sourced $ROS_DISTRO"
-    pip_install --editable '.[bags,baselines,test]'
+    pip_install --editable '.[training,bags,baselines,test]'
   else
     say "installing GAPR and its libraries; ROS 2 (rclpy, Fast DDS) from wheels, as no ROS is sourced (some minutes)"
-    pip_install --editable '.[ros,baselines,test]'
+    pip_install --editable '.[ros,training,baselines,test]'
   fi
 }
 

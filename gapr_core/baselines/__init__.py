@@ -1,4 +1,4 @@
-"""Other people's methods behind the interface of `Registrar`; each library is imported when the method is used."""
+"""Methods of others behind the interface of `Registrar`; each library is imported when the method is used."""
 
 from __future__ import annotations
 

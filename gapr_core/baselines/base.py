@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from gapr_core.clouds import Surface, finite_points, load
+from gapr_core.clouds import finite_points, load
 from gapr_core.errors import MethodUnavailableError
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -64,7 +65,7 @@ class BaselineTarget:
     @property
     def half_extent_mm(self) -> float:
         """Largest distance of a point to the mean, mm."""
-        return float(np.linalg.norm(self.points - self.origin, axis=1).max())
+        return extent.half_extent_mm(self.points)
 
 
 class NoPose(Exception):
@@ -124,10 +125,10 @@ class Baseline(ABC):
         """An accepted pose with its residual and its score."""
         distance, _ = target.tree.query(se3.apply(T, source))
         inliers = float(np.mean(distance < INLIER_MM))
-        details = {"residual_mm": truncated_residual(distance)}
+        features = {"residual_mm": truncated_residual(distance)}
         return RegistrationResult(
             RegistrationStatus.OK, T, confidence=inliers, inlier_ratio=inliers, stage_ms=stage_ms, method=self.name,
-            details=details,
+            features=features,
         )  # fmt: skip
 
     def refusal(

@@ -10,7 +10,7 @@ from gapr_core.baselines.base import Array, Baseline, BaselineTarget, NoPose, re
 from gapr_core.baselines.refined import Refined
 from gapr_core.baselines.small_gicp import PointToPlane
 
-KISS4_VOXELS_MM = (2.5, 3.5, 4.0, 6.0)  # the best four of nine on training persons at L1 to L3
+KISS4_VOXELS_MM = (2.5, 3.5, 4.0, 6.0)  # the best four of nine on training subjects at L1 to L3
 
 
 class KissMatcher(Baseline):

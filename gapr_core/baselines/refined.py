@@ -43,5 +43,7 @@ class Refined:
         seeds = [result.T_target_source for result in coarse if result.T_target_source is not None]
         refined = [self.fine.register(source, fine_target, initial=seed) for seed in seeds]
         stage_ms = {"coarse": (middle - start) * 1e3, "refine": (time.perf_counter() - middle) * 1e3}
-        best = min([r for r in refined if r.ok], key=lambda r: r.details["residual_mm"], default=(refined or coarse)[0])
+        best = min(
+            [r for r in refined if r.ok], key=lambda r: r.features["residual_mm"], default=(refined or coarse)[0]
+        )
         return replace(best, method=self.name, stage_ms=stage_ms)

@@ -1,41 +1,77 @@
-"""The append-only JSONL file of a run: one line per pair and method, torn last line forgiven."""
+"""The files of a run: append-only records (JSONL, one line per pair and method), and the plan that they belong to."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
+from gapr_core.benchmark.record import Record
 from gapr_core.errors import ConfigError
+from gapr_core.runtime import files
+from gapr_core.runtime.settings import from_dict
 
-Record = dict[str, Any]
 FILE = "records.jsonl"
 PLAN = "plan.json"
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a run was asked, and what it ran on.
+
+    Attributes:
+        command, commit, machine, started: where and when it ran, in words.
+        threads: of each worker.
+        ours: the method that the others are compared with.
+        methods: in the order of the tables.
+        folder: of the pairs.
+        pairs: name to sha256, of all shards.
+    """
+
+    command: str
+    commit: str
+    machine: str
+    threads: int
+    started: str
+    ours: str
+    methods: list[str]
+    folder: str
+    pairs: dict[str, str]
+
+
 def append(path: Path, record: Record) -> None:
-    """Add one line, on disk before the next pair starts."""
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(record, allow_nan=False) + "\n")
+    """Add one line, on disk before the next pair starts.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record.to_json(), allow_nan=False) + "\n")
+    except OSError as error:
+        raise files.unwritable(path, error) from error
+
+
+def write(path: Path, records: Iterable[Record]) -> None:
+    """Write all lines as one whole file."""
+    files.write_text(path, "".join(json.dumps(record.to_json(), allow_nan=False) + "\n" for record in records))
 
 
 def read(path: Path) -> list[Record]:
-    """Every whole record; a last line that was cut off when the run was killed is removed from the file.
+    """Every whole record; a last line that was cut off when the run was killed does not count.
 
     Raises:
-        ConfigError: a line in the middle that is not JSON.
+        ConfigError: a line in the middle that is no record.
     """
-    if not path.is_file():
-        return []
-    text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        path.write_text(whole, encoding="utf-8")
-    try:
-        return [json.loads(line) for line in whole.splitlines()]
-    except json.JSONDecodeError as error:
-        raise ConfigError("one JSON record per line", f"{path}: {error}", "remove the damaged line") from error
+    return [_record(line, number, path) for number, line in enumerate(_whole_lines(path), 1)]
+
+
+def discard_cut_line(path: Path) -> None:
+    """Take a last line that was cut off out of the file, so that the next record begins a line."""
+    whole = "".join(f"{line}\n" for line in _whole_lines(path))
+    if path.is_file() and len(whole.encode()) < path.stat().st_size:
+        files.write_text(path, whole)
 
 
 def done(records: Iterable[Record], hashes: dict[str, str]) -> set[tuple[str, str]]:
@@ -50,9 +86,9 @@ def done(records: Iterable[Record], hashes: dict[str, str]) -> set[tuple[str, st
     """
     found = set()
     for record in records:
-        if hashes.get(record["pair"], record["sha256"]) != record["sha256"]:
-            raise ConfigError("records of these pairs", f"other clouds named {record['pair']}", "choose another --out")
-        found.add((record["pair"], record["method"]))
+        if hashes.get(record.pair, record.sha256) != record.sha256:
+            raise ConfigError("records of these pairs", f"other clouds named {record.pair}", "choose another --out")
+        found.add((record.pair, record.method))
     return found
 
 
@@ -60,22 +96,42 @@ def sort(records: Iterable[Record], methods: Sequence[str]) -> list[Record]:
     """One record for each pair and method (the first one written), by pair name, then in the order of `methods`."""
     first: dict[tuple[str, str], Record] = {}
     for record in records:
-        first.setdefault((record["pair"], record["method"]), record)
+        first.setdefault((record.pair, record.method), record)
     order = {name: k for k, name in enumerate(methods)}
-    return sorted(first.values(), key=lambda r: (r["pair"], order.get(r["method"], len(order)), r["method"]))
+    return sorted(first.values(), key=lambda r: (r.pair, order.get(r.method, len(order)), r.method))
 
 
-def write_plan(folder: Path, plan: dict[str, Any]) -> None:
-    """What this run was asked: methods, pairs of all shards, command, commit, machine."""
-    (folder / PLAN).write_text(json.dumps(plan, indent=1) + "\n", encoding="utf-8")
+def write_plan(folder: Path, plan: Plan) -> None:
+    """Write plan.json."""
+    files.write_json(folder / PLAN, asdict(plan))
 
 
-def read_plan(folder: Path) -> dict[str, Any]:
+def read_plan(folder: Path) -> Plan:
     """The plan of a finished or interrupted run.
 
     Raises:
-        ConfigError: the folder is no output of `gapr benchmark`.
+        ConfigError: the folder is no output of `gapr benchmark`, or its plan is damaged.
     """
-    if not (folder / PLAN).is_file():
+    path = folder / PLAN
+    if not path.is_file():
         raise ConfigError("a folder written by gapr benchmark", str(folder), "name one that holds plan.json")
-    return dict(json.loads((folder / PLAN).read_text(encoding="utf-8")))
+    values = files.read_json(path, "a plan of gapr benchmark")
+    try:
+        return from_dict(Plan, values)
+    except ConfigError as error:
+        raise ConfigError("a plan of gapr benchmark", f"{path} ({error})", "run the benchmark again") from error
+
+
+def _whole_lines(path: Path) -> list[str]:
+    if not path.is_file():
+        return []
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return text[: text.rfind("\n") + 1].splitlines()
+
+
+def _record(line: str, number: int, path: Path) -> Record:
+    try:
+        return from_dict(Record, json.loads(line))
+    except (json.JSONDecodeError, ConfigError) as error:
+        given = f"{path}, line {number}: {error}"
+        raise ConfigError("one record of gapr benchmark per line", given, "remove the damaged line") from error

@@ -13,15 +13,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gapr_core.baselines import RegistrationMethod
+from gapr_core.benchmark import methods
+from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts
+from gapr_core.benchmark.record import Answer, Record, Verdict
 from gapr_core.data.pair_files import load_pair, pair_hash
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
-from gapr_core.evaluation import methods
-from gapr_core.evaluation.judge import answer_facts, failure_facts, jsonable, judge, pair_facts
+from gapr_core.results import RegistrationResult
 
 log = logging.getLogger(__name__)
 
-Record = dict[str, Any]
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _methods: dict[str, RegistrationMethod] = {}  # of this worker process, made at their first use
 
@@ -84,33 +85,44 @@ def run_task(task: Task) -> Record:
     except Exception as error:
         log.warning("%s failed on %s", task.method, pair.name, exc_info=True)
         return _failure(task, pair, f"{type(error).__name__}: {error}")
-    return _record(task, pair, {**answer_facts(result), **judge(pair, result), **times})
+    return _record(task, pair, answer_of(result), judge(pair, result), *times)
 
 
 def check_truth(pair: Pair) -> None:
     """Raise `ConfigError` for a pair that cannot be judged."""
-    if not pair.has_truth and pair.protocol != "wrong":
+    if not pair.has_truth and "wrong" not in pair.protocol:
         raise ConfigError(
             "a true `transform` (4, 4) in every pair", f"none in {pair.name}",
             "add it, or protocol='wrong' where no pose is right; gapr evaluate runs pairs without truth",
         )  # fmt: skip
 
 
-def _timed(method: RegistrationMethod, pair: Pair) -> tuple[Any, Record]:
+def _timed(method: RegistrationMethod, pair: Pair) -> tuple[RegistrationResult, tuple[float, float]]:
+    """The answer, and how long registering and preparing took, s."""
     start = time.perf_counter()
     target = method.prepare(pair.target, "mm")
     prepared = time.perf_counter()
-    result = method.register(pair.source, target)
-    return result, {"seconds": time.perf_counter() - prepared, "prepare_seconds": prepared - start}
+    result = methods.register(method, pair.source, target, pair.viewpoint)
+    return result, (time.perf_counter() - prepared, prepared - start)
 
 
 def _failure(task: Task, pair: Pair, reason: str) -> Record:
-    return _record(task, pair, {**failure_facts(reason), **judge(pair, None), "seconds": None, "prepare_seconds": None})
+    return _record(task, pair, failure(reason), judge(pair, None))
 
 
-def _record(task: Task, pair: Pair, facts: Record) -> Record:
-    head = {"pair": task.path.stem, "file": task.path.name, "method": task.method, "sha256": pair_hash(pair)}
-    return jsonable({**pair_facts(pair), **head, **facts})
+def _record(
+    task: Task,
+    pair: Pair,
+    answer: Answer,
+    verdict: Verdict,
+    seconds: float | None = None,
+    prepare_seconds: float | None = None,
+) -> Record:
+    facts = {**vars(pair_facts(pair)), **vars(answer), **vars(verdict), "pair": task.path.stem}
+    return Record(
+        **facts, file=task.path.name, sha256=pair_hash(pair), method=task.method, seconds=seconds,
+        prepare_seconds=prepare_seconds,
+    )  # fmt: skip
 
 
 def _start(counter: Any, threads: int) -> None:

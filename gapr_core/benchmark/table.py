@@ -6,28 +6,28 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from gapr_core import metrics
+from gapr_core.benchmark.record import ERROR, Record
 from gapr_core.metrics.confidence import SURE
 
-Record = dict[str, Any]
 Row = dict[str, Any]
 ALL = "all"
-KEYS = ("protocol", "bone", "method")
 TIMES = ("seconds", "seconds_p90", "prepare_seconds")  # what may differ between two runs of one command
 RECALLS = {"rr_paper": "within_paper", "rr_1_1": "within_1_1", "rr_2_2": "within_2_2", "rr_4_5": "within_4_5"}
 
 
 def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
     """The table, grouped by protocol, then bone (`all` last), then the methods in the order given."""
-    protocols = sorted({r["protocol"] for r in records})
+    protocols = sorted({r.protocol for r in records})
     table = []
     for protocol in [*protocols, ALL] if len(protocols) > 1 else protocols:
-        of_protocol = [r for r in records if protocol in (ALL, r["protocol"])]
+        of_protocol = [r for r in records if protocol in (ALL, r.protocol)]
         for bone in _bones(of_protocol):
-            of_bone = [r for r in of_protocol if bone in (ALL, r["bone"])]
+            of_bone = [r for r in of_protocol if bone in (ALL, r.bone)]
             for method in methods:
-                chosen = [r for r in of_bone if r["method"] == method]
+                chosen = [r for r in of_bone if r.method == method]
                 if chosen:
                     table.append({"protocol": protocol, "bone": bone, "method": method, **summary(chosen)})
     return table
@@ -35,30 +35,31 @@ def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
 
 def summary(records: Sequence[Record]) -> Row:
     """Every figure of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
-    row: Row = {"pairs": len(records), "persons": len({r["person"] for r in records})}
-    row |= _answers(records) | _accuracy([r for r in records if r["has_truth"]])
-    row |= _calibration(records) | _uncertainty([r for r in records if r.get("right")]) | _times(records)
+    row: Row = {"pairs": len(records), "persons": len({r.person for r in records})}
+    row |= _answers(records) | _accuracy([r for r in records if r.has_truth])
+    row |= _calibration(records) | _uncertainty([r for r in records if r.right]) | _times(records)
+    row |= _precision([r for r in records if r.accepted and r.has_truth])
     return {key: _rounded(value) for key, value in row.items()}
 
 
 def people(records: Sequence[Record]) -> list[str] | None:
     """Who each pair is of, for the bootstrap; None unless that is known of all."""
-    named = [r["person"] for r in records]
+    named = [r.person for r in records]
     return named if all(named) else None
 
 
 def _bones(records: Sequence[Record]) -> list[str]:
-    bones = sorted({r["bone"] for r in records})
+    bones = sorted({r.bone for r in records})
     return [*bones, ALL] if len(bones) > 1 else bones
 
 
 def _answers(records: Sequence[Record]) -> Row:
-    accepted, wrong = [r["accepted"] for r in records], [r["false_accept"] for r in records]
-    sure = [r["false_accept"] and r["confidence"] >= SURE for r in records]
+    accepted, wrong = [r.accepted for r in records], [r.false_accept for r in records]
+    sure = [r.false_accept and r.confidence >= SURE for r in records]
     low, high = metrics.interval(wrong, people(records))
     return {
         "accepted": sum(accepted), "refused": len(records) - sum(accepted),
-        "errors": sum(r["status"] == "ERROR" for r in records), "false_accepts": sum(wrong),
+        "errors": sum(r.status == ERROR for r in records), "false_accepts": sum(wrong),
         "false_accepts_sure": sum(sure), "false_accept_rate": np.mean(wrong), "false_accept_rate_low": low,
         "false_accept_rate_high": high,
     }  # fmt: skip
@@ -68,10 +69,10 @@ def _accuracy(records: Sequence[Record]) -> Row:
     """Over ALL pairs that have a truth: refusals are no success, and count with their stand-in pose in the errors."""
     row: Row = {"pairs_with_truth": len(records)}
     for name, key in RECALLS.items():
-        row[name] = metrics.recall([r[key] for r in records])
-        row[f"{name}_low"], row[f"{name}_high"] = metrics.interval([r[key] for r in records], people(records))
+        row[name] = metrics.recall([getattr(r, key) for r in records])
+        row[f"{name}_low"], row[f"{name}_high"] = metrics.interval([getattr(r, key) for r in records], people(records))
     rmse = _values(records, "rmse_mm")
-    judged, true = [r["judged"] for r in records], [r["true"] for r in records]
+    judged, true = _values(records, "judged"), _values(records, "true")
     return row | {
         "rmse_mm": _of(np.mean, rmse), "rmse_median_mm": _of(np.median, rmse),
         "chamfer_mm": _of(np.mean, _values(records, "chamfer_mm")),
@@ -80,13 +81,13 @@ def _accuracy(records: Sequence[Record]) -> Row:
         "rte_median_mm": _of(np.median, _values(records, "rte_mm")),
         "rre_median_deg": _of(np.median, _values(records, "rre_deg")),
         "whole_bone_median_mm": _of(np.median, _values(records, "whole_bone_mm")),
-        "tre_worst_median_mm": _of(np.median, [max(r["tre_mm"].values()) for r in records]),
+        "tre_worst_median_mm": _of(np.median, [max(r.tre_mm.values()) for r in records if r.tre_mm]),
     }  # fmt: skip
 
 
 def _calibration(records: Sequence[Record]) -> Row:
-    known = [r for r in records if r["best_right"] is not None]
-    confidence, right = _values(known, "confidence"), [r["best_right"] for r in known]
+    known = [r for r in records if r.best_right is not None]
+    confidence, right = _values(known, "confidence"), [bool(r.best_right) for r in known]
     return {
         "auroc": metrics.auroc(confidence, right) if known else None,
         "ece": metrics.expected_calibration_error(confidence, right) if known else None,
@@ -103,6 +104,16 @@ def _uncertainty(right: Sequence[Record]) -> Row:
     }  # fmt: skip
 
 
+def _precision(accepted: Sequence[Record]) -> Row:
+    """Of all accepted answers, right or wrong: whoever uses a pose has its `tre95_mm` and not the truth."""
+    bounded = [r for r in accepted if r.predicted_tre95_mm is not None and r.whole_bone_mm is not None]
+    bound, true = _values(bounded, "predicted_tre95_mm"), _values(bounded, "whole_bone_mm")
+    return {
+        "tre95_covers": _of(np.mean, true <= bound), "tre95_ratio": _of(np.median, bound / np.maximum(true, 1e-9)),
+        "nees_median": _of(np.median, _values(accepted, "nees") / chi2.median(6)),
+    }  # fmt: skip
+
+
 def _times(records: Sequence[Record]) -> Row:
     seconds = _values(records, "seconds")
     return {
@@ -112,7 +123,7 @@ def _times(records: Sequence[Record]) -> Row:
 
 
 def _values(records: Sequence[Record], key: str) -> np.ndarray:
-    return np.array([r[key] for r in records if r.get(key) is not None], dtype=np.float64)
+    return np.array([value for r in records if (value := getattr(r, key)) is not None], dtype=np.float64)
 
 
 def _of(statistic: Callable[[Any], Any], values: Any) -> float | None:

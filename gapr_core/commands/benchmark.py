@@ -11,22 +11,24 @@ import platform
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
-from gapr_core import origin
-from gapr_core.console import say
-from gapr_core.data.pair_files import load_pair, pair_hash
+from gapr_core.benchmark import methods as known_methods
+from gapr_core.benchmark import records, runner, table
+from gapr_core.benchmark.record import ERROR, Record
+from gapr_core.benchmark.records import Plan
+from gapr_core.benchmark.table import Row
+from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
-from gapr_core.evaluation import benchmark_report, records, runner, table, writers
-from gapr_core.evaluation.methods import OURS
-from gapr_core.evaluation.table import Row
+from gapr_core.pages import benchmark_report, writers
+from gapr_core.runtime import origin
+from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.console import say
 
-Record = dict[str, Any]
-Plan = dict[str, Any]
 DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
 
 
@@ -37,8 +39,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--methods", default=DEFAULT_METHODS, help=f"names with commas; {DEFAULT_METHODS}")
     parser.add_argument("--out", type=Path, required=True, help="folder for the table, the plots and the report")
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")
-    parser.add_argument("--jobs", type=int, default=1, help="worker processes (1)")
-    parser.add_argument("--threads", type=int, default=1, help="cores for each worker (1)")
+    parser.add_argument("--jobs", type=at_least_one, default=1, help="worker processes (1)")
+    parser.add_argument("--threads", type=at_least_one, default=1, help="cores for each worker (1)")
     parser.add_argument("--ours", help="the method that the others are compared with (gapr, or the first one)")
 
 
@@ -54,7 +56,7 @@ def run(args: Namespace) -> int:
             raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
         methods = [name.strip() for name in args.methods.split(",") if name.strip()]
         rows = benchmark(args.pairs, methods, args.out, _shard(args.shard), args.jobs, args.threads, args.ours)
-    say(f"{len(rows)} rows in {args.out / 'table.md'}; for people: {args.out / 'report.html'}")
+    say(f"{len(rows)} rows in {args.out / 'table.md'}; to look at: {args.out / 'report.html'}")
     return 0
 
 
@@ -85,22 +87,22 @@ def benchmark(
         ConfigError: no pairs, an unknown method, or results of other pairs in `out`.
         MethodUnavailableError: a method whose library is not installed.
     """
-    paths = sorted(path for path in pairs.glob("*.npz") if not path.name.startswith("."))
-    if not paths or not methods:
-        raise ConfigError("pairs NAME.npz and methods", f"{len(paths)} pairs in {pairs}, {len(methods)} methods",
-                          "make pairs with gapr make-pairs, name methods with --methods")  # fmt: skip
-    out.mkdir(parents=True, exist_ok=True)
+    paths = pair_paths(pairs)
+    if not methods:
+        raise ConfigError("methods", "none", f"name some of {', '.join(known_methods.names())} with --methods")
+    known_methods.check(methods)
     known = records.read(out / records.FILE)
-    all_methods = list(dict.fromkeys([*(record["method"] for record in records.sort(known, methods)), *methods]))
+    all_methods = list(dict.fromkeys([*(record.method for record in records.sort(known, methods)), *methods]))
     plan = _plan(pairs, paths, all_methods, threads, ours)
-    done = records.done(known, plan["pairs"])
+    done = records.done(known, plan.pairs)
     records.write_plan(out, plan)
+    records.discard_cut_line(out / records.FILE)
     tasks = [runner.Task(path, method) for path in paths[shard[0] - 1 :: shard[1]] for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
         for record in runner.run(open_tasks, jobs, threads):
-            records.append(out / records.FILE, {**record, "commit": plan["commit"]})
-            bar.set_postfix_str(f"{record['method']} {record['pair']}", refresh=False)
+            records.append(out / records.FILE, replace(record, commit=plan.commit))
+            bar.set_postfix_str(f"{record.method} {record.pair}", refresh=False)
             bar.update()
     return write(out, plan)
 
@@ -114,23 +116,23 @@ def merge(folders: Sequence[Path], out: Path) -> list[Row]:
     plans = [records.read_plan(folder) for folder in folders]
     pairs: dict[str, str] = {}
     for folder, plan in zip(folders, plans, strict=True):
-        if any(pairs.setdefault(name, digest) != digest for name, digest in plan["pairs"].items()):
+        if any(pairs.setdefault(name, digest) != digest for name, digest in plan.pairs.items()):
             raise ConfigError("shards of the same pairs", f"other clouds in {folder}", "merge runs over one folder")
-    out.mkdir(parents=True, exist_ok=True)
-    methods = list(dict.fromkeys(name for plan in plans for name in plan["methods"]))
-    records.write_plan(out, {**plans[0], "pairs": pairs, "methods": methods, "command": _command()})
-    (out / records.FILE).unlink(missing_ok=True)
-    for record in records.sort([r for folder in folders for r in records.read(folder / records.FILE)], methods):
-        records.append(out / records.FILE, record)
+    joined = [record for folder in (out, *folders) for record in records.read(folder / records.FILE)]
+    named = (*(name for plan in plans for name in plan.methods), *(record.method for record in joined))
+    methods = list(dict.fromkeys(named))
+    _check_same_pairs(joined, pairs, out)
+    records.write(out / records.FILE, records.sort(joined, methods))
+    records.write_plan(out, replace(plans[0], pairs=pairs, methods=methods, command=_command()))
     return write(out, records.read_plan(out))
 
 
 def write(out: Path, plan: Plan) -> list[Row]:
     """Table, plots and report of the records in `out`."""
-    found = records.sort(records.read(out / records.FILE), plan["methods"])
+    found = records.sort(records.read(out / records.FILE), plan.methods)
     if not found:
         raise ConfigError("results", f"none in {out}", "this shard has no pairs: use fewer shards")
-    rows, notes = table.rows(found, plan["methods"]), _notes(found, plan)
+    rows, notes = table.rows(found, plan.methods), _notes(found, plan)
     writers.write_json(out / "table.json", rows, plan)
     writers.write_csv(out / "table.csv", rows)
     writers.write_markdown(out / "table.md", rows, plan, notes)
@@ -140,24 +142,36 @@ def write(out: Path, plan: Plan) -> list[Row]:
 
 def _plan(pairs: Path, paths: Sequence[Path], methods: Sequence[str], threads: int, ours: str | None) -> Plan:
     hashes = {path.stem: pair_hash(load_pair(path)) for path in tqdm(paths, desc="reading pairs", disable=None)}
-    return {
-        "command": _command(), "commit": _commit(), "machine": _machine(), "threads": threads,
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "ours": ours or (OURS if OURS in methods else methods[0]), "methods": list(methods),
-        "folder": str(pairs.resolve()), "pairs": hashes,
-    }  # fmt: skip
+    return Plan(
+        command=_command(),
+        commit=_commit(),
+        machine=_machine(),
+        threads=threads,
+        started=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        ours=ours or (known_methods.OURS if known_methods.OURS in methods else methods[0]),
+        methods=list(methods),
+        folder=str(pairs.resolve()),
+        pairs=hashes,
+    )
+
+
+def _check_same_pairs(joined: Sequence[Record], pairs: dict[str, str], out: Path) -> None:
+    """No record of another run may be lost, nor mixed with these."""
+    unknown = [r.pair for r in joined if pairs.get(r.pair) != r.sha256]
+    if unknown:
+        raise ConfigError("an --out that is empty, or of the same pairs", f"{unknown[0]} in {out}", "choose another")
 
 
 def _notes(found: Sequence[Record], plan: Plan) -> list[str]:
-    """What a reader must know before the figures."""
+    """What a reader must know before the numbers."""
     notes = []
-    wanted, there = len(plan["pairs"]) * len(plan["methods"]), len(found)
+    wanted, there = len(plan.pairs) * len(plan.methods), len(found)
     if there < wanted:
         notes.append(f"{wanted - there} of {wanted} results are missing: one shard, or an interrupted run.")
-    commits = sorted({r["commit"] for r in found})
+    commits = sorted({r.commit for r in found})
     if len(commits) > 1:
         notes.append(f"Results of different commits: {', '.join(commits)}.")
-    failed = {f"{r['method']} on {r['pair']} ({r['reason']})" for r in found if r["status"] == "ERROR"}
+    failed = {f"{r.method} on {r.pair} ({r.reason})" for r in found if r.status == ERROR}
     return [*notes, *(f"Failed: {line}." for line in sorted(failed))]
 
 

@@ -1,1 +1,1 @@
-"""Bones and pairs to learn from and be judged on: parametric bones, shape models, test protocols, splits by person."""
+"""Bones and pairs to learn from and be judged on: parametric bones, shape models, test protocols, splits by subject."""

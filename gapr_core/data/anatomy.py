@@ -1,4 +1,4 @@
-"""Bones of real people: corresponded meshes with splits by person, CT surfaces, and a folder of one's own meshes."""
+"""Bones of real subjects: corresponded meshes with splits by subject, CT surfaces, and a folder of one's own meshes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import READERS, Surface, load
+from gapr_core.clouds import load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
+from gapr_core.formats.reading import FORMATS
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
@@ -23,7 +25,7 @@ ENVIRONMENT_VARIABLE = "GAPR_ANATOMY"
 
 @dataclass(frozen=True)
 class Corresponded:
-    """Meshes in vertex correspondence: points (P, N, 3) mm, faces (F, 3), person (P,), and the cohort's name."""
+    """Meshes in vertex correspondence: points (P, N, 3) mm, faces (F, 3), `person` (P,), and the cohort's name."""
 
     points: Array
     faces: NDArray[np.int64]
@@ -32,14 +34,14 @@ class Corresponded:
     cohort: str
 
     def of(self, people: Iterable[str]) -> Corresponded:
-        """Only the meshes of these people."""
+        """Only the meshes of these subjects."""
         wanted = set(people)
         rows = [row for row, person in enumerate(self.person) if person in wanted]
         kept = tuple(self.person[row] for row in rows)
         return Corresponded(self.points[rows], self.faces, kept, self.bone, self.cohort)
 
     def specimens(self) -> list[Specimen]:
-        """One specimen a person."""
+        """One specimen a subject."""
         return [
             Specimen(Surface(points, self.faces), self.bone, person, self.cohort)
             for points, person in zip(self.points, self.person, strict=True)
@@ -47,32 +49,32 @@ class Corresponded:
 
 
 def default_folder() -> Path:
-    """The folder named by GAPR_ANATOMY, else `../shared/anatomy` beside the repository; it may not exist."""
+    """The folder named by GAPR_ANATOMY, else `../shared/anatomy` next to the repository; it may not exist."""
     named = os.environ.get(ENVIRONMENT_VARIABLE)
     return Path(named) if named else Path(__file__).resolve().parents[2].parent / "shared" / "anatomy"
 
 
 def splits(folder: str | Path) -> dict[str, list[str]]:
-    """People of train, val and test from `splits.json`; a person stands in one split only, over all bones.
+    """Subjects of train, val and test from `splits.json`; a subject stands in one split only, over all bones.
 
     Raises:
-        ConfigError: no such file, another key, or a person in two splits.
+        ConfigError: no such file, another key, or a subject in two splits.
     """
     path = Path(folder) / "splits.json"
     if not path.is_file():
-        raise ConfigError("splits.json with people of train, val and test", f"none in {folder}", "write one")
+        raise ConfigError("splits.json with subjects of train, val and test", f"none in {folder}", "write one")
     people = json.loads(path.read_text())
     if set(people) != set(SPLITS):
         raise ConfigError(f"the keys {', '.join(SPLITS)}", f"{', '.join(people)} in {path}", "rename them")
     everybody = [person for split in SPLITS for person in people[split]]
     twice = sorted({person for person in everybody if everybody.count(person) > 1})
     if twice:
-        raise ConfigError("each person once over all splits", f"{', '.join(twice)} more than once", "keep one of them")
+        raise ConfigError("each subject once over all splits", f"{', '.join(twice)} more than once", "keep one of them")
     return {split: list(people[split]) for split in SPLITS}
 
 
 def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
-    """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), person (P,)); may be empty."""
+    """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty."""
     found = []
     for path in sorted(Path(folder).glob(f"{bone}_*.npz")):
         with np.load(path, allow_pickle=False) as data:
@@ -83,14 +85,14 @@ def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
 
 
 def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | None = None) -> list[Specimen]:
-    """The bones of one type of the people of one split, ordered by cohort and person.
+    """The bones of one type of the subjects of one split, ordered by cohort and subject.
 
     Args:
         folder: layout as in `../shared/anatomy`.
         bone: "femur", "tibia", "pelvis" or any other name that the folder has.
         split: "train", "val", "test" or "all".
         cohort: None for every corresponded set; "gias2" and the like for single meshes, `surfaces/<bone>/<cohort>_*`,
-            which carry the ids of the same people ("gias2_2008_0051_l.ply" is person "llp26_2008_0051").
+            which carry the ids of the same subjects ("gias2_2008_0051_l.ply" is subject "llp26_2008_0051").
 
     Raises:
         ConfigError: no such folder or an unknown split.
@@ -111,16 +113,16 @@ def _single_meshes(folder: Path, bone: str, cohort: str) -> list[Specimen]:
 
 
 def _person_of(stem: str) -> str:
-    """gias2_<id>_l and llp26_<id> are scans of the same person."""
+    """gias2_<id>_l and llp26_<id> are scans of the same subject."""
     return stem.removesuffix("_l").removesuffix("_r").replace("gias2_", "llp26_")
 
 
 def meshes(folder: str | Path, bone: str | None = None, split: str = "all", units: str = "mm") -> list[Specimen]:
-    """A user's own meshes, one file per person, in any format that `clouds.load` reads.
+    """A user's own meshes, one file per subject, in any format that `clouds.load` reads.
 
     `folder/<person>.stl` are all of one bone, named `bone` or after the folder; `folder/<bone>/<person>.stl` are of
-    several. With `splits.json` in the folder people are split by it, else 60/20/20 in an order drawn once from a fixed
-    seed (adding people changes it: write `splits.json` to freeze it).
+    several. With `splits.json` in the folder subjects are split by it, else 60/20/20 in an order drawn once from a
+    fixed seed (adding subjects changes it: write `splits.json` to freeze it).
 
     Raises:
         ConfigError: no meshes there, or an unknown split.
@@ -132,9 +134,9 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
     specimens = [Specimen(load(f, units), b, f.stem, "meshes") for b, files in of_bone.items() for f in files]
     if not specimens:
         raise ConfigError(
-            f"meshes ({' '.join(READERS)})",
+            f"meshes ({' '.join(FORMATS)})",
             f"none for {bone or 'any bone'} in {folder}",
-            "put one mesh per person there, or one sub-folder per bone",
+            "put one mesh per subject there, or one sub-folder per bone",
         )
     if split == "all":
         return specimens
@@ -143,7 +145,7 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
 
 
 def _mesh_files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("*") if p.suffix.lower() in READERS)
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in FORMATS)
 
 
 def _draw_splits(people: set[str]) -> dict[str, list[str]]:
@@ -160,5 +162,5 @@ def _of_split(specimens: list[Specimen], split: str, people: dict[str, list[str]
 
 
 def mirrored(specimen: Specimen) -> Specimen:
-    """The bone of the other side of the same person's body."""
+    """The bone of the other side of the same subject's body."""
     return replace(specimen, surface=specimen.surface.mirrored())

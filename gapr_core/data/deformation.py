@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import Surface
-from gapr_core.data.degradation import random_directions
+from gapr_core.geometry.sampling import random_directions
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 

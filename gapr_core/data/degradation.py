@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.data.smooth_bias import SMOOTH_BIASES
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import random_directions
 
 Array = NDArray[np.float64]
-
-
-def random_directions(count: int, rng: np.random.Generator) -> Array:
-    """(count, 3) unit vectors, uniform on the sphere."""
-    vectors = rng.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def half_extent(points: Array) -> float:
@@ -47,27 +43,26 @@ def measured(
     bias_mm: float,
     outlier_share: float,
     rng: np.random.Generator,
+    smooth_bias: str = "waves-peak",
 ) -> Array:
     """Surface points (N, 3) with white noise and smooth bias; a share of them, the last ones then, is thrown off."""
     outliers = round(outlier_share * len(points))
     dirty = points + rng.normal(0.0, noise_mm, points.shape)
     if bias_mm:
-        dirty += bias_along_normals(points, normals, bias_mm, rng)
+        dirty += bias_along_normals(points, normals, bias_mm, rng, smooth_bias)
     return np.vstack([dirty[outliers:], scatter_outliers(specimen, points[:outliers], normals[:outliers], rng)])
 
 
 def bias_along_normals(
-    points: Array, normals: Array, peak_mm: float, rng: np.random.Generator, waves: int = 4
+    points: Array, normals: Array, size_mm: float, rng: np.random.Generator, smooth_bias: str = "waves-peak"
 ) -> Array:
-    """(N, 3) offsets along the normals from a smooth field of plane waves of 60-120 mm wavelength.
+    """(N, 3) offsets along the normals, mm, from a smooth field of `smooth_bias.SMOOTH_BIASES`.
 
-    `peak_mm` is the largest absolute offset over exactly these points: "a 1 mm bias" is nowhere more than 1 mm. (Taken
-    as a root mean square, refinement from the truth itself would fail on a tenth of L2 and four tenths of L3.)
+    With "waves-peak" `size_mm` is the largest absolute offset over exactly these points: "a 1 mm bias" is nowhere more
+    than 1 mm. (Taken as a root mean square, refinement from the truth itself would fail on a tenth of L2 and four
+    tenths of L3.)
     """
-    wave_vectors = random_directions(waves, rng) * (2.0 * np.pi / rng.uniform(60.0, 120.0, (waves, 1)))
-    phases, weights = rng.uniform(0.0, 2.0 * np.pi, waves), rng.normal(size=waves)
-    field = np.sin(points @ wave_vectors.T + phases) @ weights
-    return normals * (peak_mm * field / np.abs(field).max())[:, None]
+    return normals * SMOOTH_BIASES[smooth_bias](points, size_mm, rng)[:, None]
 
 
 def scatter_outliers(

@@ -12,14 +12,17 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gapr_core.console import say
 from gapr_core.data import anatomy, pool
 from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
 from gapr_core.data.protocols import PROTOCOLS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
+from gapr_core.runtime import files
+from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.console import say
 
 FORMAT = 1
+MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
@@ -39,22 +42,22 @@ class Recipe:
         if unknown or not self.protocols:
             raise ConfigError(f"protocols of {', '.join(PROTOCOLS)}", ", ".join(unknown) or "none", "choose of these")
         if self.count < 1 or self.people < 1 or self.seed < 0 or not self.bones:
-            raise ConfigError("count and people of at least 1, a seed from 0, a bone", str(self), "correct it")
+            raise ConfigError("count and subjects of at least 1, a seed from 0, a bone", str(self), "correct it")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr make-pairs`."""
     parser.add_argument("--protocol", required=True, help=f"one or more, with commas: {', '.join(PROTOCOLS)}")
     parser.add_argument("--bones", help="with commas; default: femur,tibia,pelvis,thoracic, or what --meshes holds")
-    parser.add_argument("--count", type=int, default=40, help="pairs for each bone and protocol (40)")
+    parser.add_argument("--count", type=at_least_one, default=40, help="pairs for each bone and protocol (40)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder for NAME.npz and manifest.json")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--anatomy", type=Path, help="folder of corresponded meshes with splits.json")
-    where.add_argument("--meshes", type=Path, help="folder of your own meshes, one per person, or a folder per bone")
+    where.add_argument("--meshes", type=Path, help="folder of your own meshes, one per subject, or a folder per bone")
     parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of --meshes")
     parser.add_argument("--split", default="all", choices=(*anatomy.SPLITS, "all"), help="whose bones")
-    parser.add_argument("--people", type=int, default=20, help="parametric people for each bone (20)")
+    parser.add_argument("--people", type=at_least_one, default=20, help="parametric subjects for each bone (20)")
 
 
 def run(args: Namespace) -> int:
@@ -64,11 +67,12 @@ def run(args: Namespace) -> int:
     recipe = Recipe(
         tuple(args.protocol.split(",")), tuple(named), args.count, args.seed, args.split, args.people, origin
     )
+    begin(recipe, args.out)
     bones = {bone: _bones(args, bone) for bone in tqdm(recipe.bones, desc="bones", disable=None)}
     manifest = write_pairs(recipe, bones, args.out)
     for bone, found in bones.items():
         cohorts = ", ".join(sorted({s.cohort for s in found}))
-        say(f"{bone}: {len(found)} people of split {recipe.split} ({cohorts})")
+        say(f"{bone}: {len(found)} subjects of split {recipe.split} ({cohorts})")
     say(f"{len(manifest['pairs'])} pairs in {args.out}, hash {manifest['hash'][:16]}")
     return 0
 
@@ -88,18 +92,38 @@ def write_pairs(recipe: Recipe, bones: dict[str, list[Specimen]], out: str | Pat
         ConfigError: the folder holds pairs of another recipe, or no specimen is left for a bone.
     """
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    _check_same_recipe(recipe, out / "manifest.json")
+    begin(recipe, out)
     plan = list(_plan(recipe, bones))
     others = [specimen for found in bones.values() for specimen in found]
     pairs = [_pair_entry(job, others, out) for job in tqdm(plan, desc="pairs", unit="pair", disable=None)]
     digest = sha256("".join(f"{p['name']} {p['sha256']}\n" for p in pairs).encode()).hexdigest()
-    return _write_manifest(out / "manifest.json", recipe, pairs, digest)
+    return _write_manifest(out, recipe, pairs, digest)
+
+
+def begin(recipe: Recipe, out: Path) -> None:
+    """Make the folder with a manifest without pairs, or check that it was begun with this recipe.
+
+    Raises:
+        ConfigError: it holds pairs of another recipe, a damaged manifest, or cannot be written.
+    """
+    if not (out / MANIFEST).exists():
+        _write_manifest(out, recipe, [], "")
+    elif read_manifest(out)["recipe"] != json.loads(json.dumps(asdict(recipe))):
+        wanted = "an empty folder or one with pairs of this recipe"
+        raise ConfigError(wanted, f"other pairs in {out}", "choose another --out")
 
 
 def read_manifest(folder: str | Path) -> dict[str, Any]:
-    """The manifest of a folder of pairs."""
-    return dict(json.loads((Path(folder) / "manifest.json").read_text()))
+    """The manifest of a folder of pairs.
+
+    Raises:
+        ConfigError: there is none, or it is damaged.
+    """
+    path, what = Path(folder) / MANIFEST, "a manifest that gapr make-pairs has written"
+    manifest = files.read_json(path, what)
+    if not isinstance(manifest, dict) or not {"recipe", "hash", "pairs"} <= manifest.keys():
+        raise ConfigError(what, f"{path} (no recipe or no pairs in it)", "make the pairs again in another folder")
+    return manifest
 
 
 @dataclass(frozen=True)
@@ -116,7 +140,7 @@ def _bones(args: Namespace, bone: str) -> list[Specimen]:
 
 
 def _plan(recipe: Recipe, bones: dict[str, list[Specimen]]) -> Iterator[_Job]:
-    """Everybody in turn; people of several cohorts stand in the list one after the other, so that all come."""
+    """Everybody in turn; subjects of several cohorts stand in the list one after the other, so that all come."""
     for protocol in recipe.protocols:
         for bone in recipe.bones:
             if not bones[bone]:
@@ -136,17 +160,7 @@ def _pair_entry(job: _Job, others: list[Specimen], out: Path) -> dict[str, Any]:
     return {**entry, "cohort": pair.metadata.get("cohort", ""), "sha256": pair_hash(pair)}
 
 
-def _check_same_recipe(recipe: Recipe, path: Path) -> None:
-    wanted = json.loads(json.dumps(asdict(recipe)))
-    if path.is_file() and json.loads(path.read_text())["recipe"] != wanted:
-        raise ConfigError(
-            "an empty folder or one with pairs of this recipe", f"other pairs in {path.parent}", "choose another --out"
-        )
-    if not path.is_file():
-        _write_manifest(path, recipe, [], "")
-
-
-def _write_manifest(path: Path, recipe: Recipe, pairs: list[dict[str, Any]], digest: str) -> dict[str, Any]:
+def _write_manifest(out: Path, recipe: Recipe, pairs: list[dict[str, Any]], digest: str) -> dict[str, Any]:
     manifest = {"format": FORMAT, "recipe": asdict(recipe), "hash": digest, "pairs": pairs}
-    path.write_text(json.dumps(manifest, indent=1) + "\n")
+    files.write_json(out / MANIFEST, manifest)
     return manifest

@@ -1,4 +1,4 @@
-"""Named anatomical parameters with ranges, and how a person's are drawn."""
+"""Named anatomical parameters with ranges, and how a subject's are drawn."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 P = TypeVar("P")
-SIZE_CORRELATION = 0.7  # how strongly lengths of one person go together
+SIZE_CORRELATION = 0.7  # how strongly lengths of one subject go together
 
 
 def length(low: float, high: float) -> Any:
-    """A size, mm, that grows with the person; about 95 % of people lie between `low` and `high`."""
+    """A size, mm, that grows with the subject; about 95 % of subjects lie between `low` and `high`."""
     return field(default=(low + high) / 2.0, metadata={"range": (low, high), "grows": True})
 
 
@@ -22,7 +22,7 @@ def trait(low: float, high: float) -> Any:
 
 
 def draw(parameters: type[P], rng: np.random.Generator) -> P:
-    """One person's parameters: normal about the middle of each range, two standard deviations to its ends, clipped."""
+    """One subject's parameters: normal about the middle of each range, two standard deviations to its ends, clipped."""
     body = rng.normal()
     values = {f.name: _draw_one(f.metadata, body, rng) for f in fields(parameters) if f.metadata}  # type: ignore[arg-type]
     return parameters(**values)

@@ -1,6 +1,6 @@
 """Bones that need no data: thousands of different ones, each from a seed, watertight, in mm.
 
-Frame of every bone: x to the person's left, y backwards, z up.
+Frame of every bone: x to the subject's left, y backwards, z up.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from zlib import crc32
 
 import numpy as np
 
-from gapr_core.clouds import Surface
 from gapr_core.data import deformation
 from gapr_core.data.bones.femur import FemurParameters, femur_surface
 from gapr_core.data.bones.pelvis import PelvisParameters, pelvis_surface
@@ -19,14 +18,15 @@ from gapr_core.data.bones.tibia import TibiaParameters, tibia_surface
 from gapr_core.data.parameters import draw
 from gapr_core.data.solid import simplify
 from gapr_core.errors import ConfigError
+from gapr_core.surface import Surface
 
 
 def make_bone(name: str, seed: int) -> Surface:
-    """One bone of person `seed`: a closed mesh in mm, the same one for the same arguments.
+    """One bone of subject `seed`: a closed mesh in mm, the same one for the same arguments.
 
     Args:
         name: a key of `BONES`. Femur and tibia are a left or a right one, as the seed decides.
-        seed: the person, any non-negative integer.
+        seed: the subject, any non-negative integer.
 
     Raises:
         ConfigError: an unknown bone.
@@ -37,22 +37,22 @@ def make_bone(name: str, seed: int) -> Surface:
 
 
 def femur(seed: int) -> Surface:
-    """A whole femur of person `seed`, left or right."""
+    """A whole femur of subject `seed`, left or right."""
     return make_bone("femur", seed)
 
 
 def tibia(seed: int) -> Surface:
-    """A whole tibia of person `seed`, left or right."""
+    """A whole tibia of subject `seed`, left or right."""
     return make_bone("tibia", seed)
 
 
 def pelvis(seed: int) -> Surface:
-    """Both hip bones and the sacrum of person `seed`, joints fused."""
+    """Both hip bones and the sacrum of subject `seed`, joints fused."""
     return make_bone("pelvis", seed)
 
 
 def thoracic(seed: int) -> Surface:
-    """Sternum and costal cartilages 1-10 of person `seed`."""
+    """Sternum and costal cartilages 1-10 of subject `seed`."""
     return make_bone("thoracic", seed)
 
 

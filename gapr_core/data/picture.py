@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import Surface
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-VIEWS = {  # (direction towards the eye, up); x to the person's left, y backwards, z up
+VIEWS = {  # (direction towards the eye, up); x to the subject's left, y backwards, z up
     "anterior": ((0, -1, 0), (0, 0, 1)),
     "posterior": ((0, 1, 0), (0, 0, 1)),
     "left": ((1, 0, 0), (0, 0, 1)),

@@ -1,4 +1,4 @@
-"""Where the bones of a list of pairs come from: people in a folder, a user's own meshes, or parametric people."""
+"""Where the bones of a list of pairs come from: subjects in a folder, a user's own meshes, or parametric subjects."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 
-PARAMETRIC_SPLIT = {"train": (0, 1, 2), "val": (3,), "test": (4,)}  # of the person's number modulo 5
+PARAMETRIC_SPLIT = {"train": (0, 1, 2), "val": (3,), "test": (4,)}  # of the subject's number modulo 5
 
 
 def parametric_people(split: str, count: int) -> list[int]:
-    """The numbers (seeds of `make_bone`) of the first `count` people of a split; no number is in two splits."""
+    """The numbers (seeds of `make_bone`) of the first `count` subjects of a split; no number is in two splits."""
     if split == "all":
         return list(range(count))
     if split not in PARAMETRIC_SPLIT:
@@ -24,7 +24,7 @@ def parametric_people(split: str, count: int) -> list[int]:
 
 
 def parametric_specimen(bone: str, number: int) -> Specimen:
-    """The bone of parametric person `number`; all bones of one number are of one person."""
+    """The bone of parametric subject `number`; all bones of one number are of one subject."""
     return Specimen(make_bone(bone, number), bone, f"parametric_{number}", "parametric")
 
 

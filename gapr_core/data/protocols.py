@@ -2,13 +2,15 @@
 
 paper, overlap-40/50/60/70 and incomplete follow section III and the experiments of the paper (arXiv 2606.13488);
 L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gives them, and L2-region and L3-region
-the same of about half the size; sweep is the band that a probe covers on its way; wrong pairs have no pose.
+the same of about half the size; L2-wave and so on have another smooth bias; sweep is the band that a probe covers on
+its way; pointer, ultrasound, depth-camera and laser are simulated sensors; scene-C1 and so on are what a camera sees
+of a bone in a wound (see `scenes`); wrong and scene-wrong pairs have no pose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 from zlib import crc32
@@ -17,46 +19,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gapr_core.data import degradation
+from gapr_core.data import degradation, views
+from gapr_core.data.pair import TARGET_POINTS, Pair, place
+from gapr_core.data.scenes import derived
+from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
+from gapr_core.data.sensors import SENSORS
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent
 
 Array = NDArray[np.float64]
-TARGET_POINTS = 8192
+Change = Callable[[Pair, np.random.Generator], Pair]
 ANOTHER_PERSON = {
     "L1": 1,
     "L2": 3,
     "L3": 5,
     "paper": 7,
-}  # of the turns of `wrong`: somebody else's, as which level
-TRANSLATION_MM = 150.0
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A source and a target cloud, and the motion that takes one to the other.
-
-    Attributes:
-        source: (N, 3) mm, in its own frame.
-        target: (M, 3) mm, centred on its mean: surface coordinates minus metadata["origin_mm"].
-        T_target_source: (4, 4) truth; all NaN where no pose is right (protocol `wrong`).
-        metadata: how the pair was made: region share, overlap, noise_mm, bias_mm, outlier_share, ...
-    """
-
-    source: Array
-    target: Array
-    T_target_source: Array
-    name: str
-    bone: str
-    person: str
-    protocol: str
-    metadata: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def has_truth(self) -> bool:
-        """False where the right answer is a refusal."""
-        return bool(np.isfinite(self.T_target_source).all())
+}  # of the turns of `wrong`: another subject's, as which level
 
 
 @dataclass(frozen=True)
@@ -65,7 +44,7 @@ class Level:
 
     `share` is of the whole surface's area: of what the probe sees (`seen`), of a band of that along its longest
     direction ("band"), or of a region around the point that it looks at, whose far side is then cut away ("region"),
-    which leaves about half.
+    which leaves about half. `smooth_bias` is a name of `smooth_bias.SMOOTH_BIASES`, which says what `bias_mm` is of.
     """
 
     share: tuple[float, float]
@@ -74,6 +53,7 @@ class Level:
     bias_mm: float
     outlier_share: float
     max_points: int
+    smooth_bias: str = "waves-peak"
 
 
 LEVELS = {
@@ -84,6 +64,10 @@ LEVELS = {
     "L3-region": Level((0.10, 0.20), "region", 1.5, 1.5, 0.20, 1000),
     "sweep": Level((0.05, 0.20), "band", 1.0, 1.0, 0.05, 2000),
 }
+for _name, _rms_mm in (("L2", 0.7), ("L3", 1.06)):  # a plane wave of the level's bias as amplitude; others of its rms
+    LEVELS[f"{_name}-wave"] = replace(LEVELS[_name], smooth_bias="wave")
+    LEVELS[f"{_name}-waves"] = replace(LEVELS[_name], bias_mm=_rms_mm, smooth_bias="waves-rms")
+    LEVELS[f"{_name}-gp"] = replace(LEVELS[_name], bias_mm=_rms_mm, smooth_bias="gp-rms")
 
 
 def make_pair(
@@ -103,18 +87,24 @@ def make_pair(
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"a protocol of {', '.join(PROTOCOLS)}", repr(protocol), "choose one of these names")
-    rng = np.random.default_rng([seed, crc32(protocol.encode()), crc32(f"{specimen.bone} {specimen.person}".encode())])
-    pair = wrong(specimen, rng, others, turn) if protocol == "wrong" else PROTOCOLS[protocol](specimen, rng)
+    drawn_as = DERIVED[protocol][0] if protocol in DERIVED else protocol
+    rng = np.random.default_rng([seed, crc32(drawn_as.encode()), crc32(f"{specimen.bone} {specimen.person}".encode())])
+    make = PROTOCOLS[protocol]
+    pair = make(specimen, rng, others, turn) if protocol in STRANGERS else make(specimen, rng)
     name = f"{protocol}_{specimen.bone}_{specimen.person}_{seed}"
-    metadata = {"cohort": specimen.cohort, "seed": seed, **pair.metadata}
+    metadata = {"cohort": specimen.cohort, "seed": seed, "family": protocol, **pair.metadata}
     return replace(pair, name=name, protocol=protocol, metadata=metadata)
+
+
+def _derived(specimen: Specimen, rng: np.random.Generator, base: str, change: Change) -> Pair:
+    return change(PROTOCOLS[base](specimen, rng), rng)
 
 
 def paper(specimen: Specimen, rng: np.random.Generator, share: tuple[float, float] = (0.40, 0.70)) -> Pair:
     """Section III: a KNN crop of the target's own points, density change, noise, U[0, 180] deg per axis."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     kept = rng.uniform(*share)
-    source = target[_nearest(target, target[_crop_centre(target, rng)], kept)]
+    source = target[views.nearest(target, target[_crop_centre(target, rng)], kept)]
     metadata = {"region_share": kept, "overlap": kept}
     return _finish_like_the_paper(specimen, source, target, metadata, rng)
 
@@ -124,33 +114,44 @@ def incomplete(specimen: Specimen, rng: np.random.Generator) -> Pair:
     cloud, _ = specimen.sample(TARGET_POINTS, rng)
     first = cloud[_crop_centre(cloud, rng)]
     second = cloud[((cloud - first) ** 2).sum(axis=1).argmax()]
-    in_source, in_target = _nearest(cloud, first, 0.5), _nearest(cloud, second, 0.9)
+    in_source, in_target = views.nearest(cloud, first, 0.5), views.nearest(cloud, second, 0.9)
     overlap = len(np.intersect1d(in_source, in_target)) / len(in_target)
     metadata = {"region_share": 0.5, "target_share": 0.9, "overlap": overlap}
     return _finish_like_the_paper(specimen, cloud[in_source], cloud[in_target], metadata, rng)
 
 
 def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pair:
-    """What a probe sees of a region: drawn anew from the surface, with noise, smooth bias and outliers."""
+    """What a probe sees of a region: sampled from the surface, with noise, smooth bias and outliers."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
-    points, normals, metadata = _best_view(specimen, level, rng)
+    points, normals, metadata = views.best_view(specimen, level.share, level.share_of, rng)
     chosen = rng.permutation(len(points))[: level.max_points]
     points, normals = points[chosen], normals[chosen]
-    dirty = degradation.measured(specimen, points, normals, level.noise_mm, level.bias_mm, level.outlier_share, rng)
+    dirty = degradation.measured(
+        specimen, points, normals, level.noise_mm, level.bias_mm, level.outlier_share, rng, level.smooth_bias
+    )
     metadata |= {"noise_mm": level.noise_mm, "bias_mm": level.bias_mm, "outlier_share": level.outlier_share}
+    metadata["bias"] = level.smooth_bias
     rotation = Rotation.random(random_state=rng).as_matrix()  # uniform on SO(3)
-    return _place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)
+    return place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)
+
+
+def acquired(specimen: Specimen, rng: np.random.Generator, sensor: str) -> Pair:
+    """What a simulated sensor of `data.sensors` measures of the bone; a camera's viewpoint is in the source's frame."""
+    target, _ = specimen.sample(TARGET_POINTS, rng)
+    found = SENSORS[sensor](specimen, rng)
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    return place(specimen, rng.permutation(found.points), target, rotation, found.parameters, rng, found.viewpoint)
 
 
 def wrong(specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None) -> Pair:
-    """A source that is not of this bone: in turn another bone type, another person's; each as L1, L2, L3 and paper."""
+    """A source that is not of this bone: in turn another bone type, another subject's; each as L1, L2, L3 and paper."""
     turn = int(rng.integers(8)) if turn is None else turn
     source_of = _another(specimen, others, turn % 2, rng)
     kind = "other_person" if source_of.bone == specimen.bone else "other_bone"
     degraded_as = ("L1", "L2", "L3", "paper")[turn // 2 % 4]
-    stranger, own = (PROTOCOLS[degraded_as](who, rng) for who in (source_of, specimen))
+    other, own = (PROTOCOLS[degraded_as](who, rng) for who in (source_of, specimen))
     metadata = {
-        **stranger.metadata,
+        **other.metadata,
         "origin_mm": own.metadata["origin_mm"],
         "overlap": 0.0,
         "wrong_kind": kind,
@@ -158,19 +159,49 @@ def wrong(specimen: Specimen, rng: np.random.Generator, others: Sequence[Specime
         "source_bone": source_of.bone,
         "source_person": source_of.person,
     }
-    return replace(own, source=stranger.source, T_target_source=np.full((4, 4), np.nan), metadata=metadata)
+    return replace(own, source=other.source, T_target_source=np.full((4, 4), np.nan), metadata=metadata)
+
+
+def wrong_scene(
+    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None
+) -> Pair:
+    """A scene that is not of this bone: in turn of another bone type, of another subject's; each of three levels."""
+    turn = int(rng.integers(6)) if turn is None else turn
+    source_of = _another(specimen, others, turn % 2, rng)
+    level = ("scene-C1", "scene-C2", "scene-C3")[turn // 2 % 3]
+    pair = PROTOCOLS[level](source_of, rng)
+    target, _ = specimen.sample(TARGET_POINTS, rng)
+    origin = target.mean(axis=0)
+    metadata = {
+        **pair.metadata,
+        "origin_mm": origin,
+        "wrong_kind": "other_person" if source_of.bone == specimen.bone else "other_bone",
+        "degraded_as": level,
+        "source_bone": source_of.bone,
+        "source_person": source_of.person,
+    }
+    return Pair(
+        source=pair.source,
+        target=target - origin,
+        T_target_source=np.full((4, 4), np.nan),
+        name="",
+        bone=specimen.bone,
+        person=specimen.person,
+        protocol="",
+        metadata=metadata,
+    )
 
 
 def _another(specimen: Specimen, others: Sequence[Specimen], kind: int, rng: np.random.Generator) -> Specimen:
-    """Another bone type (kind 0) or another person's (kind 1); the other of the two where there is none of the kind."""
+    """Another bone type (kind 0) or another subject's (kind 1); the other kind where there is none."""
     other_bone = [o for o in others if o.bone != specimen.bone]
     other_person = [o for o in others if o.bone == specimen.bone and o.person != specimen.person]
     candidates = (other_bone or other_person, other_person or other_bone)[kind]
     if not candidates:
         raise ConfigError(
-            f"another bone or another person beside {specimen.bone} of {specimen.person}",
+            f"another bone or another subject than {specimen.bone} of {specimen.person}",
             f"{len(others)} other specimens, none fitting",
-            "name more bones or more people",
+            "name more bones or more subjects",
         )
     return candidates[rng.integers(len(candidates))]
 
@@ -184,129 +215,39 @@ def _finish_like_the_paper(
     source = source + rng.normal(0.0, noise_mm, source.shape)
     metadata |= {"noise_mm": noise_mm, "bias_mm": 0.0, "outlier_share": 0.0}
     rotation = Rotation.from_euler("xyz", rng.uniform(0.0, 180.0, 3), degrees=True).as_matrix()
-    return _place(specimen, rng.permutation(source), target, rotation, metadata, rng)
-
-
-def _place(
-    specimen: Specimen,
-    source: Array,
-    target: Array,
-    rotation: Array,
-    metadata: dict[str, Any],
-    rng: np.random.Generator,
-) -> Pair:
-    """Centre both on the target's mean, then move the source by the rotation and +-150 mm along each axis."""
-    origin = target.mean(axis=0)
-    T_source_target = se3.from_rotation_translation(rotation, rng.uniform(-TRANSLATION_MM, TRANSLATION_MM, 3))
-    return Pair(
-        source=se3.apply(T_source_target, source - origin),
-        target=target - origin,
-        T_target_source=se3.inverse(T_source_target),
-        name="",
-        bone=specimen.bone,
-        person=specimen.person,
-        protocol="",
-        metadata={**metadata, "origin_mm": origin},
-    )
-
-
-def _nearest(cloud: Array, centre: Array, share: float) -> NDArray[np.intp]:
-    """Indices of the `share` of the cloud (N, 3) that is nearest to `centre` (3,)."""
-    count = max(1, round(share * len(cloud)))
-    return np.argpartition(((cloud - centre) ** 2).sum(axis=1), count - 1)[:count]
+    return place(specimen, rng.permutation(source), target, rotation, metadata, rng)
 
 
 def _crop_centre(cloud: Array, rng: np.random.Generator) -> int:
     """Index of a random point; of a long bone (twice as long as wide) one from the last 5 % at either end."""
     centred = cloud - cloud.mean(axis=0)
-    variances, axes = np.linalg.eigh(centred.T @ centred / len(cloud))
-    if variances[2] < 4.0 * variances[1]:
+    axes, variances = extent.principal(cloud)
+    if variances[0] < 4.0 * variances[1]:
         return int(rng.integers(len(cloud)))
-    along = centred @ axes[:, 2]
+    along = centred @ axes[0]
     low, high = along.min(), along.max()
     margin = 0.05 * (high - low)
     end = along < low + margin if rng.random() < 0.5 else along > high - margin
     return int(rng.choice(np.flatnonzero(end)))
 
 
-def _best_view(
-    specimen: Specimen, level: Level, rng: np.random.Generator, draws: int = 20_000, tries: int = 8
-) -> tuple[Array, Array, dict[str, Any]]:
-    """Surface points and normals that a probe sees of the bone around a random point.
-
-    The probe looks from within 45 degrees of that point's normal. A view that shows too little (a look along a shaft,
-    into a fold) is no acquisition: another one is drawn, and the best of `tries` is taken.
-    """
-    best: tuple[float, Array, Array, dict[str, Any]] | None = None
-    for _ in range(tries):
-        points, normals = specimen.sample(draws, rng)
-        kept = rng.uniform(*level.share)
-        direction = _probe_direction(specimen, points[:1], normals[0], rng)
-        if direction is None:
-            continue
-        seen = VIEWS[level.share_of](specimen, points, direction, kept)
-        shown = len(seen) / (kept * draws)
-        if best is None or shown > best[0]:
-            metadata = {
-                "share": kept,
-                "share_of": level.share_of,
-                "overlap": len(seen) / draws,
-                "view_direction": direction,
-            }
-            best = shown, points[seen], normals[seen], metadata
-        if shown >= ENOUGH_SHOWN[level.share_of]:
-            break
-    if best is None:
-        given = f"{specimen.bone} of {specimen.person}, all hidden"
-        raise ConfigError("a surface that can be seen from outside", given, "check that no closed mesh surrounds it")
-    return best[1:]
-
-
-def _seen_of_region(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
-    """What is visible of the `share` of the surface that is nearest to the first point."""
-    region = _nearest(points, points[0], share)
-    return region[specimen.visible_from(points[region], direction)]
-
-
-def _nearest_seen(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
-    """The visible points nearest to the first one, until they are `share` of the surface, or all that is visible."""
-    seen = np.flatnonzero(specimen.visible_from(points, direction))
-    wanted = round(share * len(points))
-    return seen if len(seen) <= wanted else seen[_nearest(points[seen], points[0], wanted / len(seen))]
-
-
-def _band_seen(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
-    """The visible points nearest to a line through the first one, along what is visible, until they are `share`."""
-    seen = np.flatnonzero(specimen.visible_from(points, direction))
-    in_view = points[seen] - points[0]
-    in_view -= np.outer(in_view @ direction, direction)
-    along = np.linalg.eigh(np.cov(in_view.T))[1][:, 2]
-    across = np.abs(in_view @ np.cross(direction, along))
-    return seen[np.argsort(across, kind="stable")[: round(share * len(points))]]
-
-
-VIEWS = {"region": _seen_of_region, "seen": _nearest_seen, "band": _band_seen}
-ENOUGH_SHOWN = {"region": 0.25, "seen": 0.7, "band": 0.7}  # of the share asked for
-
-
-def _probe_direction(specimen: Specimen, point: Array, normal: Array, rng: np.random.Generator) -> Array | None:
-    """A unit direction within 45 degrees of the normal (either sign) from which `point` (1, 3) is seen, if any."""
-    for _ in range(8):
-        away = degradation.random_directions(1, rng)[0]
-        tilt = away - normal * (away @ normal)
-        tilt /= np.linalg.norm(tilt)
-        angle = np.arccos(rng.uniform(np.cos(np.pi / 4.0), 1.0))
-        for outward in (normal, -normal):
-            direction = np.cos(angle) * outward + np.sin(angle) * tilt
-            if specimen.visible_from(point, direction)[0]:
-                return direction
-    return None
-
-
+STRANGERS = {"wrong": wrong, "scene-wrong": wrong_scene}  # made with other bones; no pose is right
+DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same seed
+    **{f"scene-{level}-bone": (f"scene-{level}", derived.bone_alone) for level in ("C1", "C2", "C3")},
+    **{
+        f"{level}-far{percent}": (level, partial(derived.far_clutter, share=percent / 100.0))
+        for level in ("L1", "L2")
+        for percent in (10, 30)
+    },
+    "scene-ultrasound": ("ultrasound", derived.echoes),
+}
 PROTOCOLS: dict[str, Callable[..., Pair]] = {
     "paper": paper,
     **{f"overlap-{k}": partial(paper, share=(k / 100.0, k / 100.0)) for k in (40, 50, 60, 70)},
     "incomplete": incomplete,
     **{name: partial(one_sided, level=level) for name, level in LEVELS.items()},
-    "wrong": wrong,
+    **{name.replace("_", "-"): partial(acquired, sensor=name) for name in SENSORS},
+    **{name: partial(scene, level=level) for name, level in SCENE_LEVELS.items()},
+    **{name: partial(_derived, base=base, change=change) for name, (base, change) in DERIVED.items()},
+    **STRANGERS,
 }

@@ -1,4 +1,4 @@
-"""A bone's surface as other scanners, other segmentations or other people would give it."""
+"""A bone's surface as other scanners, other segmentations or other subjects would give it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapr_core.clouds import Surface
+from gapr_core.surface import Surface
 
 Scan = Callable[[Surface], Surface]
 
@@ -15,7 +15,7 @@ VOXELS_AT_ONCE = 1 << 20
 
 
 def of_size(factor: float) -> Scan:
-    """The surface of a smaller or a larger person."""
+    """The surface of a smaller or a larger subject."""
     return lambda surface: Surface(surface.points * factor, surface.faces)
 
 

@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from gapr_core.clouds import Surface
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 Grid = NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""One bone of one person, with the ray-casting state that protocols need, built once and kept."""
+"""One bone of one subject, with the ray-casting state that protocols need, built once and kept."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gapr_core.clouds import Surface
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import extent
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ class Specimen:
     Attributes:
         surface: points (N, 3) mm and faces (F, 3), in the frame of the scan.
         bone: bone type, for example "femur".
-        person: identity that splits and `wrong` pairs go by; the same for all bones of one person.
+        person: identity that splits and `wrong` pairs go by; the same for all bones of one subject.
         cohort: the data the surface comes from, for example "llp26", "parametric", "ct".
     """
 
@@ -46,11 +47,11 @@ class Specimen:
         return type(self), (self.surface, self.bone, self.person, self.cohort)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """(count, 3) points and unit normals, uniform over the area, drawn anew at every call."""
+        """(count, 3) points and unit normals, uniform over the area, drawn again at every call."""
         return self.surface.sample(count, rng)
 
     def visible_from(self, points: Array, direction: Array, clearance_mm: float = 0.1) -> NDArray[np.bool_]:
-        """Which surface points (N, 3) see a far probe in `direction` (3,) with nothing of the bone in between.
+        """Which surface points (N, 3) see a far probe in `direction`, (3,) or (N, 3), with nothing in between.
 
         Orientation of the faces does not matter: a ray from the far side runs through the bone and hits it.
         """
@@ -69,7 +70,7 @@ class Specimen:
         `upper` is the end with the larger coordinate along the axis nearest to the bone's longest direction.
         """
         triangles, centred = self.surface.triangles, self.surface.points - self._centre
-        axis = np.linalg.eigh(np.cov(centred.T))[1][:, 2]
+        axis = extent.principal(centred).axes[0].copy()
         axis *= np.sign(axis[np.abs(axis).argmax()]) * (1.0 if upper else -1.0)
         along = centred @ axis
         kept = along >= along.max() - share * np.ptp(along)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gapr_core.data import degradation
-from gapr_core.data.protocols import TARGET_POINTS, TRANSLATION_MM, Pair
+from gapr_core.data.pair import TARGET_POINTS, TRANSLATION_MM, Pair
 from gapr_core.data.specimen import Specimen
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class Motion:
         frames: clouds of the stream.
         share: of the whole surface, in one view.
         points: of one view at most.
-        noise_mm, bias_mm, outlier_share: as in `protocols.Level`; the smooth bias is drawn anew for each frame.
+        noise_mm, bias_mm, outlier_share: as in `protocols.Level`; the smooth bias is drawn again for each frame.
         step_mm, step_deg: largest motion of the bone from frame to frame, about its own centre.
         jump_every: after so many frames the bone is somewhere else altogether; 0: never.
         swing_deg: how far the probe goes around the bone, to either side.
@@ -49,7 +49,7 @@ def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> lis
     target, _ = specimen.sample(TARGET_POINTS, rng)
     origin = target.mean(axis=0)
     points, normals = specimen.sample(20_000, rng)
-    axis = np.linalg.eigh(np.cov(points.T))[1][:, 2]
+    axis = extent.principal(points).axes[0]
     towards = np.cross(axis, degradation.random_directions(1, rng)[0])
     towards /= np.linalg.norm(towards)
     pose = _anywhere(rng)
@@ -79,7 +79,7 @@ def _view(
     along = points[seen] @ axis
     place = along.min() + np.ptp(along) * (0.5 - 0.4 * np.cos(2.0 * np.pi * at))
     centre = points[seen[np.abs(along - place).argmin()]]
-    nearest = ((points[seen] - centre) ** 2).sum(axis=1).argsort()
+    nearest = ((points[seen] - centre) ** 2).sum(axis=1).argsort(kind="stable")
     return seen[nearest[: round(motion.share * len(points))]]
 
 

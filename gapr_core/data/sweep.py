@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core.data import degradation
 from gapr_core.data.specimen import Specimen
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
 
 Array = NDArray[np.float64]
 
@@ -83,14 +83,14 @@ def _seen_at(
 
 def _long_axis(points: Array) -> Array:
     """The direction (3,) of greatest extent, towards smaller z or x: from the hip down, from the left to the right."""
-    axis = np.linalg.eigh(np.cov(points.T))[1][:, 2]
+    axis = extent.principal(points).axes[0]
     return -axis * np.sign(axis[np.argmax(np.abs(axis))])
 
 
 def _measure(specimen: Specimen, points: Array, normals: Array, how: Acquisition, rng: np.random.Generator) -> Array:
     dirty = points + rng.normal(0.0, how.noise_mm, points.shape)
     dirty += degradation.bias_along_normals(points, normals, how.bias_mm, rng)
-    stray = np.flatnonzero(rng.random(len(points)) < how.outlier_share)
-    off = rng.uniform(3.0, 15.0, (len(stray), 1)) * degradation.random_directions(len(stray), rng)
-    dirty[stray] = points[stray] + off
+    outlier = np.flatnonzero(rng.random(len(points)) < how.outlier_share)
+    off = rng.uniform(3.0, 15.0, (len(outlier), 1)) * degradation.random_directions(len(outlier), rng)
+    dirty[outlier] = points[outlier] + off
     return dirty

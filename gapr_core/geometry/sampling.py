@@ -71,3 +71,9 @@ def fibonacci_directions(count: int) -> Array:
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * k
     radius = np.sqrt(1.0 - z**2)
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Array:
+    """(count, 3) unit vectors, uniform on the sphere."""
+    vectors = rng.normal(size=(count, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
+RIGHT_MM, RIGHT_DEG = 4.0, 5.0  # a pose farther off at the source's centroid, or turned farther, is wrong
+
+
+class PoseError(NamedTuple):
+    """Translation error at the source's centroid (RTE) and geodesic rotation error (RRE)."""
+
+    rte_mm: float
+    rre_deg: float
+
+    def within(self, limit_mm: float, limit_deg: float) -> bool:
+        """Neither error is larger than its limit."""
+        return self.rte_mm <= limit_mm and self.rre_deg <= limit_deg
+
+    @property
+    def is_right(self) -> bool:
+        """Within the limits of a right pose: 4 mm and 5 deg, what a confidence is the probability of."""
+        return self.within(RIGHT_MM, RIGHT_DEG)
+
 
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """(3, 3) rotation and (3,) translation as one (4, 4) matrix."""
-    T = np.eye(4)
-    T[:3, :3] = rotation
-    T[:3, 3] = translation
+    """(..., 3, 3) rotations and (..., 3) translations as (..., 4, 4) matrices."""
+    rotation = np.asarray(rotation, dtype=np.float64)
+    T = np.zeros((*rotation.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
     return T
 
 
@@ -42,14 +62,32 @@ def nearest_rigid(T: ArrayLike) -> Array:
 
 
 def kabsch(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Rigid T (4, 4) minimising sum_i w_i |T source_i - target_i|^2 (Kabsch 1976, Arun 1987); inputs (N, 3), N >= 3."""
+    """Rigid T (..., 4, 4) minimising sum_i w_i |T source_i - target_i|^2 (Kabsch 1976, Arun 1987).
+
+    Args:
+        source, target: (..., N, 3), N >= 3.
+        weights: (..., N), not negative; all equal when None.
+    """
     source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
-    w = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=np.float64)
-    w = w / w.sum()
-    source_mean, target_mean = w @ source, w @ target
-    u, _, vt = np.linalg.svd((source - source_mean).T @ ((target - target_mean) * w[:, None]))
-    rotation = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
-    return from_rotation_translation(rotation, target_mean - rotation @ source_mean)
+    w = np.ones(source.shape[:-1]) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = (w / w.sum(axis=-1, keepdims=True))[..., None]
+    source_mean, target_mean = (w * source).sum(axis=-2), (w * target).sum(axis=-2)
+    centred = source - source_mean[..., None, :], target - target_mean[..., None, :]
+    return fitting((w * centred[0]).swapaxes(-1, -2) @ centred[1], source_mean, target_mean)
+
+
+def fitting(covariance: Array, source_mean: Array, target_mean: Array) -> Array:
+    """Rigid T (..., 4, 4) of weighted sums: the last step of `kabsch`.
+
+    Args:
+        covariance: (..., 3, 3) sum of w_i (source_i - mean) (target_i - mean)^T.
+        source_mean, target_mean: (..., 3) weighted means.
+    """
+    u, _, vt = np.linalg.svd(covariance)
+    v = vt.swapaxes(-1, -2).copy()
+    v[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[..., None]  # a rotation, no mirror image
+    rotation = v @ u.swapaxes(-1, -2)
+    return from_rotation_translation(rotation, target_mean - (rotation @ source_mean[..., None])[..., 0])
 
 
 def exp(twist: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -59,11 +97,11 @@ def exp(twist: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     return from_rotation_translation(rotation, twist[:3] + centre - rotation @ centre)
 
 
-def pose_error(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> tuple[float, float]:
-    """Translation error at the source's centroid (RTE, mm) and geodesic rotation error (RRE, deg)."""
+def pose_error(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> PoseError:
+    """RTE at the centroid of `source` (N, 3) and RRE of T_estimate against T_true, both T_target_source (4, 4)."""
     centroid = np.asarray(source, dtype=np.float64).mean(axis=0, keepdims=True)
     shift = apply(T_estimate, centroid) - apply(T_true, centroid)
-    return float(np.linalg.norm(shift)), rotation_angle_deg(inverse(T_true) @ np.asarray(T_estimate))
+    return PoseError(float(np.linalg.norm(shift)), rotation_angle_deg(inverse(T_true) @ np.asarray(T_estimate)))
 
 
 def random_rotation(rng: np.random.Generator) -> Array:

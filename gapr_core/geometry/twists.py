@@ -1,4 +1,8 @@
-"""Is the covariance honest? Pose errors in the coordinates of `RegistrationResult.covariance`."""
+"""Small motions of a pose: error twists, how surprising they are under a covariance, and what they do to points.
+
+A twist is x y z (mm) rx ry rz (rad) in fixed axes of the target frame, rotation about a named centre: the coordinates
+of `RegistrationResult.covariance`.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Which points of a cloud are seen from outside, and which way is out.
 
 Two depth buffers, for two kinds of cloud. A bone of one surface has nothing to hide: the first lets a point pass unless
-something is clearly before it. A hollow one (a segmentation that follows the cortical wall on both sides) has a second
+something is clearly before it. A hollow one (a segmentation that follows the cortical bone on both sides) has a second
 surface a few millimetres below the first, within what the first lets pass: the second asks whether anything in front
-of a point lies above that point's own tangent plane, and the few outer points that this loses are found again beside
+of a point lies above that point's own tangent plane, and the few outer points that this loses are found again next to
 those that it keeps.
 """
 
@@ -23,6 +23,7 @@ View = Callable[[Array, Array, Array, float], NDArray[np.bool_]]  # direction, p
 
 STEEPEST = 2.0  # tangent of the steepest slope that the depth buffer makes room for
 FEWEST_VIEWS = 0.05  # share of the views that must see a point of the outer layer: gaps between outer points let some
+MOST_PIXELS = 1024  # across a view: points in pairs have next to no spacing, and a buffer that fine has no end
 HOLLOW_FROM = 0.15  # share of inner points that makes a bone a hollow one; deep folds of a solid pelvis reach 0.12
 
 
@@ -56,7 +57,7 @@ def unobstructed_from(direction: Array, points: Array, normals: Array, pixel_mm:
     """
     pixel, shape = _pixels(direction, points, pixel_mm)
     highest = np.full(shape[0] * shape[1], -1)
-    by_height = np.argsort(points @ direction)
+    by_height = np.argsort(points @ direction, kind="stable")
     highest[pixel[by_height]] = by_height  # the last one written stays
     slant = normals @ direction
     towards = normals * np.sign(slant)[:, None]
@@ -94,9 +95,10 @@ def outward_votes(
         (N, 3) sums of unit view directions, which point out of the body, and (N,) counts; a count of zero marks a
         point inside the shell, such as the wall of a medullary canal.
     """
+    pixel_mm = max(1.5 * spacing_mm, float(np.linalg.norm(np.ptp(points, axis=0))) / MOST_PIXELS)
     votes, counts = np.zeros_like(points), np.zeros(len(points), dtype=np.int64)
     for direction in fibonacci_directions(directions):
-        seen = seen_from(direction, points, normals, 1.5 * spacing_mm)
+        seen = seen_from(direction, points, normals, pixel_mm)
         votes[seen] += direction
         counts += seen
     return votes, counts
@@ -115,7 +117,7 @@ def outer_layer(
 
     Returns:
         (N,) mask and (N, 3) vectors that point out of the body; None for a bone of one surface. A wall thinner than
-        the spacing of the points cannot be told from one surface.
+        the spacing of the points cannot be separated from one surface.
     """
     votes, counts = outward_votes(points, normals, spacing_mm, directions, unobstructed_from)
     outer = counts >= FEWEST_VIEWS * directions

@@ -1,5 +1,7 @@
 """Metrics: pure functions of float64 numpy arrays; what each means is in docs/metrics.md."""
 
+from gapr_core.geometry.se3 import PoseError, pose_error
+from gapr_core.geometry.twists import error_twist, nees, predicted_rmse_mm
 from gapr_core.metrics.bootstrap import interval
 from gapr_core.metrics.confidence import (
     auroc,
@@ -11,10 +13,8 @@ from gapr_core.metrics.confidence import (
 )
 from gapr_core.metrics.cramer_rao import pose_bound
 from gapr_core.metrics.pose import (
-    PoseError,
     centroid_alignment,
     extreme_points,
-    pose_error,
     r2_rotation,
     r2_translation,
     recall,
@@ -24,7 +24,6 @@ from gapr_core.metrics.pose import (
     within_paper_limit,
 )
 from gapr_core.metrics.surfaces import chamfer_mm, coarse_inlier_ratio, fine_inlier_ratio
-from gapr_core.metrics.uncertainty import error_twist, nees, predicted_rmse_mm
 
 __all__ = [
     "PoseError", "auroc", "centroid_alignment", "chamfer_mm", "coarse_inlier_ratio", "error_twist",

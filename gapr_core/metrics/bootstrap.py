@@ -1,4 +1,4 @@
-"""Confidence intervals by resampling; by person, where it is known who the bones belong to."""
+"""Confidence intervals by resampling; by subject, where it is known who the bones belong to."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def interval(
 
     Args:
         values: (K,) one value per pair.
-        groups: (K,) whose pair it is; whole groups are drawn, as pairs of one person are not independent.
+        groups: (K,) whose pair it is; whole groups are drawn, as pairs of one subject are not independent.
         statistic: of a 1-D array; the mean when None.
         level: share of the resamples between the two ends.
         resamples: how many.

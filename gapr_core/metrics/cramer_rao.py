@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.geometry import se3
-from gapr_core.metrics.uncertainty import predicted_rmse_mm
+from gapr_core.geometry.twists import predicted_rmse_mm
 
 Array = NDArray[np.float64]
 NEIGHBOURS = 12  # target points that give a normal

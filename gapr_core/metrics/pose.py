@@ -3,35 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
+from gapr_core.geometry.se3 import RIGHT_DEG, RIGHT_MM
 
 Array = NDArray[np.float64]
 
 PAPER_RMSE_LIMIT = 0.02  # of the target's half extent: "after normalisation" in the paper
-STRICT_LIMITS = ((1.0, 1.0), (2.0, 2.0), (4.0, 5.0))  # mm at the source's centroid, deg
-ACCEPT_LIMIT = STRICT_LIMITS[-1]  # beyond it an accepted pose is a false accept
-
-
-class PoseError(NamedTuple):
-    """Translation error at the source's centroid and geodesic rotation error."""
-
-    rte_mm: float
-    rre_deg: float
-
-    def within(self, limit_mm: float, limit_deg: float) -> bool:
-        """Both errors below their limits."""
-        return self.rte_mm < limit_mm and self.rre_deg < limit_deg
-
-
-def pose_error(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> PoseError:
-    """RTE at the centroid of `source` (N, 3) and RRE of T_estimate against T_true, both T_target_source (4, 4)."""
-    return PoseError(*se3.pose_error(T_estimate, T_true, source))
+STRICT_LIMITS = ((1.0, 1.0), (2.0, 2.0), (RIGHT_MM, RIGHT_DEG))  # mm at the source's centroid, deg
 
 
 def rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> float:
@@ -54,10 +37,9 @@ def tre_mm(T_estimate: ArrayLike, T_true: ArrayLike, targets: Mapping[str, Array
 def extreme_points(target: ArrayLike) -> dict[str, Array]:
     """Six named targets of any bone (M, 3): its farthest points along both directions of its principal axes."""
     points = np.asarray(target, dtype=np.float64)
-    centred = points - points.mean(axis=0)
-    axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
-    axes *= np.sign(np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1))  # one sign for good
-    along = centred @ axes.T
+    axes = extent.principal(points).axes
+    axes = axes * np.sign(np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1))  # one sign for good
+    along = (points - points.mean(axis=0)) @ axes.T
     ends = {f"axis{k + 1}+": points[along[:, k].argmax()] for k in range(3)}
     return ends | {f"axis{k + 1}-": points[along[:, k].argmin()] for k in range(3)}
 
@@ -67,9 +49,9 @@ def error_motion(T_estimate: ArrayLike, T_true: ArrayLike) -> Array:
     return np.asarray(T_estimate, dtype=np.float64) @ se3.inverse(T_true)
 
 
-def within_paper_limit(rmse: float, half_extent_mm: float) -> bool:
-    """RMSE below 0.02 of the target's half extent (largest distance to its centroid)."""
-    return rmse < PAPER_RMSE_LIMIT * half_extent_mm
+def within_paper_limit(rmse: float, target: ArrayLike) -> bool:
+    """RMSE, mm, below 0.02 of the half extent of the target (M, 3), mm."""
+    return rmse < PAPER_RMSE_LIMIT * extent.half_extent_mm(np.asarray(target, dtype=np.float64))
 
 
 def recall(successes: ArrayLike) -> float:

@@ -13,7 +13,8 @@ def chamfer_mm(first: ArrayLike, second: ArrayLike, cutoff_mm: float = 10.0) -> 
     """The paper's CD: mean nearest-neighbour distance, both directions added, pairs beyond the cut-off dropped.
 
     Args:
-        first, second: (N, 3) and (M, 3) clouds in one frame, mm.
+        first: (N, 3) cloud, mm.
+        second: (M, 3) cloud in the same frame, mm.
         cutoff_mm: pairs at this distance or beyond are not counted; a direction without any pair counts as the cut-off.
     """
     return _one_way(first, second, cutoff_mm) + _one_way(second, first, cutoff_mm)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import extent
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.types import Cloud, Level, Neighborhood
 
@@ -34,7 +35,7 @@ def target_frame(target_mm: ArrayLike, config: ModelConfig) -> Frame:
     """Scale and first voxel of a target (M, 3), mm; both clouds of a pair share them."""
     points = _checked(target_mm)
     centred = points - points.mean(axis=0)
-    scale_mm = float(np.linalg.norm(centred, axis=1).max())
+    scale_mm = extent.half_extent_mm(points)
     return Frame(scale_mm, choose_voxel(centred / scale_mm, config))
 
 
@@ -106,7 +107,7 @@ def pyramid(points: Array, voxel: float, config: ModelConfig) -> list[Array]:
 def principal_axes(points: Array) -> Array:
     """(3, 3) columns: principal axes of a cloud, each pointing to its heavier tail."""
     centred = points - points.mean(axis=0)
-    axes = np.linalg.eigh(centred.T @ centred)[1]
+    axes = np.ascontiguousarray(extent.principal(points).axes[::-1].T)  # shortest first, as trained
     skewness = ((centred @ axes) ** 3).sum(axis=0)
     return np.asarray(axes * np.where(skewness < 0, -1.0, 1.0))
 

@@ -1,4 +1,4 @@
-"""The paper's figures (arXiv 2606.13488, tables I to III), on its data: printed beside ours, never mixed with them."""
+"""The paper's numbers (arXiv 2606.13488, tables I to III), on its data: printed next to ours, never mixed with them."""
 
 from __future__ import annotations
 
@@ -100,5 +100,5 @@ def of(protocol: str, bone: str) -> dict[str, Figures]:
         return TABLE_1.get(bone, {})
     if protocol == "incomplete":
         return {"GAPR-Net": TABLE_3[bone]} if bone in TABLE_3 else {}
-    figures = TABLE_2.get(bone, {}).get(protocol)
-    return {"GAPR-Net": figures} if figures else {}
+    numbers = TABLE_2.get(bone, {}).get(protocol)
+    return {"GAPR-Net": numbers} if numbers else {}

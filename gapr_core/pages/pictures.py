@@ -4,50 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from gapr_core.benchmark.record import Record
 from gapr_core.data.pair_files import load_pair
 from gapr_core.data.protocols import Pair
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
+from gapr_core.pages import palette
 
 Array = NDArray[np.float64]
-Record = dict[str, Any]
 MOST_TARGET_POINTS, MOST_SOURCE_POINTS = 5000, 1500
 
 
 def worst(records: Sequence[Record], method: str, count: int = 10) -> list[Record]:
     """False accepts first, the most confident of them first; then refused pairs that have a pose; then by RMSE."""
-    own = [r for r in records if r["method"] == method and (r["has_truth"] or r["accepted"])]
+    own = [r for r in records if r.method == method and (r.has_truth or r.accepted)]
     return sorted(own, key=_badness, reverse=True)[:count]
 
 
 def _badness(record: Record) -> tuple[float, float, float]:
-    kind = 2.0 if record["false_accept"] else 1.0 if not record["accepted"] else 0.0
-    return kind, record["confidence"] if kind == 2.0 else 0.0, record.get("rmse_mm") or 0.0
+    kind = 2.0 if record.false_accept else 1.0 if not record.accepted else 0.0
+    return kind, record.confidence if kind == 2.0 else 0.0, record.rmse_mm or 0.0
 
 
 def caption(record: Record) -> str:
     """One line on what went wrong."""
-    head = f"{record['pair']} ({record['protocol']}, {record['bone']}): "
-    if not record["accepted"]:
-        return f"{head}refused, {record['status']}, confidence {record['confidence']:.2f}. {record['reason']}"
-    if not record["has_truth"]:
-        return f"{head}FALSE ACCEPT of a wrong pair, confidence {record['confidence']:.2f}"
-    kind = "FALSE ACCEPT" if record["false_accept"] else "right"
-    errors = f"{record['rte_mm']:.2f} mm, {record['rre_deg']:.2f}°, whole bone {record['whole_bone_mm']:.2f} mm"
-    return f"{head}{kind}, {errors}, confidence {record['confidence']:.2f}"
+    head = f"{record.pair} ({record.protocol}, {record.bone}): "
+    if not record.accepted:
+        return f"{head}refused, {record.status}, confidence {record.confidence:.2f}. {record.reason}"
+    if not record.has_truth:
+        return f"{head}FALSE ACCEPT of a wrong pair, confidence {record.confidence:.2f}"
+    kind = "FALSE ACCEPT" if record.false_accept else "right"
+    errors = f"{record.rte_mm:.2f} mm, {record.rre_deg:.2f}°, whole bone {record.whole_bone_mm:.2f} mm"
+    return f"{head}{kind}, {errors}, confidence {record.confidence:.2f}"
 
 
 def picture(record: Record, folder: Path) -> Figure:
     """Two views along the bone's two shorter principal axes."""
-    pair = load_pair(folder / f"{record['file']}")
+    pair = load_pair(folder / record.file)
     centre = pair.target.mean(axis=0)
-    axes = np.linalg.eigh((pair.target - centre).T @ (pair.target - centre))[1][:, ::-1].T
+    axes = extent.principal(pair.target).axes
     clouds = [((points - centre) @ axes.T, colour, size, name) for points, colour, size, name in _clouds(record, pair)]
     length, *widths = np.ptp(clouds[0][0], axis=0)
     long = max(widths) < 0.45 * length  # views of a long bone one below the other
@@ -62,11 +62,11 @@ def picture(record: Record, folder: Path) -> Figure:
 
 def _clouds(record: Record, pair: Pair) -> list[tuple[Array, str, float, str]]:
     source = _thin(pair.source, MOST_SOURCE_POINTS)
-    clouds = [(_thin(pair.target, MOST_TARGET_POINTS), "#9aa2ab", 1.2, "target")]
+    clouds = [(_thin(pair.target, MOST_TARGET_POINTS), palette.TARGET, 1.2, "target")]
     if pair.has_truth:
-        clouds.append((se3.apply(pair.T_target_source, source), "#0b5fa5", 2.0, "source, true pose"))
-    if record["transform"]:
-        clouds.append((se3.apply(record["transform"], source), "#d1495b", 2.0, "source, answer"))
+        clouds.append((se3.apply(pair.T_target_source, source), palette.FIRST, 2.0, "source, true pose"))
+    if record.transform:
+        clouds.append((se3.apply(record.transform, source), palette.SECOND, 2.0, "source, answer"))
     return clouds
 
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import Surface
 from gapr_core.data.picture import shade
+from gapr_core.pages.report import level
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -47,16 +48,18 @@ def save_poster(
     figure.suptitle(title, fontsize=13)
     rows: Any = figure.subfigures(2, 1, height_ratios=[1.15, 1.0])
     bone, below = rows
-    _draw_bone(bone, target, points, distances_mm)
+    draw_bone(bone, target, points, distances_mm)
     all_axes = np.ravel(below.subplots(1, len(charts)))
     for axes, (name, (values, limit)) in zip(all_axes, charts.items(), strict=True):
-        _draw_chart(axes, name, values, limit, x_title)
+        draw_chart(axes, name, values, limit, x_title)
     figure.savefig(path)
 
 
-def _draw_bone(figure: Any, target: Surface, points: Array, distances_mm: Array) -> None:
-    size = np.ptp(target.points, axis=0)
-    turn = LYING if size[2] > 1.5 * size[0] else np.eye(3)
+def draw_bone(figure: Any, target: Surface, points: Array, distances_mm: Array, facing: Array | None = None) -> None:
+    """The bone, a long one lying, with points on it that are coloured by their distance, seen as `level` says."""
+    size, (x, y) = np.ptp(target.points, axis=0), level(facing)
+    to_front = np.array([[-y, x, 0.0], [-x, -y, 0.0], [0.0, 0.0, 1.0]])
+    turn = (LYING if size[2] > 1.5 * size[0] else np.eye(3)) @ to_front
     turned = replace(target, points=target.points @ turn.T, normals=None)
     low, high = turned.points.min(axis=0) - 8.0, turned.points.max(axis=0) + 8.0
     axes = figure.subplots()
@@ -69,7 +72,8 @@ def _draw_bone(figure: Any, target: Surface, points: Array, distances_mm: Array)
     axes.axis("off")
 
 
-def _draw_chart(axes: Any, name: str, values: Sequence[float], limit: float | None, x_title: str) -> None:
+def draw_chart(axes: Any, name: str, values: Sequence[float], limit: float | None, x_title: str) -> None:
+    """One curve over the frames, counted from 1, with a dashed line at the limit."""
     axes.plot(np.arange(1, len(values) + 1), values, "o-", color="#1f5fa8", markersize=4, linewidth=1.2)
     if limit is not None:
         axes.axhline(limit, color="0.5", linestyle="--", linewidth=1.0)

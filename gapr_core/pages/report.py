@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import base64
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
@@ -12,13 +13,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import Surface
+from gapr_core.pages import palette
+from gapr_core.runtime import files
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
 TEMPLATE = Path(__file__).with_name("templates") / "report.html"
-BONE_COLOUR = "#eadfc8"
 WORST_SHOWN_MM = 5.0  # where the colours of distances end
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture of a page.
+
+    Attributes:
+        png: its bytes; None where there is none, which is said in its place.
+        name: what it shows, for those who cannot see it.
+        caption: a line below.
+        is_bad: the caption tells of a mistake.
+    """
+
+    png: bytes | None
+    name: str
+    caption: str = ""
+    is_bad: bool = False
+
+
+def _image(image: Image) -> str:
+    shown = "<p>(not on this machine)</p>"
+    if image.png is not None:
+        data = base64.b64encode(image.png).decode()
+        shown = f'<img alt="{escape(image.name)}" src="data:image/png;base64,{data}">'
+    kind = ' class="bad"' if image.is_bad else ""
+    return f"<figure>{shown}<figcaption{kind}>{escape(image.caption)}</figcaption></figure>"
 
 
 class Report:
@@ -42,28 +70,51 @@ class Report:
         """Plain text."""
         self._parts.append(f"<p>{escape(text)}</p>")
 
+    def subheading(self, text: str) -> None:
+        """A part of a section begins."""
+        self._parts.append(f"<h3>{escape(text)}</h3>")
+
+    def note(self, text: str) -> None:
+        """Text that must not be overlooked, or, at the end of a page, where it comes from."""
+        self._parts.append(f'<p class="note">{escape(text)}</p>')
+
+    def bullets(self, lines: Sequence[str]) -> None:
+        """A list."""
+        self._parts.append(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>")
+
+    def images(self, images: Sequence[Image]) -> None:
+        """Pictures side by side, as many as fit."""
+        self._parts.append(f'<div class="images">{"".join(map(_image, images))}</div>')
+
     def facts(self, values: Mapping[str, str]) -> None:
-        """What matters most, as big figures: name to value."""
+        """What matters most, in big type: name to value."""
         tiles = (f'<div class="fact"><b>{escape(v)}</b><span>{escape(k)}</span></div>' for k, v in values.items())
         self._parts.append(f'<div class="facts">{"".join(tiles)}</div>')
 
     def table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[str] = (), text: Sequence[str] = ()
+        self,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[str]],
+        marks: Sequence[str] = (),
+        text: Sequence[str] = (),
+        best: Set[tuple[int, int]] = frozenset(),
     ) -> None:
         """A table of strings.
 
         Args:
             columns: the headings.
             rows: the cells, row by row.
-            marks: for each row "ok", "hold", "bad" or "": its colour.
+            marks: for each row "ok", "hold", "bad", "first" (of a group), "aside" or "": how it looks.
             text: the columns that hold words; the others are set to the right.
+            best: (row, column) of the cells in bold.
         """
         classes = [' class="text"' if name in text else "" for name in columns]
         head = "".join(f"<th{c}>{escape(name)}</th>" for name, c in zip(columns, classes, strict=True))
-        body = "".join(
-            f'<tr class="{mark}">{"".join(f"<td{c}>{escape(v)}</td>" for v, c in zip(row, classes, strict=True))}</tr>'
-            for row, mark in zip(rows, marks or [""] * len(rows), strict=True)
-        )
+        body = ""
+        for i, (row, mark) in enumerate(zip(rows, marks or [""] * len(rows), strict=True)):
+            texts = [f"<b>{escape(cell)}</b>" if (i, j) in best else escape(cell) for j, cell in enumerate(row)]
+            cells = "".join(f"<td{c}>{cell}</td>" for cell, c in zip(texts, classes, strict=True))
+            body += f'<tr class="{mark}">{cells}</tr>'
         html = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         self._parts.append(f'<div class="table">{html}</div>')
 
@@ -77,7 +128,7 @@ class Report:
         """One self-contained HTML file."""
         page = Template(TEMPLATE.read_text(encoding="utf-8"))
         text = page.substitute(title=escape(self.title), lead=escape(self.lead), body="\n".join(self._parts))
-        Path(path).write_text(text, encoding="utf-8")
+        files.write_text(path, text)
 
 
 @dataclass(frozen=True)
@@ -89,50 +140,81 @@ class Step:
         caption: one line above the view.
         points: (N, 3) mm in the target's frame; empty when there is no pose.
         distances_mm: (N,) distance of each point to the target's surface.
+        others: (M, 3) mm, points that do not count for the pose: shown in grey.
     """
 
     label: str
     caption: str
     points: Array
     distances_mm: Array
+    others: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def alignment_figure(target: Surface, steps: Sequence[Step], shown: int = -1) -> Any:
-    """A plotly figure: the target and on it the points of one step, coloured by distance; a slider chooses the step."""
+def alignment_figure(target: Surface, steps: Sequence[Step], shown: int = -1, facing: Array | None = None) -> Any:
+    """A plotly figure: the target and on it the points of one step, coloured by distance; a slider chooses the step.
+
+    `facing` is the direction (3,) in the target's frame from which the view begins; from the front where it is None.
+    """
     import plotly.graph_objects as go
 
     shown = range(len(steps))[shown]
-    clouds = [_cloud_trace(step, visible=k == shown) for k, step in enumerate(steps)]
+    kinds = (_cloud_trace, _others_trace) if any(len(step.others) for step in steps) else (_cloud_trace,)
+    clouds = [trace(step, visible=k == shown) for trace in kinds for k, step in enumerate(steps)]
     figure = go.Figure([_target_trace(target), *clouds])
-    choices = [
-        {
-            "method": "update",
-            "label": step.label,
-            "args": [{"visible": [True, *(k == chosen for k in range(len(steps)))]}, {"title.text": step.caption}],
-        }
-        for chosen, step in enumerate(steps)
-    ]
-    hidden = {"visible": False}
-    slider = {"active": shown, "steps": choices, "currentvalue": {"prefix": "frame "}, "pad": {"t": 0, "b": 40}}
-    figure.update_layout(
-        title={"text": steps[shown].caption, "font": {"size": 15}, "x": 0.02},
-        height=600,
-        margin={"l": 0, "r": 0, "t": 44, "b": 0},
-        showlegend=False,
-        sliders=[slider] if len(steps) > 1 else [],
-        scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, **_camera(target)},
-    )
+    own = np.tile(np.eye(len(steps), dtype=bool), len(kinds))
+    choices = [(step.label, [True, *visible], step.caption) for step, visible in zip(steps, own.tolist(), strict=True)]
+    figure.update_layout(**view_layout(target, choices, shown, "frame ", facing))
     return figure
 
 
-def _camera(target: Surface) -> dict[str, Any]:
-    """From the front (-y), a long bone lying across, as large as the page allows; true proportions."""
+def view_layout(
+    target: Surface,
+    choices: Sequence[tuple[str, list[bool], str]],
+    shown: int,
+    word: str,
+    facing: Array | None = None,
+) -> Any:
+    """The layout of a 3-D view with a slider.
+
+    Args:
+        target: what it is about.
+        choices: label, which traces are visible, and caption of every choice.
+        shown: which choice the view begins with.
+        word: what stands before the label.
+        facing: (3,) direction from which the view begins; from the front where it is None.
+    """
+    steps = [
+        {"method": "update", "label": label, "args": [{"visible": visible}, {"title.text": caption}]}
+        for label, visible, caption in choices
+    ]
+    hidden = {"visible": False}
+    slider = {"active": shown, "steps": steps, "currentvalue": {"prefix": word}, "pad": {"t": 0, "b": 40}}
+    return {
+        "title": {"text": choices[shown][2], "font": {"size": 15}, "x": 0.02},
+        "height": 600,
+        "margin": {"l": 0, "r": 0, "t": 44, "b": 0},
+        "showlegend": False,
+        "sliders": [slider] if len(choices) > 1 else [],
+        "scene": {"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, **_camera(target, facing)},
+    }
+
+
+def _camera(target: Surface, facing: Array | None) -> dict[str, Any]:
+    """From the side that `facing` says, a long bone lying across, as large as the page allows; true proportions."""
     size = np.ptp(target.points, axis=0)
     lies = size[2] > 1.5 * size[0]
     up = {"x": -1, "y": 0, "z": 0} if lies else {"x": 0, "y": 0, "z": 1}
     ratio = size * (4.2 / size[2] if lies else 2.0 / size[[0, 2]].max())
-    camera = {"eye": {"x": 0.15, "y": -1.2, "z": 0.15}, "up": up, "projection": {"type": "orthographic"}}
+    x, y = 1.2 * level(facing)
+    camera = {"eye": {"x": x + 0.15, "y": y, "z": 0.15}, "up": up, "projection": {"type": "orthographic"}}
     return {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True)), "camera": camera}
+
+
+def level(facing: Array | None) -> Array:
+    """(2,) x and y of a unit direction across the long axis z: that of `facing` (3,), or the front (-y) for none."""
+    across = np.zeros(2) if facing is None else facing[:2]
+    length = float(np.linalg.norm(across))
+    return across / length if length > 1e-6 else np.array([0.0, -1.0])
 
 
 def _target_trace(target: Surface) -> Any:
@@ -140,12 +222,14 @@ def _target_trace(target: Surface) -> Any:
 
     x, y, z = target.points.astype(np.float32).T
     if target.faces is None:
-        return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": BONE_COLOUR}, hoverinfo="skip")
+        return go.Scatter3d(
+            x=x, y=y, z=z, mode="markers", marker={"size": 1.5, "color": palette.BONE}, hoverinfo="skip"
+        )
     i, j, k = target.faces.astype(np.int32).T
     lighting = {"ambient": 0.5, "diffuse": 0.7, "specular": 0.1, "roughness": 0.8}
     light = {"x": 1.0, "y": 3.0, "z": -10.0}  # in view coordinates: from the eye, a little from above
     mesh = {"x": x, "y": y, "z": z, "i": i, "j": j, "k": k}
-    return go.Mesh3d(**mesh, color=BONE_COLOUR, lighting=lighting, lightposition=light, hoverinfo="skip")
+    return go.Mesh3d(**mesh, color=palette.BONE, lighting=lighting, lightposition=light, hoverinfo="skip")
 
 
 def _cloud_trace(step: Step, visible: bool) -> Any:
@@ -157,6 +241,14 @@ def _cloud_trace(step: Step, visible: bool) -> Any:
     marker = {"size": 2.5, "color": step.distances_mm.astype(np.float32), **colours}
     hover = "%{marker.color:.2f} mm off<extra></extra>"
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, visible=visible, hovertemplate=hover)
+
+
+def _others_trace(step: Step, visible: bool) -> Any:
+    import plotly.graph_objects as go
+
+    x, y, z = step.others.reshape(-1, 3).astype(np.float32).T
+    marker = {"size": 1.5, "color": palette.OTHERS}
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, visible=visible, hoverinfo="skip")
 
 
 def timeline_figure(

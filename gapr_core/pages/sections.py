@@ -1,12 +1,12 @@
-"""The printed tables: columns, headings, the paper's figures below ours, and where another method is better."""
+"""The printed tables: columns, headings, the paper's numbers below ours, and where another method is better."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from gapr_core.evaluation import paper_figures
-from gapr_core.evaluation.table import ALL, Row
+from gapr_core.benchmark.table import ALL, Row
+from gapr_core.pages import paper_numbers
 
 
 class Column(NamedTuple):
@@ -77,6 +77,9 @@ SAFETY = [
     Column("AUROC", number("auroc", 3), "auroc", 1),
     Column("ECE", number("ece", 3), "ece", -1),
     Column("NEES/6", number("nees_6", 2)),
+    Column("median NEES/5.35", number("nees_median", 2)),
+    Column("TRE ≤ tre95 %", percent("tre95_covers")),
+    Column("tre95 / TRE", number("tre95_ratio", 2)),
     Column("× bound", number("bound_ratio", 2)),
     Column("s", number("seconds", 3)),
     Column("s, 90 %", number("seconds_p90", 3)),
@@ -92,11 +95,13 @@ SUMMARY = [
 ]
 LEGEND = (
     "RR: registration recall, all pairs with a truth counted, refusals are no success; in brackets 95 % bootstrap "
-    "intervals by person. RMSE, CD, R², RTE, RRE, whole bone and TRE count a refusal with centroid on centroid without "
+    "intervals by subject. RMSE, CD, R², RTE, RRE, whole bone and TRE count a refusal with centroid on centroid, no "
     "rotation. RTE (at the source's centroid), RRE, whole bone (RMSE over the target) and worst TRE (of the named "
     "targets) are medians. False accept: an accepted pose beyond 4 mm or 5°, or any accepted pose on a wrong pair. "
     "AUROC and ECE judge the confidence of every pose given, also of the best one behind a refusal. NEES/6 (about 1 is "
-    "honest) and × bound (RMSE over the Cramer-Rao bound, root-mean-square) are of the right answers. s: median "
+    "honest) and × bound (RMSE over the Cramer-Rao bound, root-mean-square) are of the right answers; of all "
+    "accepted ones: median NEES/5.35, share whose error over the whole bone is below tre95_mm, median of tre95_mm "
+    "over that error. s: median "
     "register time without reading files and without preparing the target, which is apart. The confidence of a "
     "baseline is its share of source points within 5 mm, not calibrated. R²(R) is no measure of accuracy: Euler "
     "angles wrap around. Definitions: docs/metrics.md."
@@ -104,7 +109,7 @@ LEGEND = (
 
 
 def sections(rows: Sequence[Row]) -> list[Section]:
-    """A summary over all bones; per protocol how accurate (the paper's figures below ours), and how safe and fast."""
+    """A summary over all bones; per protocol how accurate (the paper's numbers below ours), and how safe and fast."""
     protocols = dict.fromkeys(row["protocol"] for row in rows)
     last_bone = {row["protocol"]: row["bone"] for row in rows}  # `all`, or the only one
     over_bones = [row for row in rows if row["bone"] == last_bone[row["protocol"]]]
@@ -170,10 +175,10 @@ def _best(group: Sequence[Row], columns: Sequence[Column]) -> set[tuple[int, int
 
 def _paper_cells(protocol: str, bone: str, columns: Sequence[Column]) -> list[list[str]]:
     lines = []
-    for method, f in paper_figures.of(protocol, bone).items():
+    for method, f in paper_numbers.of(protocol, bone).items():
         cd = "–" if f.chamfer_mm is None else f"{f.chamfer_mm:.3f}"
-        figures = {"rr_paper": f"{f.rr_percent:.1f}", "rmse_mm": f"{f.rmse_mm:.3f}", "chamfer_mm": cd}
+        numbers = {"rr_paper": f"{f.rr_percent:.1f}", "rmse_mm": f"{f.rmse_mm:.3f}", "chamfer_mm": cd}
         named = {"R²(R)": f"{f.r2_rotation:.3f}", "R²(t)": f"{f.r2_translation:.3f}"}
-        own = [figures.get(c.key) or named.get(c.title, "") for c in columns]
-        lines.append([bone, f"{method} (the paper's figure, on the paper's data)", *own])
+        own = [numbers.get(c.key) or named.get(c.title, "") for c in columns]
+        lines.append([bone, f"{method} (the paper's number, on the paper's data)", *own])
     return lines

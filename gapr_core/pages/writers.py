@@ -3,39 +3,38 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from gapr_core.evaluation.sections import LEGEND, sections, where_beaten
-from gapr_core.evaluation.table import Row
-
-Plan = dict[str, Any]
+from gapr_core.benchmark.records import Plan
+from gapr_core.benchmark.table import Row
+from gapr_core.pages import markdown
+from gapr_core.pages.sections import LEGEND, sections, where_beaten
+from gapr_core.runtime import files
 
 
 def write_json(path: Path, rows: Sequence[Row], plan: Plan) -> None:
     """Rows and what made them."""
-    path.write_text(json.dumps({"run": plan, "rows": list(rows)}, indent=1) + "\n", encoding="utf-8")
+    files.write_json(path, {"run": asdict(plan), "rows": list(rows)})
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """One line per row, empty where there is no figure."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with files.replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
 
 
 def write_markdown(path: Path, rows: Sequence[Row], plan: Plan, notes: Sequence[str]) -> None:
-    """The table for people."""
+    """The table as Markdown."""
     parts = ["# Benchmark", *(f"> {note}" for note in notes)]
     for section in sections(rows):
         body = [[f"**{c}**" if (i, j) in section.best else c for j, c in enumerate(line)]
                 for i, line in enumerate(section.cells)]  # fmt: skip
-        lines = [section.header, ["---"] * len(section.header), *body]
-        parts += [f"## {section.title}", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
-    beaten = where_beaten(rows, plan["ours"])
-    parts += [f"## Where another method beats {plan['ours']}", "\n".join(f"- {line}" for line in beaten)]
-    made = f"Made by `{plan['command']}` at commit {plan['commit']}, {plan['threads']} thread(s), {plan['machine']}."
-    path.write_text("\n\n".join([*parts, LEGEND, made]) + "\n", encoding="utf-8")
+        parts += [f"## {section.title}", markdown.table(section.header, body)]
+    beaten = where_beaten(rows, plan.ours)
+    parts += [f"## Where another method beats {plan.ours}", "\n".join(f"- {line}" for line in beaten)]
+    made = f"Made by `{plan.command}` at commit {plan.commit}, {plan.threads} thread(s), {plan.machine}."
+    files.write_text(path, "\n\n".join([*parts, LEGEND, made]) + "\n")

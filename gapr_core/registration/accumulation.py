@@ -9,23 +9,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.clouds import EXTENT_LIMITS_MM, Surface, check_extent, finite_points
-from gapr_core.config import RefinementConfig, SourceConfig
+from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
-from gapr_core.refinement import evaluate
-from gapr_core.registrar import Registrar
+from gapr_core.registration.refinement import evaluate
+from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.tracking import Tracker
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_core.target import PreparedTarget
-from gapr_core.tracking import Tracker
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-OFF = 2.5  # a source lies off the bone when it is so many times farther from it than all together
-MOST_OFF = 3  # so many such sources in a row are not stray any more: the bone has moved
-FEWEST_POINTS = 20  # of a source that can be said to lie off
-MOST_POINTS = SourceConfig().most_points  # that are kept of one source, and looked at of all
 
 
 class Accumulator:
@@ -50,6 +45,9 @@ class Accumulator:
         if most < 1:
             raise ConfigError("at least 1 source to keep", str(most), "1 registers every source by itself")
         self.method, self.most = method, most
+        self.config = (method.registrar if isinstance(method, Tracker) else method).config
+        if isinstance(method, Tracker):
+            method.share_points()
         self._target: PreparedTarget | None = None
         self.reset()
 
@@ -70,13 +68,13 @@ class Accumulator:
         """Keep a source (N, 3), mm, without registering; the oldest one goes when there are too many.
 
         An empty source, and one that is there already, changes nothing. One that is metres away from the others cannot
-        be of the same bone in the same frame: it is left out, and the third in a row starts the collection anew.
+        be of the same bone in the same frame: it is left out, and the third in a row restarts the collection.
 
         Raises:
             InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
         """
         points = finite_points(source)
-        points = points[sampling.thin(points, MOST_POINTS)]
+        points = points[sampling.thin(points, self.config.accumulation.most_points)]
         if not len(points) or _is_among(points, self._kept + self._new):
             return
         if (extent_mm := Surface(points).extent_mm) > EXTENT_LIMITS_MM[1]:
@@ -89,10 +87,11 @@ class Accumulator:
     def _leave_out(self, points: Array, given: str) -> None:
         """Raises, but for the third in a row, before which the collection is forgotten."""
         self._off = [*self._off, points]
-        if len(self._off) < MOST_OFF:
-            mend = f"look at the transforms; {MOST_OFF} in a row start the collection anew"
-            raise InvalidPointCloudError("a source near the others, in one frame", given, mend)
-        log.warning("%d sources in a row are metres away from the others: the collection starts anew", MOST_OFF)
+        most_off = self.config.accumulation.most_off
+        if len(self._off) < most_off:
+            how = f"look at the transforms; {most_off} in a row restart the collection"
+            raise InvalidPointCloudError("a source near the others, in one frame", given, how)
+        log.warning("%d sources in a row are metres away from the others: the collection restarts", most_off)
         self.reset()
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
@@ -100,19 +99,26 @@ class Accumulator:
         return self.method.prepare(target, units)
 
     def register(
-        self, source: ArrayLike, target: PreparedTarget, initial: ArrayLike | None = None
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
         """The pose of all that is collected, this source (N, 3), mm, included; see `Registrar.register`.
 
-        Another target than before starts a new collection. A source that cannot be registered is not kept.
+        Another target than before starts a new collection. A source that cannot be registered is not kept, and one
+        without a finite point is refused: what was collected before says nothing about it.
         """
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target
+        if not len(finite_points(source)):
+            return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason="the source has no finite point")
         before = self._new
         self.collect(source)
         try:
-            result = self.method.register(_together(self._last()), target, initial)
+            result = self.method.register(_together(self._last()), target, initial, viewpoint)
         except Exception:
             self._new = [points for points in self._new if _is_among(points, before)]
             raise
@@ -127,24 +133,34 @@ class Accumulator:
         newest = self._new[-1:]
         if result.T_target_source is not None:
             everything = _together(self._last())
-            off = [source for source in self._new if _lies_off(source, everything, result.T_target_source, target)]
-        strangers = [source for source in off if not _is_among(source, self._off)]
-        self._off = [*self._off, *strangers] if off and len(off) == len(self._new) else strangers
+            off = [source for source in self._new if self._lies_off(source, everything, result.T_target_source, target)]
+        newly_off = [source for source in off if not _is_among(source, self._off)]
+        self._off = [*self._off, *newly_off] if off and len(off) == len(self._new) else newly_off
         self._kept = [s for s in self._kept + self._new if not _is_among(s, off)][-self.most :]
         self._new = []
-        if len(self._off) >= MOST_OFF:
-            return self._begin_anew(result)
+        if len(self._off) >= self.config.accumulation.most_off:
+            return self._restart(result)
         if newest and _is_among(newest[0], off):
             count = len(self._kept)
             return _refused(result, f"the newest source lies off the bone where {count} others found it: left out")
         return result
 
-    def _begin_anew(self, result: RegistrationResult) -> RegistrationResult:
-        strays = self._off
+    def _restart(self, result: RegistrationResult) -> RegistrationResult:
+        moved = self._off
         self.reset()
-        self._kept = strays[-self.most :]
-        reason = f"{len(strays)} sources in a row lie off the bone: it has moved, and the collection starts anew"
+        self._kept = moved[-self.most :]
+        reason = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"
         return _refused(result, reason)
+
+    def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget) -> bool:
+        """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3)."""
+        limits, refinement = self.config.accumulation, self.config.refinement
+        if len(source) < limits.fewest_points:
+            return False
+        some = points[:: 1 + len(points) // limits.most_points]
+        distances = (evaluate(T, each, target, refinement).signed_mm for each in (source, some))
+        own, of_all = (float(np.median(np.nan_to_num(np.abs(d), nan=np.inf))) for d in distances)
+        return own > limits.off * max(of_all, refinement.smallest_sigma_mm)
 
 
 def _together(sources: list[Array]) -> Array:
@@ -155,16 +171,6 @@ def _is_among(source: Array, others: list[Array]) -> bool:
     return any(np.array_equal(source, other) for other in others)
 
 
-def _lies_off(source: Array, points: Array, T: Array, target: PreparedTarget) -> bool:
-    """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3)."""
-    if len(source) < FEWEST_POINTS:
-        return False
-    some = points[:: 1 + len(points) // MOST_POINTS]
-    distances = (evaluate(T, each, target, RefinementConfig()).signed_mm for each in (source, some))
-    own, of_all = (float(np.median(np.nan_to_num(np.abs(d), nan=np.inf))) for d in distances)
-    return own > OFF * max(of_all, RefinementConfig().smallest_sigma_mm)
-
-
 def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
     return replace(
         result,
@@ -173,6 +179,7 @@ def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
         covariance=None,
         centre_mm=None,
         tre_mm=None,
+        tre95_mm=None,
         confidence=0.0,
         reason=reason,
     )

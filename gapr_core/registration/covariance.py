@@ -1,28 +1,30 @@
-"""How uncertain a refined pose is, under noise and under the smooth bias that probes and segmentations have.
+"""How uncertain a refined pose is: noise, smooth bias, and the stand-off and scale that no residual shows.
 
-The weighted least-squares pose reacts to residuals e by H^-1 J^T W e. With independent noise of variance s^2 and a
-smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), its covariance is the sandwich
-H^-1 J^T W (s^2 I + b^2 K) W J H^-1 (White 1980; Censi 2007 for the noise alone). A Hessian alone is over-confident.
-A weak prior is in H and in the noise: a motion of which nothing was observed has the prior's variance, not none.
+A least-squares pose reacts to errors e of the residuals by a gain, G e. With independent noise of variance s^2, a
+smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), a stand-off of variance o^2 that all points share and a
+relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
+Censi 2007 for the noise alone). A Hessian alone is over-confident. The size of the bias comes from the residuals
+(`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone hardly moves the
+pose, and one seen from one side does. A weak prior keeps a motion of which nothing was observed uncertain, but finite.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
-from gapr_core.config import CovarianceConfig
-from gapr_core.metrics.uncertainty import predicted_rmse_mm
-from gapr_core.refinement import Fit
+from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.registration import sensor as sensors
+from gapr_core.registration.bias_field import POSE_PRIOR, NormalEquations, fields, root_mean_square
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.sensor import Errors
 
 Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
-POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class PoseUncertainty:
 
     Attributes:
         covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
-        bias_mm: standard deviation of the smooth bias that the covariance reckons with.
+        bias_mm: standard deviation of the smooth bias that the covariance allows for.
         smooth_mm: the smooth misfit that the residuals show (see `smooth_misfits_mm`).
         short_mm: the same at a shorter range, which also holds what is rougher: another bone's surface.
         weakest_turn: (3,) unit axis, target frame, about which the rotation is least certain.
@@ -55,23 +57,78 @@ class PoseUncertainty:
         """Standard deviation about the least certain axis, deg."""
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
 
-    def tre_mm(self, points: Array, centroid: Array) -> float:
-        """Predicted root-mean-square error over (M, 3) target points: the trace of J Sigma J^T (Fitzpatrick 1998)."""
-        return predicted_rmse_mm(self.covariance, points, centroid)
 
-
-def estimate(fit: Fit, config: CovarianceConfig) -> PoseUncertainty:
-    """Covariance of a fit from its residuals; always symmetric and positive definite."""
-    J, w = fit.jacobian, fit.weights
-    H = (J * w[:, None]).T @ J + POSE_PRIOR
-    noise = fit.sigma_mm**2 * ((J * (w**2)[:, None]).T @ J + POSE_PRIOR)
-    smooth_mm, short_mm = smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
-    bias_mm = np.hypot(config.bias_floor_mm, config.bias_gain * smooth_mm)
-    H_inverse = np.linalg.inv(H)
-    covariance = H_inverse @ (noise + bias_mm**2 * _correlated(fit, config)) @ H_inverse
+def estimate(fit: Fit, config: CovarianceConfig, sensor: SensorConfig | None = None) -> PoseUncertainty:
+    """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite."""
+    count = int(np.count_nonzero(fit.weights))
+    known = sensors.errors(sensor or SensorConfig(), count)
+    spanned = fields(fit, config.correlation_mm, config.centres)
+    bias_mm = config.bias_gain * expected_bias_mm(NormalEquations.of(fit, spanned), known.bias_mm, config)
+    expected = replace(
+        known,
+        noise_mm=expected_noise_mm(fit.sigma_mm, count, known.noise_mm, config.noise_points),
+        bias_mm=bias_mm,
+        standoff_mm=float(np.hypot(known.standoff_mm, config.long_share * bias_mm)),
+    )
+    covariance = sandwich(fit, spanned, expected)
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
-    weakest = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
-    return PoseUncertainty(covariance, float(bias_mm), smooth_mm, short_mm, *weakest)
+    smooth_mm, short_mm = smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
+    turn, shift = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
+    return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm, turn, shift)
+
+
+def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:
+    """Standard deviation of a point, of `count` points whose residuals spread by `sigma_mm` after a fit of 6 unknowns.
+
+    The sensor's own noise counts as `worth` points: of a dozen points the residuals alone say little.
+    """
+    freedom = max(worth + count - 6.0, 1.0)
+    return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
+
+
+def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: CovarianceConfig) -> float:
+    """Root mean square of the bias's size under the residuals, log-normal about the sensor's typical one before."""
+    sizes_mm = np.array(config.sizes_mm)
+    log_prior = -0.5 * (np.log(sizes_mm / max(typical_mm, sizes_mm[0])) / config.bias_spread) ** 2
+    log_prior += np.log(np.gradient(np.log(sizes_mm)))  # the sizes are not evenly spaced
+    log_posterior = log_prior + equations.log_likelihood(sizes_mm, config.smallest_share)
+    return float(np.sqrt(max(root_mean_square(sizes_mm, log_posterior) ** 2 - config.no_bias_mm**2, 0.0)))
+
+
+def sandwich(fit: Fit, fields: Array, errors: Errors) -> Array:
+    """(6, 6) G (s^2 I + b^2 F F^T + o^2 1 1^T + q^2 r r^T) G^T + the prior's share, for the gain G of the fit.
+
+    s is the noise, b the bias with fields F, o the stand-off, which moves all points along their normals, and q the
+    scale, which moves a point by its distance r from the centroid along its normal.
+    """
+    inlier = fit.weights > 0.0
+    gain, prior = gain_of(fit, fields, errors.noise_mm)
+    offsets = fit.moved[inlier] - (fit.moved[inlier].mean(axis=0) if inlier.any() else 0.0)
+    outward = np.einsum("ni,ni->n", offsets, fit.gradients[inlier])
+    common = np.column_stack(
+        [errors.bias_mm * fields[inlier], np.full(inlier.sum(), errors.standoff_mm), errors.scale * outward]
+    )
+    moved = gain @ common
+    return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + prior)
+
+
+def gain_of(fit: Fit, fields: Array, noise_mm: float) -> tuple[Array, Array]:
+    """How the pose reacts to errors of the inliers: (6, n) twist per mm, and the prior's (6, 6) covariance.
+
+    G = (J^T V^-1 J + P)^-1 J^T V^-1 up to its sign, with V = s^2 W^-1 + c^2 F F^T (Aitken 1935): c is the bias for
+    which the pose is corrected, 0 for plain least squares. V^-1 by Woodbury's identity. P keeps what is not observed
+    finite.
+    """
+    inlier = fit.weights > 0.0
+    J, F = fit.jacobian[inlier], fields[inlier]
+    precision = fit.weights[inlier, None] / noise_mm**2
+    VJ = precision * J
+    if fit.bias_mm > 0.0:
+        WF = precision * F
+        VJ -= WF @ np.linalg.solve(F.T @ WF + np.eye(F.shape[1]) / fit.bias_mm**2, WF.T @ J)
+    P = POSE_PRIOR / noise_mm**2
+    H_inverse = np.linalg.inv(J.T @ VJ + P)
+    return H_inverse @ VJ.T, H_inverse @ P @ H_inverse
 
 
 def smooth_misfits_mm(fit: Fit, neighbours: tuple[int, ...]) -> tuple[float, ...]:
@@ -92,22 +149,6 @@ def smooth_misfits_mm(fit: Fit, neighbours: tuple[int, ...]) -> tuple[float, ...
         return float(np.sqrt(max((averages**2).mean() - signed.var() / count, 0.0)))
 
     return tuple(misfit_mm(count) if len(points) > count else fit.sigma_mm for count in neighbours)
-
-
-def _correlated(fit: Fit, config: CovarianceConfig) -> Array:
-    """J^T W K W J of a smooth field, from a regular subset of the inliers scaled to all of them."""
-    inlier = np.flatnonzero(fit.weights > 0.0)
-    if not len(inlier):
-        return np.zeros((6, 6))
-    some = inlier[:: max(1, len(inlier) // config.correlation_points)]
-    weighted = fit.jacobian[some] * fit.weights[some, None] * (len(inlier) / len(some))
-    points = fit.moved[some]
-    return np.asarray(weighted.T @ smooth_correlation(points, points, config.correlation_mm) @ weighted)
-
-
-def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:
-    """(N, M) exp(-d^2 / 2 l^2) between points (N, 3) and (M, 3): how alike a smooth bias is in both."""
-    return np.asarray(np.exp(-0.5 * cdist(a, b, "sqeuclidean") / length_mm**2))
 
 
 def _largest_axis(block: Array) -> Array:

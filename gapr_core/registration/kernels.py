@@ -67,7 +67,7 @@ def residual(x, y, z, q, elements, spacing, variance):
 def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spacing, limits, variances):
     """Gauss-Newton from every pose (K, 4, 4); one iteration per entry of `limits` (Tukey scale) and `variances`.
 
-    `trust` (N,) are weights of the points beside Tukey's. Where the variance of the noise is given, a residual also
+    `trust` (N,) are weights of the points as well as Tukey's. Where the variance of the noise is given, a residual also
     weighs as much as the noise's share in its variance; the rest is the element's. Returns the poses and their mean
     squared distances, truncated at the last limit.
     """

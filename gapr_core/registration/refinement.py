@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gapr_core import refinement_kernels as kernels
 from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.parallel import thread_count
-from gapr_core.target import PreparedTarget
+from gapr_core.registration import kernels
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.runtime.parallel import thread_count
 
 Array = NDArray[np.float64]
 
@@ -37,6 +37,7 @@ class Fit:
         gradients: (N, 3) unit surface normals at the foot points, target frame.
         elements: (N,) indices of the nearest target points, -1 where none is near.
         moved: (N, 3) source points in the target frame.
+        bias_mm: standard deviation of the smooth bias for which the pose is corrected; 0 for plain least squares.
     """
 
     T: Array
@@ -46,6 +47,7 @@ class Fit:
     gradients: Array
     elements: NDArray[np.int64]
     moved: Array
+    bias_mm: float = 0.0
 
     @property
     def jacobian(self) -> Array:

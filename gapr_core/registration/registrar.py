@@ -2,48 +2,51 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core import confidence, covariance, doubts
-from gapr_core import source as sources
-from gapr_core import target as targets
-from gapr_core.clouds import Surface
-from gapr_core.confidence import Calibration
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.proposals.base import Proposer
-from gapr_core.proposals.search import NormalAlignedSearch
-from gapr_core.refinement import Fit, evaluate, refine_fully
-from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_core.smooth_bias import compensate
-from gapr_core.source import PreparedSource, Unusable
-from gapr_core.target import PreparedTarget
-from gapr_core.verification import Candidates, verify
+from gapr_core.registration import clutter, cortices, explained
+from gapr_core.registration import source as sources
+from gapr_core.registration import target as targets
+from gapr_core.registration.assessment import Assessment, answer, assess
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.guidance import guide
+from gapr_core.registration.precision_model import Precision
+from gapr_core.registration.proposals.base import Proposer
+from gapr_core.registration.proposals.search import NormalAlignedSearch
+from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.sensor import offset_surface
+from gapr_core.registration.smooth_bias import bias_corrected
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import verify
+from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
+from gapr_core.runtime.clock import Clock
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-
-BOTH_WALLS = 0.82  # a source follows both walls of a hollow bone when they leave less than this share of its residuals
-UNFAMILIAR = 0.85  # such a source, which no probe gives, is not what the confidence was fitted on: it is at most this
-DOUBT = 0.4  # the confidence is at most this where a rule, not the model, says that the pose may be another one
 
 
 class Registrar:
     """Lays partial sources on one or many prepared targets.
 
     Proposers are asked in turn, each round with the poses of all so far, until an answer is sure: with the shipped
-    weights the network first, and the exhaustive search only where the network's answer leaves a doubt.
+    weights the network first, and the exhaustive search only if the network's answer is not sure.
 
     Args:
         config: every setting.
         proposers: where hypotheses come from; the weight-free search when not given.
         calibrations: the confidence model of each round; the shipped ones when not given.
+        scene_calibration: the confidence model of a source with a viewpoint; the shipped one when not given.
+        precision: what corrects the predicted errors; the shipped one when not given.
     """
 
     name = "gapr"
@@ -53,13 +56,17 @@ class Registrar:
         config: RegistrarConfig | None = None,
         proposers: Sequence[Proposer] | None = None,
         calibrations: Sequence[Calibration] | None = None,
+        scene_calibration: Calibration | None = None,
+        precision: Precision | None = None,
     ) -> None:
         self.config = config or RegistrarConfig()
         self.proposers: tuple[Proposer, ...] = tuple(proposers or (_search(self.config),))
         self.calibrations = tuple(calibrations or (Calibration.shipped(p.name) for p in self.proposers))
+        self._scene_calibration = scene_calibration
         if len(self.calibrations) != len(self.proposers):
             given = f"{len(self.calibrations)} for {len(self.proposers)} proposers"
             raise ConfigError("one confidence model for each proposer", given, "pass as many")
+        self.precision = precision or Precision.load()
 
     @classmethod
     def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu") -> Registrar:
@@ -74,136 +81,138 @@ class Registrar:
             ConfigError: no such device.
         """
         config = config or RegistrarConfig()
-        return cls(config, (_network(device), _search(config)))
+        return cls(config, (network(device), _search(config)))
+
+    @cached_property
+    def scene_calibration(self) -> Calibration:
+        """The confidence model of a source with a viewpoint, read when the first one comes."""
+        return self._scene_calibration or Calibration.shipped(clutter.NAME)
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Everything static about a target, the proposers' share included; see `gapr_core.target.prepare`."""
+        """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
         prepared = targets.prepare(target, units, self.config.target)
         for proposer in self.proposers:
-            for each in filter(None, (prepared, prepared.both_walls)):
+            for each in filter(None, (prepared, prepared.both_cortices)):
                 proposer.prepare(each)
         return prepared
 
     def register(
-        self, source: ArrayLike, target: PreparedTarget, initial: ArrayLike | None = None
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
         """The pose of a source on the target, or a refusal.
 
         Args:
             source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
             target: from `prepare`.
-            initial: (4, 4) T_target_source to try besides all others, such as the pose of the frame before.
+            initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
+            viewpoint: (3,) mm, source frame: where the camera was, if there was one.
 
         Raises:
             InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm.
         """
-        clock = _Clock()
+        clock = Clock()
+        return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
+
+    def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
+        """The answer to an assessment: thresholds, guidance where asked for, times."""
+        if isinstance(assessment, Refusal):
+            return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
+        guidance = guide(assessment, self.config.guidance) if self.config.guide else None
+        return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
+
+    def assess(
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
+        clock: Clock | None = None,
+    ) -> Assessment | Refusal:
+        """What `register` knows before `min_confidence` and `max_tre_mm` decide: for calibration and research."""
+        clock = clock or Clock()
+        target = offset_surface(target, self.config.sensor)
         prepared = sources.prepare(source, self.config.source)
-        if isinstance(prepared, Unusable):
-            return RegistrationResult(prepared.status, reason=prepared.reason, stage_ms=clock.lap("prepare"))
         clock.lap("prepare")
-        poses = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
-        result = self._in_rounds(prepared, target, poses, clock)
-        if target.both_walls is not None and self._follows_both_walls(prepared, target.both_walls, result):
-            result = self._in_rounds(prepared, target.both_walls, result.details["best_pose"][None], clock, UNFAMILIAR)
-        return replace(result, stage_ms=clock.stages)
+        if isinstance(prepared, Refusal):
+            return prepared
+        start = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
+        if viewpoint is None:
+            assessment = self._in_rounds(prepared, target, start, clock)
+        else:
+            assessment = self._in_scene(prepared, target, start, _place(viewpoint), clock)
+        if assessment is None:
+            return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no hypothesis was proposed")
+        if viewpoint is None and target.both_cortices is not None and cortices.follows_both(assessment, self.config):
+            again = self._in_rounds(prepared, target.both_cortices, assessment.fit.T[None], clock)
+            assessment = (again or assessment).limited(self.config.cortices.largest_confidence)
+        if assessment.is_sure(self.config.min_confidence):
+            assessment = bias_corrected(assessment, self.config)
+            clock.lap("refine")
+        return explained.named_clutter(assessment, self.config).corrected(self.precision)
 
     def _in_rounds(
-        self, prepared: PreparedSource, target: PreparedTarget, poses: Array, clock: _Clock, most: float = 1.0
-    ) -> RegistrationResult:
-        """Ask one proposer after the other until an answer is sure; `most` limits the confidence."""
-        result = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="nothing was proposed")
-        fit: Fit | None = None
+        self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock
+    ) -> Assessment | None:
+        """Ask one proposer after the other, each round with the poses of all so far, until an answer is sure."""
+        config, assessment = self.config, None
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
-            rng = np.random.default_rng(self.config.seed)
-            poses = np.concatenate([poses, proposer.propose(prepared, target, rng).poses])
+            rng = np.random.default_rng(config.seed)
+            poses = np.concatenate([poses, proposer.propose(source, target, rng).poses])
             clock.lap("propose")
-            if len(poses):
-                candidates = verify(poses, prepared, target, self.config.verification, self.config.num_threads)
-                clock.lap("verify")
-                fit = refine_fully(
-                    candidates.poses[0], prepared.points, target, self.config.refinement, prepared.neighbours
-                )
-                clock.lap("refine")
-                result = self._assess(fit, candidates, prepared, target, calibration, most)
-            result = replace(result, details=result.details | {"rounds": number, "proposer": proposer.name})
-            clock.lap("assess")
-            if result.confidence >= max(self.config.sure, self.config.min_confidence):
-                break
-        if fit is not None and result.covariance is not None:
-            result = self._freed_from_bias(result, fit, result.covariance, prepared, target)
+            if not len(poses):
+                continue
+            candidates = verify(poses, source, target, config.verification, config.num_threads)
+            clock.lap("verify")
+            fit = refine_fully(candidates.poses[0], source.points, target, config.refinement, source.neighbours)
             clock.lap("refine")
-        return result
+            assessment = assess(fit, candidates, source, target, calibration, config)
+            assessment = replace(assessment, proposer=proposer.name, rounds=number)
+            clock.lap("assess")
+            if assessment.is_sure(max(config.sure, config.min_confidence)):
+                break
+        return assessment
 
-    def _freed_from_bias(
-        self, result: RegistrationResult, fit: Fit, known: Array, source: PreparedSource, target: PreparedTarget
-    ) -> RegistrationResult:
-        """An accepted answer, of covariance `known`, with its pose and what follows from it freed of smooth bias."""
-        config = self.config
-        freed = compensate(fit, known, source, target, config.smooth_bias, config.refinement)
-        if freed is fit:
-            return result
-        uncertainty, centre_mm = covariance.estimate(freed, config.covariance), freed.moved.mean(axis=0)
-        return replace(
-            result,
-            T_target_source=freed.T,
-            covariance=uncertainty.covariance,
-            tre_mm=uncertainty.tre_mm(target.points, centre_mm),
-            centre_mm=centre_mm,
-        )
-
-    def _follows_both_walls(
-        self, prepared: PreparedSource, both_walls: PreparedTarget, result: RegistrationResult
-    ) -> bool:
-        """True when the inner wall explains much of what the outer one leaves open: no probe sees it, a mesh has it."""
-        if "best_pose" not in result.details:
-            return False
-        fit = evaluate(result.details["best_pose"], prepared.points, both_walls, self.config.refinement)
-        return bool(fit.sigma_mm < BOTH_WALLS * np.exp(result.details["log_sigma"]))
-
-    def _assess(
-        self,
-        fit: Fit,
-        candidates: Candidates,
-        source: PreparedSource,
-        target: PreparedTarget,
-        calibration: Calibration,
-        most: float,
-    ) -> RegistrationResult:
-        uncertainty = covariance.estimate(fit, self.config.covariance)
-        figures = confidence.measure(fit, candidates, uncertainty, source, target)
-        probability = min(calibration.probability(figures), most)
-        pushed = probability >= self.config.min_confidence and doubts.can_be_pushed(
-            fit, source, target, self.config.verification, self.config.num_threads
-        )
-        if pushed or doubts.is_matched(candidates) or doubts.is_loose(uncertainty):
-            probability = min(probability, DOUBT)
-        common = {
-            "confidence": probability,
-            "inlier_ratio": figures["inlier_ratio"],
-            "alternatives": tuple(candidates.poses[1:]),
-            "details": figures | {"best_pose": fit.T, "bias_mm": uncertainty.bias_mm},
-        }
-        if not probability >= self.config.min_confidence:  # nor where it is no number
-            status, reason = doubts.why_not(candidates, uncertainty, probability, pushed)
-            return RegistrationResult(status, reason=reason, **common)  # type: ignore[arg-type]
-        centre_mm = fit.moved.mean(axis=0)
-        return RegistrationResult(
-            RegistrationStatus.OK,
-            fit.T,
-            uncertainty.covariance,
-            tre_mm=uncertainty.tre_mm(target.points, centre_mm),
-            centre_mm=centre_mm,
-            **common,  # type: ignore[arg-type]
-        )
+    def _in_scene(
+        self, source: PreparedSource, target: PreparedTarget, poses: Array, viewpoint: Array, clock: Clock
+    ) -> Assessment | None:
+        """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
+        config, settings, threads = self.config, self.config.clutter, self.config.num_threads
+        scene, assessment = clutter.look(source, viewpoint), None
+        for number in range(settings.rounds):
+            scene = clutter.with_regions(scene, settings, number)
+            pool = clutter.propose(scene, target, poses, settings, threads)
+            clock.lap("propose")
+            if not len(pool.poses):
+                continue
+            candidates = clutter.verify(pool, scene, target, settings, threads)
+            poses = candidates.poses
+            clock.lap("verify")
+            part = explained.refine(poses[0], scene, target, config)
+            clock.lap("refine")
+            assessment = explained.assess(part, candidates, scene, target, self.scene_calibration, config)
+            assessment = replace(assessment, proposer=clutter.NAME, rounds=number + 1)
+            clock.lap("assess")
+            if assessment.is_sure(max(config.sure, config.min_confidence)):
+                break
+        return assessment
 
 
-def _network(device: str) -> Proposer:
+def network(device: str = "cpu") -> Proposer:
+    """GAPR-Net with the shipped weights.
+
+    Raises:
+        MethodUnavailableError: torch or safetensors is not installed.
+        ConfigError: no such device.
+    """
     try:
-        from gapr_core.proposals.network import NetworkProposer
+        from gapr_core.registration.proposals.network import NetworkProposer
     except ImportError as error:
-        mend = "run: pip install torch safetensors, or take Registrar(), which needs no network"
-        raise MethodUnavailableError("torch and safetensors for GAPR-Net", str(error), mend) from error
+        how = "run: pip install 'gapr_ros[network]', or do without: Registrar(), or --method gapr_search"
+        raise MethodUnavailableError("torch and safetensors for GAPR-Net", str(error), how) from error
     return NetworkProposer.from_weights(device=device)
 
 
@@ -211,22 +220,15 @@ def _search(config: RegistrarConfig) -> NormalAlignedSearch:
     return NormalAlignedSearch(config.search, config.num_threads)
 
 
+def _place(viewpoint: ArrayLike) -> Array:
+    place = np.asarray(viewpoint, dtype=np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InvalidPointCloudError("a finite (3,) viewpoint", f"shape {place.shape}", "pass x, y, z in mm")
+    return place
+
+
 def _rigid(pose: ArrayLike) -> Array:
     T = np.asarray(pose, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InvalidPointCloudError("a finite (4, 4) initial pose", f"shape {T.shape}", "pass T_target_source in mm")
     return se3.nearest_rigid(T)
-
-
-class _Clock:
-    """Wall time of each stage, ms, summed over the rounds."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> dict[str, float]:
-        now = time.perf_counter()
-        self.stages[stage] = self.stages.get(stage, 0.0) + (now - self._last) * 1000.0
-        self._last = now
-        return self.stages

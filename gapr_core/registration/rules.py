@@ -1,41 +1,87 @@
-"""Rules beside the confidence: a pose that may as well be another one is not believed, whatever the figures say."""
+"""The safety rules: what refuses a pose, whatever its probability. Each rule refuses alone.
+
+Three rules are geometry and never look at the probability: a motion that is not observed, a pose that can be pushed
+aside, a rival that is as good. Two are the user's thresholds: `min_confidence` and `max_tre_mm`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import VerificationConfig
-from gapr_core.covariance import PoseUncertainty
+from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.metrics.uncertainty import motion_jacobians
-from gapr_core.refinement import Fit, refine_many
-from gapr_core.results import RegistrationStatus
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
-from gapr_core.verification import Candidates
+from gapr_core.geometry.twists import motion_jacobians
+from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.refinement import Fit, refine_many
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import Candidates
+from gapr_core.results import Refusal, RegistrationStatus
 
 Array = NDArray[np.float64]
 
-LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations beyond which a direction counts as not observed
-EQUAL_SHARE, EQUAL_MM = 0.015, 0.25  # a mean square larger by less than this share, or this length squared, is as good
+DEFAULT = RulesConfig()
 WEAKEST = 3  # motions along which a pose is pushed: on a plane so many are not observed
 PUSH = 1.5  # how far, in distances at which two poses are no longer the same
 
 
-def is_matched(candidates: Candidates) -> bool:
+def by_geometry(
+    fit: Fit,
+    candidates: Candidates,
+    uncertainty: PoseUncertainty,
+    probability: float,
+    source: PreparedSource,
+    target: PreparedTarget,
+    config: RegistrarConfig,
+) -> Refusal | None:
+    """Why the pose may as well be another one; None when no rule says so.
+
+    The costly rule, which pushes the pose, is asked for only where the pose would be accepted otherwise.
+    """
+    if is_loose(uncertainty, config.rules):
+        return Refusal(RegistrationStatus.DEGENERATE, _what_is_loose(uncertainty))
+    if is_matched(candidates, config.rules):
+        return Refusal(RegistrationStatus.AMBIGUOUS, _which_rival(candidates, source))
+    would_pass = probability >= config.min_confidence
+    if would_pass and can_be_pushed(fit, source, target, config.verification, config.num_threads, config.rules):
+        return Refusal(
+            RegistrationStatus.DEGENERATE,
+            "a pose a few mm away fits as well: the observed surface is flat or straight",
+        )
+    return None
+
+
+def by_threshold(probability: float, tre95_mm: float, config: RegistrarConfig) -> Refusal | None:
+    """Why the pose does not meet what the user asks for; None when it does. A probability of NaN does not."""
+    if not probability >= config.min_confidence:
+        reason = f"the best pose is right with a probability of only {probability:.2f}"
+        return Refusal(RegistrationStatus.LOW_CONFIDENCE, reason)
+    if config.max_tre_mm > 0.0 and not tre95_mm <= config.max_tre_mm:
+        reason = f"the error over the bone is below {tre95_mm:.1f} mm (95 %), allowed are {config.max_tre_mm:g} mm"
+        return Refusal(RegistrationStatus.IMPRECISE, reason)
+    return None
+
+
+def is_matched(candidates: Candidates, rules: RulesConfig = DEFAULT) -> bool:
     """True when a distinct pose explains the source as well as the best one."""
     scores = candidates.scores
-    return len(scores) > 1 and bool(scores[1] < _as_good(scores[0]))
+    return len(scores) > 1 and bool(scores[1] < _as_good(scores[0], rules))
 
 
-def is_loose(uncertainty: PoseUncertainty) -> bool:
+def is_loose(uncertainty: PoseUncertainty, rules: RulesConfig = DEFAULT) -> bool:
     """True when a direction of motion is not observed: a spin about a shaft, a slide along it."""
-    return uncertainty.largest_turn_deg > LARGEST_TURN_DEG or uncertainty.largest_shift_mm > LARGEST_SHIFT_MM
+    turn_deg, shift_mm = uncertainty.largest_turn_deg, uncertainty.largest_shift_mm
+    return turn_deg > rules.largest_turn_deg or shift_mm > rules.largest_shift_mm
 
 
 def can_be_pushed(
-    fit: Fit, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+    fit: Fit,
+    source: PreparedSource,
+    target: PreparedTarget,
+    config: VerificationConfig,
+    num_threads: int = 0,
+    rules: RulesConfig = DEFAULT,
 ) -> bool:
     """True when the pose, pushed along its least certain motions, rests elsewhere and explains the source as well.
 
@@ -49,34 +95,16 @@ def can_be_pushed(
     rested, scores = refine_many(poses, some, target, np.linspace(*config.final_limits_mm), num_threads)
     apart = np.array([_rms_mm(se3.apply(T, some) - se3.apply(rested[0], some)) for T in rested])
     elsewhere = apart >= config.same_pose_mm
-    return bool((scores[elsewhere] < _as_good(scores[0])).any())
+    return bool((scores[elsewhere] < _as_good(scores[0], rules)).any())
 
 
-def why_not(
-    candidates: Candidates, uncertainty: PoseUncertainty, probability: float, pushed: bool
-) -> tuple[RegistrationStatus, str]:
-    """Status and sentence of a refusal."""
-    if is_loose(uncertainty):
-        return RegistrationStatus.DEGENERATE, (
-            f"the turn about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
-            f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
-        )
-    if pushed:
-        return RegistrationStatus.DEGENERATE, "a pose a few mm aside is as good: what is seen is flat or straight"
-    if is_matched(candidates):
-        apart = se3.rotation_angle_deg(se3.inverse(candidates.poses[0]) @ candidates.poses[1])
-        return RegistrationStatus.AMBIGUOUS, f"another pose, turned by {apart:.0f} deg, explains the source as well"
-    reason = f"the best pose found is right with a probability of {probability:.2f} only"
-    return RegistrationStatus.LOW_CONFIDENCE, reason
-
-
-def _as_good(score: float) -> float:
+def _as_good(score: float, rules: RulesConfig) -> float:
     """Mean square, mm^2, below which another pose explains the source as well as one of this mean square.
 
     Above 2 mm of noise a small share is chance. Below it is the target's own roughness that decides between such poses:
     terraces of voxels, or what a smooth element leaves of an edge.
     """
-    return max((1.0 + EQUAL_SHARE) * score, score + EQUAL_MM**2)
+    return max((1.0 + rules.equal_share) * score, score + rules.equal_mm**2)
 
 
 def _weakest_motions(fit: Fit) -> Array:
@@ -91,6 +119,18 @@ def _weakest_motions(fit: Fit) -> Array:
 
 def _rms_mm(vectors: Array) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+
+def _what_is_loose(uncertainty: PoseUncertainty) -> str:
+    return (
+        f"the rotation about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
+        f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
+    )
+
+
+def _which_rival(candidates: Candidates, source: PreparedSource) -> str:
+    shift_mm, turn_deg = se3.pose_error(candidates.poses[1], candidates.poses[0], source.points)
+    return f"another pose, {shift_mm:.0f} mm and {turn_deg:.0f} deg away, explains the source as well"
 
 
 def _named(axis: Array) -> str:

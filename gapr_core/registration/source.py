@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,19 +11,14 @@ from scipy.spatial import cKDTree
 from gapr_core import clouds
 from gapr_core.config import SourceConfig
 from gapr_core.geometry import quadrics, sampling
-from gapr_core.results import RegistrationStatus
+from gapr_core.results import Refusal, RegistrationStatus
 
 Array = NDArray[np.float64]
 
 MOST_RAW_POINTS = 100_000  # more are drawn from at random before the even thinning
-
-
-@dataclass(frozen=True)
-class Unusable:
-    """Why a source cannot give a pose, whatever the target."""
-
-    status: RegistrationStatus
-    reason: str
+FEWEST_DENSE = 400  # points from which a cloud is dense enough to tell an isolated point
+COMPANIONS, ISOLATED_MM, ISOLATED_GAPS = 6, 12.0, 5.0  # see `without_isolated`
+MOST_COMPARED = 20_000  # points among which neighbours are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +32,7 @@ class PreparedSource:
         neighbours: (N, k) indices of each point's nearest points, itself first.
         order: (N,) indices such that every prefix is spread over the whole cloud, trustworthy points first.
         spacing_mm: median distance between neighbouring points.
+        oriented: the normals point out of the body, to where the sensor was, so that their sign says something.
     """
 
     points: Array
@@ -45,10 +41,11 @@ class PreparedSource:
     neighbours: NDArray[np.int64]
     order: NDArray[np.int64]
     spacing_mm: float
+    oriented: bool = False
 
     @property
     def normals(self) -> Array:
-        """(N, 3) unit normals of arbitrary sign."""
+        """(N, 3) unit normals, of arbitrary sign unless `oriented`."""
         return self.axes[:, 2]
 
     @property
@@ -56,12 +53,17 @@ class PreparedSource:
         """Roughness of the source alone: median distance of neighbours to their plane, mm."""
         return float(np.median(self.flatness_mm))
 
+    def facing(self, viewpoint: Array) -> PreparedSource:
+        """The same with normals that point to the viewpoint (3,), mm: a sensor sees surfaces from outside."""
+        away = np.einsum("ni,ni->n", self.normals, viewpoint - self.points) < 0.0
+        return replace(self, axes=self.axes * np.where(away[:, None], [1.0, -1.0, -1.0], 1.0)[..., None], oriented=True)
+
     def subset(self, count: int) -> Array:
         """(min(count, N), 3) of its points, spread over the whole cloud."""
         return self.points[self.order[:count]]
 
 
-def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSource | Unusable:
+def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSource | Refusal:
     """Clean, thin and describe a source (N, 3), mm.
 
     Returns:
@@ -74,45 +76,62 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     points = clouds.finite_points(source)
     if len(points) > MOST_RAW_POINTS:
         points = points[np.random.default_rng(0).choice(len(points), MOST_RAW_POINTS, replace=False)]
-    points = np.unique(points, axis=0)
+    points = without_isolated(np.unique(points, axis=0))
     if len(points) < config.fewest_points:
-        return _too_few(f"{len(points)} distinct finite points, at least {config.fewest_points} are needed")
+        return Refusal(
+            RegistrationStatus.TOO_FEW_POINTS,
+            f"{len(points)} distinct finite points, at least {config.fewest_points} are needed",
+        )
     extent_mm = float(np.linalg.norm(np.ptp(points, axis=0)))
     if extent_mm > clouds.EXTENT_LIMITS_MM[1] or extent_mm < 1.0:
         clouds.check_extent(extent_mm, "mm", "the source")
-    if extent_mm < config.smallest_extent_mm:
-        return _too_few(f"a source {extent_mm:.1f} mm across, at least {config.smallest_extent_mm:g} mm are needed")
     width_mm = float(np.sqrt(np.linalg.eigvalsh(np.cov(points.T))[1]))
     if width_mm < config.smallest_width_mm:
-        return Unusable(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
-    return _describe(points[sampling.thin(points, config.most_points)], config)
+        return Refusal(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
+    return describe(points[sampling.thin(points, config.most_points)], config)
 
 
-def _too_few(reason: str) -> Unusable:
-    return Unusable(RegistrationStatus.TOO_FEW_POINTS, reason)
+def without_isolated(points: Array) -> Array:
+    """Points (N, 3), mm, without those far from all others: far echoes, flying pixels.
+
+    A point is isolated when its sixth nearest neighbour is farther than 12 mm and than five times what is typical of
+    the cloud: Open3D's `remove_radius_outlier` with a radius that follows the spacing. Of a sparse cloud, such as a
+    pointer gives, every point counts: it stays as it is.
+    """
+    if len(points) < FEWEST_DENSE:
+        return points
+    some = points[:: -(-len(points) // MOST_COMPARED)]
+    gaps = cKDTree(some).query(points, k=COMPANIONS + 1)[0][:, -1]
+    return points[gaps <= max(ISOLATED_MM, ISOLATED_GAPS * float(np.median(gaps)))]
 
 
-def _describe(points: Array, config: SourceConfig) -> PreparedSource:
+def describe(points: Array, config: SourceConfig) -> PreparedSource:
+    """Frames, neighbours and order of points (N, 3), mm, that are clean and thin already."""
     tree = cKDTree(points)
-    neighbours = tree.query(points, k=min(config.normal_neighbours, len(points)))[1]
+    neighbours = tree.query(points, k=_neighbour_count(len(points), config))[1]
     frames = quadrics.local_frames(points, neighbours)
-    lonely = np.linalg.norm(points - points[neighbours].mean(axis=1), axis=1) / np.linalg.norm(
-        points[neighbours[:, -1]] - points, axis=1
-    )
+    reach_mm = np.linalg.norm(points[neighbours[:, -1]] - points, axis=1)
+    isolation = np.linalg.norm(points - points[neighbours].mean(axis=1), axis=1) / np.maximum(reach_mm, 1e-9)
     return PreparedSource(
         points,
         frames.axes,
         frames.flatness_mm,
         neighbours,
-        _spread_order(points, lonely),
+        _spread_order(points, isolation),
         quadrics.spacing(points, tree),
     )
 
 
-def _spread_order(points: Array, lonely: Array, spread: int = 512) -> NDArray[np.int64]:
+def _neighbour_count(count: int, config: SourceConfig) -> int:
+    """How many points give a normal: of few points a quarter, so that it stays one of a part of the source."""
+    return min(config.normal_neighbours, max(count // 4, config.fewest_points), count)
+
+
+def _spread_order(points: Array, isolation: Array, spread: int = 512) -> NDArray[np.int64]:
     """Points in the middle of their neighbours first, farthest-point order among them; then the rest, shuffled."""
-    trusted = np.flatnonzero(lonely <= np.quantile(lonely, 0.8))
+    trusted = np.flatnonzero(isolation <= np.quantile(isolation, 0.8))
     start = int(np.linalg.norm(points[trusted] - points[trusted].mean(axis=0), axis=1).argmin())
-    first = trusted[sampling.farthest_points(points[trusted], spread, start)]
+    spread_out = sampling.farthest_points(points[trusted], spread, start)
+    first = trusted[spread_out[np.sort(np.unique(spread_out, return_index=True)[1])]]  # some may lie on each other
     rest = np.setdiff1d(np.arange(len(points)), first)
     return np.concatenate([first, np.random.default_rng(0).permutation(rest)])

@@ -12,13 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core import clouds
-from gapr_core.clouds import Surface
 from gapr_core.config import TargetConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import distance_field, quadrics, sampling, visibility
 from gapr_core.geometry.distance_field import DistanceField
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+
+DOUBLES_MM = 0.02  # points of a cloud that are this close are one: the spacing is that of the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class PreparedTarget:
         anchors: (A,) indices of evenly spread points where the search places the source.
         spacing_mm: median distance between neighbouring points.
         surface: what was loaded, mm, for display.
-        both_walls: of a hollow bone the same with its inner wall, for a source that follows both; else None.
+        both_cortices: of a hollow bone the same with its inner cortex, for a source that follows both; else None.
         elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
             surroundings, at an edge or a thin blade) side by side, for the compiled loops.
         cache: what proposers keep per target (a network's features).
@@ -49,7 +51,7 @@ class PreparedTarget:
     spacing_mm: float
     surface: Surface
     elements: Array
-    both_walls: PreparedTarget | None = None
+    both_cortices: PreparedTarget | None = None
     cache: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property
@@ -92,8 +94,8 @@ def prepare(
     _check_is_a_body(points, config)
     spacing_mm = quadrics.spacing(points)
     whole = _described(*_outer_shell(points, normals, spacing_mm, config), surface, config)
-    outer = _outer_wall(points, normals, spacing_mm, config)
-    return whole if outer is None else replace(_described(*outer, surface, config), both_walls=whole)
+    outer = _outer_cortex(points, normals, spacing_mm, config)
+    return whole if outer is None else replace(_described(*outer, surface, config), both_cortices=whole)
 
 
 def _described(points: Array, normals: Array, surface: Surface, config: TargetConfig) -> PreparedTarget:
@@ -126,6 +128,7 @@ def _surface_elements(surface: Surface, config: TargetConfig) -> tuple[Array, Ar
         keep = sampling.thin(points, config.most_points)
         return points[keep], normals[keep]
     unique = np.unique(surface.points, axis=0)
+    unique = unique[sampling.voxel_indices(unique, DOUBLES_MM)]
     points = unique[sampling.thin(unique, config.most_points)]
     neighbours = cKDTree(points).query(points, k=min(config.normal_neighbours, len(points)))[1]
     return points, quadrics.local_frames(points, np.atleast_2d(neighbours)).normals
@@ -149,8 +152,8 @@ def _outer_shell(points: Array, normals: Array, spacing_mm: float, config: Targe
     return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)
 
 
-def _outer_wall(points: Array, normals: Array, spacing_mm: float, config: TargetConfig) -> tuple[Array, Array] | None:
-    """Points and outward normals of a hollow bone's outer wall; None for a bone of one surface."""
+def _outer_cortex(points: Array, normals: Array, spacing_mm: float, config: TargetConfig) -> tuple[Array, Array] | None:
+    """Points and outward normals of a hollow bone's outer cortex; None for a bone of one surface."""
     found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions)
     if found is None:
         return None

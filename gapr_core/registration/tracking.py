@@ -1,22 +1,27 @@
-"""One target, a stream of sources: each pose is looked for where the last one was, and where that is not sure, anew."""
+"""One target, a stream of sources: each pose is searched where the last one was, and in full where that is not sure."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.clouds import Surface, finite_points
-from gapr_core.confidence import Calibration
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.proposals.base import Proposals
-from gapr_core.registrar import Registrar
-from gapr_core.results import RegistrationResult
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.evidence import Evidence
+from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.results import Refusal, RegistrationResult
+from gapr_core.runtime.clock import Clock
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -40,9 +45,9 @@ class Memory:
         """The pose first, then its rivals."""
         return Proposals(self.poses, np.linspace(1.0, 0.0, len(self.poses)))
 
-    def keep(self, pose: Array, rivals: tuple[Array, ...]) -> None:
-        """Remember the answer of a full registration: (4, 4) T_target_source, mm, and its distinct alternatives."""
-        self.poses = np.stack([pose, *rivals])
+    def keep(self, poses: Sequence[Array]) -> None:
+        """Remember the hypotheses of a full registration, best first: (4, 4) T_target_source, mm, each."""
+        self.poses = np.stack(poses)
 
     def follow(self, pose: Array, source: Array) -> None:
         """The source (N, 3), mm, has moved from the remembered pose T_k nearest to `pose`: all others move with it.
@@ -60,7 +65,8 @@ class Tracker:
 
     The last pose and its rivals are refined on the new source first. Where that answer is sure (`RegistrarConfig.sure`)
     it stands; else the registrar's proposers are asked as for a single source. So a jump, another frame or a wrong
-    track costs time, not truth. Used by one thread at a time.
+    track costs time, not truth. The confidence of a source also rests on those before it (`Evidence`): sources that
+    agree raise it, and those that fit badly lower it. Used by one thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
@@ -83,7 +89,8 @@ class Tracker:
         self._memory = Memory()
         proposers = (self._memory, *self.registrar.proposers)
         calibrations = (calibration or Calibration.shipped(Memory.name), *self.registrar.calibrations)
-        self._tracking = Registrar(self.registrar.config, proposers, calibrations)
+        self._tracking = Registrar(self.registrar.config, proposers, calibrations, precision=self.registrar.precision)
+        self._evidence = Evidence(self.registrar.config.evidence)
         self.reset()
 
     @classmethod
@@ -92,8 +99,18 @@ class Tracker:
         return cls(Registrar.from_pretrained(config, device), recheck)
 
     def reset(self) -> None:
-        """Forget the track: the next source is registered in full."""
+        """Forget the track and what the frames said: the next source is registered in full."""
+        self._forget_track()
+        self._bone: PreparedTarget | None = None
+        self._evidence.reset()
+
+    def share_points(self) -> None:
+        """The sources of this stream share their points, as those of an `Accumulator` do: many count as one."""
+        self._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
+
+    def _forget_track(self) -> None:
         self._target: PreparedTarget | None = None
+        self._last: Array | None = None
         self._tracked = 0  # sources since the last full registration
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
@@ -101,41 +118,76 @@ class Tracker:
         return self.registrar.prepare(target, units)
 
     def register(
-        self, source: ArrayLike, target: PreparedTarget, initial: ArrayLike | None = None
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
         """The pose of the next source, or a refusal; another target than before starts a new track.
 
         Args:
             source: (N, 3), mm, in the same frame as the sources before.
             target: from `prepare`.
-            initial: (4, 4) T_target_source to try besides all others; starts a new track.
+            initial: (4, 4) T_target_source to try as well; starts a new track.
+            viewpoint: (3,) mm, source frame: where the camera was, if there was one.
 
         Raises:
             InvalidPointCloudError: as `Registrar.register`.
         """
-        if initial is not None or target is not self._target:
+        if target is not self._bone:
             self.reset()
-        if self._target is None:
-            result = self.registrar.register(source, target, initial)
-        elif self._tracked + 1 < self.recheck:
-            result = self._tracking.register(source, target)
-        else:
-            result = self.registrar.register(source, target, self._memory.poses[0])
-        self._remember(result, finite_points(source), target)
+            self._bone = target
+        if initial is not None:
+            self._forget_track()
+        clock = Clock()
+        assessment = self._assess(source, target, initial, viewpoint, clock)
+        if isinstance(assessment, Assessment):
+            assessment = self._with_evidence(assessment)
+        result = self.registrar.conclude(assessment, clock)
+        if isinstance(assessment, Assessment):
+            self._remember(result, assessment.source.points, target)
         return result
+
+    def _assess(
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None,
+        viewpoint: ArrayLike | None,
+        clock: Clock,
+    ) -> Assessment | Refusal:
+        """Where the last pose was, or in full; a camera's cloud in full, with the last pose among the hypotheses."""
+        if self._target is None:
+            return self.registrar.assess(source, target, initial, viewpoint, clock)
+        if viewpoint is None and self._tracked + 1 < self.recheck:
+            return self._tracking.assess(source, target, clock=clock)
+        return self.registrar.assess(source, target, self._memory.poses[0], viewpoint, clock)
+
+    def _with_evidence(self, assessment: Assessment) -> Assessment:
+        """The probability in the light of the frames before; a frame that a safety rule refuses says nothing."""
+        if assessment.refusal is not None:
+            return assessment
+        agrees = self._last is not None and _gap_mm(assessment, self._last) <= self._evidence.config.agree_mm
+        self._last = assessment.fit.T
+        return replace(assessment, probability=self._evidence.add(assessment.probability, agrees))
 
     def _remember(self, result: RegistrationResult, source: Array, target: PreparedTarget) -> None:
         """A refusal changes no pose: the bone may be where it was."""
-        if "proposer" not in result.details:  # nothing was registered
-            return
         if result.T_target_source is None:  # after a full registration the next source gets one as well
             return
-        followed = result.details["proposer"] == Memory.name
+        followed = result.proposer == Memory.name
         self._tracked = self._tracked + 1 if followed else 0
         if followed:
             self._memory.follow(result.T_target_source, source)
-        elif result.alternatives:
+        elif len(result.hypotheses) > 1:
             self._target = target
-            self._memory.keep(result.T_target_source, result.alternatives)
+            self._memory.keep([result.T_target_source, *(rival.T_target_source for rival in result.hypotheses[1:])])
         else:
-            self.reset()  # no rival: the next answer could not be weighed against anything
+            self._forget_track()  # no rival: the next answer could not be weighed against anything
+
+
+def _gap_mm(assessment: Assessment, T: Array) -> float:
+    """Root-mean-square distance over the source between the assessed pose and another one."""
+    gap = assessment.fit.moved - se3.apply(T, assessment.source.points)
+    return float(np.sqrt((gap**2).sum(axis=1).mean()))

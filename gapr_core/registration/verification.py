@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import VerificationConfig
-from gapr_core.refinement import refine_many
-from gapr_core.refinement_kernels import distinct
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
+from gapr_core.registration.kernels import distinct
+from gapr_core.registration.refinement import refine_many
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 

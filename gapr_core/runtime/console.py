@@ -1,4 +1,4 @@
-"""Where commands speak to people."""
+"""Where commands speak to users."""
 
 from __future__ import annotations
 

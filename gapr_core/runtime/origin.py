@@ -1,24 +1,53 @@
-"""What code runs on what processor: the words that stand beside every figure."""
+"""What code runs on what processor: the words that stand with every number."""
 
 from __future__ import annotations
 
+import json
 import platform
 import subprocess
+from collections.abc import Iterable
+from dataclasses import asdict
+from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
+
+from gapr_core import __version__
+
+WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
 
 def commit() -> str | None:
     """The source tree's commit; None where the package was installed without its repository."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
     asked = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
         answer = subprocess.run(asked, capture_output=True, text=True, timeout=30)
     except (OSError, subprocess.TimeoutExpired):
-        return None  # no git here: the version stands beside it
+        return None  # no git here: the version is given as well
     return answer.stdout.strip() or None
+
+
+def of_answers(config: Any) -> dict[str, str]:
+    """What an answer depends on but the clouds and the method: code, settings and weights, as short texts.
+
+    Args:
+        config: a dataclass of settings.
+    """
+    return {
+        "version": f"{__version__} {commit() or ''}".strip(),
+        "settings": _digest([json.dumps(asdict(config), sort_keys=True).encode()]),
+        "weights": _digest(path.read_bytes() for path in sorted(WEIGHTS.iterdir()) if path.suffix != ".md"),
+    }
+
+
+def _digest(parts: Iterable[bytes]) -> str:
+    digest = sha256()
+    for part in parts:
+        digest.update(sha256(part).digest())
+    return digest.hexdigest()[:16]
 
 
 def release() -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from gapr_core.errors import WeightsError
 from gapr_core.model.network import GAPRNet
+from gapr_core.runtime import files
 
 
 def save_checkpoint(
@@ -24,10 +24,9 @@ def save_checkpoint(
     tensors |= {f"ema.{name}": t for name, t in ema.state_dict().items()}
     for index, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": t for name, t in moments.items()}
-    new = path.with_suffix(".new")
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
-    save_file(contiguous, str(new), metadata={"state": json.dumps(state)})
-    os.replace(new, path)
+    with files.replacing(path) as new:
+        save_file(contiguous, str(new), metadata={"state": json.dumps(state)})
 
 
 def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
-from gapr_core.console import say
 from gapr_core.errors import ConfigError
+from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.console import say
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -22,7 +23,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--initial", default=None, help="weights (safetensors) of the same network to begin with")
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--out", type=Path, help="folder of the run, an interrupted one goes on; with --plot a PNG")
-    parser.add_argument("--pairs", type=int, default=None, help="length of the schedule, in pairs")
+    parser.add_argument("--pairs", type=at_least_one, default=None, help="length of the schedule, in pairs")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
     parser.add_argument("--workers", type=int, default=None, help="processes that make pairs")
     parser.add_argument(
@@ -52,7 +53,7 @@ def plot(runs: list[Path], out: Path | None) -> int:
     from gapr_core.training import curves
 
     if out is None and len(runs) > 1:
-        raise ConfigError("--out PNG beside several runs", "none", "name the picture")
+        raise ConfigError("--out PNG with several runs", "none", "name the picture")
     out = out or runs[0] / "curves.png"
     if out.suffix.lower() != ".png":
         raise ConfigError("a name that ends in .png", str(out), "rename it")

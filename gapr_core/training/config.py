@@ -4,100 +4,52 @@ from __future__ import annotations
 
 import os
 import sysconfig
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from gapr_core.errors import ConfigError
 from gapr_core.model.config import ModelConfig
+from gapr_core.runtime.settings import Settings, read_yaml, setting
 
-
-def _default_mix() -> dict[str, float]:
-    one_sided = {"L1": 0.15, "L2": 0.25, "L3": 0.2, "L2-region": 0.05, "L3-region": 0.05, "sweep": 0.1}
-    return one_sided | {"paper": 0.12, "incomplete": 0.08}
+ONE_SIDED = {"L1": 0.15, "L2": 0.25, "L3": 0.2, "L2-region": 0.05, "L3-region": 0.05, "sweep": 0.1}
+MIX = ONE_SIDED | {"paper": 0.12, "incomplete": 0.08}
 
 
 @dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides a run; two runs with the same entries on one CPU thread are equal bit by bit.
+class TrainConfig(Settings):
+    """Everything that decides a run; two runs with the same entries on one CPU thread are equal bit by bit."""
 
-    Attributes:
-        model: path of a yaml in `config/model`; empty for the defaults (`best`).
-        initial: weights (safetensors) of the same network to begin with; empty for random ones.
-        bones: bone types.
-        mix: protocols and how often each is drawn.
-        pairs: length of the schedule, in pairs.
-        batch: pairs per optimiser step, over all processes.
-        micro_batch: pairs per forward pass, by concatenation; gradients accumulate up to `batch`.
-        learning_rate, weight_decay, clip: AdamW, and the limit on the gradient's norm.
-        warmup: share of the schedule with a rising learning rate; a cosine falls from there to `final_rate` of it.
-        ema: decay of the averaged weights, which are what is validated and exported.
-        pool: how many bones are in use at once; each serves `reuse` pairs before the next person comes in.
-        share: neighbouring pairs that look at the same target, whose features are then computed once.
-        synthetic: share of bones that are drawn from the shape model instead of being a person of the split.
-        seed: of weights, bones, pairs and patches.
-        workers: processes that make pairs; 0 makes them in the training process.
-        precision: `float32` or `bfloat16` (autocast).
-        device: `auto`, `cpu` or `cuda`.
-        checkpoint_minutes, validate_minutes: how often.
-        validation_pairs: per protocol of the mix.
-    """
-
-    model: str = ""
-    initial: str = ""
-    bones: tuple[str, ...] = ("femur", "tibia", "pelvis", "thoracic")
-    mix: dict[str, float] = field(default_factory=_default_mix)
-    pairs: int = 24_000
-    batch: int = 8
-    micro_batch: int = 4
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
-    clip: float = 1.0
-    warmup: float = 0.02
-    final_rate: float = 0.01
-    ema: float = 0.995
-    pool: int = 128
-    reuse: int = 16
-    share: int = 2
-    synthetic: float = 0.7
-    seed: int = 0
-    workers: int = 0
-    precision: str = "float32"
-    device: str = "auto"
-    checkpoint_minutes: float = 3.0
-    validate_minutes: float = 10.0
-    validation_pairs: int = 8
+    model: str = setting("", "path of a yaml in config/model; empty: the defaults (best)")
+    initial: str = setting("", "weights (safetensors) of the same network to begin with; empty: random ones")
+    bones: tuple[str, ...] = setting(("femur", "tibia", "pelvis", "thoracic"), "bone types")
+    mix: dict[str, float] = setting(MIX, "protocols and how often each is drawn", low=0)
+    pairs: int = setting(24_000, "length of the schedule, in pairs", low=1)
+    batch: int = setting(8, "pairs per optimiser step, over all processes", low=1)
+    micro_batch: int = setting(4, "pairs per forward pass; gradients add up to a batch", low=1)
+    learning_rate: float = setting(5e-4, "of AdamW", low=0)
+    weight_decay: float = setting(1e-4, "of AdamW", low=0)
+    clip: float = setting(1.0, "limit on the gradient's norm", low=0)
+    warmup: float = setting(0.02, "share of the schedule with a rising learning rate", low=0, high=1)
+    final_rate: float = setting(0.01, "learning rate at the end of the cosine over that at its start", low=0, high=1)
+    ema: float = setting(0.995, "decay of the averaged weights, which are validated and exported", low=0, high=1)
+    pool: int = setting(128, "bones in use at once", low=1)
+    reuse: int = setting(16, "pairs that a bone serves before the next subject comes in", low=1)
+    share: int = setting(2, "neighbouring pairs with one target, whose features are computed once", low=1)
+    synthetic: float = setting(0.7, "share of bones drawn from the shape model, not from the split", low=0, high=1)
+    seed: int = setting(0, "of weights, bones, pairs and patches", low=0)
+    workers: int = setting(0, "processes that make pairs; 0: the training process makes them", low=0)
+    precision: str = setting("float32", "of the forward pass", choices=("float32", "bfloat16"))
+    device: str = setting("auto", "auto, cpu or cuda")
+    checkpoint_minutes: float = setting(3.0, "between two checkpoints", low=0, unit="min")
+    validate_minutes: float = setting(10.0, "between two validations", low=0, unit="min")
+    validation_pairs: int = setting(8, "per protocol of the mix", low=0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.batch % self.micro_batch:
             raise ConfigError("a batch of whole micro-batches", f"{self.batch} and {self.micro_batch}", "make them fit")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ConfigError("precision float32 or bfloat16", self.precision, "choose one")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """The defaults with `values` over them.
-
-        Raises:
-            ConfigError: for a key that does not exist.
-        """
-        unknown = sorted(set(values) - {f.name for f in fields(cls)})
-        if unknown:
-            raise ConfigError("keys of TrainConfig", ", ".join(unknown), "mend the names")
-        given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
-        return cls(**given)
-
-    @classmethod
-    def from_yaml(cls, path: str | Path) -> TrainConfig:
-        """The defaults with a yaml's entries over them."""
-        return cls.from_dict(yaml.safe_load(Path(path).read_text()) or {})
-
-    def to_dict(self) -> dict[str, Any]:
-        """All entries, as `from_dict` takes them."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -122,11 +74,13 @@ def default_plan() -> Path:
 def read_plan(path: Path) -> list[Variant]:
     """The rows of all tables; paths relative to the working folder, so that they mean the same on another machine."""
     models = Path(os.path.relpath(path.resolve().parent / "model"))
-    tables = yaml.safe_load(path.read_text())
-    return [
-        Variant(table, row["label"], models / f"{row['model']}.yaml", row.get("paper"))
-        for table, rows in tables.items() for row in rows
-    ]  # fmt: skip
+    return [_variant(table, row, models, path) for table, rows in read_yaml(path).items() for row in rows or ()]
+
+
+def _variant(table: str, row: Any, models: Path, path: Path) -> Variant:
+    if not isinstance(row, dict) or not {"label", "model"} <= row.keys():
+        raise ConfigError(f"rows with label and model in {path}", f"{row!r} under {table}", "correct the row")
+    return Variant(table, row["label"], models / f"{row['model']}.yaml", row.get("paper"))
 
 
 def trained_as(plan: Sequence[Variant]) -> dict[Path, Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +15,13 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError
+from gapr_core.pages import palette
+from gapr_core.runtime import files
 
 Array = NDArray[np.float64]
 Table = dict[str, Array]  # column name -> (rows,)
 
 log = logging.getLogger(__name__)
-COLOURS = (
-    "#0b5fa5", "#d1495b", "#2e9e6b", "#e0992b", "#7b5ea7", "#3aa6b9", "#8c6d46", "#c06c9c", "#6b7a2f", "#555555"
-)  # fmt: skip
 LOSSES = {"coarse": "-", "fine": "--"}
 INLIERS = {"coarse_inliers": "-", "fine_inliers": "--"}
 RECALLS = {
@@ -56,9 +54,8 @@ def draw(folders: Sequence[Path], out: Path, names: Sequence[str] = ()) -> Path:
         ConfigError: a folder in which no run has logged anything.
     """
     runs = [read(folder, name) for folder, name in zip(folders, names or labels(folders), strict=True)]
-    new = out.with_suffix(".new.png")
-    figure(runs).savefig(new, dpi=110)
-    os.replace(new, out)
+    with files.replacing(out) as new:
+        figure(runs).savefig(new, dpi=110)
     return out
 
 
@@ -167,7 +164,7 @@ def figure(runs: Sequence[Run]) -> Figure:
 
 
 def _legend_columns(texts: list[str]) -> int:
-    """Of a legend below the axes: as many as fit beside each other."""
+    """Of a legend below the axes: as many as fit next to each other."""
     return max(1, min(8, len(texts), LEGEND_LETTERS // (max(map(len, texts)) + 8)))
 
 
@@ -179,7 +176,7 @@ def _title(runs: Sequence[Run]) -> str:
 
 
 def _colours(count: int) -> list[str]:
-    return [COLOURS[k % len(COLOURS)] for k in range(count)]
+    return [palette.SERIES[k % len(palette.SERIES)] for k in range(count)]
 
 
 def _panel(axes: Axes, title: str, y: str, share: bool = False) -> None:
@@ -203,7 +200,7 @@ def _reach(run: Run, longest: float, share: float = 0.02) -> int:
 
 def _losses(axes: Axes, run: Run, colour: str, one: bool, reach: int) -> None:
     for k, (name, dash) in enumerate(LOSSES.items()):
-        shade = COLOURS[k] if one else colour
+        shade = palette.SERIES[k] if one else colour
         if one:
             axes.plot(run.steps["pairs"], run.steps[name], color=shade, lw=0.5, alpha=0.25)
         axes.plot(run.steps["pairs"], smooth(run.steps[name], reach), color=shade, lw=1.8, ls="-" if one else dash)
@@ -212,7 +209,7 @@ def _losses(axes: Axes, run: Run, colour: str, one: bool, reach: int) -> None:
 def _inliers(axes: Axes, run: Run, colour: str, one: bool) -> None:
     scores = run.scores.get(ALL, {})
     for k, (name, dash) in enumerate(INLIERS.items()):
-        shade, style = (COLOURS[k], "-") if one else (colour, dash)
+        shade, style = (palette.SERIES[k], "-") if one else (colour, dash)
         if name in scores:
             axes.plot(scores["pairs"], scores[name], marker="o", ms=3.5, lw=1.8, color=shade, ls=style)
 

@@ -29,7 +29,7 @@ OWN_TARGET = ("incomplete",)  # protocols whose target is not the whole bone
 
 
 class People:
-    """Bones of one type: people of the split, and new ones from their shape model; parametric where there is none."""
+    """Bones of one type: subjects of the split, and new ones from their shape model; parametric where there is none."""
 
     def __init__(self, bone: str, folder: Path | None, split: str) -> None:
         self.bone, self.split = bone, split
@@ -41,7 +41,7 @@ class People:
             raise ConfigError(f"meshes or a parametric model of {bone}", "neither", "leave it out of `bones`")
 
     def draw(self, number: int, synthetic: float, seed: int) -> Specimen:
-        """Person `number`: always the same one."""
+        """Subject `number`: always the same one."""
         rng = np.random.default_rng([seed, number])
         if not self.real:
             people = parametric_people(self.split, 2000)

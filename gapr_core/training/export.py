@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from gapr_core.console import say
 from gapr_core.model import weights
+from gapr_core.runtime.console import say
 
 LICENCES = {
     "femur, tibia, pelvis (llp26)": "MAP client plug-in fieldworklowerlimb2sidegenerationstep, Apache-2.0",
@@ -36,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def card(trained: dict[str, Any]) -> dict[str, Any]:
     """What the header says about the weights: the run's own card, data, licences and split."""
-    people = "train people of splits.json only, their shape models, and parametric bones"
+    people = "train subjects of splits.json only, their shape models, and parametric bones"
     return {**trained, "data": people, "licences": LICENCES, "precision": "float16"}
 
 

@@ -1,6 +1,6 @@
 """Where a run comes from: code, machine and data, one entry for each time it was begun or taken up again.
 
-Kept in a file of its own beside config.json: another commit or machine is no reason to refuse to go on.
+Kept in a file of its own next to config.json: another commit or machine is no reason to refuse to go on.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import torch
 
 import gapr_core.data
 from gapr_core.data import anatomy
-from gapr_core.origin import commit, cpu_name, release
+from gapr_core.runtime.files import write_json
+from gapr_core.runtime.origin import commit, cpu_name, release
 from gapr_core.training.config import TrainConfig
 
 FILE = "provenance.json"
@@ -44,9 +45,7 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
     begun_with = _digest([Path(config.initial).read_bytes()]) if config.initial and not step else None
     entry = {"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)}
     entries.append(entry | {"initial": begun_with})
-    new = path.with_suffix(".new")
-    new.write_text(json.dumps(entries, indent=1) + "\n")
-    os.replace(new, path)
+    write_json(path, entries)
     return list(entries)
 
 
@@ -61,7 +60,8 @@ def _sentence(entry: Entry) -> str:
     return (
         f"Trained by {by}, torch {entry['torch']}, {entry['processes']} process(es) of "
         f"{entry['threads']} thread(s) on {entry['gpu'] or entry['cpu']}, {entry['platform']}; data: "
-        f"{drawn['train_people']} real train people (hash {drawn['anatomy']}), parametric model {drawn['parametric']}."
+        f"{drawn['train_people']} real train subjects (hash {drawn['anatomy']}), "
+        f"parametric model {drawn['parametric']}."
     )
 
 
@@ -83,7 +83,7 @@ def machine() -> Entry:
 
 
 def data(bones: Iterable[str], folder: Path | None) -> Entry:
-    """What the bones are drawn from: how many train people, a hash over them and their meshes, the parametric model."""
+    """Where the bones come from: how many train subjects, a hash over them and their meshes, the parametric model."""
     people = sorted(anatomy.splits(folder)["train"]) if folder else []
     return {
         "train_people": len(people), "anatomy": meshes_hash(bones, people, folder) if folder else None,
@@ -92,7 +92,7 @@ def data(bones: Iterable[str], folder: Path | None) -> Entry:
 
 
 def meshes_hash(bones: Iterable[str], people: list[str], folder: Path) -> str:
-    """sha256 (16 digits) over the people and over names and contents of their mesh files, wherever the folder lies."""
+    """sha256 (16 digits) over the subjects and the names and contents of their mesh files, wherever the folder is."""
     files = sorted({path for bone in bones for path in folder.glob(f"{bone}_*.npz")}, key=lambda path: path.name)
     return _digest([*people, *(part for path in files for part in (path.name, path.read_bytes()))])
 

@@ -1,4 +1,4 @@
-"""New people for training: a statistical shape model of the corresponded meshes of the training split."""
+"""New subjects for training: a statistical shape model of the corresponded meshes of the training split."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import Surface
 from gapr_core.data.anatomy import Corresponded
 from gapr_core.data.deformation import deform
 from gapr_core.geometry import se3
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ShapeModel:
-    """Mean and deviations of P aligned people: `mean` (N, 3) mm, `deviations` (P, N, 3) mm, `faces` (F, 3)."""
+    """Mean and deviations of P aligned subjects: `mean` (N, 3) mm, `deviations` (P, N, 3) mm, `faces` (F, 3)."""
 
     mean: Array
     deviations: Array
@@ -34,12 +34,12 @@ class ShapeModel:
         return cls(mean, points - mean, np.asarray(people.faces, dtype=np.int64))
 
     def draw(self, rng: np.random.Generator) -> Surface:
-        """A person of the Gaussian that the people span: the same as drawing every principal component."""
+        """A subject of the Gaussian that the subjects span: the same as drawing every principal component."""
         weights = rng.normal(size=len(self.deviations)) / np.sqrt(max(len(self.deviations) - 1, 1))
         return Surface(self.mean + np.tensordot(weights, self.deviations, axes=1), self.faces, None)
 
 
 def vary(surface: Surface, rng: np.random.Generator) -> Surface:
-    """The same bone as somebody else's: up to 10 % larger or smaller, other waves and texture, left or right."""
+    """The same bone as another subject's: up to 10 % larger or smaller, other waves and texture, left or right."""
     changed = deform(replace(surface, points=surface.points * rng.uniform(0.9, 1.1)), rng)
     return changed if rng.random() < 0.5 else changed.mirrored()

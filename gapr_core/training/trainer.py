@@ -23,6 +23,7 @@ from gapr_core.errors import ConfigError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
+from gapr_core.runtime import files
 from gapr_core.training import distributed, provenance
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.config import TrainConfig
@@ -55,7 +56,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     """
     rank, world, device = distributed.start(config.device)
     model = ModelConfig.from_yaml(config.model) if config.model else ModelConfig()
-    settle(folder, config, model, rank)
+    claim_folder(folder, config, model, rank)
     torch.manual_seed(config.seed)
     checkpoint = folder / "checkpoint.safetensors"
     network = (GAPRNet(model) if checkpoint.exists() else begin(config, model)).to(device)
@@ -180,7 +181,7 @@ def average(ema: GAPRNet, network: GAPRNet, decay: float) -> None:
         kept.lerp_(new, 1.0 - decay)
 
 
-def settle(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> None:
+def claim_folder(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> None:
     """Write the run's settings, or check that they are those the folder was begun with.
 
     The network's settings count, not the path of their yaml; an entry that did not exist then stood at its default.
@@ -195,9 +196,7 @@ def settle(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> 
         if (replace(there[0], model=config.model), there[1]) != (config, model):
             raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
     elif rank == 0:
-        folder.mkdir(parents=True, exist_ok=True)
-        settings = {"train": config.to_dict(), "model": model.to_dict()}
-        path.write_text(json.dumps(settings, indent=1) + "\n")
+        files.write_json(path, {"train": config.to_dict(), "model": model.to_dict()})
 
 
 def log_row(
@@ -207,8 +206,8 @@ def log_row(
     means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in ("coarse", "fine", "early")}
     row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
     total = means["coarse"] + means["fine"] + 0.5 * means["early"]
-    figures = {"rate": rate, "norm": norm, "loss": total, **means}
-    return row | {name: float(f"{value:.5g}") for name, value in figures.items()}
+    values = {"rate": rate, "norm": norm, "loss": total, **means}
+    return row | {name: float(f"{value:.5g}") for name, value in values.items()}
 
 
 def report(
@@ -217,9 +216,9 @@ def report(
     """Validate the averaged weights: lines of validation.csv, and one on the terminal."""
     scores = validate(ema, held_out, device)
     for protocol, score in scores.items():
-        figures = {name: round(value, 4) for name, value in asdict(score).items()}
+        values = {name: round(value, 4) for name, value in asdict(score).items()}
         row = {"pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1), "protocol": protocol}
-        append(folder / "validation.csv", row | figures)
+        append(folder / "validation.csv", row | values)
     total = scores["all"]
     tqdm.write(
         f"{state['step'] * config.batch} pairs  {state['seconds'] / 60:.0f} min  inliers: coarse "
@@ -229,7 +228,7 @@ def report(
 
 
 def draw_curves(folder: Path) -> None:
-    """curves.png anew; where even matplotlib cannot be loaded, a warning instead of the end of the run."""
+    """Draw curves.png again; where even matplotlib cannot be loaded, a warning instead of the end of the run."""
     try:
         from gapr_core.training import curves
     except ImportError as error:

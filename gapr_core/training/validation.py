@@ -1,4 +1,4 @@
-"""How good the network is on pairs of other people: inlier ratios and recall of its raw poses."""
+"""How good the network is on pairs of other subjects: inlier ratios and recall of its raw poses."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from gapr_core.data import anatomy, parametric
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import Pair, make_pair
 from gapr_core.geometry import se3
+from gapr_core.geometry.se3 import PoseError
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet, Output
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.model.repositioning import move
 from gapr_core.model.types import Cloud
-from gapr_core.proposals.consensus import local_to_global
-from gapr_core.proposals.network import correspondences_mm
+from gapr_core.registration.proposals.consensus import local_to_global
+from gapr_core.registration.proposals.network import correspondences_mm
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.targets import TrainingPair, training_pair
 
 Array = NDArray[np.float64]
+
+NEAR_MM, NEAR_DEG = 20.0, 15.0  # from here refinement usually finds the truth
 
 
 @dataclass(frozen=True)
@@ -95,10 +98,10 @@ def score_pair(network: GAPRNet, v: ValidationPair, device: torch.device) -> Sco
     found = correspondences_mm(output.matches, v.pair.source, v.pair.target)
     radius_mm = float(v.pair.radius[0]) * float(v.pair.source.scale_mm[0])
     poses, _ = local_to_global(found, 1.5 * radius_mm)
-    errors = [se3.pose_error(T, v.T_target_source, v.source_mm) for T in poses] or [(np.inf, 180.0)]
-    near = [mm < 20.0 and deg < 15.0 for mm, deg in errors]
+    errors = [se3.pose_error(T, v.T_target_source, v.source_mm) for T in poses] or [PoseError(np.inf, 180.0)]
+    near = [error.within(NEAR_MM, NEAR_DEG) for error in errors]
     coarse, fine = inlier_ratios(output, pair.source, pair)
-    return Scores(coarse, fine, float(errors[0][0] < 4.0 and errors[0][1] < 5.0), float(near[0]), float(any(near)))
+    return Scores(coarse, fine, float(errors[0].is_right), float(near[0]), float(any(near)))
 
 
 def inlier_ratios(output: Output, source: Cloud, pair: TrainingPair) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 from tqdm import tqdm
 
-from gapr_ros.bags import Bag, BagError, open_bag, recorded_qos
+from gapr_ros.bags.files import Bag, BagError, open_bag, recorded_qos
 
 CLOCK_HZ = 40.0
 DISCOVERY_S = 1.0
@@ -63,7 +63,7 @@ class Replay:
         node: publishes; need not spin.
         bag: from `open_bag`.
         options: see there.
-        on_message: told the topic and the time (ns) after each message was sent.
+        on_message: is given the topic and the time (ns) after each message was sent.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ def parse_arguments(args: Sequence[str]) -> tuple[Path, ReplayOptions]:
     parser.add_argument("--rate", type=_positive, default=1.0, help="speed; 2: twice as fast")
     parser.add_argument("--loop", action="store_true", help="start over at the end")
     parser.add_argument("--clock", type=_positive, nargs="?", const=CLOCK_HZ, default=0.0, metavar="HZ",
-                        help=f"publish /clock, {CLOCK_HZ:g} times a second unless told")  # fmt: skip
+                        help=f"publish /clock, {CLOCK_HZ:g} times a second by default")  # fmt: skip
     parser.add_argument("--wait", type=float, default=DISCOVERY_S, metavar="S", help="longest wait for listeners")
     parser.add_argument("--listeners", type=int, default=1, metavar="N", help="listeners per topic to wait for")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -67,7 +67,7 @@ class BagWriter:
         self._writer.close()
 
     def write_cloud(self, topic: str, points: ArrayLike, frame_id: str, stamp_ns: int) -> None:
-        """Points (N, 3) in the unit of the topic (metres on the wire), as float32, seen and received at `stamp_ns`."""
+        """Points (N, 3) in the unit of the topic (metres in ROS), as float32, seen and received at `stamp_ns`."""
         header = Header(frame_id=frame_id, stamp=Time(nanoseconds=stamp_ns).to_msg())
         self.write(topic, xyz_to_cloud(np.asarray(points, dtype=np.float32), header), stamp_ns)
 

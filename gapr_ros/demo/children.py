@@ -1,4 +1,4 @@
-"""Programs that run beside this one and end with it, however it ends."""
+"""Programs that run next to this one and end with it, however it ends."""
 
 from __future__ import annotations
 

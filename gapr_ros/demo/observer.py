@@ -8,14 +8,39 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_msgs.msg import Float64
+from sensor_msgs.msg import PointCloud2
 
-from gapr_ros import intake, wire
-from msg_adapters import pose_to_matrix
+from gapr_ros.node import timeline, wire
+from msg_adapters import cloud_to_field, cloud_to_xyz, pose_to_matrix
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Used:
+    """The points of a cloud that the node looked at: (N, 3) mm in the cloud's frame, and which it took for bone."""
+
+    points: Array
+    is_taken: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """Where the node wants to look next.
+
+    Attributes:
+        points: (M, 3) of the bone, mm, in its own frame.
+        gain_mm: (M,) what a look there would gain.
+        centre: (3,) mm, of the best look.
+    """
+
+    points: Array
+    gain_mm: Array
+    centre: Array
 
 
 @dataclass
@@ -25,19 +50,22 @@ class Answer:
     Attributes:
         T_target_source: (4, 4), mm, of an accepted pose.
         refusal: why there is none.
-        confidence, tre_mm: as the node says.
+        confidence, tre_mm, tre95_mm: as the node says.
         exec_ms: what the node says that it took.
         heard_s: when the answer arrived here, on the monotonic clock.
         sent_s: when the cloud was sent.
+        used: which points the node looked at and took for bone.
     """
 
-    T_target_source: NDArray[np.float64] | None = None
+    T_target_source: Array | None = None
     refusal: str = ""
     confidence: float = 0.0
     tre_mm: float | None = None
+    tre95_mm: float | None = None
     exec_ms: float = 0.0
     heard_s: float = float("nan")
     sent_s: float = float("nan")
+    used: Used | None = None
 
     @property
     def latency_ms(self) -> float:
@@ -56,17 +84,25 @@ class Observer(Node):
     def __init__(self, node_name: str = "register_node", **kwargs: Any) -> None:
         super().__init__("gapr_observer", **kwargs)
         self.answers: dict[int, Answer] = {}
-        self.confidences = 0
         self.node_state, self.node_failure = "", ""
         self.player_found, self.dropped = False, 0
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self)
-        self._status_name = f"{node_name}: registration"
+        self._status_name = f"{self.get_namespace().rstrip('/')}/{node_name}: registration"
         self._sent: dict[int, float] = {}
-        self._poses: dict[int, NDArray[np.float64]] = {}
-        self.create_subscription(PoseWithCovarianceStamped, f"{node_name}/pose", self._on_pose, 50)
-        self.create_subscription(Float64, f"{node_name}/confidence", self._on_confidence, 50)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        self._poses: dict[int, Array] = {}
+        self._used: dict[int, Used] = {}
+        self._gain: tuple[Array, Array] | None = None
+        self._centre: Array | None = None
+        listen = self.create_subscription
+        self._heard = [
+            listen(DiagnosticStatus, f"{node_name}/status", self._on_status, 50),
+            listen(PoseWithCovarianceStamped, f"{node_name}/pose", self._on_pose, 50),
+            listen(PointCloud2, f"{node_name}/residuals", self._on_residuals, 50),
+            listen(PointCloud2, f"{node_name}/guidance", self._on_guidance, 10),
+            listen(PoseStamped, f"{node_name}/next_view", self._on_next_view, 10),
+        ]
+        listen(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
     def listen(self, seconds: float) -> None:
         """Take in what comes, one message or nothing, waiting at most that long."""
@@ -77,18 +113,57 @@ class Observer(Node):
         """How many clouds have been sent."""
         return len(self._sent)
 
+    @property
+    def node_ready(self) -> bool:
+        """The node is active, has found who sends clouds, and is heard here: what is sent now is not lost."""
+        heard = all(subscription.get_publisher_count() for subscription in self._heard)
+        return self.node_state == "active" and self.player_found and heard
+
+    @property
+    def advice(self) -> Advice | None:
+        """The last word on where to look next; None before the first, or once `forget_advice` was called."""
+        return None if self._gain is None or self._centre is None else Advice(*self._gain, self._centre)
+
+    def forget_advice(self) -> None:
+        """What comes next is of the next cloud."""
+        self._gain = self._centre = None
+
     def note_sent(self, topic: str, stamp_ns: int) -> None:
         """A cloud with this stamp has just been sent."""
         self._sent[_ms(stamp_ns)] = time.monotonic()
 
-    def _on_confidence(self, message: Float64) -> None:
-        self.confidences += 1
+    def complete(self) -> None:
+        """Add poses and used points to the answers: they come as messages of their own, a moment later."""
+        for stamp, answer in self.answers.items():
+            answer.T_target_source, answer.used = self._poses.get(stamp), self._used.get(stamp)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        stamp = _ms(intake.stamp_ns(message.header))
-        self._poses[stamp] = wire.core_pose(pose_to_matrix(message))
-        if stamp in self.answers:
-            self.answers[stamp].T_target_source = self._poses[stamp]
+        self._poses[_ms(timeline.stamp_ns(message.header))] = wire.core_pose(pose_to_matrix(message))
+
+    def _on_residuals(self, message: PointCloud2) -> None:
+        points_mm = wire.to_mm(cloud_to_xyz(message, keep_nan=True), "m")
+        used = Used(points_mm, cloud_to_field(message, "inlier").astype(bool))
+        self._used[_ms(timeline.stamp_ns(message.header))] = used
+
+    def _on_guidance(self, message: PointCloud2) -> None:
+        gain_mm = wire.to_mm(cloud_to_field(message, "intensity").astype(np.float64), "m")
+        self._gain = wire.to_mm(cloud_to_xyz(message, keep_nan=True), "m"), gain_mm
+
+    def _on_next_view(self, message: PoseStamped) -> None:
+        self._centre = wire.to_mm(pose_to_matrix(message)[:3, 3], "m")
+
+    def _on_status(self, message: DiagnosticStatus) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        stamp, refused = round(float(values["stamp"]) * 1e3), bool(values["reason"])
+        self.answers[stamp] = Answer(
+            refusal=message.message.removeprefix("refused: ") if refused else "",
+            confidence=float(values["confidence"] or 0.0),
+            tre_mm=_millimetres(values["tre"]),
+            tre95_mm=_millimetres(values["tre95"]),
+            exec_ms=float(values["exec_ms"] or 0.0),
+            heard_s=time.monotonic(),
+            sent_s=self._sent.get(stamp, float("nan")),
+        )
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -99,25 +174,11 @@ class Observer(Node):
         self.node_state = values["state"]
         self.player_found, self.dropped = int(values["publishers_on_points"]) > 0, int(values["frames_dropped"])
         self.node_failure = status.message if status.level == DiagnosticStatus.ERROR else ""
-        stamp = _milliseconds(values["cloud_stamp"])
-        if stamp is None or stamp in self.answers:
-            return
-        refused = int(values["consecutive_refusals"]) > 0
-        self.answers[stamp] = Answer(
-            T_target_source=self._poses.get(stamp),
-            refusal=values["last_refusal"] if refused else "",
-            confidence=float(values["confidence"] or 0.0),
-            tre_mm=float(values["tre_mm"]) if values["tre_mm"] else None,
-            exec_ms=float(values["exec_ms"] or 0.0),
-            heard_s=time.monotonic(),
-            sent_s=self._sent.get(stamp, float("nan")),
-        )
 
 
 def _ms(stamp_ns: int) -> int:
     return round(stamp_ns * 1e-6)
 
 
-def _milliseconds(stamp_s: str) -> int | None:
-    """Seconds in decimal, as diagnostics write them; None when no cloud has come yet."""
-    return round(float(stamp_s) * 1e3) if stamp_s else None
+def _millimetres(metres: str) -> float | None:
+    return float(wire.to_mm(np.array(float(metres)), "m")) if metres else None

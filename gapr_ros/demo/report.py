@@ -5,23 +5,46 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
+from scipy.spatial import cKDTree
 
 from gapr_core.data.specimen import Specimen
-from gapr_core.evaluation.poster import save_poster
-from gapr_core.evaluation.report import Report, Step, alignment_figure, timeline_figure
 from gapr_core.geometry import se3
-from gapr_ros.observer import Answer
-
-if TYPE_CHECKING:
-    from gapr_ros.demo import Scene
+from gapr_core.pages.camera_pictures import KEY, CameraView, save_scene_poster, views_as_png
+from gapr_core.pages.poster import save_poster
+from gapr_core.pages.report import Image, Report, Step, alignment_figure, timeline_figure
+from gapr_ros.demo.act import Act
+from gapr_ros.demo.observer import Answer
 
 LIMIT_MM, LIMIT_DEG = 4.0, 5.0  # farther off at the source's centroid, or turned farther, is wrong
-COLUMNS = ("frame", "points", "answer", "confidence", "TRE mm", "error mm", "error deg", "latency ms")
+LIMITS = {"confidence": 0.5, "error at the centroid, mm": LIMIT_MM, "error, deg": LIMIT_DEG}
+BONE_COLUMNS = ("bone %", "taken", "right %")
+LEFT_OUT = ("points", "TRE mm")  # of a scene's table in the terminal, which is not wide enough
 STYLES = {"ok": "green", "hold": "yellow", "bad": "bold red", "": "dim"}
+NEAR_MM = 1.5  # a point this near to one that the node used shares its lot: the node thins
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """Which points of a cloud (N) were looked at, and taken for bone, and which are bone."""
+
+    looked_at: NDArray[np.bool_]
+    is_taken: NDArray[np.bool_]
+    is_bone: NDArray[np.bool_]
+
+    @property
+    def right_share(self) -> float:
+        """Of the points taken for bone, how many are; not finite where none was taken."""
+        return float(self.is_bone[self.is_taken].mean()) if self.is_taken.any() else float("nan")
+
+    def cells(self) -> tuple[str, ...]:
+        """The part of a row, as text."""
+        right = f"{100.0 * self.right_share:.0f}" if self.is_taken.any() else ""
+        return f"{100.0 * self.is_bone.mean():.0f}", str(int(self.is_taken.sum())), right
 
 
 @dataclass(frozen=True)
@@ -33,6 +56,7 @@ class Row:
     answer: Answer | None
     error_mm: float = float("nan")
     error_deg: float = float("nan")
+    taken: Taken | None = None
 
     @property
     def mark(self) -> str:
@@ -45,27 +69,58 @@ class Row:
 
     def cells(self) -> tuple[str, ...]:
         """The row as text, one string a column."""
+        head = (str(self.frame), str(self.points), *(self.taken.cells() if self.taken else ()))
         answer = self.answer
         if answer is None:
-            return (str(self.frame), str(self.points), "no answer: a newer cloud came first", "", "", "", "", "")
+            return (*head, "overtaken by a newer cloud", "", "", "", "", "", "")
         words = {"ok": "pose", "hold": f"refused: {answer.refusal}", "bad": "WRONG pose"}[self.mark]
         posed = self.mark != "hold"
-        tre = f"{answer.tre_mm:.1f}" if posed and answer.tre_mm is not None else ""
+        precision = [
+            f"{value:.1f}" if posed and value is not None else "" for value in (answer.tre_mm, answer.tre95_mm)
+        ]
         errors = (f"{self.error_mm:.2f}", f"{self.error_deg:.2f}") if posed else ("", "")
         latency = f"{answer.latency_ms:.0f}" if np.isfinite(answer.latency_ms) else ""
-        return (str(self.frame), str(self.points), words, f"{answer.confidence:.2f}", tre, *errors, latency)
+        return (*head, words, f"{answer.confidence:.2f}", *precision, *errors, latency)
 
 
-def judge(scene: Scene, answers: Mapping[int, Answer]) -> list[Row]:
+def columns(rows: Sequence[Row]) -> tuple[str, ...]:
+    """The headings of the rows' cells."""
+    bone = BONE_COLUMNS if rows and rows[0].taken else ()
+    return (
+        "frame",
+        "points",
+        *bone,
+        "answer",
+        "confidence",
+        "TRE mm",
+        "95 % mm",
+        "error mm",
+        "error deg",
+        "latency ms",
+    )
+
+
+def judge(act: Act, answers: Mapping[int, Answer]) -> list[Row]:
     """Every frame of the bag with its answer, against the truth that only the simulation knows."""
     rows = []
-    for number, cloud in enumerate(scene.sweep.clouds):
-        answer = answers.get(scene.stamp_ms(number))
+    for number, (cloud, truth) in enumerate(zip(act.clouds, act.truths, strict=True)):
+        answer = answers.get(act.stamp_ms(number))
         errors = (float("nan"), float("nan"))
         if answer is not None and answer.T_target_source is not None:
-            errors = se3.pose_error(answer.T_target_source, scene.sweep.T_target_source, cloud)
-        rows.append(Row(number + 1, len(cloud), answer, *errors))
+            errors = se3.pose_error(answer.T_target_source, truth, cloud)
+        taken = _taken(cloud, act.is_bone[number], answer) if act.is_bone else None
+        rows.append(Row(number + 1, len(cloud), answer, *errors, taken))
     return rows
+
+
+def _taken(cloud: np.ndarray, is_bone: NDArray[np.bool_], answer: Answer | None) -> Taken:
+    """What the node says of the points that it used, for every point of the cloud; of a refused cloud none is taken."""
+    used = answer.used if answer is not None else None
+    if used is None or not len(used.points):
+        return Taken(np.zeros(len(cloud), dtype=bool), np.zeros(len(cloud), dtype=bool), is_bone)
+    distance, nearest = cKDTree(used.points).query(cloud)
+    looked_at = distance <= NEAR_MM
+    return Taken(looked_at, looked_at & used.is_taken[nearest] & (answer.T_target_source is not None), is_bone)
 
 
 def passed(rows: Sequence[Row]) -> bool:
@@ -76,17 +131,19 @@ def passed(rows: Sequence[Row]) -> bool:
 
 def verdict(rows: Sequence[Row]) -> str:
     """The outcome in a sentence."""
-    counts = _counts(rows)
+    counts = facts(rows)
     return "  ".join(f"{name}: {value}." for name, value in counts.items())
 
 
 def rich_table(rows: Sequence[Row]) -> Table:
     """For the terminal."""
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for name in COLUMNS:
-        table.add_column(name, justify="left" if name == "answer" else "right", no_wrap=True)
+    table, names = Table(box=None, header_style="bold", pad_edge=False), columns(rows)
+    shown = [k for k, name in enumerate(names) if not (rows[0].taken and name in LEFT_OUT)]
+    for k in shown:
+        table.add_column(names[k], justify="left" if names[k] == "answer" else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(_first_words(cell) for cell in row.cells()), style=STYLES[row.mark])
+        cells = row.cells()
+        table.add_row(*(_first_words(cells[k]) for k in shown), style=STYLES[row.mark])
     return table
 
 
@@ -95,68 +152,98 @@ def _first_words(text: str) -> str:
     return ":".join(text.split(":")[:2])
 
 
-def write(scene: Scene, rows: Sequence[Row], folder: Path) -> None:
+def write(act: Act, rows: Sequence[Row], folder: Path) -> None:
     """report.html and report.png."""
-    steps = _steps(scene, rows)
+    steps = _steps(act, rows)
     shown = max((k for k, row in enumerate(rows) if row.mark in ("ok", "bad")), default=len(rows) - 1)
-    charts = _charts(rows)
-    _page(scene, rows, steps, shown, charts).write(folder / "report.html")
-    title = f"{scene.name}: {steps[shown].caption}"
-    limits = {"confidence": 0.5, "error at the centroid, mm": LIMIT_MM, "error, deg": LIMIT_DEG}
-    panels = {name: (values, limits.get(name)) for name, values in charts.items() if name in limits}
-    save_poster(folder / "report.png", scene.bone, steps[shown].points, steps[shown].distances_mm, title, panels)
+    charts, views, facing = _charts(rows), _views(act, rows), _facing(act, shown)
+    _page(act, rows, alignment_figure(act.bone, steps, shown, facing), views).write(folder / "report.html")
+    title = f"{act.name}: {steps[shown].caption}"
+    panels = {name: (values, LIMITS.get(name)) for name, values in charts.items() if name != "latency, ms"}
+    on_bone = steps[shown].points, steps[shown].distances_mm
+    if views:
+        save_scene_poster(folder / "report.png", act.bone, views, *on_bone, title, panels, facing)
+    else:
+        save_poster(folder / "report.png", act.bone, *on_bone, title, panels)
 
 
-def _page(
-    scene: Scene, rows: Sequence[Row], steps: Sequence[Step], shown: int, charts: Mapping[str, Sequence[float]]
-) -> Report:
-    lead = (
-        f"A tracked probe sweeps along a {scene.name}; the one-sided cloud of all it has seen so far goes from a bag "
-        "through register_node, a ROS 2 process of its own, to a pose of the pre-operative bone, or to a refusal."
-    )
-    report = Report("From a bag to a trusted pose", lead)
-    report.facts(_counts(rows))
+def _page(act: Act, rows: Sequence[Row], on_bone: Any, views: Sequence[CameraView]) -> Report:
+    report = Report(act.title, act.lead)
+    report.facts(facts(rows))
+    if views:
+        report.heading("What the camera sees")
+        report.paragraph("Every image, and what the node took for bone in it.")
+        report.images([Image(views_as_png(views), "the images, with the points taken for bone", KEY)])
     report.heading("The points laid on the bone")
-    report.figure(alignment_figure(scene.bone, steps, shown))
-    report.heading("Frame by frame")
-    report.paragraph(
-        "Errors are against the truth of the simulation, which the node never sees: at the centroid of the cloud and "
-        "as an angle; TRE is what the node expects of its own pose, over the whole bone. More than "
-        f"{LIMIT_MM:g} mm or {LIMIT_DEG:g} degrees is a wrong pose. Dashed: the limits."
-    )
-    limits = {"confidence": 0.5, "error at the centroid, mm": LIMIT_MM, "error, deg": LIMIT_DEG}
-    report.figure(timeline_figure([row.frame for row in rows], charts, "frame", limits))
-    report.table(COLUMNS, [row.cells() for row in rows], [row.mark for row in rows], text=("answer",))
+    report.figure(on_bone)
+    add_frames(report, rows)
     return report
 
 
-def _steps(scene: Scene, rows: Sequence[Row]) -> list[Step]:
-    bone = Specimen(scene.bone, scene.name, "")
-    return [_step(row, cloud, bone) for row, cloud in zip(rows, scene.sweep.clouds, strict=True)]
+def add_frames(report: Report, rows: Sequence[Row]) -> None:
+    """The charts and the table of all frames."""
+    report.heading("Frame by frame")
+    report.paragraph(
+        "Errors are against the truth of the simulation, which the node never sees: at the centroid of the cloud and "
+        "as an angle; TRE is what the node expects of its own pose, over the whole bone, with its 95 % bound. More "
+        f"than {LIMIT_MM:g} mm or {LIMIT_DEG:g} degrees is a wrong pose. Dashed: the limits."
+    )
+    report.figure(timeline_figure([row.frame for row in rows], _charts(rows), "frame", LIMITS))
+    report.table(columns(rows), [row.cells() for row in rows], [row.mark for row in rows], text=("answer",))
+
+
+def _steps(act: Act, rows: Sequence[Row]) -> list[Step]:
+    bone = Specimen(act.bone, act.name, "")
+    return [_step(row, cloud, bone) for row, cloud in zip(rows, act.clouds, strict=True)]
 
 
 def _step(row: Row, cloud: np.ndarray, bone: Specimen) -> Step:
     if row.answer is None or row.answer.T_target_source is None:
-        return Step(str(row.frame), f"frame {row.frame}: {row.cells()[2]}", np.zeros((0, 3)), np.zeros(0))
+        words = row.cells()[columns([row]).index("answer")]
+        return Step(str(row.frame), f"frame {row.frame}: {words}", np.zeros((0, 3)), np.zeros(0))
     aligned = se3.apply(row.answer.T_target_source, cloud)
+    on, aside = (aligned, aligned[:0]) if row.taken is None else (
+        aligned[row.taken.is_taken], aligned[~row.taken.is_taken]
+    )  # fmt: skip
     caption = (
         f"frame {row.frame}, {row.points} points: confidence {row.answer.confidence:.2f}, "
         f"error {row.error_mm:.2f} mm, {row.error_deg:.2f} deg"
     )
-    return Step(str(row.frame), caption, aligned, bone.distance(aligned))
+    return Step(str(row.frame), caption, on, bone.distance(on), aside)
+
+
+def _facing(act: Act, frame: int) -> np.ndarray | None:
+    """Where the camera is, seen from its points, in the bone's frame; None for a probe, which is on all sides."""
+    if not act.is_bone:
+        return None
+    middle = act.clouds[frame].mean(axis=0)
+    return act.truths[frame][:3, :3] @ -middle  # the camera is at the origin of its frame
+
+
+def _views(act: Act, rows: Sequence[Row]) -> list[CameraView]:
+    """The images of a camera, in its own frame; none where a probe sweeps."""
+    words = {"ok": "pose", "hold": "refused", "bad": "WRONG pose", "": "no answer"}
+    return [
+        CameraView(f"frame {row.frame}: {words[row.mark]}", cloud, row.taken.looked_at, row.taken.is_taken)
+        for row, cloud in zip(rows, act.clouds, strict=True)
+        if row.taken is not None
+    ]
 
 
 def _charts(rows: Sequence[Row]) -> dict[str, list[float]]:
     nan = float("nan")
-    return {
-        "confidence": [row.answer.confidence if row.answer else nan for row in rows],
+    charts = {"confidence": [row.answer.confidence if row.answer else nan for row in rows]}
+    if any(row.taken for row in rows):
+        charts["bone of taken, %"] = [100.0 * row.taken.right_share if row.taken else nan for row in rows]
+    return charts | {
         "error at the centroid, mm": [row.error_mm for row in rows],
         "error, deg": [row.error_deg for row in rows],
         "latency, ms": [row.answer.latency_ms if row.answer else nan for row in rows],
     }
 
 
-def _counts(rows: Sequence[Row]) -> dict[str, str]:
+def facts(rows: Sequence[Row]) -> dict[str, str]:
+    """What matters most."""
     marks = [row.mark for row in rows]
     names = {
         "ok": "right poses",

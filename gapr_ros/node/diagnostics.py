@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from gapr_ros.model import Model
-from gapr_ros.outcome import Outcome
-from gapr_ros.refusal import Reason
+from gapr_ros.node.model import Model
+from gapr_ros.node.outcome import Outcome
+from gapr_ros.node.refusal import Reason
 
 SILENCE_S = 2.0
 THROTTLE_S = 5.0
@@ -58,7 +58,13 @@ class Counters:
 
 @dataclass
 class Input:
-    """What is known about the topic of the clouds."""
+    """What is known about the topic of the clouds.
+
+    Attributes:
+        qos: what it is subscribed with.
+        publishers: how many there are.
+        mismatch: why no cloud of some of them comes; empty when all can.
+    """
 
     qos: str = ""
     publishers: int = 0
@@ -101,19 +107,51 @@ class RefusalLog:
         self._reason, self._at, self._silent = outcome.reason, time.monotonic(), 0
 
 
-def registration_status(
-    name: str, state: str, failure: str, model: Model | None, counters: Counters, last: Outcome | None, source: Input
-) -> DiagnosticStatus:
+@dataclass(frozen=True)
+class Snapshot:
+    """What the node knows of itself at one moment.
+
+    Attributes:
+        name: of the node, with its namespace.
+        state: of its lifecycle.
+        loading: which bone is being read, and for how long; empty when none is.
+        failure: why the last transition failed; empty when it did not.
+        counters: what became of every cloud.
+        model: the bone, when there is one.
+        last: what became of the last cloud.
+        source: what is known about the topic of the clouds.
+        listening: whether it is subscribed to.
+        conflicts: what is wrong around the node.
+        hardware_id: the bone's file.
+        child_frame: what goes to /tf as child; empty when nothing does.
+    """
+
+    name: str
+    state: str
+    loading: str
+    failure: str
+    counters: Counters
+    model: Model | None
+    last: Outcome | None
+    source: Input
+    listening: bool
+    conflicts: tuple[str, ...]
+    hardware_id: str
+    child_frame: str
+
+
+def registration_status(now: Snapshot) -> DiagnosticStatus:
     """The state of the registration."""
-    level, message = DiagnosticStatus.OK, f"{state}, {counters.accepted} accepted, {counters.refused} refused"
-    if counters.consecutive_refusals:
-        level, message = DiagnosticStatus.WARN, f"refused: {counters.last_refusal}"
-    if state != "active":
-        level, message = DiagnosticStatus.WARN, state
-    if failure:
-        level, message = DiagnosticStatus.ERROR, failure
-    path, points = ("", 0) if model is None else (model.path, len(model.target.points))
-    values = {"state": state, "model_path": path, "model_points": points, **_of_cloud(last)}
+    level, message = _level(now)
+    counters, source = now.counters, now.source
+    path, points = ("", 0) if now.model is None else (now.model.path, len(now.model.target.points))
+    values = {
+        "state": now.state,
+        "child_frame": now.child_frame,
+        "model_path": path,
+        "model_points": points,
+        **_of_cloud(now.last),
+    }
     values |= {
         "frames_received": counters.received, "frames_dropped": counters.dropped,
         "frames_accepted": counters.accepted, "frames_refused": counters.refused, "frames_merged": counters.merged,
@@ -121,42 +159,68 @@ def registration_status(
         "consecutive_refusals": counters.consecutive_refusals, "last_refusal": counters.last_refusal,
         "cloud_qos": source.qos, "publishers_on_points": source.publishers,
     }  # fmt: skip
-    return _status(level, f"{name}: registration", message, values)
+    return status_message(level, f"{now.name}: registration", now.hardware_id, message, values)
 
 
-def input_status(name: str, counters: Counters, source: Input | None, last: Outcome | None) -> DiagnosticStatus:
+def _level(now: Snapshot) -> tuple[bytes, str]:
+    """How bad it is, and the sentence that says so; the worst wins."""
+    if now.failure and not now.loading:
+        return DiagnosticStatus.ERROR, now.failure
+    if now.state != "active":
+        return DiagnosticStatus.WARN, f"{now.state}, {now.loading}" if now.loading else now.state
+    if now.counters.consecutive_refusals:
+        return DiagnosticStatus.WARN, f"refused: {now.counters.last_refusal}"
+    return DiagnosticStatus.OK, f"{now.state}, {now.counters.accepted} accepted, {now.counters.refused} refused"
+
+
+def input_status(now: Snapshot) -> DiagnosticStatus:
     """Whether clouds come, and come whole."""
-    silent_s = time.monotonic() - counters.last_cloud_at
-    level, message = DiagnosticStatus.OK, f"{counters.received} clouds"
-    if source is None:
-        message, source = "not listening", Input()
-    elif source.mismatch:
-        level, message = DiagnosticStatus.ERROR, source.mismatch
-    elif last is not None and last.reason is Reason.BAD_FIELDS:
-        level, message = DiagnosticStatus.ERROR, f"{last.reason}: {last.text}"
-    elif not source.publishers:
-        level, message = DiagnosticStatus.WARN, "nobody publishes clouds"
-    elif silent_s > SILENCE_S:
-        level, message = DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s"
-    values = {"frames_received": counters.received, "frames_lost": counters.lost, "seconds_since_last": silent_s,
-              "publishers_on_points": source.publishers, "cloud_qos": source.qos}  # fmt: skip
-    return _status(level, f"{name}: input", message, values)
+    silent_s = time.monotonic() - now.counters.last_cloud_at
+    level, message = _level_of_input(now, silent_s)
+    values = {
+        "frames_received": now.counters.received,
+        "frames_lost": now.counters.lost,
+        "seconds_since_last": silent_s,
+        "publishers_on_points": now.source.publishers,
+        "cloud_qos": now.source.qos,
+        "conflicts": "; ".join(now.conflicts),
+    }
+    return status_message(level, f"{now.name}: input", now.hardware_id, message, values)
+
+
+def _level_of_input(now: Snapshot, silent_s: float) -> tuple[bytes, str]:
+    if not now.listening:
+        return DiagnosticStatus.OK, "not listening"
+    if now.source.mismatch:
+        return DiagnosticStatus.ERROR, now.source.mismatch
+    if now.last is not None and now.last.reason is Reason.BAD_FIELDS:
+        return DiagnosticStatus.ERROR, f"{now.last.reason}: {now.last.text}"
+    if now.conflicts:
+        return DiagnosticStatus.WARN, "; ".join(now.conflicts)
+    if not now.source.publishers:
+        return DiagnosticStatus.WARN, "nobody publishes clouds"
+    if silent_s > SILENCE_S:
+        return DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s"
+    return DiagnosticStatus.OK, f"{now.counters.received} clouds"
 
 
 def _of_cloud(last: Outcome | None) -> dict[str, object]:
     names = ("cloud_stamp", "cloud_frame", "points_in", "points_used", "cloud_age_s", "confidence", "tre_mm",
-             "inlier_ratio", "found_by", "exec_ms")  # fmt: skip
+             "tre95_mm", "inlier_ratio", "found_by", "exec_ms")  # fmt: skip
     if last is None:
         return dict.fromkeys(names, "")
     stamp = f"{last.header.stamp.sec}.{last.header.stamp.nanosec:09d}"
     values = (stamp, last.cloud_frame, last.points_in, last.points_used, last.age_s, last.confidence_out,
-              last.tre_mm, last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
+              last.tre_mm, last.tre95_mm, last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
     return dict(zip(names, values, strict=True))
 
 
-def _status(level: bytes, name: str, message: str, values: dict[str, object]) -> DiagnosticStatus:
+def status_message(
+    level: bytes, name: str, hardware_id: str, message: str, values: Mapping[str, object]
+) -> DiagnosticStatus:
+    """A status with its values as text."""
     pairs = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=name, message=message, hardware_id="gapr", values=pairs)
+    return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
 
 
 def _text(value: object) -> str:

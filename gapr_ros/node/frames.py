@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_ros.refusal import Reason, RefusedError
+from gapr_core.errors import ConfigError
+from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, transform_to_matrix
 
 if TYPE_CHECKING:
@@ -22,10 +25,19 @@ POLL_S = 0.005
 
 
 class Frames:
-    """Looks transforms up and sends them; without tf2_ros it says so once and refuses look-ups."""
+    """Looks transforms up and sends them; without tf2_ros it says so once and refuses look-ups.
 
-    def __init__(self, node: Node, publish: bool, listen: bool) -> None:
-        self._node = node
+    Args:
+        node: publishes and subscribes.
+        publish: send to /tf.
+        listen: look up from the start; else from the first `listen()`.
+        note_sent: is given every transform that goes to /tf.
+    """
+
+    def __init__(
+        self, node: Node, publish: bool, listen: bool, note_sent: Callable[[TransformStamped], None] | None = None
+    ) -> None:
+        self._node, self._note_sent = node, note_sent
         self._sent_ns = -1
         self._tf2 = _import_tf2() if publish or listen else None
         if self._tf2 is None and (publish or listen):
@@ -64,12 +76,14 @@ class Frames:
         """To /tf, if its stamp is newer than that of the last one (tf2 warns about repeated data) and it has frames."""
         if self._broadcaster is None or stamp_ns <= self._sent_ns or not transform.header.frame_id:
             return False
+        if self._note_sent is not None:
+            self._note_sent(transform)
         self._broadcaster.sendTransform(transform)
         self._sent_ns = stamp_ns
         return True
 
     def forget(self) -> None:
-        """Time went back: older stamps are news again."""
+        """Time starts over: older stamps are news again."""
         self._sent_ns = -1
 
     def close(self) -> None:
@@ -79,6 +93,25 @@ class Frames:
         if self._broadcaster is not None:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
         self._listener = self._buffer = self._broadcaster = None
+
+
+def check_names(parameters: NodeParameters) -> None:
+    """Frames of the node's own that tf2 would not take, or that are the same.
+
+    Raises:
+        ConfigError: an empty model_frame, a leading slash, or the same name twice.
+    """
+    for name in ("model_frame", "output_frame"):
+        value = getattr(parameters, name)
+        if value.startswith("/"):
+            raise ConfigError(f"{name} without a leading slash", f"'{value}'", f"write {value.lstrip('/')}")
+    if not parameters.model_frame:
+        raise ConfigError("a model_frame", "an empty one", "give the bone's frame a name, such as femur_preop")
+    if parameters.model_frame == parameters.output_frame:
+        given = f"'{parameters.model_frame}' for both"
+        raise ConfigError(
+            "an output_frame other than model_frame", given, "poses of the bone cannot be in its own frame"
+        )
 
 
 def _import_tf2() -> Any | None:

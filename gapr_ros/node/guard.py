@@ -35,7 +35,7 @@ def transition(callback: Callable[..., TransitionCallbackReturn]) -> Callable[..
     def wrapper(self: Any, state: Any) -> TransitionCallbackReturn:
         try:
             result = callback(self, state)
-            self.call_soon(self.reporter.send)  # after the state has changed
+            self.call_soon(self.report)  # after the state has changed
             return result
         except Exception as error:
             self.report_failure(f"{callback.__name__.removeprefix('on_')} failed: {describe(error)}")

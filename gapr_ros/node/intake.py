@@ -1,48 +1,67 @@
-"""From a serialised PointCloud2 to the points in mm that registration gets, or the reason why not."""
+"""From a serialised cloud to the points in mm that registration gets, or the reason why not."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
-from rclpy.time import Time
-from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from gapr_core.clouds import EXTENT_LIMITS_MM, Surface
-from gapr_ros import wire
+from gapr_core.clouds import EXTENT_LIMITS_MM
+from gapr_core.surface import Surface
+from gapr_ros.node import wire
+from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.region import Crop
 from gapr_ros.parameters import NodeParameters
-from gapr_ros.refusal import Reason, RefusedError
-from msg_adapters import InvalidMessageError, cloud_to_xyz
+from msg_adapters import INPUTS, InvalidMessageError
 
 Array = NDArray[np.float64]
-BACKWARD_NS = 1_000_000_000  # a stamp this much older than the last one: time went back (a bag in a loop)
+BEYOND = 1e12  # no coordinate, whatever its unit, but bytes that were read as one
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
 
 
-def read_message(data: bytes) -> PointCloud2:
-    """The message, or a refusal when its bytes are no PointCloud2."""
+def read_message(data: bytes, cloud_type: str) -> Any:
+    """The message of the type that `msg_adapters.INPUTS` names, or a refusal when its bytes are none."""
     try:
-        return deserialize_message(data, PointCloud2)
+        return deserialize_message(data, INPUTS[cloud_type].message)
     except Exception as error:  # the middleware raises several kinds
-        raise RefusedError(Reason.BAD_FIELDS, f"the bytes are no whole PointCloud2 ({error})") from error
+        raise RefusedError(Reason.BAD_FIELDS, f"the bytes are no whole {cloud_type} ({error})") from error
 
 
-def stamp_ns(header: Header) -> int:
-    """The stamp, ns."""
-    return Time.from_msg(header.stamp).nanoseconds
+def read_header(data: bytes) -> Header | None:
+    """The header alone, which every input begins with: microseconds, however large the cloud is.
+
+    None when the bytes are no message; `read_message` says why.
+    """
+    try:
+        return deserialize_message(data, Header)
+    except Exception:  # the middleware raises several kinds
+        return None
 
 
-def check_age(header: Header, now_ns: int, max_age_s: float) -> None:
-    """Refuse a cloud that is too old. Off without a limit, before the clock runs and for clouds without a stamp."""
-    stamp = stamp_ns(header)
-    age_s = (now_ns - stamp) * 1e-9
-    if max_age_s > 0.0 and now_ns > 0 and stamp > 0 and age_s > max_age_s:
-        raise RefusedError(Reason.STALE, f"the cloud is {age_s:.3g} s old, max_cloud_age is {max_age_s:g} s")
+def plain_frame(frame_id: str) -> str:
+    """A frame's name as tf2 knows it: without the leading slash of ROS 1."""
+    return frame_id.lstrip("/")
 
 
-def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParameters) -> Array:
-    """Read, convert, clean and thin a cloud: (N, 3) float64, mm, finite, in the cloud's frame.
+def check_frame(frame: str, model_frame: str) -> None:
+    """Refuse a cloud in no frame at all, and one in that of the bone.
+
+    Raises:
+        RefusedError: bad_frame.
+    """
+    if not frame:
+        raise RefusedError(Reason.BAD_FRAME, "the cloud has no frame_id: a pose in no frame means nothing")
+    if frame == model_frame:
+        text = f"the cloud is in '{frame}', which is the bone's own frame: set model_frame, or the driver's frame_id"
+        raise RefusedError(Reason.BAD_FRAME, text)
+
+
+def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crops: Sequence[Crop] = ()) -> Array:
+    """Read, convert, clean, crop and thin a cloud: (N, 3) float64, mm, finite, in the cloud's frame.
 
     A cloud that is registered together with others (`accumulate`) may be of any size but empty: `check_together` looks
     at all of them.
@@ -50,11 +69,13 @@ def take_in(cloud: PointCloud2, model_extent_mm: float, parameters: NodeParamete
     Raises:
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
     """
-    points = _finite_points(cloud)
+    points = _finite_points(cloud, parameters.cloud_type)
     points = _within_range(wire.to_mm(points, parameters.cloud_unit), parameters)
+    for crop in crops:
+        points = crop(points)
     check_count(len(points), 1 if parameters.accumulate > 1 else parameters.min_points)
     points = thin(points, parameters.max_points, parameters.seed)
-    if parameters.accumulate == 1:
+    if parameters.accumulate <= 1:
         check_unit(points, model_extent_mm, parameters.cloud_unit)
     check_spread(points, parameters.cloud_unit)
     return points
@@ -83,7 +104,7 @@ def is_one_bone(points_mm: Array, model_extent_mm: float) -> bool:
 
 
 def check_spread(points_mm: Array, unit: str) -> None:
-    """Refuse a cloud with points that are metres apart, be it a few strays: no bone is so long."""
+    """Refuse a cloud with points that are metres apart, even a few: no bone is so long."""
     extent_mm = Surface(points_mm).extent_mm
     if extent_mm > EXTENT_LIMITS_MM[1]:
         size = f"{extent_mm:.3g} mm across read as {unit}, {EXTENT_LIMITS_MM[1]:g} mm are the most"
@@ -118,10 +139,11 @@ def thin(points: Array, most: int, seed: int) -> Array:
     return points[np.sort(chosen)]
 
 
-def _finite_points(cloud: PointCloud2) -> Array:
-    count = cloud.width * cloud.height
+def _finite_points(cloud: Any, cloud_type: str) -> Array:
+    count = INPUTS[cloud_type].count(cloud)
     try:
-        points = cloud_to_xyz(cloud, drop_zeros=True)
+        points = INPUTS[cloud_type].points(cloud)
+        points = points[(np.abs(points) < BEYOND).all(axis=1)]
     except InvalidMessageError as error:
         raise RefusedError(Reason.BAD_FIELDS, str(error)) from error
     if count == 0:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gapr_core import clouds
-from gapr_core.clouds import Surface
 from gapr_core.errors import ConfigError
+from gapr_core.formats.options import ReadOptions
+from gapr_core.surface import Surface
 from gapr_ros.parameters import NodeParameters
 
 Array = NDArray[np.float64]
@@ -27,12 +31,27 @@ class Model:
         target: what the registration method prepared from it.
         points_mm: (M, 3) of the bone in `model_frame`, for display.
         extent_mm: diagonal of its bounding box.
+        tree: of `points_mm`.
     """
 
     path: str
     target: Any
     points_mm: Array
     extent_mm: float
+    tree: cKDTree
+
+    @property
+    def file(self) -> str:
+        """Its file, without folder."""
+        return Path(self.path).name
+
+    @property
+    def name(self) -> str:
+        """Its file, without folder and ending."""
+        return Path(self.path).stem
+
+    def __str__(self) -> str:
+        return f"{self.path}: {len(self.target.points)} points, {self.extent_mm:.0f} mm across"
 
 
 def load_model(method: Any, parameters: NodeParameters) -> Model:
@@ -43,17 +62,41 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     """
     if not parameters.model_path:
         raise ConfigError("model_path", "nothing", "give -p model_path:=/path/to/bone.stl")
-    surface = clouds.load(parameters.model_path, units=parameters.model_unit)
+    options = ReadOptions(axes="as_is")  # model_axes says what to turn, whatever the file says of itself
+    surface = clouds.load(parameters.model_path, units=parameters.model_unit, options=options)
     factors = AXES[parameters.model_axes] * parameters.model_scale
     normals = None if surface.normals is None else surface.normals * AXES[parameters.model_axes]
     surface = Surface(surface.points * factors, surface.faces, normals)
     target = method.prepare(surface, units="mm")
-    return Model(parameters.model_path, target, _for_display(surface.points), surface.extent_mm)
+    points_mm = _for_display(surface.points)
+    return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm))
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A registration method with the bone that it has prepared: what a session works with."""
+
+    method: Any
+    model: Model
+
+
+def make_ready(method_factory: Callable[[NodeParameters], Any], parameters: NodeParameters) -> Ready:
+    """Make the method, read the bone, prepare it, and warm up; seconds, so do it where nobody waits.
+
+    Raises:
+        GaprError: as `load_model`, or a method that cannot be made.
+    """
+    method = method_factory(parameters)
+    model = load_model(method, parameters)
+    warm_up(method, model)
+    return Ready(method, model)
 
 
 def warm_up(method: Any, model: Model) -> None:
     """Register the bone to itself once, so that no cloud waits for code that is compiled on first use."""
     method.register(model.points_mm, model.target)
+    if hasattr(method, "reset"):
+        method.reset()
 
 
 def _for_display(points_mm: Array) -> Array:

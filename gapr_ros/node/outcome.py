@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from gapr_ros.refusal import Reason
-from gapr_ros.worker import Job
+from gapr_core.results import RegistrationResult
+from gapr_ros.node.refusal import Reason
+from gapr_ros.node.worker import Job
 
 Array = NDArray[np.float64]
 
@@ -23,13 +24,14 @@ class Outcome:
         cloud_frame: frame of the cloud.
         header: frame of the pose (`output_frame` or that of the cloud) and stamp of the cloud.
         reason: why there is no pose, or None.
-        text: the reason in full, for people.
+        text: the reason in full.
         pose: (4, 4) T_frame_model, metres; None when refused.
         covariance: (6, 6) of that pose, metres and radians, fixed axes of the frame.
         confidence: of the registration, 0 to 1, whatever was decided later.
         points_in, points_used: of the message; given to registration, those of clouds that are registered with it too.
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
-        tre_mm, inlier_ratio: of the registration.
+        tre_mm, tre95_mm, inlier_ratio: of the registration.
+        result: its whole answer; None where it was not asked.
         found_by: how far the registration had to look: track, network or search.
         exec_ms: wall time of the whole way.
     """
@@ -46,6 +48,8 @@ class Outcome:
     points_used: int = 0
     age_s: float | None = None
     tre_mm: float | None = None
+    tre95_mm: float | None = None
+    result: RegistrationResult | None = None
     inlier_ratio: float = 0.0
     found_by: str = ""
     exec_ms: float = 0.0
@@ -63,6 +67,11 @@ class Outcome:
     def refuse(self, reason: Reason, text: str) -> None:
         """Take the pose away."""
         self.reason, self.text, self.pose, self.covariance = reason, text, None, None
+
+    @classmethod
+    def refused(cls, job: Job, header: Header, reason: Reason, text: str) -> Outcome:
+        """Of a cloud that is not taken in at all."""
+        return cls(job, header.frame_id, header, reason, text)
 
     def tell(self) -> None:
         """Give it to those who wait for it."""

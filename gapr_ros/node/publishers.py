@@ -1,77 +1,111 @@
-"""What the node sends: the bone once, and for every cloud a confidence and, when accepted, a pose."""
+"""What the node sends: the bone once, for every cloud what became of it, and a pose when it is accepted."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from rclpy.lifecycle import LifecyclePublisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64, Header
 
 from gapr_core.geometry import se3
-from gapr_ros import intake, wire
-from gapr_ros.frames import Frames
-from gapr_ros.model import Model
-from gapr_ros.outcome import Outcome
+from gapr_ros.node import messages, timeline, wire
+from gapr_ros.node.frames import Frames
+from gapr_ros.node.host import Host
+from gapr_ros.node.model import Model
+from gapr_ros.node.outcome import Outcome
 from msg_adapters import covariance_to_list, matrix_to_pose, matrix_to_transform, xyz_to_cloud
 
-if TYPE_CHECKING:
-    from rclpy.lifecycle import LifecycleNode, LifecyclePublisher
-
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TOPICS = {
+    "transform": (TransformStamped, 10),
+    "confidence": (Float64, 10),
+    "status": (DiagnosticStatus, 10),
+    "hypotheses": (PoseArray, 10),
+    "residuals": (PointCloud2, 1),
+    "guidance": (PointCloud2, 1),
+    "next_view": (PoseStamped, 1),
+    "model": (PointCloud2, LATCHED),
+    "aligned": (PointCloud2, 1),
+}
 
 
 class Publishers:
     """The topics under `~/`, and /tf; silent while the node is not active."""
 
-    def __init__(self, node: LifecycleNode, frames: Frames, model_frame: str) -> None:
-        self._node, self._frames, self._model_frame = node, frames, model_frame
+    def __init__(self, host: Host, frames: Frames) -> None:
+        self._host, self._frames = host, frames
+        advertise = host.ros.create_lifecycle_publisher
+        self._topics = {name: advertise(kind, f"~/{name}", qos) for name, (kind, qos) in TOPICS.items()}
+        self._vision = messages.vision_types()
+        if self._vision is not None:
+            self._topics["detection"] = advertise(self._vision.Detection3DArray, "~/detection", 10)
         self._pose = self._advertise_pose()
-        self._transform = node.create_lifecycle_publisher(TransformStamped, "~/transform", 10)
-        self._confidence = node.create_lifecycle_publisher(Float64, "~/confidence", 10)
-        self._model = node.create_lifecycle_publisher(PointCloud2, "~/model", LATCHED)
-        self._aligned = node.create_lifecycle_publisher(PointCloud2, "~/aligned", 1)
 
     def send_model(self, model: Model) -> None:
         """The bone, latched, in its own frame."""
-        header = Header(frame_id=self._model_frame, stamp=self._node.get_clock().now().to_msg())
-        self._model.publish(xyz_to_cloud(wire.to_metres(model.points_mm).astype("f4"), header))
+        self._topics["model"].publish(xyz_to_cloud(wire.to_metres(model.points_mm).astype("f4"), self._of_model()))
 
     def send(self, outcome: Outcome, model: Model) -> None:
-        """The confidence of every cloud, then the pose of an accepted one."""
-        self._confidence.publish(Float64(data=outcome.confidence_out))
-        if not outcome.ok:
-            return
+        """What became of a cloud, then its pose where it has one, then what there is to look at."""
+        self._topics["confidence"].publish(Float64(data=outcome.confidence_out))
+        name = self._host.ros.get_fully_qualified_name()
+        self._topics["status"].publish(messages.status(outcome, name, model.file))
+        if outcome.ok:
+            self._send_pose(outcome)
+            self._send_aligned(outcome, model)
+        self._send_seen(outcome)
+        if self._vision is not None:
+            found = messages.detection(self._vision, outcome, model.name, model.points_mm)
+            self._topics["detection"].publish(found)
+
+    def withdraw_pose(self) -> None:
+        """No late listener gets the last pose any more: the topic is given up and advertised again."""
+        old, self._pose = self._pose, self._advertise_pose()
+        if old.is_activated:
+            self._pose.on_activate(None)
+        self._host.ros.destroy_lifecycle_publisher(old)
+
+    def close(self) -> None:
+        """Give the topics back."""
+        for publisher in (self._pose, *self._topics.values()):
+            self._host.ros.destroy_lifecycle_publisher(publisher)
+
+    def _advertise_pose(self) -> LifecyclePublisher:
+        return self._host.ros.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED)
+
+    def _of_model(self) -> Header:
+        stamp = self._host.ros.get_clock().now().to_msg()
+        return Header(frame_id=self._host.parameters.model_frame, stamp=stamp)
+
+    def _is_heard(self, name: str) -> bool:
+        return self._topics[name].get_subscription_count() > 0
+
+    def _send_pose(self, outcome: Outcome) -> None:
         message = PoseWithCovarianceStamped(header=outcome.header)
         message.pose.pose = matrix_to_pose(outcome.pose)
         message.pose.covariance = covariance_to_list(outcome.covariance)
         self._pose.publish(message)
-        self._send_transform(outcome)
-        self._send_aligned(outcome, model)
-
-    def withdraw_pose(self) -> None:
-        """No late listener gets the last pose any more: the topic is given up and taken anew."""
-        old, self._pose = self._pose, self._advertise_pose()
-        if old.is_activated:
-            self._pose.on_activate(None)
-        self._node.destroy_lifecycle_publisher(old)
-
-    def close(self) -> None:
-        """Give the topics back."""
-        for publisher in (self._pose, self._transform, self._confidence, self._model, self._aligned):
-            self._node.destroy_lifecycle_publisher(publisher)
-
-    def _advertise_pose(self) -> LifecyclePublisher:
-        return self._node.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED)
-
-    def _send_transform(self, outcome: Outcome) -> None:
-        transform = TransformStamped(header=outcome.header, child_frame_id=self._model_frame)
+        transform = TransformStamped(header=outcome.header, child_frame_id=self._host.parameters.model_frame)
         transform.transform = matrix_to_transform(outcome.pose)
-        self._transform.publish(transform)
-        self._frames.send(transform, intake.stamp_ns(outcome.header))
+        self._topics["transform"].publish(transform)
+        self._frames.send(transform, timeline.stamp_ns(outcome.header))
 
     def _send_aligned(self, outcome: Outcome, model: Model) -> None:
-        if self._aligned.get_subscription_count():
+        if self._is_heard("aligned"):
             points = se3.apply(outcome.pose, wire.to_metres(model.points_mm))
-            self._aligned.publish(xyz_to_cloud(points.astype("f4"), outcome.header))
+            self._topics["aligned"].publish(xyz_to_cloud(points.astype("f4"), outcome.header))
+
+    def _send_seen(self, outcome: Outcome) -> None:
+        """What people look at: with refusals above all."""
+        if self._host.parameters.publish_hypotheses:
+            self._topics["hypotheses"].publish(messages.hypotheses(outcome))
+        if outcome.result is None:
+            return
+        residuals, guidance = outcome.result.residuals, outcome.result.guidance
+        if residuals is not None and self._is_heard("residuals"):
+            self._topics["residuals"].publish(messages.residuals(residuals, outcome.header))
+        if guidance is not None and guidance.patches:
+            self._topics["guidance"].publish(messages.guidance(guidance, self._of_model()))
+            self._topics["next_view"].publish(messages.next_view(guidance, self._of_model()))

@@ -15,13 +15,17 @@ class Reason(str, Enum):
     BAD_FIELDS = "bad_fields"
     NON_FINITE = "non_finite"
     UNIT_MISMATCH = "unit_mismatch"
+    BAD_FRAME = "bad_frame"
     STALE = "stale"
+    FUTURE = "future"
     TF_MISSING = "tf_missing"
     TIMEOUT = "timeout"
     NOT_CONVERGED = "not_converged"
     AMBIGUOUS = "ambiguous"
     DEGENERATE = "degenerate"
     LOW_CONFIDENCE = "low_confidence"
+    IMPRECISE = "imprecise"
+    CLUTTER = "clutter"
     JUMP = "jump"
     SUPERSEDED_BY_RESET = "superseded_by_reset"
 
@@ -29,11 +33,9 @@ class Reason(str, Enum):
         return self.value
 
 
+# the node has the core's own words for what the data decided
 OF_STATUS = {
-    RegistrationStatus.AMBIGUOUS: Reason.AMBIGUOUS,
-    RegistrationStatus.DEGENERATE: Reason.DEGENERATE,
-    RegistrationStatus.LOW_CONFIDENCE: Reason.LOW_CONFIDENCE,
-    RegistrationStatus.TOO_FEW_POINTS: Reason.TOO_FEW_POINTS,
+    status: Reason(status.value.lower()) for status in RegistrationStatus if status is not RegistrationStatus.OK
 }
 
 

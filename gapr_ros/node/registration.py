@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.time import Time
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
-from gapr_ros import intake, wire
-from gapr_ros.frames import Frames
-from gapr_ros.guard import describe
-from gapr_ros.model import Model
-from gapr_ros.outcome import Outcome
+from gapr_ros.node import intake, region, timeline, wire
+from gapr_ros.node.frames import Frames
+from gapr_ros.node.guard import describe
+from gapr_ros.node.model import Model
+from gapr_ros.node.outcome import Outcome
+from gapr_ros.node.refusal import OF_STATUS, Reason, RefusedError
+from gapr_ros.node.region import Crop, Place
+from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
-from gapr_ros.refusal import OF_STATUS, Reason, RefusedError
-from gapr_ros.worker import Job
+from msg_adapters import INPUTS
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,7 @@ class Situation:
     parameters: NodeParameters
     epoch: int
     seed: Seed | None
+    place: Place | None
     now_ns: int
 
 
@@ -59,7 +60,7 @@ class Registration:
 
     def __init__(self, frames: Frames, situation: Callable[[], Situation]) -> None:
         self._frames, self._situation = frames, situation
-        self._frame, self._stamp_ns = "", 0  # of the last cloud; what the method remembers holds there only
+        self._frame = ""  # of the last answer; what the method remembers holds there only
 
     def process(self, job: Job) -> Outcome:
         """The outcome of one cloud; never raises."""
@@ -98,28 +99,42 @@ class Registration:
         """(N, 3) points of a cloud, mm, in the frame of the answer."""
         if outcome.job.epoch != now.epoch:
             raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset")
-        cloud = intake.read_message(outcome.job.cloud)
+        cloud = intake.read_message(outcome.job.cloud, now.parameters.cloud_type)
         _note_header(outcome, cloud, now)
-        intake.check_age(cloud.header, now.now_ns, now.parameters.max_cloud_age)
+        timeline.check_age(timeline.stamp_ns(cloud.header), now.now_ns, now.parameters.max_cloud_age)
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
-        points_mm = wire.moved_mm(T_frame_cloud, intake.take_in(cloud, now.model.extent_mm, now.parameters))
-        self._watch(outcome.header, now)
+        crops = self._crops(T_frame_cloud, outcome, now)
+        points_mm = intake.take_in(cloud, now.model.extent_mm, now.parameters, crops)
+        points_mm = wire.moved_mm(T_frame_cloud, points_mm)
+        self._watch_frame(outcome.header.frame_id, now)
         return points_mm
 
-    def _watch(self, header: Header, now: Situation) -> None:
-        """What the method remembers is of one frame, and of time that goes forward."""
-        stamp_ns = intake.stamp_ns(header)
-        went_back = stamp_ns < self._stamp_ns - intake.BACKWARD_NS
-        if (header.frame_id != self._frame or went_back) and self._stamp_ns and hasattr(now.method, "reset"):
+    def _crops(self, T_frame_cloud: Array, outcome: Outcome, now: Situation) -> list[Crop]:
+        """What the region of interest takes away, in the cloud's own frame."""
+        crops, place = [], now.place
+        if region.has_box(now.parameters):
+            crops.append(region.box(now.parameters, self._lookup(now.parameters.crop_frame, outcome, now)))
+        if now.parameters.crop_to_track > 0.0 and place is not None and place.frame == outcome.header.frame_id:
+            T_cloud_model = se3.inverse(T_frame_cloud) @ place.T_frame_model
+            crops.append(region.around(now.model.tree, T_cloud_model, now.parameters.crop_to_track))
+        return crops
+
+    def _watch_frame(self, frame: str, now: Situation) -> None:
+        """What the method remembers is of one frame."""
+        if self._frame and frame != self._frame and hasattr(now.method, "reset"):
             now.method.reset()
-        self._frame, self._stamp_ns = header.frame_id, stamp_ns
+        self._frame = frame
 
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
         seed = self._initial(outcome, now)
         options = {} if seed is None else {"initial": seed}
+        viewpoint_mm = self._viewpoint_mm(outcome, now)
+        if viewpoint_mm is not None:
+            options["viewpoint"] = viewpoint_mm
         result = now.method.register(points_mm, now.model.target, **options)
         outcome.confidence, outcome.inlier_ratio = float(result.confidence), float(result.inlier_ratio)
-        outcome.tre_mm, outcome.found_by = result.tre_mm, str(result.details.get("proposer", ""))
+        outcome.result, outcome.found_by = result, result.proposer
+        outcome.tre_mm, outcome.tre95_mm = result.tre_mm, result.tre95_mm
         return result
 
     def _initial(self, outcome: Outcome, now: Situation) -> Array | None:
@@ -134,6 +149,16 @@ class Registration:
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         return wire.core_pose(T_frame_cloud @ se3.inverse(T_seed_cloud) @ now.seed.T_frame_model)
 
+    def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:
+        """(3,) where the camera was, in the frame of the answer; None where it is not known, or not one place."""
+        frame = now.parameters.viewpoint
+        if frame == "none" or now.parameters.accumulate > 1:
+            return None
+        T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
+        if frame != "origin":
+            T_frame_cloud = T_frame_cloud @ se3.inverse(self._lookup(frame, outcome, now))
+        return T_frame_cloud[:3, 3] * wire.MM_PER_M
+
     def _lookup(self, frame: str, outcome: Outcome, now: Situation) -> Array:
         """T_frame_cloud at the cloud's stamp; no frame is that of the cloud."""
         if not frame:
@@ -142,11 +167,17 @@ class Registration:
         return self._frames.lookup(frame, outcome.cloud_frame, stamp, now.parameters.tf_timeout)
 
 
+def needs_frames(parameters: NodeParameters) -> bool:
+    """Whether clouds cannot be read without tf2."""
+    has_viewpoint = parameters.viewpoint not in ("none", "origin")
+    return bool(parameters.output_frame or parameters.crop_frame or has_viewpoint)
+
+
 def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
     """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
     together = np.vstack([now.method.collected, points_mm])
     if not intake.is_one_bone(together, now.model.extent_mm):
-        together = points_mm  # the method leaves this cloud out, or starts anew with it
+        together = points_mm  # the method leaves this cloud out, or starts again with it
     outcome.points_used = len(together)
     try:
         intake.check_together(together, now.model.extent_mm, now.parameters)
@@ -156,13 +187,13 @@ def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
         raise
 
 
-def _note_header(outcome: Outcome, cloud: PointCloud2, now: Situation) -> None:
+def _note_header(outcome: Outcome, cloud: Any, now: Situation) -> None:
     """Frame and stamp of the answer; a cloud without a stamp gets the time at which it arrived."""
-    stamp_ns = intake.stamp_ns(cloud.header)
-    outcome.points_in = cloud.width * cloud.height
-    outcome.header.frame_id = now.parameters.output_frame or cloud.header.frame_id
+    stamp_ns = timeline.stamp_ns(cloud.header)
+    outcome.points_in = INPUTS[now.parameters.cloud_type].count(cloud)
+    outcome.cloud_frame = intake.plain_frame(cloud.header.frame_id)
+    outcome.header.frame_id = now.parameters.output_frame or outcome.cloud_frame
     outcome.header.stamp = Time(nanoseconds=stamp_ns or outcome.job.received_ns).to_msg()
-    outcome.cloud_frame = cloud.header.frame_id
     outcome.age_s = (now.now_ns - stamp_ns) * 1e-9 if stamp_ns and now.now_ns else None
 
 
@@ -175,9 +206,20 @@ def _check(result: RegistrationResult, seconds: float, parameters: NodeParameter
     if not result.confidence >= parameters.min_confidence:
         text = f"confidence {result.confidence:.2f}, min_confidence is {parameters.min_confidence:g}"
         raise RefusedError(Reason.LOW_CONFIDENCE, text)
+    _check_precision(result, parameters.max_tre)
     for name, value in (("pose", result.T_target_source), ("covariance", result.covariance)):
         if value is None or not np.isfinite(value).all():
             raise RefusedError(Reason.NOT_CONVERGED, f"{result.method} gave no finite {name}")
+
+
+def _check_precision(result: RegistrationResult, most_m: float) -> None:
+    """Refuse a pose whose error over the bone is not bounded by `max_tre`; a method that gives no bound has none."""
+    if most_m <= 0.0:
+        return
+    bound_m = wire.metres_from_mm(np.inf if result.tre95_mm is None else result.tre95_mm)
+    if not bound_m <= most_m:
+        text = f"the 95 % bound of the error over the bone is {bound_m:.3g} m, max_tre is {most_m:g} m"
+        raise RefusedError(Reason.IMPRECISE, text)
 
 
 def _note_pose(outcome: Outcome, result: RegistrationResult, points_mm: Array, parameters: NodeParameters) -> None:

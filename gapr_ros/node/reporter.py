@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from gapr_ros.diagnostics import Input, input_status, registration_status
-from gapr_ros.guard import guarded
-
-if TYPE_CHECKING:
-    from gapr_ros.register_node import RegisterNode
+from gapr_ros.node.diagnostics import Snapshot, input_status, registration_status
+from gapr_ros.node.guard import guarded
 
 
 class Reporter:
-    """Collects what the node knows and sends it."""
+    """Sends what the node knows.
 
-    def __init__(self, node: RegisterNode) -> None:
-        self._node = node
+    Args:
+        node: publishes.
+        look: what is known now.
+    """
+
+    def __init__(self, node: Node, look: Callable[[], Snapshot]) -> None:
+        self._node, self._look = node, look
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
     def get_logger(self) -> object:
@@ -28,14 +31,7 @@ class Reporter:
     @guarded
     def send(self) -> None:
         """Two statuses: registration and input."""
-        node, name = self._node, self._node.get_name()
-        source = None if node.subscriptions_in is None else node.subscriptions_in.describe()
-        model = None if node.session is None else node.session.model
-        last = None if node.session is None else node.session.last_outcome
-        message = DiagnosticArray()
-        message.header.stamp = node.get_clock().now().to_msg()
-        message.status = [
-            registration_status(name, node.state, node.failure, model, node.counters, last, source or Input()),
-            input_status(name, node.counters, source, last),
-        ]
+        now = self._look()
+        message = DiagnosticArray(status=[registration_status(now), input_status(now)])
+        message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

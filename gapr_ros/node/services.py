@@ -1,22 +1,19 @@
-"""The node's four services. None blocks the executor: the long ones wait for the worker as coroutines."""
+"""The node's four services. None blocks the executor: the long ones wait as coroutines."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from gapr_ros.guard import describe
-from gapr_ros.model import Model
-from gapr_ros.session import Session
-
-if TYPE_CHECKING:
-    from gapr_ros.register_node import RegisterNode
+from gapr_ros.node.guard import describe
+from gapr_ros.node.host import Host
+from gapr_ros.node.loader import Loader
+from gapr_ros.node.session import Session
 
 
 class NotNowError(Exception):
@@ -40,21 +37,30 @@ def answering(service: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Services:
-    """`~/register`, `~/reset`, `~/reload_model` and `~/set_enabled`."""
+    """`~/register`, `~/reset`, `~/reload_model` and `~/set_enabled`.
 
-    def __init__(self, node: RegisterNode) -> None:
-        self._node = node
+    Args:
+        host: the node.
+        loader: reads bones.
+        state: its lifecycle state, asked for with every call.
+        session: what lives between configure and cleanup; None before and after.
+    """
+
+    def __init__(
+        self, host: Host, loader: Loader, state: Callable[[], str], session: Callable[[], Session | None]
+    ) -> None:
+        self._host, self._loader, self._state, self._configured = host, loader, state, session
         group = ReentrantCallbackGroup()  # a second call must not wait for the first
         for name in ("register", "reset", "reload_model"):
-            node.create_service(Trigger, f"~/{name}", getattr(self, name), callback_group=group)
-        node.create_service(SetBool, "~/set_enabled", self.set_enabled, callback_group=group)
+            host.ros.create_service(Trigger, f"~/{name}", getattr(self, name), callback_group=group)
+        host.ros.create_service(SetBool, "~/set_enabled", self.set_enabled, callback_group=group)
 
     @answering
     async def register(self, _: Trigger.Request) -> tuple[bool, str]:
         """Register the newest cloud now and answer with what became of it."""
         session, waiter = self._session(), Future()
-        if self._node.state != "active":
-            raise NotNowError(f"the node is {self._node.state}: activate it")
+        if self._state() != "active":
+            raise NotNowError(f"the node is {self._state()}: activate it")
         if not session.enabled:
             raise NotNowError("the node is disabled: call ~/set_enabled")
         if not session.register_newest(waiter):
@@ -71,14 +77,18 @@ class Services:
     @answering
     async def reload_model(self, _: Trigger.Request) -> tuple[bool, str]:
         """Read the bone again; clouds are registered to the old one until the new one is ready."""
-        session, waiter = self._session(), Future()
-        session.worker.run(partial(self._load, session, waiter))
-        model = await waiter
-        if isinstance(model, Model):
-            return True, f"{model.path}: {len(model.target.points)} points, {model.extent_mm:.0f} mm across"
-        why = f"the old bone stays: {describe(model)}"
-        self._node.get_logger().error(f"reload_model failed, {why}")
-        return False, why
+        session = self._session()
+        if self._loader.busy:
+            raise NotNowError(f"{self._loader}: one bone at a time")
+        ready = await self._loader.load()
+        if self._configured() is not session:
+            raise NotNowError("the node was cleaned up meanwhile")
+        if isinstance(ready, BaseException):
+            why = f"the old bone stays: {describe(ready)}"
+            self._host.ros.get_logger().error(f"reload_model failed, {why}")
+            return False, why
+        session.replace(ready)
+        return True, str(ready.model)
 
     @answering
     async def set_enabled(self, request: SetBool.Request) -> tuple[bool, str]:
@@ -90,28 +100,7 @@ class Services:
         return True, "enabled" if request.data else "disabled: clouds are counted as dropped"
 
     def _session(self) -> Session:
-        if self._node.session is None:
-            raise NotNowError(f"the node is {self._node.state}: configure it")
-        return self._node.session
-
-    def _load(self, session: Session, waiter: Future) -> None:
-        """In the worker's thread."""
-        try:
-            self._must_be_there(session)
-            model: Model | Exception = session.read_model()
-        except Exception as error:
-            model = error
-        self._node.call_soon(partial(self._swap, session, model, waiter))
-
-    def _swap(self, session: Session, model: Model | Exception, waiter: Future) -> None:
-        try:
-            self._must_be_there(session)
-            if isinstance(model, Model):
-                session.replace_model(model)
-        except Exception as error:
-            model = error
-        waiter.set_result(model)
-
-    def _must_be_there(self, session: Session) -> None:
-        if self._node.session is not session:
-            raise NotNowError("the node was cleaned up meanwhile")
+        session = self._configured()
+        if session is None:
+            raise NotNowError(f"the node is {self._state()}: configure it")
+        return session

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from std_msgs.msg import Header
 
-from gapr_ros import intake, track
-from gapr_ros.diagnostics import RefusalLog
-from gapr_ros.frames import Frames
-from gapr_ros.model import Model, load_model, warm_up
-from gapr_ros.outcome import Outcome
+from gapr_ros.node import intake, timeline, track
+from gapr_ros.node.conflicts import Conflicts
+from gapr_ros.node.diagnostics import RefusalLog
+from gapr_ros.node.frames import Frames
+from gapr_ros.node.host import Host
+from gapr_ros.node.model import Model, Ready
+from gapr_ros.node.outcome import Outcome
+from gapr_ros.node.publishers import Publishers
+from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.registration import Registration, Seed, Situation, needs_frames
+from gapr_ros.node.shared_frame import SharedFrame
+from gapr_ros.node.timeline import Timeline
+from gapr_ros.node.track import Track
+from gapr_ros.node.worker import Job, Worker
 from gapr_ros.parameters import NodeParameters
-from gapr_ros.publishers import Publishers
-from gapr_ros.refusal import Reason, RefusedError
-from gapr_ros.registration import Registration, Seed, Situation
-from gapr_ros.track import Track
-from gapr_ros.worker import Job, Worker
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
-if TYPE_CHECKING:
-    from gapr_ros.register_node import RegisterNode
-
-STOP_TIMEOUT_S = 10.0
+MOST_FRAMES = 5  # of clouds, that are named
 
 
 class Session:
@@ -32,58 +35,93 @@ class Session:
 
     All methods belong to the executor's thread, except those under "the worker's thread".
 
-    Raises:
-        GaprError: a bone that cannot be read or prepared.
+    Args:
+        host: the node.
+        ready: the method and the bone.
+        method_factory: makes another method when its own settings change.
     """
 
-    def __init__(self, node: RegisterNode, method_factory: Callable[[NodeParameters], Any]) -> None:
-        self._node, self._method_factory = node, method_factory
-        self._method = method_factory(node.parameters)
-        self._min_confidence, self._reading = node.parameters.min_confidence, _reading(node.parameters)
-        self.enabled = True
+    def __init__(self, host: Host, ready: Ready, method_factory: Callable[[NodeParameters], Any]) -> None:
+        self._host, self._ready, self._method_factory = host, ready, method_factory
+        self._limits, self._reading = _limits(host.parameters), _reading(host.parameters)
+        self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
-        self._track, self._epoch, self._seed, self._last_stamp_ns = Track(), 0, None, 0
-        self._log_refusal = RefusalLog(node.get_logger().warning)
-        self.model = self.read_model()
-        warm_up(self._method, self.model)
-        self._forget_clouds()
-        self._frames = Frames(node, node.parameters.publish_tf, listen=bool(node.parameters.output_frame))
-        self._publishers = Publishers(node, self._frames, node.parameters.model_frame)
+        self.conflicts = Conflicts(host.ros.get_logger().warning)
+        self._timeline, self._track = Timeline(), Track()
+        self._epoch, self._seed, self._cloud_frames = 0, None, []
+        self._log_refusal = RefusalLog(host.ros.get_logger().warning)
+        publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
+        self._shared = SharedFrame(host, self.conflicts) if publish else None
+        self._frames = Frames(host.ros, publish, listen, self._shared.note_own if self._shared else None)
+        self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation)
         self.worker = Worker(self._work, self._held, self._period_s)
 
+    @property
+    def model(self) -> Model:
+        """The bone."""
+        return self._ready.model
+
     def close(self) -> None:
-        """End the worker and give the topics back."""
+        """End the worker, after the cloud that it has in hand, and give the topics back; waits for nothing."""
         self.stop_waiting("the node stopped")
-        if not self.worker.stop(STOP_TIMEOUT_S):
-            self._node.get_logger().error(f"the registration has not ended after {STOP_TIMEOUT_S:g} s: left alone")
+        self._closed = True
+        self.worker.stop()
         self._publishers.close()
         self._frames.close()
+        if self._shared is not None:
+            self._shared.close()
 
     # --- in: the executor's thread ---
 
     def take_cloud(self, data: bytes) -> None:
-        """A serialised cloud arrived: into the mailbox, nothing more."""
-        counters = self._node.counters
+        """A serialised cloud arrived: into the mailbox, unless its time or its frame is refused."""
+        counters, now_ns = self._host.counters, self._host.now_ns()
         counters.receive()
         if not self.enabled:
             counters.dropped += 1
             return
-        accumulates = self._node.parameters.accumulate > 1
-        pushed_out = self.worker.put(
-            Job(data, self._epoch, self._node.now_ns()), leave=self._collect if accumulates else None
-        )
-        counters.dropped += pushed_out and not accumulates
+        header = intake.read_header(data)  # None: the worker says what is wrong with the bytes
+        try:
+            if header is not None:
+                self._admit(header, now_ns)
+        except RefusedError as refusal:
+            job = Job(b"", self._epoch, now_ns)
+            self._answer(Outcome.refused(job, header, refusal.reason, refusal.text))
+            return
+        self._put(Job(data, self._epoch, now_ns))
+
+    def _admit(self, header: Header, now_ns: int) -> None:
+        """Judge frame and time of a cloud before it can push another one out of the mailbox."""
+        frame = intake.plain_frame(header.frame_id)
+        intake.check_frame(frame, self._host.parameters.model_frame)
+        if self._timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters):
+            self._restart("the stamps of the clouds went back")
+        self._note_frame(frame)
+
+    def _put(self, job: Job) -> None:
+        accumulates = self._host.parameters.accumulate > 1
+        pushed_out = self.worker.put(job, leave=self._collect if accumulates else None)
+        self._host.counters.dropped += pushed_out and not accumulates
+
+    def _note_frame(self, frame: str) -> None:
+        """Clouds in two frames move the bone's parent to and fro, unless there is one output_frame for all."""
+        if frame not in self._cloud_frames and len(self._cloud_frames) < MOST_FRAMES:
+            self._cloud_frames.append(frame)
+        many = len(self._cloud_frames) > 1 and not self._host.parameters.output_frame
+        names = ", ".join(self._cloud_frames)
+        text = f"clouds come in {len(self._cloud_frames)} frames ({names}): the parent of the bone changes with them"
+        self.conflicts.note("cloud frames", f"{text}; set output_frame" if many else "")
 
     def take_seed(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
         try:
             T_frame_model = pose_to_matrix(message)
         except InvalidMessageError as error:
-            self._node.get_logger().warning(f"initialpose is ignored: {error}")
+            self._host.ros.get_logger().warning(f"initialpose is ignored: {error}")
             return
         self._begin_anew()
-        self._seed = Seed(T_frame_model, message.header.frame_id)
+        self._seed = Seed(T_frame_model, intake.plain_frame(message.header.frame_id))
         if message.header.frame_id:
             self._frames.listen()
 
@@ -96,97 +134,108 @@ class Session:
 
     # --- the worker's thread ---
 
-    def read_model(self) -> Model:
-        """The bone that the parameters name now, prepared."""
-        return load_model(self._method, self._node.parameters)
-
     def _work(self, job: Job) -> None:
-        self._node.call_soon(partial(self._settle, self._registration.process(job)))
+        self._host.call_soon(partial(self._settle, self._registration.process(job)))
 
     def _collect(self, job: Job) -> None:
         """A cloud that a newer one pushed out of the mailbox is registered with it."""
-        self._node.call_soon(partial(self._node.counters.leave, self._registration.collect(job)))
+        self._host.call_soon(partial(self._host.counters.leave, self._registration.collect(job)))
 
     def _situation(self) -> Situation:
-        node = self._node
-        return Situation(self._method, self.model, node.parameters, self._epoch, self._seed, node.now_ns())
+        host, ready = self._host, self._ready
+        place = self._track.place
+        return Situation(ready.method, ready.model, host.parameters, self._epoch, self._seed, place, host.now_ns())
 
     def _renew_method(self) -> None:
-        self._method = self._method_factory(self._node.parameters)
+        method = self._method_factory(self._host.parameters)
+        self._host.call_soon(lambda: setattr(self, "_ready", replace(self._ready, method=method)))
 
     def _forget_clouds(self) -> None:
         """Poses and clouds that the method remembers, as `Tracker` and `Accumulator` do."""
-        if hasattr(self._method, "reset"):
-            self._method.reset()
+        if hasattr(self._ready.method, "reset"):
+            self._ready.method.reset()
 
     def _held(self) -> bool:
-        return not self._node.parameters.continuous
+        return not self._host.parameters.continuous
 
     def _period_s(self) -> float:
-        max_rate = self._node.parameters.max_rate
+        max_rate = self._host.parameters.max_rate
         return 1.0 / max_rate if max_rate > 0.0 else 0.0
 
     # --- out: the executor's thread again ---
 
     def _settle(self, outcome: Outcome) -> None:
-        """Decide on an outcome, count it, send it, and tell who waits for it."""
+        """Decide on an outcome of the worker and answer."""
         self._decide(outcome)
+        self._answer(outcome)
+
+    def _answer(self, outcome: Outcome) -> None:
+        """Count an outcome, send it, and tell who waits for it."""
         self.last_outcome = outcome
-        self._node.counters.settle(outcome)
+        self._host.counters.settle(outcome)
         if not outcome.ok:
             self._log_refusal(outcome)
         try:
-            self._publishers.send(outcome, self.model)
+            if not self._closed:
+                self._publishers.send(outcome, self.model)
         finally:
             outcome.tell()
-            self._node.reporter.send()
+            self._host.report()
 
     def _decide(self, outcome: Outcome) -> None:
         if outcome.job.epoch != self._epoch:
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, "a reset came while the cloud was on its way")
             return
-        self._watch_stamps(outcome)
+        if outcome.reason is Reason.STALE:  # it grew old in the mailbox, and changes nothing
+            return
         if not outcome.ok:
             self._track.miss()
             return
         try:
             centre_m = track.centre_of(self.model.points_mm)
-            self._track.judge(outcome.pose, outcome.header.frame_id, centre_m, self._node.parameters)
+            self._track.judge(outcome.pose, outcome.header.frame_id, centre_m, self._host.parameters)
             self._seed = None
         except RefusedError as refusal:
             outcome.refuse(refusal.reason, refusal.text)
 
-    def _watch_stamps(self, outcome: Outcome) -> None:
-        """A bag that starts over without simulated time shows in its stamps only, as `Registration` sees too."""
-        stamp_ns = intake.stamp_ns(outcome.header)
-        if 0 < stamp_ns < self._last_stamp_ns - intake.BACKWARD_NS:
-            self._node.get_logger().warning("stamps went back: the track is cleared")
-            self._forget()
-        self._last_stamp_ns = stamp_ns or self._last_stamp_ns
-
     # --- state ---
 
     def reset(self) -> None:
-        """Forget track, seed, all clouds so far and the pose that late listeners get."""
+        """Forget track, seed, all clouds so far, their stamps and the pose that late listeners get."""
+        self._timeline.forget()
+        self._clear()
+
+    def _clear(self) -> None:
         self._begin_anew()
         self.worker.outdate(self._epoch)
         self._publishers.withdraw_pose()
+        self._cloud_frames = []
+
+    def clock_jumped(self) -> None:
+        """The node's clock went back."""
+        self._timeline.forget()
+        self._restart("the clock jumped back")
+
+    def _restart(self, why: str) -> None:
+        self._host.ros.get_logger().warning(f"{why}: time starts over and the track is cleared")
+        self._clear()
+        self._frames.forget()
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
-        if self._reading != (reading := _reading(self._node.parameters)):
+        if self._reading != (reading := _reading(self._host.parameters)):
             self._reading = reading
             self.worker.run(self._forget_clouds)
-        if self._min_confidence != self._node.parameters.min_confidence:
-            self._min_confidence = self._node.parameters.min_confidence
-            if self._node.parameters.accumulate > 1:
-                self._node.get_logger().warning("min_confidence changed: the clouds collected so far are forgotten")
+        if self._limits != (limits := _limits(self._host.parameters)):
+            self._limits = limits
+            if self._host.parameters.accumulate > 1:
+                self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)
         self.worker.wake()
 
-    def replace_model(self, model: Model) -> None:
+    def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
-        self.model = model
+        self._ready = ready
         self._begin_anew()
         self._publishers.withdraw_pose()
         self.send_model()
@@ -200,7 +249,7 @@ class Session:
         self._begin_anew()
         waiting = self.worker.clear()
         if waiting is not None:
-            self._node.counters.dropped += 1
+            self._host.counters.dropped += 1
             outcome = Outcome(waiting)
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.tell()
@@ -209,14 +258,16 @@ class Session:
         """Forget track, seed and collected clouds; clouds on their way will be refused."""
         self._epoch += 1
         self.worker.run(self._forget_clouds)
-        self._forget()
-
-    def _forget(self) -> None:
         self._track.clear()
-        self._seed, self._last_stamp_ns = None, 0
-        self._frames.forget()
+        self._seed = None
 
 
 def _reading(parameters: NodeParameters) -> tuple[Any, ...]:
     """How clouds are read: what was collected under other settings cannot be registered with what comes."""
-    return parameters.cloud_unit, parameters.range_min, parameters.range_max
+    box = parameters.crop_min, parameters.crop_max
+    return parameters.cloud_unit, parameters.range_min, parameters.range_max, *box
+
+
+def _limits(parameters: NodeParameters) -> tuple[float, ...]:
+    """What the method itself refuses by."""
+    return parameters.min_confidence, parameters.max_tre

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.geometry import se3
-from gapr_ros import wire
+from gapr_ros.node import wire
+from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.region import Place
 from gapr_ros.parameters import NodeParameters
-from gapr_ros.refusal import Reason, RefusedError
 
 Array = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ class Track:
         self._frame = ""
         self._candidate: Array | None = None
         self._accepted: Array | None = None
-        self._streak = 0
+        self._streak, self._sure = 0, False
 
     def clear(self) -> None:
         """Forget everything."""
@@ -46,11 +47,16 @@ class Track:
         if self._streak < parameters.require_consecutive:
             text = f"{self._streak} of {parameters.require_consecutive} good poses in a row (require_consecutive)"
             raise RefusedError(Reason.LOW_CONFIDENCE, text)
-        self._accepted = T_frame_model
+        self._accepted, self._sure = T_frame_model, True
 
     def miss(self) -> None:
-        """A cloud was refused: the row of good poses ends."""
-        self._streak, self._candidate = 0, None
+        """A cloud was refused: the row of good poses ends, and the bone may be elsewhere."""
+        self._streak, self._candidate, self._sure = 0, None, False
+
+    @property
+    def place(self) -> Place | None:
+        """Where the bone was with the last cloud; None when that was refused."""
+        return Place(self._accepted, self._frame) if self._accepted is not None and self._sure else None
 
     def _check_jump(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
         if self._accepted is None:

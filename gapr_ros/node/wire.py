@@ -1,4 +1,4 @@
-"""Between the core (mm, T_target_source) and the wire (metres, T_cloud_model): the only place that converts.
+"""Between the core (mm, T_target_source) and ROS (metres, T_cloud_model): the only place that converts.
 
 The target is the model (pre-operative bone), the source is the cloud: T_cloud_model is the inverse of T_target_source.
 """
@@ -31,7 +31,7 @@ def metres_from_mm(length_mm: float) -> float:
 
 
 def moved_mm(T: Array, points_mm: Array) -> Array:
-    """Points in mm moved by a transform of the wire (4, 4), metres."""
+    """Points in mm moved by a ROS transform (4, 4), metres."""
     return points_mm @ T[:3, :3].T + T[:3, 3] * MM_PER_M
 
 
@@ -43,7 +43,7 @@ def wire_pose(T_target_source: Array) -> Array:
 
 
 def core_pose(T_cloud_model: Array) -> Array:
-    """A pose from the wire (4, 4), metres, as T_target_source in mm."""
+    """A pose from ROS (4, 4), metres, as T_target_source in mm."""
     T = se3.inverse(T_cloud_model)
     T[:3, 3] *= MM_PER_M
     return T

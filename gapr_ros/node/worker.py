@@ -19,7 +19,7 @@ class Job:
     """One cloud on its way through the worker.
 
     Attributes:
-        cloud: serialised PointCloud2, as it came from the middleware.
+        cloud: serialised message, as it came from the middleware.
         epoch: the reset count when it arrived; a later reset makes its result worthless.
         received_ns: the node's clock when it arrived, ns.
         waiters: futures of service calls that want its outcome.
@@ -109,7 +109,7 @@ class Worker:
             waiting, self._slot, self._last = self._slot, None, None
         return waiting
 
-    def stop(self, timeout_s: float) -> bool:
+    def stop(self, timeout_s: float = 0.0) -> bool:
         """End the thread after what it is doing and the tasks. False when that takes longer than `timeout_s`."""
         with self._wake:
             self._stopping = True

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from msg_adapters import InvalidMessageError, cloud_to_xyz, xyz_to_cloud
+from msg_adapters import InvalidMessageError, cloud_to_field, cloud_to_xyz, xyz_to_cloud
 
 CODES = {"b": PointField.INT8, "B": PointField.UINT8, "h": PointField.INT16, "H": PointField.UINT16,
          "i": PointField.INT32, "I": PointField.UINT32, "f": PointField.FLOAT32, "d": PointField.FLOAT64}  # fmt: skip
@@ -72,6 +72,11 @@ def test_every_legal_layout_gives_back_its_points(layout):
     assert xyz.dtype == np.float64
     np.testing.assert_array_equal(xyz, expected)
     assert bytes(cloud.data) == before, "the message must not change"
+    for name, kind, _ in layout["fields"]:
+        if name not in "xyz":  # `build` writes ones
+            field = cloud_to_field(cloud, name)
+            assert field.dtype.kind + str(field.dtype.itemsize) == np.dtype(kind).kind + str(struct.calcsize(kind))
+            np.testing.assert_array_equal(field, np.ones(len(xyz)))
 
 
 @settings(max_examples=100, deadline=None)
@@ -172,3 +177,21 @@ def test_a_vga_cloud_is_read_in_a_fraction_of_its_frame_time():
     start = time.perf_counter()
     cloud_to_xyz(cloud)
     assert time.perf_counter() - start < 0.25
+
+
+def test_a_field_keeps_its_order_and_is_independent_of_the_message():
+    cloud = xyz_to_cloud(np.zeros((2, 2, 3)), fields={"distance": np.array([[1.0, 2.0], [3.0, np.nan]])})
+    distance = cloud_to_field(cloud, "distance")
+    np.testing.assert_array_equal(distance, [1.0, 2.0, 3.0, np.nan])
+    distance[:] = 0.0
+    assert cloud_to_field(cloud, "distance")[2] == 3.0
+    assert cloud_to_field(xyz_to_cloud(np.zeros((0, 3)), fields={"inlier": np.zeros(0, "u1")}), "inlier").shape == (0,)
+
+
+def test_a_field_that_is_missing_or_of_no_known_type_is_an_error():
+    cloud = xyz_to_cloud(np.zeros((2, 3)), fields={"inlier": np.zeros(2, "u1")})
+    with pytest.raises(InvalidMessageError, match="exactly one field distance, the cloud has: x, y, z, inlier"):
+        cloud_to_field(cloud, "distance")
+    cloud.fields[3].datatype = 99
+    with pytest.raises(InvalidMessageError, match="field inlier has the unknown type 99"):
+        cloud_to_field(cloud, "inlier")

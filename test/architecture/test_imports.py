@@ -63,7 +63,14 @@ def is_message_package(name):
     return name.endswith(("_msgs", "_srvs", "_interfaces"))
 
 
-DISTRIBUTIONS = {"yaml": "pyyaml", "vtkmodules": "vtk", "small_gicp": "small_gicp", "kiss_matcher": "kiss-matcher"}
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "yaml": "pyyaml",
+    "skimage": "scikit-image",
+    "vtkmodules": "vtk",
+    "small_gicp": "small_gicp",
+    "kiss_matcher": "kiss-matcher",
+}
 FROM_ROS = {"rclpy", "tf2_ros", "ament_index_python", "rpyutils"}
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+import gapr_core
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gapr_core", "msg_adapters", "gapr_ros")
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
@@ -25,9 +27,9 @@ def test_package_xml_and_setup_py_agree_on(field):
     assert MANIFEST.find(field).text == setup_py(field)
 
 
-def test_the_changelog_has_an_entry_for_the_version_or_for_the_one_to_come():
-    changelog = (ROOT / "CHANGELOG.rst").read_text()
-    assert "Forthcoming" in changelog or MANIFEST.find("version").text in changelog
+def test_the_version_is_the_same_in_setup_py_package_xml_the_library_and_the_changelog():
+    latest = re.search(r"^(\d+\.\d+\.\d+) \(", (ROOT / "CHANGELOG.rst").read_text(), flags=re.MULTILINE)[1]
+    assert setup_py("version") == MANIFEST.find("version").text == gapr_core.__version__ == latest
 
 
 def test_every_entry_point_leads_to_something_that_can_be_called():

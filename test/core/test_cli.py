@@ -125,3 +125,17 @@ def test_evaluate_refuses_every_kind_of_damaged_pair_and_goes_on(tmp_path, pair)
     answers = json.loads(out.read_text())
     assert answers.pop("whole")["status"] == "OK"
     assert {answer["status"] for answer in answers.values()} == {"INVALID_INPUT"} and len(answers) == 6
+
+
+def test_evaluate_answers_again_what_other_settings_have_answered(tmp_path, pair):
+    (tmp_path / "pairs").mkdir()
+    np.savez(tmp_path / "pairs" / "a.npz", source=pair.source[:5], target=pair.target)
+    run = ["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "o.json"), "--method", "gapr_search"]
+    answers = []
+    for more in ([], ["--set", "source.fewest_points=40"], ["--set", "source.fewest_points=40"]):
+        assert cli.main([*run, *more]) == 0
+        answers.append(json.loads((tmp_path / "o.json").read_text())["a"])
+    assert answers[0]["settings"] != answers[1]["settings"] and "40" in answers[1]["reason"]
+    assert answers[1] == answers[2]  # not asked again
+    assert answers[0]["version"].startswith("0.") and answers[0]["weights"]
+    assert answers[0]["tre95_mm"] is None and answers[0]["covariance"] is None

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gapr_core import clouds
-from gapr_core.clouds import Surface
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.surface import Surface
 
 VERTICES = np.array([[0, 0, 0], [40, 0, 0], [0, 30, 0], [0, 0, 20]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -93,12 +93,12 @@ def test_metres_become_millimetres(tmp_path):
     assert clouds.load(VERTICES / 1000.0, units="m").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
 
 
-def test_metres_read_as_millimetres_are_refused_with_the_mend():
+def test_metres_read_as_millimetres_are_refused_with_the_way_to_fix_it():
     with pytest.raises(InvalidPointCloudError, match="it looks like m: pass units='m'"):
         clouds.load(VERTICES / 1000.0, units="mm")
 
 
-def test_millimetres_read_as_metres_are_refused_with_the_mend():
+def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
     with pytest.raises(InvalidPointCloudError, match="it looks like mm"):
         clouds.load(VERTICES, units="m")
 
@@ -130,7 +130,7 @@ def test_an_unreadable_file_is_named_in_one_sentence(tmp_path, name, content):
         clouds.load(tmp_path / name)
 
 
-def test_a_missing_file_and_an_unknown_format_are_told_apart(tmp_path):
+def test_a_missing_file_and_an_unknown_format_are_distinguished(tmp_path):
     with pytest.raises(InvalidPointCloudError, match="a file that exists"):
         clouds.load(tmp_path / "none.ply")
     with pytest.raises(InvalidPointCloudError, match=r"\.ply \.pcd"):

@@ -1,22 +1,28 @@
+"""Settings: one place for default, range and help; the same from a file, the command line and Python."""
+
+from dataclasses import dataclass, fields, is_dataclass
+
 import pytest
 
-from gapr_core.config import RegistrarConfig, as_dict, flatten, from_dict
+from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig, VerificationConfig
 from gapr_core.errors import ConfigError
+from gapr_core.runtime import settings
+from gapr_core.runtime.settings import Settings, from_dict, setting
 
 
 def test_a_written_configuration_reads_back_the_same():
     config = RegistrarConfig(seed=4)
-    assert from_dict(RegistrarConfig, as_dict(config)) == config
+    assert RegistrarConfig.from_dict(config.to_dict()) == config
 
 
 def test_what_is_not_named_keeps_its_default_and_lists_become_tuples():
     config = from_dict(
         RegistrarConfig,
-        {"search": {"keep": 7}, "verification": {"coarse_limits_mm": [9.0, 4.0, 3]}, "min_confidence": 1},
+        {"search": {"keep": 7}, "verification": {"coarse_limits_mm": [9.0, 4, 3]}, "min_confidence": 1},
     )
     assert config.search.keep == 7 and config.search.spins == RegistrarConfig().search.spins
     assert config.verification.coarse_limits_mm == (9.0, 4.0, 3)
-    assert config.min_confidence == 1.0
+    assert isinstance(config.min_confidence, float) and config.min_confidence == 1.0
 
 
 @pytest.mark.parametrize("values", [{"seeds": 1}, {"search": {"keeps": 1}}])
@@ -25,11 +31,113 @@ def test_a_name_that_does_not_exist_is_refused_with_those_that_do(values):
         from_dict(RegistrarConfig, values)
 
 
-@pytest.mark.parametrize("values", [{"seed": "4"}, {"search": {"keep": 1.5}}, {"min_confidence": None}])
-def test_a_value_of_another_kind_is_refused(values):
+WRONG_TYPES = [
+    {"seed": "4"}, {"search": {"keep": 1.5}}, {"min_confidence": None}, {"guide": 1}, {"seed": True},
+    {"verification": {"coarse_limits_mm": [9.0, 4.0]}}, {"smooth_bias": {"sizes_mm": 1.0}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("values", WRONG_TYPES)
+def test_a_value_of_another_type_is_refused(values):
     with pytest.raises(ConfigError, match="of type"):
         from_dict(RegistrarConfig, values)
 
 
-def test_flat_names_have_dots():
-    assert flatten(RegistrarConfig())["search.keep"] == RegistrarConfig().search.keep
+@pytest.mark.parametrize("values", [3, [1], {"search": 4}])
+def test_what_is_no_mapping_is_refused(values):
+    with pytest.raises(ConfigError, match="a mapping of settings"):
+        from_dict(RegistrarConfig, values)
+
+
+OUT_OF_RANGE = [
+    {"min_confidence": 7.0}, {"min_confidence": -0.1}, {"min_confidence": float("nan")}, {"num_threads": -1},
+    {"refinement": {"iterations": 0}}, {"smooth_bias": {"sizes_mm": [0.1, -1.0]}}, {"max_tre_mm": -1.0},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("values", OUT_OF_RANGE)
+def test_a_value_out_of_range_is_refused_with_the_range(values):
+    with pytest.raises(ConfigError, match="at least|to"):
+        from_dict(RegistrarConfig, values)
+
+
+def test_ranges_hold_in_python_as_well_and_their_ends_are_inside():
+    with pytest.raises(ConfigError, match="min_confidence of 0 to 1"):
+        RegistrarConfig(min_confidence=7)
+    assert RegistrarConfig(min_confidence=1.0).min_confidence == 1.0
+    assert SmoothBiasConfig(evidence=float("inf")).evidence == float("inf")
+
+
+@dataclass(frozen=True)
+class Paint(Settings):
+    colour: str = setting("red", "of the wall", choices=("red", "blue"))
+    coats: dict[str, float] = setting({"first": 1.0}, "litres of each", low=0.0, unit="l")
+    note: str | None = None
+
+
+def test_choices_mappings_and_absent_values_are_checked_like_numbers():
+    assert from_dict(Paint, {"colour": "blue", "coats": {"a": 2}, "note": None}) == Paint("blue", {"a": 2.0})
+    with pytest.raises(ConfigError, match="one of red, blue"):
+        Paint("green")
+    with pytest.raises(ConfigError, match="at least 0 l"):
+        Paint(coats={"a": -1.0})
+
+
+def test_a_missing_value_without_a_default_is_named():
+    @dataclass(frozen=True)
+    class Point:
+        x: float
+        y: float = 0.0
+
+    assert from_dict(Point, {"x": 1}) == Point(1.0)
+    with pytest.raises(ConfigError, match="expected x for Point"):
+        from_dict(Point, {"y": 1.0})
+
+
+def test_a_file_and_assignments_over_it_make_the_settings(tmp_path):
+    (tmp_path / "my.yaml").write_text("min_confidence: 0.7\nrefinement:\n  rounds: 5\n  iterations: 2\n")
+    assigned = ["refinement.iterations=4", "refinement.rest_mm=1e-2", "smooth_bias.sizes_mm=[0.5, 1]"]
+    config = settings.load(RegistrarConfig, tmp_path / "my.yaml", assigned)
+    assert config.min_confidence == 0.7
+    assert config.refinement == RefinementConfig(rounds=5, iterations=4, rest_mm=0.01)
+    assert config.smooth_bias.sizes_mm == (0.5, 1.0)
+    assert settings.load(RegistrarConfig) == RegistrarConfig()
+
+
+@pytest.mark.parametrize("text", ["seed", "seed=1.5", "seed.x=1", "nothing=1", "seed=[", "search=3", "=1"])
+def test_a_bad_assignment_is_one_sentence(text):
+    with pytest.raises(ConfigError):
+        settings.load(RegistrarConfig, None, [text])
+
+
+@pytest.mark.parametrize("content", [None, b"a: [", b"- 1", b"text", b"\xff\xfe\x00x", b"a: !!python/name:os.system x"])
+def test_a_damaged_or_missing_file_is_one_sentence_that_names_it(tmp_path, content):
+    if content is not None:
+        (tmp_path / "my.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match="my.yaml") as caught:
+        settings.load(RegistrarConfig, tmp_path / "my.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_every_setting_has_a_help_and_every_number_a_range():
+    def check(cls):
+        for each in fields(cls):
+            default = getattr(cls(), each.name)
+            if is_dataclass(default):
+                check(type(default))
+                continue
+            assert each.metadata.get("text"), f"{cls.__name__}.{each.name}"
+            if not isinstance(default, bool | str):
+                assert settings.range_text(each), f"{cls.__name__}.{each.name}"
+            if each.name.endswith("_mm"):
+                assert each.metadata["unit"] == "mm", f"{cls.__name__}.{each.name}"
+
+    check(RegistrarConfig)
+
+
+def test_the_table_of_settings_has_dotted_names_ranges_and_help():
+    rows = {row.name: row for row in settings.table(RegistrarConfig)}
+    assert rows["search.keep"].default == RegistrarConfig().search.keep
+    assert rows["min_confidence"].range == "0 to 1" and rows["min_confidence"].text
+    assert rows["verification.same_pose_mm"].range == "at least 0.1 mm"
+    assert rows["verification.final_limits_mm"].default == VerificationConfig().final_limits_mm

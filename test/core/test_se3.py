@@ -27,6 +27,24 @@ def test_kabsch_ignores_points_of_no_weight():
     assert np.allclose(se3.kabsch(POINTS, moved, np.r_[0.0, np.ones(19)]), T)
 
 
+def test_kabsch_of_a_batch_is_that_of_each_pair_of_clouds_with_its_own_weights():
+    source, target = rng.normal(size=(2, 4, 9, 3))
+    weights = rng.uniform(0.1, 1.0, (4, 9))
+    one_by_one = [se3.kabsch(*each) for each in zip(source, target, weights, strict=True)]
+    np.testing.assert_allclose(se3.kabsch(source, target, weights), one_by_one, atol=1e-12)
+
+
+def test_kabsch_beats_every_motion_nearby():
+    source, target, weights = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), rng.uniform(0.1, 1.0, 9)
+
+    def cost(motion):
+        return weights @ ((se3.apply(motion, source) - target) ** 2).sum(axis=1)
+
+    best = se3.kabsch(source, target, weights)
+    nearby = [se3.exp(0.01 * twist) @ best for twist in np.vstack([np.eye(6), -np.eye(6)])]
+    assert cost(best) < min(map(cost, nearby))
+
+
 def test_the_rotation_angle_is_the_geodesic_one():
     turn = se3.from_rotation_translation(Rotation.from_rotvec([0.0, 0.0, np.radians(25.0)]).as_matrix(), [0, 0, 0])
     assert se3.rotation_angle_deg(turn) == pytest.approx(25.0)

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gapr_core.geometry import se3
+from gapr_core.geometry.twists import error_twist, motion_jacobians, nees, predicted_rmse_mm
 from gapr_core.metrics import cramer_rao
 from gapr_core.metrics.bootstrap import interval
-from gapr_core.metrics.uncertainty import error_twist, motion_jacobians, nees, predicted_rmse_mm
 
 
 def random_pose(rng):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gapr_core.clouds import Surface
 from gapr_core.geometry import se3
+from gapr_core.surface import Surface
 
 
 def bone() -> Surface:

@@ -32,9 +32,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import SetBool, Trigger
 
+from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.register_node import RegisterNode
+from gapr_ros.node.lifecycle import RegisterNode
 from msg_adapters import xyz_to_cloud
 
 DOMAIN = 1 + os.getpid() % 101
@@ -81,9 +82,18 @@ class Spinner:
         self.executor.add_node(node)
         self._thread.start()
 
-    def close(self) -> None:
+    def do(self, call: Callable[[], Any]) -> Any:
+        """The result of a call in the executor's thread: nothing may be destroyed while it waits for it."""
+        task = self.executor.create_task(call)
+        wait_until(task.done, what="the executor's thread")
+        return task.result()
+
+    def stop(self) -> None:
         self.executor.shutdown(timeout_sec=5.0)
         self._thread.join(5.0)
+
+    def close(self) -> None:
+        self.stop()
         for node in self._nodes:
             node.destroy_node()
         self.context.try_shutdown()
@@ -106,6 +116,7 @@ class Client:
         self.confidences: list[float] = []
         self.models: list[PointCloud2] = []
         self.diagnostics: list[DiagnosticArray] = []
+        self._services: dict[str, Any] = {}
         listen = self.node.create_subscription
         listen(PoseWithCovarianceStamped, f"{NODE}/pose", self.poses.append, LATCHED)
         listen(TransformStamped, f"{NODE}/transform", self.transforms.append, 10)
@@ -117,8 +128,14 @@ class Client:
         self.clock = self.node.create_publisher(Clock, "/clock", 10)
         self._spinner.start(self.node)
 
+        self.do = self._spinner.do
+
     def close(self) -> None:
         self._spinner.close()
+
+    def forget(self, publisher: Any) -> None:
+        """Give a publisher back."""
+        self.do(lambda: self.node.destroy_publisher(publisher))
 
     def values(self, status: str = "registration") -> dict[str, str]:
         """Key and value of the newest diagnostics, with `level` and `message`; empty before the first."""
@@ -144,7 +161,7 @@ class Client:
         self.points.publish(cloud)
 
     def ask(self, cloud: PointCloud2 | np.ndarray, timeout_s: float = 20.0, **kwargs: Any) -> dict[str, str]:
-        """Publish one cloud and wait for its answer: the diagnostics after it was settled."""
+        """Publish one cloud and wait for its answer: the diagnostics after it was counted."""
         before = _answered(self.values())
         self.send(cloud, **kwargs)
         wait_until(lambda: _answered(self.values()) == before + 1, timeout_s, f"an answer; last: {self.values()}")
@@ -152,9 +169,10 @@ class Client:
 
     def ready(self, kind: Any, name: str) -> Any:
         """A client whose service has been found."""
-        client = self.node.create_client(kind, name)
-        wait_until(client.service_is_ready, 20.0, f"service {name}")
-        return client
+        if name not in self._services:
+            self._services[name] = self.do(lambda: self.node.create_client(kind, name))
+        wait_until(self._services[name].service_is_ready, 20.0, f"service {name}")
+        return self._services[name]
 
     def call(self, name: str, request: Any = None, timeout_s: float = 20.0) -> Any:
         """The response of one of the node's services."""
@@ -163,7 +181,6 @@ class Client:
         client = self.ready(kind, f"{NODE}/{name}")
         future = client.call_async(request)
         wait_until(future.done, timeout_s, f"the answer of {name}")
-        self.node.destroy_client(client)
         return future.result()
 
 
@@ -172,17 +189,18 @@ def _answered(values: dict[str, str]) -> int:
 
 
 @contextmanager
-def node_in_thread(method: Any, model_path: Path, **parameters: Any) -> Iterator[RegisterNode]:
+def node_in_thread(method: Any, model_path: Path, namespace: str = "", **parameters: Any) -> Iterator[RegisterNode]:
     """A register_node in this process with a registration method of the test's own."""
     spinner = Spinner(context())
     values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False, "diagnostics_period": 0.1}
     overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
-    node = RegisterNode(lambda _: method, context=spinner.context, parameter_overrides=overrides)
+    options = {"context": spinner.context, "parameter_overrides": overrides, "namespace": namespace}
+    node = RegisterNode(lambda _: method, **options)
     spinner.start(node)
     try:
         yield node
     finally:
-        spinner.executor.shutdown(timeout_sec=5.0)
+        spinner.stop()
         node.close()
         spinner.close()
 
@@ -191,13 +209,19 @@ class NodeProcess:
     """`python -m gapr_ros.register_node` as a process of its own."""
 
     def __init__(
-        self, folder: Path, *arguments: str, module: str = "gapr_ros.register_node", **parameters: Any
+        self,
+        folder: Path,
+        *arguments: str,
+        module: str = "gapr_ros.register_node",
+        script: Path | None = None,
+        **parameters: Any,
     ) -> None:
-        self.log_path = folder / f"{module}-{time.monotonic_ns()}.log"
+        self.log_path = folder / f"{script.stem if script else module}-{time.monotonic_ns()}.log"
         self._log = self.log_path.open("wb")
         given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={yaml_value(value)}")]
         ros = ["--ros-args", *given] if given else []
-        command = [sys.executable, "-m", module, *arguments, *ros]
+        program = [str(script)] if script else ["-m", module]
+        command = [sys.executable, *program, *arguments, *ros]
         self.process = subprocess.Popen(
             command, stdout=self._log, stderr=subprocess.STDOUT, env=environment(folder), cwd=REPOSITORY
         )
@@ -214,6 +238,22 @@ class NodeProcess:
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.wait(timeout_s)
+
+    def stop_cpu_s(self, number: int, timeout_s: float = 30.0) -> float:
+        """CPU time from a signal to an end with 0: the wall clock says nothing on a busy machine."""
+        process = psutil.Process(self.process.pid)
+        before_s = last_s = sum(process.cpu_times()[:2])
+        self.process.send_signal(number)
+        deadline = time.monotonic() + timeout_s
+        while self.process.poll() is None and time.monotonic() < deadline:
+            try:
+                last_s = sum(process.cpu_times()[:2])
+            except psutil.NoSuchProcess:
+                break
+            time.sleep(0.01)
+        code = self.wait(5.0)
+        assert code in (0, -number) and (code == 0 or number == signal.SIGKILL), (code, self.log)
+        return last_s - before_s
 
     def wait(self, timeout_s: float = 20.0) -> int:
         try:
@@ -247,7 +287,7 @@ class StandIn:
     name = "stand-in"
 
     def __init__(self) -> None:
-        self.answer = accepted()
+        self.answer, self.config = accepted(), RegistrarConfig()
         self.error: Exception | None = None
         self.calls: list[dict[str, Any]] = []
         self.gate = threading.Event()
@@ -258,12 +298,37 @@ class StandIn:
         self.prepared += 1
         return target
 
-    def register(self, source: np.ndarray, target: Any, initial: np.ndarray | None = None) -> RegistrationResult:
-        self.calls.append({"source": source, "initial": initial, "target": target})
+    def register(
+        self, source: np.ndarray, target: Any, initial: np.ndarray | None = None, viewpoint: np.ndarray | None = None
+    ) -> RegistrationResult:
+        self.calls.append({"source": source, "initial": initial, "target": target, "viewpoint": viewpoint})
         assert self.gate.wait(20.0)
         if self.error is not None:
             raise self.error
         return self.answer
+
+
+class Collecting(StandIn):
+    """A stand-in that keeps clouds as an `Accumulator` does."""
+
+    def __init__(self):
+        super().__init__()
+        self.kept = []
+
+    @property
+    def collected(self):
+        return np.concatenate([np.empty((0, 3)), *self.kept])
+
+    def collect(self, source):
+        self.kept.append(source)
+
+    def register(self, source, target, initial=None, viewpoint=None):
+        result = super().register(source, target, initial, viewpoint)
+        self.collect(source)
+        return result
+
+    def reset(self):
+        self.kept = []
 
 
 def accepted(T: np.ndarray | None = None, confidence: float = 0.9, **kwargs: Any) -> RegistrationResult:

@@ -19,10 +19,10 @@ from harness import Client, NodeProcess, context, wait_until
 from rclpy.node import Node
 
 from gapr_core.geometry import se3
-from gapr_ros import wire
-from gapr_ros.bag_replay import Replay, ReplayOptions
-from gapr_ros.bag_writing import BagWriter
-from gapr_ros.bags import open_bag
+from gapr_ros.bags.files import open_bag
+from gapr_ros.bags.replay import Replay, ReplayOptions
+from gapr_ros.bags.writing import BagWriter
+from gapr_ros.node import wire
 from msg_adapters import pose_to_matrix
 
 T_TARGET_SOURCE = se3.from_rotation_translation(se3.random_rotation(np.random.default_rng(5)), [90.0, -40.0, 120.0])

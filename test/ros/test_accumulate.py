@@ -9,7 +9,7 @@ import numpy as np
 from harness import NodeProcess, pose_mm, wait_until
 
 from gapr_core.geometry import se3
-from gapr_ros import wire
+from gapr_ros.node import wire
 from msg_adapters import pose_to_matrix
 
 KINDS = ("accepted", "refused", "dropped", "merged", "lost")

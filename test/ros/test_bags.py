@@ -13,10 +13,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from gapr_ros import bag_replay
-from gapr_ros.bag_replay import Replay, ReplayOptions
-from gapr_ros.bag_writing import BagWriter, offered
-from gapr_ros.bags import BagError, open_bag
+from gapr_ros.bags import replay as bag_replay
+from gapr_ros.bags.files import BagError, open_bag
+from gapr_ros.bags.replay import Replay, ReplayOptions
+from gapr_ros.bags.writing import BagWriter, offered
 from msg_adapters import cloud_to_xyz
 
 START_NS = 1_700_000_000_250_000_000
@@ -96,7 +96,7 @@ def test_rate_topics_and_clock_are_obeyed(bag_path, listener):
 
 
 def test_a_looped_bag_starts_over_until_it_is_interrupted(bag_path, listener, tmp_path):
-    player = NodeProcess(tmp_path, str(bag_path), "--loop", "--rate", "4", "--clock", module="gapr_ros.bag_replay")
+    player = NodeProcess(tmp_path, str(bag_path), "--loop", "--rate", "4", "--clock", module="gapr_ros.bags.replay")
     wait_until(lambda: len(listener.heard["clouds"]) > 25, 20.0, player.log)
     assert player.stop() == 0, player.log
     clocks = [m.sec + m.nanosec * 1e-9 for m in listener.heard["clocks"]]

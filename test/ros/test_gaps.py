@@ -1,10 +1,10 @@
-"""Clouds that the middleware lost, told from the numbers of their publishers."""
+"""Clouds that the middleware lost, detected from the numbers of their publishers."""
 
 from __future__ import annotations
 
 import pytest
 
-from gapr_ros.diagnostics import Gaps
+from gapr_ros.node.diagnostics import Gaps
 
 
 @pytest.mark.parametrize(

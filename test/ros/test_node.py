@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from harness import Client, StandIn, accepted, node_in_thread, pose_mm, wait_until
+from harness import Client, Collecting, accepted, node_in_thread, pose_mm, wait_until
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.parameter import Parameter
@@ -22,8 +22,8 @@ from std_srvs.srv import SetBool, Trigger
 from gapr_core import Accumulator
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros import frames
-from gapr_ros.refusal import Reason, RefusedError
+from gapr_ros.node import frames
+from gapr_ros.node.refusal import Reason, RefusedError
 from msg_adapters import cloud_to_xyz, list_to_covariance, pose_to_matrix, transform_to_matrix, xyz_to_cloud
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
@@ -151,29 +151,6 @@ def test_the_newest_cloud_wins_and_every_other_is_counted(live):
     np.testing.assert_allclose(method.calls[-1]["source"], (0.01 + GOOD[:300] * 10) * 1000.0, atol=1e-3)
 
 
-class Collecting(StandIn):
-    """A stand-in that keeps clouds as an `Accumulator` does."""
-
-    def __init__(self):
-        super().__init__()
-        self.kept = []
-
-    @property
-    def collected(self):
-        return np.concatenate([np.empty((0, 3)), *self.kept])
-
-    def collect(self, source):
-        self.kept.append(source)
-
-    def register(self, source, target, initial=None):
-        result = super().register(source, target, initial)
-        self.collect(source)
-        return result
-
-    def reset(self):
-        self.kept = []
-
-
 def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob_path, client):
     method = Collecting()
     with node_in_thread(method, blob_path, accumulate=4) as node:
@@ -234,7 +211,8 @@ def test_another_frame_and_stamps_that_go_back_start_a_new_collection(blob_path,
         client.ask(GOOD, frame="other", stamp_s=12.0)
         assert len(method.kept) == 1
         client.ask(GOOD, frame="other", stamp_s=13.0)
-        client.ask(GOOD, frame="other", stamp_s=3.0)
+        for stamp_s in (3.0, 3.1, 3.2):
+            client.ask(GOOD, frame="other", stamp_s=stamp_s)
         assert len(method.kept) == 1
 
 
@@ -303,16 +281,11 @@ def test_a_waiting_cloud_is_registered_with_a_seed_that_came_after_it(blob_path,
 def test_a_reload_that_a_cleanup_overtakes_is_answered(live):
     node, client, method = live
     method.gate.clear()
-    client.send(GOOD)
-    wait_until(lambda: len(method.calls) > 1)
     reload_model = client.ready(Trigger, "/register_node/reload_model").call_async(Trigger.Request())
-    wait_until(lambda: node.session.worker._tasks)
-    change = client.ready(ChangeState, "/register_node/change_state")
+    wait_until(lambda: node._loader.busy)
     for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
-        done = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
-        wait_until(lambda done=done: node.session is None or done.done(), 20.0)
+        assert change_state(client, transition)
     method.gate.set()
-    wait_until(done.done, 20.0)
     wait_until(reload_model.done, 10.0, "the answer of reload_model")
     assert not reload_model.result().success and "cleaned up" in reload_model.result().message
 
@@ -394,7 +367,7 @@ def test_best_effort_publishers_are_heard(blob_path, method, chosen):
     client = Client(ReliabilityPolicy.BEST_EFFORT)
     with node_in_thread(method, blob_path, cloud_reliability=chosen):
         client.wait_for_state("active")
-        wait_until(lambda: client.values()["cloud_qos"] == "best_effort")
+        wait_until(lambda: "best_effort" in client.values()["cloud_qos"])
         time.sleep(0.3)
         assert client.ask(GOOD)["level"] == 0
         assert client.values("input")["level"] == 0
@@ -416,7 +389,7 @@ def test_time_that_goes_back_clears_the_track(blob_path, client, method):
         assert "1 of 2" in client.ask(GOOD, stamp_s=1000.0)["last_refusal"]
         assert client.ask(GOOD, stamp_s=1000.1)["level"] == 0
         set_clock(client, node, 990)
-        assert "1 of 2" in client.ask(GOOD, stamp_s=1000.2)["last_refusal"], "the track begins anew"
+        assert "1 of 2" in client.ask(GOOD, stamp_s=990.1)["last_refusal"], "the track restarts"
 
 
 def set_clock(client, node, seconds):
@@ -428,15 +401,6 @@ def set_clock(client, node, seconds):
         return abs(node.now_ns() - seconds * 1e9) < 1e6
 
     wait_until(arrived)
-
-
-def test_stamps_that_go_back_clear_the_track_without_simulated_time(blob_path, client, method):
-    with node_in_thread(method, blob_path, max_jump_translation=0.01):
-        client.wait_for_state("active")
-        client.ask(GOOD, stamp_s=1000.0)
-        method.answer = accepted(pose_mm([0, 0, 0], [50.0, 0, 0]))
-        assert "jump" in client.ask(GOOD, stamp_s=1000.5)["last_refusal"]
-        assert client.ask(GOOD, stamp_s=990.0)["level"] == 0
 
 
 def test_before_the_clock_runs_clouds_have_no_age_and_are_not_stale(blob_path, client, method):
@@ -451,13 +415,6 @@ def test_a_cloud_without_a_stamp_gets_the_time_of_its_arrival(live):
     client.ask(xyz_to_cloud(GOOD, Header(frame_id="probe")))
     wait_until(lambda: client.poses)
     assert abs(client.poses[0].header.stamp.sec - time.time()) < 5.0
-
-
-def test_a_cloud_without_a_frame_is_answered_in_no_frame(live):
-    node, client, method = live
-    assert client.ask(GOOD, frame="")["level"] == 0
-    wait_until(lambda: client.poses)
-    assert client.poses[0].header.frame_id == ""
 
 
 @pytest.mark.parametrize("path", ["", "/absent/bone.stl", "text.ply", "empty.stl", "metres.npy", "bone.docx"])
@@ -483,7 +440,6 @@ def change_state(client, transition):
     service = client.ready(ChangeState, "/register_node/change_state")
     future = service.call_async(ChangeState.Request(transition=Transition(id=transition)))
     wait_until(future.done)
-    client.node.destroy_client(service)
     return future.result().success
 
 

@@ -12,8 +12,8 @@ from harness import NodeProcess, StandIn, context, node_in_thread, wait_until
 from rclpy.parameter import Parameter
 
 from gapr_ros import parameters
+from gapr_ros.node.lifecycle import RegisterNode
 from gapr_ros.parameters import FIELDS, NodeParameters, ParameterError
-from gapr_ros.register_node import RegisterNode
 
 FILE = Path(__file__).parents[2] / "config" / "register_node.yaml"
 
@@ -24,6 +24,7 @@ def test_the_parameter_file_is_the_dataclass():
 
 def test_yaml_reads_the_defaults_back_with_their_types():
     values = yaml.safe_load(parameters.as_yaml())["/**"]["ros__parameters"]
+    values = {name: parameters.plain(value) for name, value in values.items()}
     assert values == dataclasses.asdict(NodeParameters())
     assert {name: type(value) for name, value in values.items()} == {n: type(f.default) for n, f in FIELDS.items()}
 
@@ -48,9 +49,13 @@ def ros():
         ("model_path", 5, 'write "5"'),
         ("continuous", "yes", "write true"),
         ("min_confidence", 1.5, "within 0 to 1"),
-        ("timeout", float("nan"), "must be within"),
+        ("timeout", float("nan"), "must be at least 0.001 s, got nan"),
         ("cloud_unit", "cm", "one of m, mm, got 'cm'"),
         ("seed", -1, "within 0 to"),
+        ("crop_min", [0.0, 1.0], "must be three doubles"),
+        ("crop_max", [0, 0, 1], "write [0.0, 0.0, 0.1]"),
+        ("standoff", 0.5, "within -0.01 to 0.01"),
+        ("sensor", "lidar", "one of unknown, pointer, ultrasound, depth_camera, laser"),
     ],
 )
 def test_a_wrong_value_is_refused_with_what_to_write(ros, name, value, hint):
@@ -106,3 +111,27 @@ def test_live_parameters_change_while_running_and_the_others_say_how(blob_path, 
         assert not refused.successful and "one of m, mm" in refused.reason
         assert not ask([Parameter("max_rate", value=5)]).successful
         assert node.parameters.seed == 0 and node.parameters.cloud_unit == "m"
+
+
+@pytest.mark.parametrize(
+    ("sensor", "output_frame", "accumulate", "together", "sentence"),
+    [
+        ("unknown", "", 0, 1, ""),
+        ("depth_camera", "tracker", 0, 1, ""),
+        ("ultrasound", "reference", 0, 50, "the last 50 clouds are registered as one"),
+        ("pointer", "reference", 0, 500, "the last 500 clouds are registered as one"),
+        ("ultrasound", "", 0, 1, "by itself, because output_frame is empty"),
+        ("ultrasound", "reference", 7, 7, "the last 7 clouds"),
+        ("ultrasound", "reference", 1, 1, ""),
+    ],
+)
+def test_slices_and_touched_points_are_registered_together_where_the_bone_rests_and_the_node_says_so(
+    ros, sensor, output_frame, accumulate, together, sentence
+):
+    given = {"sensor": sensor, "output_frame": output_frame, "accumulate": accumulate, "autostart": False}
+    overrides = [Parameter(name, value=value) for name, value in given.items()]
+    node = RegisterNode(lambda _: StandIn(), context=ros, parameter_overrides=overrides)
+    assert node.parameters.accumulate == together
+    assert sentence in " ".join(parameters.remarks(node.parameters))
+    assert bool(sentence) == bool(parameters.remarks(node.parameters))
+    node.close()

@@ -1,14 +1,13 @@
-"""Launch file and RViz configuration speak of the topics that the node has."""
+"""The RViz configuration speaks of the topics that the node has."""
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 
 import yaml
 from harness import node_in_thread, wait_until
 
-from gapr_ros.parameters import FIELDS
+from gapr_ros.node.publishers import TOPICS
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,13 +33,5 @@ def test_rviz_shows_topics_that_the_node_has(blob_path, method):
     assert len(shown) >= 5
     assert shown <= sends | hears
     assert {"/points", "/initialpose"} <= hears
-    own = {f"/register_node/{name}" for name in ("pose", "transform", "confidence", "model", "aligned")}
+    own = {f"/register_node/{name}" for name in ("pose", *TOPICS)}
     assert own | {"/diagnostics"} <= sends
-
-
-def test_the_launch_file_gives_parameters_and_topics_that_exist():
-    tree = ast.parse((ROOT / "launch" / "register.launch.py").read_text())
-    constants = {node.targets[0].id: ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)}
-    assert set(constants["TEXTS"]) <= set(FIELDS)
-    assert set(constants["ARGUMENTS"]) - {"points", "initialpose", "use_sim_time", "params_file", "rviz"} <= set(FIELDS)
-    assert set(constants["TEXTS"]) <= set(constants["ARGUMENTS"])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gapr_core.geometry import se3
-from gapr_ros import wire
+from gapr_ros.node import wire
 
 T_TARGET_SOURCE = pose_mm([0.3, -1.1, 0.7], [120.0, -40.0, 300.0])
 FLOORS = (1e-9, 1e-9)

@@ -7,7 +7,7 @@ import time
 
 from harness import wait_until
 
-from gapr_ros.worker import Job, Worker
+from gapr_ros.node.worker import Job, Worker
 
 
 class Bench:

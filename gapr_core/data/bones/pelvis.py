@@ -1,4 +1,4 @@
-"""A pelvis with its sacrum, joints fused. Frame: x to the person's left, y backwards, z up; origin amid the bone.
+"""A pelvis with its sacrum, joints fused. Frame: x to the subject's left, y backwards, z up; origin amid the bone.
 
 The left hip bone is laid out by landmarks in millimetres (an average adult); parameters move the landmarks, each side
 on its own, and the right side is mirrored.
@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.clouds import Surface
 from gapr_core.data.bones.sacrum import add_sacrum
 from gapr_core.data.parameters import length, trait
 from gapr_core.data.solid import Solid, ball, clipped, ellipsoid, sheet, tube
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def pelvis_surface(p: PelvisParameters, rng: np.random.Generator, spacing_mm: fl
 
 
 def _spread(points: ArrayLike, p: PelvisParameters) -> Array:
-    """Landmarks of the average pelvis moved to the person's widths, height and depth."""
+    """Landmarks of the average pelvis moved to the subject's widths, height and depth."""
     x, y, z = np.asarray(points, dtype=np.float64).T
     widths = [p.tuberosity_distance_mm / 112.0, p.hip_distance_mm / 168.0, p.intercristal_mm / 278.0]
     wide = np.interp(z, [-112.0, -56.0, 50.0], widths)
@@ -109,7 +109,7 @@ def _spread(points: ArrayLike, p: PelvisParameters) -> Array:
 
 
 class _Hip:
-    """One hip bone: its landmarks on the person's own place, on its own side."""
+    """One hip bone: its landmarks on the subject's own place, on its own side."""
 
     def __init__(self, p: PelvisParameters, side: float, rng: np.random.Generator) -> None:
         self.p, self.side, self.rng = p, side, rng

@@ -81,8 +81,8 @@ def _crests(solid: Solid, middle: Array, back: Array) -> None:
         solid.add(ball(spinous, 4.5 - 0.4 * level), 5.0)
         path.append(spinous - 3.0 * back[level])
         for side in (-1.0, 1.0):
-            beside = _at(middle, level + 0.6) + (WING_RADII[level] + 1.0) * back[level]
-            solid.add(ball(beside + [side * (27.0 - 5.0 * level), 0.0, 0.0], 3.5), 4.0)
+            lateral = _at(middle, level + 0.6) + (WING_RADII[level] + 1.0) * back[level]
+            solid.add(ball(lateral + [side * (27.0 - 5.0 * level), 0.0, 0.0], 3.5), 4.0)
     solid.add(tube(path, [6.0, 6.0, 5.5, 5.0]), 9.0)
 
 

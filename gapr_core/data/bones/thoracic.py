@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from gapr_core.clouds import Surface
 from gapr_core.data.parameters import length, trait
 from gapr_core.data.solid import Shape, Solid, ball, sheet, tube
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ def _cartilages(solid: Solid, chest: _Chest, side: float, rng: np.random.Generat
 
 
 def _outline(chest: _Chest, rib: int, above: Array | None, rng: np.random.Generator) -> Array:
-    """Control points (K, 2) as x, z on the person's own chest."""
+    """Control points (K, 2) as x, z on the subject's own chest."""
     p = chest.p
     path = np.array(PATHS[rib], dtype=np.float64) + rng.normal(0.0, p.asymmetry_mm, np.shape(PATHS[rib]))
     path[:, 0] *= np.interp(-path[:, 1], [0.0, 140.0, 200.0], [1.0, 1.0, p.costal_angle]) * p.chest_width_mm / 280.0

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import Surface
 from gapr_core.data.parameters import length, trait
 from gapr_core.data.solid import Grid, Solid, ball, ellipsoid, half_space, loft, profile, tube, wheel
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 

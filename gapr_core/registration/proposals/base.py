@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class Proposer(Protocol):
 
     @property
     def name(self) -> str:
-        """What figures are printed under."""
+        """The name in tables and logs."""
         ...
 
     def prepare(self, target: PreparedTarget) -> object:

@@ -9,6 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.geometry import se3
+
 Array = NDArray[np.float64]
 
 
@@ -47,7 +49,7 @@ def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -
     patches = np.unique(found.patch, return_counts=True)
     large = patches[0][patches[1] >= 3]
     members = (found.patch[None] == large[:, None]) * found.score
-    return _settle(_batched_kabsch(found, members), found, radius_mm, count)
+    return _converge(_batched_kabsch(found, members), found, radius_mm, count)
 
 
 def ransac(
@@ -63,11 +65,12 @@ def ransac(
     p, q = found.source[triples], found.target[triples]
     sides_p, sides_q = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
     rigid = (np.abs(sides_p - sides_q) < 2.0 * radius_mm).all(axis=1) & (sides_p > 2.0 * radius_mm).all(axis=1)
-    weights = np.ones((int(rigid.sum()), 3))
-    return _settle(_kabsch(p[rigid], q[rigid], weights), found, radius_mm, count)
+    return _converge(se3.kabsch(p[rigid], q[rigid]), found, radius_mm, count)
 
 
-def _settle(poses: Array, found: Correspondences, radius_mm: float, count: int, rounds: int = 4) -> tuple[Array, Array]:
+def _converge(
+    poses: Array, found: Correspondences, radius_mm: float, count: int, rounds: int = 4
+) -> tuple[Array, Array]:
     """The best poses, each refitted to the correspondences it explains, near-copies dropped."""
     if len(poses) == 0:
         return np.empty((0, 4, 4)), np.empty(0)
@@ -127,21 +130,4 @@ def _batched_kabsch(found: Correspondences, weights: Array) -> Array:
     total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
     p_mean, q_mean = weights @ found.source / total, weights @ found.target / total
     covariance = (weights @ found.products / total).reshape(-1, 3, 3) - p_mean[:, :, None] * q_mean[:, None]
-    return _poses(covariance, p_mean, q_mean)
-
-
-def _kabsch(p: Array, q: Array, weights: Array) -> Array:
-    """Weighted SVD (Arun 1987) of K small sets: p, q (K, n, 3), weights (K, n)."""
-    w = (weights / weights.sum(axis=1, keepdims=True))[..., None]
-    p_mean, q_mean = (w * p).sum(axis=1), (w * q).sum(axis=1)
-    return _poses((w * (p - p_mean[:, None])).transpose(0, 2, 1) @ (q - q_mean[:, None]), p_mean, q_mean)
-
-
-def _poses(covariance: Array, p_mean: Array, q_mean: Array) -> Array:
-    u, _, vt = np.linalg.svd(covariance)
-    v = vt.transpose(0, 2, 1).copy()
-    v[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
-    poses = np.tile(np.eye(4), (len(covariance), 1, 1))
-    poses[:, :3, :3] = v @ u.transpose(0, 2, 1)
-    poses[:, :3, 3] = q_mean - np.einsum("kij,kj->ki", poses[:, :3, :3], p_mean)
-    return poses
+    return se3.fitting(covariance, p_mean, q_mean)

@@ -13,14 +13,14 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import Frame, build_cloud, target_frame
 from gapr_core.model.types import Cloud, Features, Matches
-from gapr_core.proposals.base import Proposals
-from gapr_core.proposals.consensus import Correspondences, local_to_global, ransac
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
+from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.proposals.consensus import Correspondences, local_to_global, ransac
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 METHODS = ("local_to_global", "ransac")
-SHIPPED = Path(__file__).parents[1] / "weights" / "gapr_net.safetensors"
+SHIPPED = Path(__file__).parents[2] / "weights" / "gapr_net.safetensors"
 
 
 class NetworkProposer:
@@ -30,7 +30,7 @@ class NetworkProposer:
         network: in evaluation mode, on any device.
         method: `local_to_global`, or `ransac` as the paper says.
         count: most poses for one pair.
-        weights_name: what the target's share of the work is kept under, beside the device, so that networks of the
+        weights_name: what the target's share of the work is kept under, with the device, so that networks of the
             same weights share it; without a name it is the network's alone.
     """
 

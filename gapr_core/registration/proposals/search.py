@@ -2,7 +2,8 @@
 
 A reference point of the source is put on an anchor of the target, normal on normal, and turned about the normal in
 steps. Each pose is scored by the distances of a few probe points of the source in the target's distance field. The
-sign of a source normal is unknown (one-sided clouds look alike from both sides), so both are tried.
+sign of a source normal is unknown (one-sided clouds look alike from both sides), so both are tried, unless the sensor's
+place has decided it.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 from gapr_core.config import SearchConfig
 from gapr_core.geometry import quadrics, sampling
 from gapr_core.geometry.distance_field import DistanceField
-from gapr_core.parallel import thread_count
-from gapr_core.proposals.base import Proposals
-from gapr_core.source import PreparedSource
-from gapr_core.target import PreparedTarget
+from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.runtime.parallel import thread_count
 
 Array = NDArray[np.float64]
 
@@ -40,16 +41,16 @@ class NormalAlignedSearch:
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """The best spin of every (reference, sign, anchor), best `keep` of them all."""
         references = _references(source, self.config.references)
+        signs = np.array([1.0] if source.oriented else [1.0, -1.0])
         anchor_axes = _anchor_axes(target)
-        local = np.stack([_probes_in_frame(source, i, sign, self.config) for i in references for sign in (1.0, -1.0)])
+        local = np.stack([_probes_in_frame(source, i, sign, self.config) for i in references for sign in signs])
         anchors = target.points[target.anchors].astype(np.float32)
         score, spin = self._score(local, anchors, anchor_axes.astype(np.float32), target.field)
         best = np.argsort(score, axis=None, kind="stable")[: self.config.keep]
         view, anchor = np.unravel_index(best, score.shape)
         angles = 2.0 * np.pi * spin[view, anchor] / self.config.spins
-        poses = _poses(
-            source, references[view // 2], np.where(view % 2, -1.0, 1.0), angles, target, anchor_axes, anchor
-        )
+        reference, sign = references[view // len(signs)], signs[view % len(signs)]
+        poses = _poses(source, reference, sign, angles, target, anchor_axes, anchor)
         return Proposals(poses, -score[view, anchor].astype(np.float64))
 
     def _score(

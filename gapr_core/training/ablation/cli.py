@@ -1,9 +1,9 @@
-"""gapr ablate: train the paper's ablations at one budget, examine them on people they never saw, and compare.
+"""gapr ablate: train the paper's ablations at one budget, examine them on subjects they never saw, and compare.
 
 gapr ablate --out runs/ablation --pairs 8000 --anatomy DIR --jobs 2
 
 Stop it at any time and call it again: finished networks stay, the one under way goes on from its checkpoint. OUT gets
-table.md, table.json, table.csv and curves_*.png anew after every network, pairs/ with the examination's pairs, and one
+table.md, table.json, table.csv and curves_*.png again after every network, pairs/ with the examination's pairs, and one
 folder a network and seed, as `gapr train` writes it, with exam.json.
 """
 
@@ -22,15 +22,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
-from gapr_core import metrics, target
+from gapr_core import metrics
 from gapr_core.config import RefinementConfig
-from gapr_core.console import say
 from gapr_core.data.anatomy import SPLITS
-from gapr_core.data.make_pairs import Recipe, read_manifest, write_pairs
+from gapr_core.data.make_pairs import MANIFEST, Recipe, read_manifest, write_pairs
 from gapr_core.data.pair_files import load_pair
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import Pair
@@ -39,14 +37,18 @@ from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
-from gapr_core.proposals.consensus import local_to_global
-from gapr_core.proposals.network import correspondences_mm
-from gapr_core.refinement import refine_fully
-from gapr_core.training.ablation_table import FIGURES, folder_of, write
+from gapr_core.registration import target
+from gapr_core.registration.proposals.consensus import local_to_global
+from gapr_core.registration.proposals.network import correspondences_mm
+from gapr_core.registration.refinement import refine_fully
+from gapr_core.runtime import files
+from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.console import say
+from gapr_core.training.ablation.table import FIGURES, folder_of, write
 from gapr_core.training.config import TrainConfig, Variant, default_plan, read_plan, trained_as
 from gapr_core.training.dataset import available
 from gapr_core.training.targets import training_pair
-from gapr_core.training.trainer import settle, train
+from gapr_core.training.trainer import claim_folder, train
 from gapr_core.training.validation import inlier_ratios
 
 Record = dict[str, Any]
@@ -66,15 +68,15 @@ class Task:
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr ablate`."""
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison; an interrupted one goes on")
-    parser.add_argument("--pairs", type=int, required=True, help="budget of every network, in training pairs")
+    parser.add_argument("--pairs", type=at_least_one, required=True, help="budget of every network, in training pairs")
     parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
     parser.add_argument("--plan", type=Path, help="which networks, in which tables (config/ablation.yaml)")
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of every network, seeds 0, 1, ... (1)")
+    parser.add_argument("--seeds", type=at_least_one, default=1, help="trainings of every network, seeds 0, 1, ... (1)")
     parser.add_argument("--protocols", default="paper,L1,L2", help="of the examination, with commas (paper,L1,L2)")
-    parser.add_argument("--count", type=int, default=10, help="pairs of the examination, per protocol and bone (10)")
+    parser.add_argument("--count", type=at_least_one, default=10, help="pairs of the exam, per protocol and bone (10)")
     parser.add_argument("--split", default="test", choices=[s for s in SPLITS if s != "train"], help="whose bones")
-    parser.add_argument("--jobs", type=int, default=1, help="networks at a time, which share the cores (1)")
+    parser.add_argument("--jobs", type=at_least_one, default=1, help="networks at a time, which share the cores (1)")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
 
 
@@ -125,7 +127,7 @@ def ablate(
     }  # fmt: skip
     for folder, settings in todo.items():
         if (folder / "config.json").exists():
-            settle(folder, settings, ModelConfig.from_yaml(settings.model), 1)
+            claim_folder(folder, settings, ModelConfig.from_yaml(settings.model), 1)
     examination(recipe, out / "pairs", anatomy)
     tasks = [Task(folder, settings, anatomy, out / "pairs", deadline) for folder, settings in todo.items()]
     missing = [task for task in tasks if not (task.folder / "exam.json").exists()]
@@ -145,7 +147,7 @@ def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
     """The pairs of the examination, made once: the same for every network."""
     if "wrong" in recipe.protocols:
         raise ConfigError("protocols with a true pose", "wrong", "leave it out")
-    complete = (folder / "manifest.json").exists() and read_manifest(folder)
+    complete = (folder / MANIFEST).exists() and read_manifest(folder)
     if not (complete and complete["hash"] and complete["recipe"] == json.loads(json.dumps(asdict(recipe)))):
         people = {bone: specimens(bone, recipe.split, recipe.people, anatomy) for bone in recipe.bones}
         write_pairs(recipe, people, folder)
@@ -163,7 +165,7 @@ def finish_all(tasks: Sequence[Task], jobs: int) -> Iterator[bool]:
 
 
 def finish_quietly(task: Task, threads: int) -> bool:
-    """`finish` in a process beside others; what it says goes to output.log in the task's folder."""
+    """`finish` in a process next to others; what it says goes to output.log in the task's folder."""
     torch.set_num_threads(threads)
     task.folder.mkdir(parents=True, exist_ok=True)
     with (task.folder / "output.log").open("a") as file, redirect_stderr(file), redirect_stdout(file):
@@ -178,11 +180,9 @@ def finish(task: Task) -> bool:
     if not trained(task):
         return False
     network = weights.load(task.folder / "weights.safetensors")[0]
-    files = sorted(task.pairs.glob("*.npz"))
-    records = [examine(network, load_pair(f)) for f in tqdm(files, task.folder.name, False, unit="pair", disable=None)]
-    new = task.folder / "exam.new"
-    new.write_text(json.dumps({"pairs": read_manifest(task.pairs)["hash"], "records": records}, indent=1) + "\n")
-    os.replace(new, task.folder / "exam.json")
+    pairs = sorted(task.pairs.glob("*.npz"))
+    records = [examine(network, load_pair(f)) for f in tqdm(pairs, task.folder.name, False, unit="pair", disable=None)]
+    files.write_json(task.folder / "exam.json", {"pairs": read_manifest(task.pairs)["hash"], "records": records})
     return True
 
 
@@ -213,7 +213,6 @@ def examine(network: GAPRNet, pair: Pair) -> Record:
 
 
 def _recalled(pair: Pair, T: Any, prefix: str) -> Record:
-    half_extent = float(np.linalg.norm(pair.target - pair.target.mean(axis=0), axis=1).max())
-    close = metrics.within_paper_limit(metrics.rmse_mm(T, pair.T_target_source, pair.source), half_extent)
-    strict = metrics.pose_error(T, pair.T_target_source, pair.source).within(4.0, 5.0)
-    return {f"{prefix}rr_paper": float(close), f"{prefix}rr_4_5": float(strict)}
+    close = metrics.within_paper_limit(metrics.rmse_mm(T, pair.T_target_source, pair.source), pair.target)
+    right = metrics.pose_error(T, pair.T_target_source, pair.source).is_right
+    return {f"{prefix}rr_paper": float(close), f"{prefix}rr_4_5": float(right)}

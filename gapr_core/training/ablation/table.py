@@ -14,6 +14,8 @@ import numpy as np
 
 from gapr_core import metrics
 from gapr_core.data.make_pairs import Recipe
+from gapr_core.pages.markdown import table as table_of
+from gapr_core.runtime import files
 from gapr_core.training import curves, provenance
 from gapr_core.training.config import TrainConfig, Variant, trained_as
 
@@ -36,18 +38,18 @@ def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recip
     rows = [row(v, protocol, folders[v], recipe) for v in plan for protocol in _protocols(recipe)]
     made = provenance.summary([folder for found in folders.values() for folder in found])
     settings = {"train": config.to_dict(), "exam": asdict(recipe), "seeds": seeds, "made": made}
-    (out / "table.json").write_text(json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n")
+    files.write_json(out / "table.json", {"settings": settings, "rows": rows})
     with (out / "table.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
     tables = list(dict.fromkeys(v.table for v in plan))
     pictures = {table: draw(out, {v: folders[v] for v in plan if v.table == table}) for table in tables}
-    (out / "table.md").write_text(markdown(rows, pictures, settings))
+    files.write_text(out / "table.md", markdown(rows, pictures, settings))
 
 
 def row(variant: Variant, protocol: str, folders: Sequence[Path], recipe: Recipe) -> Record:
-    """Means over pairs and seeds with 95 % intervals over people; None where no seed is finished."""
+    """Means over pairs and seeds with 95 % intervals over subjects; None where no seed is finished."""
     exams = [json.loads((f / "exam.json").read_text())["records"] for f in folders if (f / "exam.json").exists()]
     chosen = [r for records in exams for r in records if protocol in (ALL, r["protocol"])]
     found: Record = {"table": variant.table, "network": variant.label, "model": variant.model.stem}
@@ -55,8 +57,8 @@ def row(variant: Variant, protocol: str, folders: Sequence[Path], recipe: Recipe
     found |= {"protocol": protocol, "seeds": len(exams), "pairs": len(chosen), "paper_rr_percent": on_paper}
     for name in FIGURES:
         values, people = [r[name] for r in chosen], [r["person"] for r in chosen]
-        figures = (float(np.mean(values)), *metrics.interval(values, people)) if chosen else (None,) * 3
-        for end, value in zip(("", "_low", "_high"), figures, strict=True):
+        numbers = (float(np.mean(values)), *metrics.interval(values, people)) if chosen else (None,) * 3
+        for end, value in zip(("", "_low", "_high"), numbers, strict=True):
             found[name + end] = None if value is None else round(value, 4)
     return found
 
@@ -71,17 +73,17 @@ def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
 
 
 def markdown(rows: Sequence[Record], pictures: dict[str, str | None], settings: Record) -> str:
-    """The tables for people, the paper's figures in a column of their own."""
+    """The tables as Markdown, the paper's numbers in a column of their own."""
     parts = ["# Ablations", _preamble(settings)]
     for table, picture in pictures.items():
         own = [r for r in rows if r["table"] == table]
         parts.append(f"## {table}")
         for protocol in dict.fromkeys(r["protocol"] for r in own):
-            beside = any(r["paper_rr_percent"] for r in own if r["protocol"] == protocol)
-            head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if beside else [])]
-            lines = [head, ["---"] * len(head), *(_cells(r, beside) for r in own if r["protocol"] == protocol)]
+            has_paper = any(r["paper_rr_percent"] for r in own if r["protocol"] == protocol)
+            head = ["network", *FIGURES.values(), *(["the paper's recall, its data"] if has_paper else [])]
+            lines = [_cells(r, has_paper) for r in own if r["protocol"] == protocol]
             count = max(r["pairs"] for r in own if r["protocol"] == protocol)
-            parts += [f"Protocol {protocol}, {count} pairs", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+            parts += [f"Protocol {protocol}, {count} pairs", table_of(head, lines)]
         parts += [f"![curves]({picture})"] if picture else []
     return "\n\n".join([*parts, *settings["made"]]) + "\n"
 
@@ -90,19 +92,19 @@ def _preamble(settings: Record) -> str:
     run, exam = settings["train"], settings["exam"]
     return (
         f"{run['pairs']} training pairs a network, {settings['seeds']} seed(s), the same pairs in the same order for "
-        f"all; examined on people of split {exam['split']}, {exam['count']} pairs a protocol and bone "
-        f"({', '.join(exam['bones'])}).\n\nIn %, with 95 % intervals from a bootstrap over people. Recall is of the "
+        f"all; examined on subjects of split {exam['split']}, {exam['count']} pairs a protocol and bone "
+        f"({', '.join(exam['bones'])}).\n\nIn %, with 95 % intervals from a bootstrap over subjects. Recall is of the "
         "best raw pose (local-to-global consensus, no search): RMSE < 0.02 x the target's half extent, or 4 mm and 5° "
-        "at the source's centroid; refined: after the point-to-surface refinement. The paper's figures are on its own "
-        "data at its own budget: compare the order of the rows, not the figures. A dash: not finished, or no figure."
+        "at the source's centroid; refined: after the point-to-surface refinement. The paper's numbers are on its own "
+        "data at its own budget: compare the order of the rows, not the values. A dash: not finished, or no value."
     )
 
 
-def _cells(r: Record, beside: bool) -> list[str]:
+def _cells(r: Record, has_paper: bool) -> list[str]:
     own = [f"{100 * r[n]:.1f} ({100 * r[n + '_low']:.1f} to {100 * r[n + '_high']:.1f})" if r["pairs"] else "–"
            for n in FIGURES]  # fmt: skip
     on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
-    return [r["network"], *own, *(on_paper if beside else [])]
+    return [r["network"], *own, *(on_paper if has_paper else [])]
 
 
 def _protocols(recipe: Recipe) -> list[str]:

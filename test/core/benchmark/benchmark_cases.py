@@ -2,17 +2,19 @@
 
 import numpy as np
 
+from gapr_core.benchmark.judge import answer_of, judge, pair_facts
+from gapr_core.benchmark.record import Record
 from gapr_core.data.protocols import Pair
-from gapr_core.evaluation.judge import answer_facts, jsonable, judge, pair_facts
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.runtime.settings import from_dict
 
 FAKES = '''
 import os
 import numpy as np
 from gapr_core.errors import MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus
 
 class Fake:
     """The source is made of the target's first points, in order: least squares finds the pose."""
@@ -40,7 +42,7 @@ class Shy(Fake):
 
     def answer(self, source, target, T):
         return RegistrationResult(
-            RegistrationStatus.AMBIGUOUS, confidence=0.4, reason="two poses", details={"best_pose": T}
+            RegistrationStatus.AMBIGUOUS, confidence=0.4, reason="two poses", hypotheses=(Hypothesis(T, 0.4),)
         )
 
 class Raising(Fake):
@@ -86,8 +88,10 @@ def ok(T, confidence=0.8, covariance=None):
 
 
 def record(pair, result, method="m", seconds=0.5):
+    """A record as it comes back from its file."""
     facts = {"method": method, "seconds": seconds, "prepare_seconds": 0.1, "sha256": "0", "file": f"{pair.name}.npz"}
-    return jsonable({**pair_facts(pair), **facts, **answer_facts(result), **judge(pair, result)})
+    facts |= {**vars(pair_facts(pair)), **vars(answer_of(result)), **vars(judge(pair, result))}
+    return from_dict(Record, Record(**facts).to_json())
 
 
 def shifted(pair, mm):

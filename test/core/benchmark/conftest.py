@@ -9,8 +9,9 @@ sys.path.insert(0, str(Path(__file__).parent))  # for benchmark_cases
 
 from benchmark_cases import FAKES, make_pair  # noqa: E402
 
+from gapr_core.benchmark import runner
+from gapr_core.commands import benchmark
 from gapr_core.data.pair_files import save_pair  # noqa: E402
-from gapr_core.evaluation import benchmark, runner  # noqa: E402
 
 
 @pytest.fixture

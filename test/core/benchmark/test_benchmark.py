@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from benchmark_cases import make_pair
 
+from gapr_core.benchmark import records, runner
+from gapr_core.benchmark.table import TIMES
+from gapr_core.commands import benchmark
 from gapr_core.data.pair_files import save_pair
 from gapr_core.errors import ConfigError, MethodUnavailableError
-from gapr_core.evaluation import benchmark, records, runner
-from gapr_core.evaluation.table import TIMES
 
 
 def timeless(rows):
@@ -33,6 +34,16 @@ def test_two_shards_merged_equal_one_run_and_the_same_run_again(pairs, fakes, tm
     assert timeless(benchmark.benchmark(pairs, methods, tmp_path / "again")) == timeless(whole)
     assert "results are missing" in (tmp_path / "shard1" / "table.md").read_text()
     assert "results are missing" not in (tmp_path / "merged" / "table.md").read_text()
+
+
+def test_merging_into_one_of_the_folders_keeps_its_records(pairs, fakes, tmp_path, in_process):
+    out = [tmp_path / name for name in ("a", "b")]
+    for k in (1, 2):
+        benchmark.benchmark(pairs, fakes("good"), out[k - 1], shard=(k, 2))
+    both = [record for folder in out for record in records.read(folder / records.FILE)]
+    benchmark.merge(out, out[0])
+    assert sorted(r.pair for r in records.read(out[0] / records.FILE)) == sorted(r.pair for r in both)
+    assert len(both) == 7
 
 
 def test_worker_processes_give_the_same_table_in_any_number(pairs, fakes, tmp_path, no_report, request):

@@ -1,26 +1,29 @@
 """Records and rows from hand-made answers."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from benchmark_cases import make_pair, ok, record, shifted, some_records
 
-from gapr_core.evaluation import sections, table
-from gapr_core.evaluation.judge import judge, pair_facts
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.benchmark import table
+from gapr_core.benchmark.judge import judge, pair_facts
+from gapr_core.benchmark.record import Verdict
+from gapr_core.pages import sections
+from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus
 
 
 def test_a_shift_is_measured_in_every_error_and_limit():
     pair = make_pair(0)
     facts = judge(pair, ok(shifted(pair, 3.0)))
     for key in ("rte_mm", "rmse_mm", "whole_bone_mm"):
-        assert facts[key] == pytest.approx(3.0)
-    assert all(value == pytest.approx(3.0) for value in facts["tre_mm"].values())
-    assert (facts["within_1_1"], facts["within_2_2"], facts["within_4_5"]) == (False, False, True)
-    assert facts["right"] and not facts["false_accept"] and not facts["stand_in"]
-    assert facts["within_paper"] == (3.0 < 0.02 * pair_facts(pair)["half_extent_mm"])
-    assert judge(pair, ok(shifted(pair, 4.1)))["false_accept"]
+        assert getattr(facts, key) == pytest.approx(3.0)
+    assert all(value == pytest.approx(3.0) for value in facts.tre_mm.values())
+    assert (facts.within_1_1, facts.within_2_2, facts.within_4_5) == (False, False, True)
+    assert facts.right and not facts.false_accept and not facts.stand_in
+    assert facts.within_paper == (3.0 < 0.02 * pair_facts(pair).half_extent_mm)
+    assert judge(pair, ok(shifted(pair, 4.1))).false_accept
 
 
 def test_a_refusal_is_never_within_a_limit_even_where_its_stand_in_would_be():
@@ -28,45 +31,45 @@ def test_a_refusal_is_never_within_a_limit_even_where_its_stand_in_would_be():
     on_centroid = pair.source - pair.source.mean(axis=0) + pair.target.mean(axis=0)
     aligned = type(pair)(on_centroid, pair.target, np.eye(4), "a", "femur", "p", "L1")
     facts = judge(aligned, RegistrationResult(RegistrationStatus.LOW_CONFIDENCE))
-    assert facts["rmse_mm"] == pytest.approx(0.0, abs=1e-9) and facts["stand_in"]
-    assert not any(facts[key] for key in ("within_paper", "within_4_5", "right", "false_accept"))
-    assert facts["best_right"] is None
+    assert facts.rmse_mm == pytest.approx(0.0, abs=1e-9) and facts.stand_in
+    assert not any(getattr(facts, key) for key in ("within_paper", "within_4_5", "right", "false_accept"))
+    assert facts.best_right is None
 
 
 def test_the_pose_behind_a_refusal_is_judged_for_calibration():
     pair = make_pair(0)
     for T, right in ((shifted(pair, 1.0), True), (shifted(pair, 50.0), False)):
-        refusal = RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.4, details={"best_pose": T})
-        assert judge(pair, refusal)["best_right"] is right
+        refusal = RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.4, hypotheses=(Hypothesis(T, 0.4),))
+        assert judge(pair, refusal).best_right is right
 
 
 def test_any_pose_for_a_wrong_pair_is_a_false_accept_and_a_refusal_is_not():
     pair = make_pair(0, "wrong")
-    assert judge(pair, ok(np.eye(4))) == {"right": False, "false_accept": True, "best_right": False}
+    assert judge(pair, ok(np.eye(4))) == Verdict(right=False, false_accept=True, best_right=False)
     refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE)
-    assert judge(pair, refusal) == {"right": False, "false_accept": False, "best_right": None}
+    assert judge(pair, refusal) == Verdict(right=False, false_accept=False)
 
 
 def test_nees_and_the_ratio_to_the_bound_come_with_a_covariance_and_a_noise():
     pair = make_pair(0)
     covariance = np.diag([1.0] * 3 + [1e-4] * 3)
     facts = judge(pair, ok(shifted(pair, 2.0), covariance=covariance))
-    assert facts["nees"] == pytest.approx(4.0)
-    assert facts["bound_ratio"] == pytest.approx(2.0 / facts["bound_rmse_mm"])
-    assert "nees" not in judge(pair, ok(shifted(pair, 2.0)))
+    assert facts.nees == pytest.approx(4.0)
+    assert facts.bound_ratio == pytest.approx(2.0 / facts.bound_rmse_mm)
+    assert judge(pair, ok(shifted(pair, 2.0))).nees is None
 
 
 def test_targets_named_in_the_pair_take_the_place_of_the_extreme_points():
     pair = make_pair(0)
-    assert set(judge(pair, ok(shifted(pair, 1.0)))["tre_mm"]) == {f"axis{k}{s}" for k in (1, 2, 3) for s in "+-"}
+    assert set(judge(pair, ok(shifted(pair, 1.0))).tre_mm) == {f"axis{k}{s}" for k in (1, 2, 3) for s in "+-"}
     pair.metadata["landmark_hip_centre"] = np.array([1.0, 2.0, 3.0])
-    assert set(judge(pair, ok(shifted(pair, 1.0)))["tre_mm"]) == {"hip_centre"}
+    assert set(judge(pair, ok(shifted(pair, 1.0))).tre_mm) == {"hip_centre"}
 
 
 def test_records_are_plain_json_without_nan():
     pair = make_pair(0)
     pair.metadata["overlap"] = np.float64("nan")
-    text = json.dumps(record(pair, ok(shifted(pair, 1.0), covariance=np.eye(6))), allow_nan=False)
+    text = json.dumps(record(pair, ok(shifted(pair, 1.0), covariance=np.eye(6))).to_json(), allow_nan=False)
     assert json.loads(text)["overlap"] is None
 
 
@@ -85,7 +88,7 @@ def test_a_row_counts_what_happened():
 
 def test_rows_do_not_depend_on_the_order_of_the_pairs_within_a_group():
     found = some_records()
-    assert table.rows(found, ["a", "b"]) == table.rows(sorted(found, key=lambda r: r["pair"]), ["a", "b"])
+    assert table.rows(found, ["a", "b"]) == table.rows(sorted(found, key=lambda r: r.pair), ["a", "b"])
 
 
 def test_the_table_says_where_another_method_is_better_and_only_there():
@@ -97,14 +100,14 @@ def test_the_table_says_where_another_method_is_better_and_only_there():
     assert sections.where_beaten(table.rows(some_records()[:3], ["a"]), "a") == ["nowhere in these pairs"]
 
 
-def test_the_figures_of_the_paper_stand_below_ours_and_are_marked():
+def test_the_numbers_of_the_paper_stand_below_ours_and_are_marked():
     pair = make_pair(0, "paper")
     found = sections.sections(table.rows([record(pair, ok(shifted(pair, 1.0)), "a")], ["a"]))
     accuracy = next(s for s in found if s.title == "Protocol paper: accuracy")
-    marked = {line[1]: line for line in accuracy.cells if "the paper's figure, on the paper's data" in line[1]}
+    marked = {line[1]: line for line in accuracy.cells if "the paper's number, on the paper's data" in line[1]}
     assert len(marked) == 6
     recall = accuracy.header.index("RR % (RMSE < 0.02 half extent)")
-    name = "GAPR-Net (the paper's figure, on the paper's data)"
+    name = "GAPR-Net (the paper's number, on the paper's data)"
     assert marked[name][recall] == "95.6" and accuracy.cells[0][recall].startswith("100.0")
 
 
@@ -116,3 +119,16 @@ def test_the_best_cell_of_a_column_is_marked_unless_all_are_equal():
     same = [{**row, "rr_4_5": 0.5} for row in rows if row["protocol"] == "L1"]
     accuracy = next(s for s in sections.sections(same) if s.title == "Protocol L1: accuracy")
     assert not {(0, column), (1, column)} & accuracy.best
+
+
+def test_the_error_bound_is_judged_on_every_accepted_pose_right_or_wrong():
+    pair = make_pair(0)
+    answers = [replace(ok(shifted(pair, mm)), tre95_mm=bound) for mm, bound in ((1.0, 2.0), (3.0, 2.4), (9.0, 27.0))]
+    refused = RegistrationResult(RegistrationStatus.AMBIGUOUS)
+    row = table.summary([record(pair, answer) for answer in (*answers, refused)])
+    assert row["tre95_covers"] == pytest.approx(2 / 3, abs=1e-5)
+    assert row["tre95_ratio"] == pytest.approx(2.0)  # of 2, 0.8 and 3
+    assert row["nees_median"] is None
+    covariance = np.diag([1.0] * 3 + [1e-4] * 3)
+    exact = table.summary([record(pair, ok(shifted(pair, mm), covariance=covariance)) for mm in (1.0, 2.0, 5.0)])
+    assert exact["nees_median"] == pytest.approx(4.0 / 5.348, rel=1e-3)

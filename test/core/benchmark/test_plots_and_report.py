@@ -1,4 +1,4 @@
-"""Plots show the figures of the records; the report is one file that a browser shows without a network."""
+"""Plots show the numbers of the records; the report is one file that a browser shows without a network."""
 
 import re
 import shutil
@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from benchmark_cases import make_pair, ok, record, shifted, some_records
 
+from gapr_core.benchmark import table
+from gapr_core.benchmark.records import Plan
 from gapr_core.data.pair_files import save_pair
-from gapr_core.evaluation import benchmark_report, pictures, plots, table
+from gapr_core.pages import benchmark_report, pictures, plots
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
 
@@ -21,7 +23,8 @@ def test_recall_against_threshold_steps_at_the_errors_and_never_counts_a_refusal
     x, y = curve(plots.recall_against_threshold(some_records(), ["a", "b"]), "a")
     assert y[x < 0.49].max() == 0.0
     assert y[(x > 0.51) & (x < 29)] == pytest.approx(1 / 3)
-    assert y[-1] == pytest.approx(1 / 3)  # the third is exactly 30 mm off, the second was refused
+    assert y[-2] == pytest.approx(1 / 3)
+    assert y[-1] == pytest.approx(2 / 3)  # the third is exactly 30 mm off, the second was refused
     assert curve(plots.recall_against_threshold(some_records(), ["a", "b"]), "b")[1][-1] == 1.0
 
 
@@ -59,10 +62,10 @@ def test_the_ellipse_found_is_that_of_the_errors():
 
 def test_the_worst_cases_begin_with_the_most_confident_false_accept():
     worst = pictures.worst(some_records(), "a")
-    assert [r["accepted"] for r in worst] == [True, False, True]
-    assert worst[0]["false_accept"] and worst[0]["confidence"] == 0.95
+    assert [r.accepted for r in worst] == [True, False, True]
+    assert worst[0].false_accept and worst[0].confidence == 0.95
     assert "FALSE ACCEPT" in pictures.caption(worst[0]) and "refused" in pictures.caption(worst[1])
-    assert pictures.worst(some_records(), "b")[0]["protocol"] == "wrong"
+    assert pictures.worst(some_records(), "b")[0].protocol == "wrong"
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +74,10 @@ def report(tmp_path_factory):
     pairs = [*map(make_pair, range(3)), make_pair(7, "wrong")]
     for pair in pairs[:3]:
         save_pair(folder / f"{pair.name}.npz", pair)
-    plan = {
-        "ours": "a", "methods": ["a", "b"], "folder": str(folder), "pairs": {p.name: "0" for p in pairs},
-        "command": "gapr benchmark <&>", "commit": "c0ffee", "machine": "m", "threads": 1, "started": "now",
-    }  # fmt: skip
+    plan = Plan(
+        ours="a", methods=["a", "b"], folder=str(folder), pairs={p.name: "0" for p in pairs},
+        command="gapr benchmark <&>", commit="c0ffee", machine="m", threads=1, started="now",
+    )  # fmt: skip
     found = some_records()
     refused = record(pairs[3], RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="<b>two</b> poses"), "a")
     found = [*found[:-2], refused, found[-1]]
@@ -86,7 +89,7 @@ def test_the_report_needs_nothing_but_itself(report):
     page = (report / "report.html").read_text()
     sources = re.findall(r"(?:src|href)=[\"']([^\"']{0,40})", page)
     assert sources and all(source.startswith("data:image/png;base64,") for source in sources)
-    assert "http" not in re.sub(r"base64,[^']*", "", page) and "<script" not in page
+    assert "http" not in re.sub(r"base64,[^\"]*", "", page) and "<script" not in page
     assert "One &lt;note&gt;." in page and "gapr benchmark &lt;&amp;&gt;" in page
     assert "c0ffee" in page and "worst 3 cases of a" in page
     assert (report / "plots" / "worst_01.png").stat().st_size > 5000

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapr_core.clouds import Surface
 from gapr_core.data.specimen import Specimen
+from gapr_core.surface import Surface
 
 
 def ball_specimen(radius: float = 60.0, person: str = "p0", bone: str = "ball", stretch: float = 1.0) -> Specimen:

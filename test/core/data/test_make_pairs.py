@@ -12,7 +12,9 @@ from gapr_core.data import anatomy, make_pairs, pool
 from gapr_core.data.make_pairs import Recipe, read_manifest, write_pairs
 from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
 from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.surface import Surface
 
 BONES = {"ball": [ball_specimen(person="a"), ball_specimen(50.0, person="b")], "knob": [knob_specimen(person="a")]}
 RECIPE = Recipe(("L3", "wrong"), ("ball", "knob"), count=3, seed=7)
@@ -69,7 +71,7 @@ def test_the_same_seed_gives_the_same_hash_and_another_seed_another_one(tmp_path
 @pytest.mark.parametrize("protocol", ["paper", "L2"])
 def test_the_protocols_make_the_same_pairs_from_version_to_version(protocol):
     """Golden: what changes these points changes every frozen list. Then print the new ones and say so in CHANGELOG."""
-    pair = make_pair(protocol, ball_specimen(), 0)
+    pair = make_pair(protocol, octahedron(), 0)
     np.testing.assert_allclose(pair.source[:3], GOLDEN_POINTS[protocol], atol=0.006)
 
 
@@ -120,7 +122,7 @@ def test_folders_in_the_folder_are_bones_and_no_person_is_in_two_splits(tmp_path
 
 
 def test_a_folder_without_meshes_says_what_it_wants(tmp_path):
-    with pytest.raises(ConfigError, match="one mesh per person"):
+    with pytest.raises(ConfigError, match="one mesh per subject"):
         anatomy.meshes(tmp_path)
 
 
@@ -143,7 +145,18 @@ def test_a_bone_that_the_anatomy_lacks_is_a_parametric_one_and_says_so(tmp_path)
         pool.specimens("tibia", "exam", anatomy_folder=tmp_path)
 
 
+def octahedron():
+    """Corners and faces written out: meshes of a library change with its version."""
+    corners = np.array([[60, 0, 0], [-60, 0, 0], [0, 50, 0], [0, -50, 0], [0, 0, 70], [0, 0, -70]]) + [
+        300.0,
+        -200.0,
+        900.0,
+    ]
+    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    return Specimen(Surface(corners, np.array(faces)), "ball", "p0", "hand-made")
+
+
 GOLDEN_POINTS = {
-    "paper": [[-24.43, -36.54, -14.86], [-88.1, -87.92, -31.14], [-87.74, -81.03, -5.26]],
-    "L2": [[88.89, 66.0, 59.36], [59.49, 56.72, 10.13], [93.7, 64.96, 41.3]],
+    "paper": [[28.87, 115.43, -87.58], [44.43, 97.72, -51.10], [24.47, 127.45, -102.36]],
+    "L2": [[-4.15, -48.02, 58.96], [-58.42, -27.72, 51.82], [-30.27, -25.81, 28.71]],
 }

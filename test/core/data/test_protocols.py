@@ -8,14 +8,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shapes import ball_specimen, knob_specimen
 
-from gapr_core.clouds import Surface
 from gapr_core.data import degradation
 from gapr_core.data.protocols import LEVELS, PROTOCOLS, TARGET_POINTS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.surface import Surface
 
-WITH_TRUTH = [name for name in PROTOCOLS if name != "wrong"]
+OF_THE_BONE = [name for name in PROTOCOLS if not name.startswith("scene") and "-far" not in name]  # see test_scenes
+WITH_TRUTH = [name for name in OF_THE_BONE if name != "wrong"]
 RADIUS = 60.0
 OTHERS = [ball_specimen(person="p1"), knob_specimen(person="p0"), knob_specimen(person="p1")]
 
@@ -24,7 +25,7 @@ def in_target_frame(pair):
     return se3.apply(pair.T_target_source, pair.source)
 
 
-@pytest.mark.parametrize("protocol", list(PROTOCOLS))
+@pytest.mark.parametrize("protocol", OF_THE_BONE)
 def test_the_same_seed_gives_the_same_pair_and_another_seed_another_one(protocol):
     first, again, other = (make_pair(protocol, ball_specimen(), seed, OTHERS) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.source, again.source)
@@ -37,8 +38,9 @@ def test_the_same_seed_gives_the_same_pair_and_another_seed_another_one(protocol
 def test_the_true_pose_lays_the_source_on_the_surface(protocol):
     pair = make_pair(protocol, ball_specimen(RADIUS), 1)
     off = np.linalg.norm(in_target_frame(pair) + pair.metadata["origin_mm"] - [300.0, -200.0, 900.0], axis=1) - RADIUS
-    clean = np.abs(off) < 6.0 * pair.metadata["noise_mm"] + 3.0 * pair.metadata["bias_mm"]
-    assert clean.mean() >= 1.0 - pair.metadata["outlier_share"]
+    systematic_mm = 3.0 * pair.metadata["bias_mm"] + 3.0 * abs(pair.metadata.get("standoff_mm", 0.0))
+    clean = np.abs(off) < 6.0 * pair.metadata["noise_mm"] + systematic_mm
+    assert clean.mean() >= 0.99 - pair.metadata["outlier_share"]
     assert abs(np.median(off)) < 1.5
     assert np.linalg.det(pair.T_target_source[:3, :3]) == pytest.approx(1.0)
 
@@ -204,7 +206,7 @@ def test_wrong_pairs_come_from_another_bone_or_another_person_and_have_no_pose()
 
 def test_wrong_without_anybody_else_says_what_is_missing():
     same_person_twice = [ball_specimen(person="p0"), ball_specimen(person="p0")]
-    with pytest.raises(ConfigError, match="another bone or another person"):
+    with pytest.raises(ConfigError, match="another bone or another subject"):
         make_pair("wrong", ball_specimen(person="p0"), 0, same_person_twice)
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from gapr_core.data.pool import parametric_specimen
-from gapr_core.training import calibration_pairs
 
 
 @pytest.fixture(scope="module")
@@ -14,19 +13,9 @@ def tibia():
 
 @pytest.mark.parametrize("upper", [False, True])
 def test_an_end_of_a_bone_is_that_share_of_its_length_on_that_side_and_closed(tibia, upper):
-
     end = tibia.end(0.3, upper)
     whole, cut = tibia.surface.points[:, 2], end.surface.points[:, 2]
     assert np.ptp(cut) == pytest.approx(0.3 * np.ptp(whole), rel=0.1)
     assert (cut.max() == whole.max(), cut.min() == whole.min()) == (upper, not upper)
     assert end.surface.to_open3d().is_edge_manifold(allow_boundary_edges=False)
     assert (end.bone, end.person) == (tibia.bone, tibia.person)
-
-
-def test_short_scans_for_the_calibration_are_of_the_same_end_and_have_strangers_for_wrong_pairs(tibia):
-    others = [parametric_specimen(bone, number) for bone in ("tibia", "femur") for number in (0, 1, 2)]
-    own, *some = calibration_pairs.shortened(tibia, others, seed=4)
-    assert sorted(o.bone for o in some) == ["femur", "femur", "tibia", "tibia"]
-    assert all(o.person != tibia.person for o in some if o.bone == "tibia")
-    share = np.ptp(own.surface.points[:, 2]) / np.ptp(tibia.surface.points[:, 2])
-    assert 0.1 < share < 0.65

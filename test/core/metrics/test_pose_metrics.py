@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gapr_core.geometry import se3
+from gapr_core.geometry.se3 import PoseError
 from gapr_core.metrics import pose
 
 
@@ -22,7 +23,7 @@ def test_rotation_error_is_the_geodesic_angle_of_scipy(rng):
     for _ in range(20):
         a, b = random_pose(rng), random_pose(rng)
         relative = Rotation.from_matrix(a[:3, :3]).inv() * Rotation.from_matrix(b[:3, :3])
-        assert pose.pose_error(a, b, source).rre_deg == pytest.approx(np.degrees(relative.magnitude()))
+        assert se3.pose_error(a, b, source).rre_deg == pytest.approx(np.degrees(relative.magnitude()))
 
 
 def test_turning_about_the_source_centroid_costs_no_translation(rng):
@@ -30,9 +31,14 @@ def test_turning_about_the_source_centroid_costs_no_translation(rng):
     true = random_pose(rng)
     centre = se3.apply(true, source).mean(axis=0)
     turned = se3.exp([0, 0, 0, 0, 0, np.radians(7)], centre) @ true
-    error = pose.pose_error(turned, true, source)
+    error = se3.pose_error(turned, true, source)
     assert error.rte_mm == pytest.approx(0.0, abs=1e-9) and error.rre_deg == pytest.approx(7.0)
-    assert not error.within(4.0, 5.0) and error.within(4.0, 7.1)
+    assert not error.is_right and error.within(4.0, 7.1)
+
+
+def test_a_pose_exactly_at_the_limits_is_right_and_one_beyond_either_is_not():
+    assert PoseError(4.0, 5.0).is_right
+    assert not PoseError(4.001, 0.0).is_right and not PoseError(0.0, 5.001).is_right
 
 
 def test_rmse_is_the_paper_s_way_over_the_inverse_of_the_truth(rng):
@@ -56,7 +62,7 @@ def test_errors_do_not_depend_on_where_the_source_frame_is(rng):
     points = {"hip": target[0]}
     for measure, cloud, other in (
         (pose.rmse_mm, source, moved),
-        (pose.pose_error, source, moved),
+        (se3.pose_error, source, moved),
         (pose.whole_bone_rmse_mm, target, target),
         (pose.tre_mm, points, points),
     ):
@@ -77,8 +83,9 @@ def test_extreme_points_of_a_box_are_at_the_ends_of_its_long_axis(rng):
 
 
 def test_the_paper_limit_scales_with_the_bone():
-    assert pose.within_paper_limit(1.9, 100.0) and not pose.within_paper_limit(2.0, 100.0)
-    assert pose.within_paper_limit(3.9, 200.0)
+    small, large = ([[-half, 0.0, 0.0], [half, 0.0, 0.0]] for half in (100.0, 200.0))
+    assert pose.within_paper_limit(1.9, small) and not pose.within_paper_limit(2.0, small)
+    assert pose.within_paper_limit(3.9, large)
 
 
 def test_recall_counts_failures_and_is_nan_of_nothing():

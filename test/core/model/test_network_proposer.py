@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from gapr_core import source as sources
-from gapr_core import target as targets
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
-from gapr_core.proposals.network import NetworkProposer
+from gapr_core.registration import source as sources
+from gapr_core.registration import target as targets
+from gapr_core.registration.proposals.network import NetworkProposer
 
 
 @pytest.fixture(scope="module")

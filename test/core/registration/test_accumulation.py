@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
+from gapr_core import Accumulator, Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
@@ -81,7 +81,7 @@ def test_sources_that_are_metres_apart_are_not_kept_together(registrar, frames, 
     moved = own + [5e3, 0.0, 0.0]
     assert accumulator.register(moved, prepared).status == registrar.register(moved, prepared).status
     np.testing.assert_array_equal(accumulator.collected, moved)
-    assert "starts anew" in caplog.text
+    assert "restarts" in caplog.text
 
 
 def test_a_single_source_that_is_metres_away_does_not_end_a_collection(registrar, frames, prepared):
@@ -101,24 +101,24 @@ def test_another_target_starts_a_new_collection(registrar, frames, prepared):
     np.testing.assert_array_equal(accumulator.collected, frames[1].source)
 
 
-def test_a_stray_source_is_left_out_and_after_three_the_bone_has_moved(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=len(frames))  # full: a stray one must not cost a good one
+def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=len(frames))  # full: a distant one must not cost a good one
     for pair in frames[:-1]:
         accumulator.collect(pair.source)
     before = accumulator.register(frames[-1].source, prepared)
     assert before.ok
     kept = len(accumulator.collected)
     off = se3.exp([0.0, 25.0, 10.0, 0.0, 0.0, 0.0])
-    stray = [se3.apply(off, pair.source) for pair in frames[4:7]]
-    refused = accumulator.register(stray[0], prepared)
+    distant = [se3.apply(off, pair.source) for pair in frames[4:7]]
+    refused = accumulator.register(distant[0], prepared)
     assert not refused.ok and "left out" in refused.reason and refused.confidence == 0.0
     assert len(accumulator.collected) == kept
-    assert accumulator.register(frames[5].source, prepared).ok, "a good one in between: the stray one was an accident"
-    for source in stray:
+    assert accumulator.register(frames[5].source, prepared).ok, "a good one in between: the distant one was an accident"
+    for source in distant:
         refused = accumulator.register(source, prepared)
         assert not refused.ok
-    assert "starts anew" in refused.reason
-    np.testing.assert_array_equal(accumulator.collected, np.concatenate(stray))
+    assert "restarts" in refused.reason
+    np.testing.assert_array_equal(accumulator.collected, np.concatenate(distant))
 
 
 def test_a_reset_reaches_the_tracker(frames, prepared):
@@ -134,3 +134,12 @@ def test_a_reset_reaches_the_tracker(frames, prepared):
     before = tracker.resets
     accumulator.reset()
     assert tracker.resets == before + 1
+
+
+def test_a_source_without_a_finite_point_gets_no_answer_from_what_was_collected_before(registrar, femur_cloud):
+    accumulator, target = Accumulator(registrar, most=3), registrar.prepare(femur_cloud)
+    piece = femur_cloud[femur_cloud[:, 2] > np.quantile(femur_cloud[:, 2], 0.5)]
+    assert accumulator.register(piece, target).ok
+    for nothing in (np.full((50, 3), np.nan), np.empty((0, 3))):
+        result = accumulator.register(nothing, target)
+        assert result.status is RegistrationStatus.TOO_FEW_POINTS and result.T_target_source is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapr_core.geometry import se3
-from gapr_core.proposals.consensus import Correspondences, distinct, local_to_global, ransac
+from gapr_core.registration.proposals.consensus import Correspondences, distinct, local_to_global, ransac
 
 
 def scene(share_right: float, second_share: float = 0.0, seed: int = 0):

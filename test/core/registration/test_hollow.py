@@ -1,4 +1,4 @@
-"""Bones whose model follows the cortical wall on both sides, as a segmentation by threshold gives them."""
+"""Bones whose model follows the cortical bone on both sides, as a segmentation by threshold gives them."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ WALL_MM = 4.0
 
 @pytest.fixture(scope="module")
 def hollow_cloud(femur):
-    """8192 points of the outer and of the inner wall, which are which, and the outer wall's normals."""
+    """8192 points of the outer and of the inner cortex, which are which, and those of the outer cortex's normals."""
     points, normals = femur.sample(8192, np.random.default_rng(1))
     inner = np.arange(8192) % 5 < 2
     return points - WALL_MM * normals * inner[:, None], inner, normals
@@ -28,7 +28,7 @@ def outer_layer(points):
     return visibility.outer_layer(points, normals, quadrics.spacing(points))
 
 
-def test_the_outer_wall_is_told_from_the_inner_one(hollow_cloud):
+def test_the_outer_cortex_is_separated_from_the_inner_one(hollow_cloud):
     points, inner, normals = hollow_cloud
     outer, outward = outer_layer(points)
     assert outer[~inner].mean() > 0.98
@@ -36,26 +36,26 @@ def test_the_outer_wall_is_told_from_the_inner_one(hollow_cloud):
     assert (np.einsum("ni,ni->n", normals[outer], outward[outer]) > 0).mean() > 0.98
 
 
-def test_a_bone_of_one_surface_has_no_inner_wall(femur_cloud, target):
+def test_a_bone_of_one_surface_has_no_inner_cortex(femur_cloud, target):
     assert outer_layer(femur_cloud) is None
-    assert target.both_walls is None
+    assert target.both_cortices is None
 
 
-def test_one_sided_noise_does_not_slip_between_the_walls(registrar, hollow, femur):
-    """With the inner wall in the target the points that noise takes inwards would count for it, and the pose drift."""
+def test_one_sided_noise_does_not_slip_between_the_cortices(registrar, hollow, femur):
+    """With the inner cortex in the target, points that noise takes inwards would count for it: the pose drifts."""
     rng = np.random.default_rng(2)
     points, normals = femur.sample(12_000, rng)
     seen = points[normals @ [0.0, -1.0, 0.0] > 0.3][:2000]
     source = seen + rng.normal(0.0, 1.5, seen.shape)
     T_true = se3.inverse(se3.exp(np.array([80.0, -40.0, 20.0, 1.0, 0.5, -0.7]), np.zeros(3)))
-    results = [registrar.register(se3.apply(se3.inverse(T_true), source), t) for t in (hollow, hollow.both_walls)]
+    results = [registrar.register(se3.apply(se3.inverse(T_true), source), t) for t in (hollow, hollow.both_cortices)]
     assert results[0].ok
-    poses = [result.details["best_pose"] @ se3.inverse(T_true) for result in results]
+    poses = [result.best @ se3.inverse(T_true) for result in results]
     errors_mm = [np.sqrt(((se3.apply(T, seen) - seen) ** 2).sum(axis=1).mean()) for T in poses]
     assert errors_mm[0] < 0.5 < errors_mm[1]
 
 
-def test_a_source_that_follows_both_walls_is_registered_to_both(registrar, hollow, hollow_cloud):
+def test_a_source_that_follows_both_cortices_is_registered_to_both(registrar, hollow, hollow_cloud):
     points = hollow_cloud[0]
     end = points[points[:, 2] > np.quantile(points[:, 2], 0.5)]
     source = end + np.random.default_rng(3).normal(0.0, 1.0, end.shape)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
-from gapr_core.clouds import Surface
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.surface import Surface
 
 
 @pytest.fixture(scope="module")

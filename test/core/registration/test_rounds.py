@@ -1,27 +1,27 @@
-"""Who is asked, and how often: the network first, the search only where a doubt remains."""
+"""Who is asked, and how often: the network first, the search only if the answer is not sure."""
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
-from gapr_core.confidence import CALIBRATIONS, DEFAULT_CALIBRATION, FEATURES, Calibration
+from gapr_core.benchmark import methods
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, MethodUnavailableError
-from gapr_core.evaluation import methods
 from gapr_core.geometry import se3
-from gapr_core.proposals.base import Proposals
-from gapr_core.proposals.network import NetworkProposer
-from gapr_core.proposals.search import NormalAlignedSearch
+from gapr_core.registration.additive import Additive
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.proposals.network import NetworkProposer
+from gapr_core.registration.proposals.search import NormalAlignedSearch
 
 ONE_THREAD = RegistrarConfig(num_threads=1)
 
 
 class Fixed:
-    """Proposes what it is told to, and counts how often it is asked."""
+    """Proposes what it is given, and counts how often it is asked."""
 
     def __init__(self, name, poses):
         self.name, self.poses, self.asked, self.prepared = name, poses, 0, 0
@@ -41,10 +41,10 @@ def pair(femur):
 
 def test_a_sure_answer_ends_the_rounds(pair):
     right, never = Fixed("network", pair.T_target_source[None]), Fixed("search", np.eye(4)[None])
-    registrar = Registrar(ONE_THREAD, [right, never], [Calibration.load()] * 2)
+    registrar = Registrar(ONE_THREAD, [right, never], [Calibration.shipped("search")] * 2)
     target = registrar.prepare(pair.target)
     result = registrar.register(pair.source, target)
-    assert result.ok and result.details["rounds"] == 1
+    assert result.ok and result.rounds == 1
     assert (right.prepared, right.asked, never.prepared, never.asked) == (1, 1, 1, 0)
 
 
@@ -54,8 +54,8 @@ def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair):
     config = RegistrarConfig(num_threads=1, sure=1.1)
     registrar = Registrar(config, [first, second])
     result = registrar.register(pair.source, registrar.prepare(pair.target))
-    assert (first.asked, second.asked, result.details["rounds"]) == (1, 1, 2)
-    assert se3.pose_error(result.details["best_pose"], pair.T_target_source, pair.source)[0] < 1.0
+    assert (first.asked, second.asked, result.rounds) == (1, 1, 2)
+    assert se3.pose_error(result.best, pair.T_target_source, pair.source)[0] < 1.0
 
 
 def test_without_any_hypothesis_the_answer_is_a_refusal(pair):
@@ -73,13 +73,20 @@ def test_the_shipped_network_and_the_search_are_asked_in_this_order():
 
 def test_each_round_has_the_confidence_model_that_was_fitted_for_it():
     network, search = Registrar.from_pretrained(ONE_THREAD).calibrations
-    for model, path in ((network, CALIBRATIONS["network"]), (search, DEFAULT_CALIBRATION)):
-        assert np.array_equal(model.means, Calibration.load(path).means)
-    assert not np.array_equal(network.means, search.means)
+    assert (network.proposer, search.proposer) == ("network", "search")
+    assert network.model.constant != search.model.constant
+
+
+def test_a_proposer_that_nobody_fitted_a_confidence_for_is_refused_and_works_with_one_of_its_own(pair):
+    mine = Fixed("mine", pair.T_target_source[None])
+    with pytest.raises(MethodUnavailableError, match="'mine'.*gapr_core.calibration"):
+        Registrar(ONE_THREAD, [mine])
+    registrar = Registrar(ONE_THREAD, [mine], [Calibration("mine", Additive(3.0, ()), {})])
+    assert registrar.register(pair.source, registrar.prepare(pair.target)).ok
 
 
 def test_a_confidence_that_is_no_number_is_a_refusal(pair):
-    broken = replace(Calibration.undecided(), scales=np.full(len(FEATURES), np.nan))
+    broken = Calibration("network", Additive(np.nan, ()), {})
     registrar = Registrar(ONE_THREAD, [Fixed("network", pair.T_target_source[None])], [broken])
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     assert not result.ok and result.T_target_source is None
@@ -88,12 +95,12 @@ def test_a_confidence_that_is_no_number_is_a_refusal(pair):
 def test_the_network_alone_finds_a_one_sided_view(pair):
     registrar = Registrar(ONE_THREAD, [NetworkProposer.from_weights()])
     result = registrar.register(pair.source, registrar.prepare(pair.target))
-    assert se3.pose_error(result.details["best_pose"], pair.T_target_source, pair.source)[0] < 1.0
+    assert se3.pose_error(result.best, pair.T_target_source, pair.source)[0] < 1.0
 
 
 def test_as_many_confidence_models_as_proposers_are_needed():
     with pytest.raises(ConfigError, match="2 for 1"):
-        Registrar(calibrations=[Calibration.load()] * 2)
+        Registrar(calibrations=[Calibration.shipped("search")] * 2)
 
 
 def test_a_gpu_that_is_not_there_and_a_missing_torch_are_named(monkeypatch):
@@ -102,8 +109,8 @@ def test_a_gpu_that_is_not_there_and_a_missing_torch_are_named(monkeypatch):
     if not torch.cuda.is_available():
         with pytest.raises(ConfigError, match="no GPU"):
             Registrar.from_pretrained(device="cuda")
-    monkeypatch.setitem(sys.modules, "gapr_core.proposals.network", None)
-    with pytest.raises(MethodUnavailableError, match="pip install torch"):
+    monkeypatch.setitem(sys.modules, "gapr_core.registration.proposals.network", None)
+    with pytest.raises(MethodUnavailableError, match="pip install"):
         Registrar.from_pretrained()
 
 

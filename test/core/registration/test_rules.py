@@ -4,20 +4,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gapr_core import Registrar, RegistrarConfig, doubts
-from gapr_core import source as sources
-from gapr_core import target as targets
-from gapr_core.clouds import Surface
+from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import CovarianceConfig, RefinementConfig, VerificationConfig
-from gapr_core.covariance import estimate
 from gapr_core.data import scans
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
+from gapr_core.data.scenes.things import BOX_FACES
 from gapr_core.data.specimen import Specimen
-from gapr_core.refinement import Fit, refine_fully
+from gapr_core.registration import rules
+from gapr_core.registration import source as sources
+from gapr_core.registration import target as targets
+from gapr_core.registration.covariance import estimate
+from gapr_core.registration.refinement import Fit, refine_fully
+from gapr_core.registration.verification import Candidates
 from gapr_core.results import RegistrationStatus
-from gapr_core.training.calibration_pairs import BOX_FACES
-from gapr_core.verification import Candidates
+from gapr_core.surface import Surface
 
 TURN = Rotation.from_euler("xyz", [20.0, 30.0, 40.0], degrees=True).as_matrix()
 SIDES_MM = np.array([120.0, 80.0, 50.0])
@@ -80,12 +81,12 @@ def fit_of_plane(**kwargs):
 
 def test_what_was_not_observed_is_uncertain_and_not_exact():
     uncertainty = estimate(fit_of_plane(), CovarianceConfig())
-    assert doubts.is_loose(uncertainty)
+    assert rules.is_loose(uncertainty)
     assert uncertainty.largest_shift_mm > 100.0 and uncertainty.largest_turn_deg > 100.0
     np.linalg.cholesky(uncertainty.covariance)
     assert np.sqrt(uncertainty.covariance[2, 2]) < 0.5  # across the plane it is known
     nothing = estimate(fit_of_plane(weights=np.zeros(500)), CovarianceConfig())
-    assert doubts.is_loose(nothing)
+    assert rules.is_loose(nothing)
 
 
 @pytest.fixture(scope="module")
@@ -96,17 +97,17 @@ def femur_fit():
 
 
 def test_a_pose_on_a_bone_comes_back_when_it_is_pushed(femur_fit):
-    assert not doubts.can_be_pushed(*femur_fit, VerificationConfig(), 1)
+    assert not rules.can_be_pushed(*femur_fit, VerificationConfig(), 1)
 
 
 def test_a_pose_on_a_plane_stays_where_it_is_pushed(search):
     target, source = search.prepare(rough_box()), sources.prepare(edge(0.1))
     fit = refine_fully(np.eye(4), source.points, target, RefinementConfig())
-    assert doubts.can_be_pushed(fit, source, target, VerificationConfig(), 1)
+    assert rules.can_be_pushed(fit, source, target, VerificationConfig(), 1)
 
 
 def test_the_motions_that_are_pushed_are_those_that_the_residuals_say_least_about():
-    points, motions = fit_of_plane().moved, doubts._weakest_motions(fit_of_plane())
+    points, motions = fit_of_plane().moved, rules._weakest_motions(fit_of_plane())
     moves = np.array([motion[:3] + np.cross(motion[3:], points - points.mean(axis=0)) for motion in motions])
     assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(1.0)
     assert np.abs(moves[:, :, 2]).max() < 1e-6  # along the plane, never across
@@ -120,4 +121,4 @@ def candidates(*scores):
                                                  ((0.01, 0.08), False), ((1.0,), False), ((16.0, 16.2), True),
                                                  ((16.0, 16.3), False)])  # fmt: skip
 def test_a_rival_is_as_good_within_a_share_or_within_the_roughness(scores, matched):
-    assert doubts.is_matched(candidates(*scores)) is matched
+    assert rules.is_matched(candidates(*scores)) is matched

@@ -1,13 +1,14 @@
 import numpy as np
 import pytest
 
-from gapr_core import source as sources
 from gapr_core.config import CovarianceConfig, RefinementConfig, SmoothBiasConfig
-from gapr_core.covariance import estimate
 from gapr_core.data.degradation import bias_along_normals
 from gapr_core.geometry import se3
-from gapr_core.refinement import refine_fully
-from gapr_core.smooth_bias import NormalEquations, compensate
+from gapr_core.registration import source as sources
+from gapr_core.registration.bias_field import NormalEquations
+from gapr_core.registration.covariance import estimate
+from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.smooth_bias import believed_size_mm, corrected_fit
 
 REFINEMENT, CONFIG = RefinementConfig(), SmoothBiasConfig()
 
@@ -24,44 +25,44 @@ def view(femur, target, seed, bias_mm, noise_mm=0.4):
     return prepared, refine_fully(np.eye(4), prepared.points, target, REFINEMENT, prepared.neighbours)
 
 
-def freed_from_bias(fit, source, target, config=CONFIG):
+def without_bias(fit, source, target, config=CONFIG):
     known = estimate(fit, CovarianceConfig()).covariance
-    return compensate(fit, known, source, target, config, REFINEMENT)
+    return corrected_fit(fit, known, source, target, config, REFINEMENT)
 
 
 def error_mm(T, source):
     return float(np.sqrt(((se3.apply(T, source.points) - source.points) ** 2).sum(axis=1).mean()))
 
 
-def test_a_smooth_bias_costs_less_when_it_is_reckoned_with(femur, target):
-    plain, freed = [], []
+def test_a_smooth_bias_costs_less_when_it_is_modelled(femur, target):
+    plain, corrected = [], []
     for seed in range(6):
         source, fit = view(femur, target, seed, bias_mm=1.5)
         plain.append(error_mm(fit.T, source))
-        freed.append(error_mm(freed_from_bias(fit, source, target).T, source))
-    assert np.mean(np.square(freed)) < 0.7 * np.mean(np.square(plain))
+        corrected.append(error_mm(without_bias(fit, source, target).T, source))
+    assert np.mean(np.square(corrected)) < 0.7 * np.mean(np.square(plain))
 
 
 def test_without_a_bias_the_pose_stays_bit_by_bit(femur, target):
     for seed in range(4):
         source, fit = view(femur, target, seed, bias_mm=0.0)
-        assert freed_from_bias(fit, source, target) is fit
+        assert without_bias(fit, source, target) is fit
 
 
 def test_too_few_points_and_infinite_evidence_leave_the_pose(femur, target):
     source, fit = view(femur, target, 0, bias_mm=1.5)
     for config in (SmoothBiasConfig(evidence=np.inf), SmoothBiasConfig(fewest_points=10_000)):
-        assert freed_from_bias(fit, source, target, config) is fit
+        assert without_bias(fit, source, target, config) is fit
 
 
 def test_a_move_that_the_covariance_rules_out_is_not_made(femur, target):
     source, fit = view(femur, target, 0, bias_mm=1.5)
-    assert freed_from_bias(fit, source, target) is not fit
-    assert compensate(fit, np.eye(6) * 1e-8, source, target, CONFIG, REFINEMENT) is fit
+    assert without_bias(fit, source, target) is not fit
+    assert corrected_fit(fit, np.eye(6) * 1e-8, source, target, CONFIG, REFINEMENT) is fit
 
 
 @pytest.mark.parametrize("size_mm", [0.0, 0.2, 0.8])
-def test_the_size_of_a_bias_is_found_and_a_motion_beside_it(size_mm):
+def test_the_size_of_a_bias_is_found_and_a_motion_with_it(size_mm):
     """Linear problem with fields and motions drawn at random: the estimate is right on average."""
     rng = np.random.default_rng(3)
     count, sizes, motions, expected = 1500, [], [], np.array([0.3, -0.2, 0.1, 0.02, 0.0, -0.01])
@@ -70,7 +71,7 @@ def test_the_size_of_a_bias_is_found_and_a_motion_beside_it(size_mm):
         y = -J @ expected + fields @ rng.normal(0.0, size_mm or 1e-9, 20) + rng.normal(0.0, 0.5, count)
         WJ, WF = J / 0.25, fields / 0.25
         equations = NormalEquations(J.T @ WJ, J.T @ WF, fields.T @ WF, WJ.T @ y, WF.T @ y)
-        sizes.append(equations.size_mm(CONFIG))
+        sizes.append(believed_size_mm(equations, CONFIG))
         motions.append(equations.step(max(sizes[-1], 0.05)))
     assert np.mean(sizes) == pytest.approx(size_mm, rel=0.25, abs=0.02)
     assert np.mean(motions, axis=0) == pytest.approx(expected, abs=0.02)

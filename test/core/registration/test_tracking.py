@@ -1,15 +1,16 @@
-"""A stream of sources: near the last pose first, anew where that is not sure."""
+"""A stream of sources: near the last pose first, in full if that is not sure."""
 
 import numpy as np
 import pytest
 
-from gapr_core import Registrar, RegistrarConfig, Tracker
+from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.proposals.base import Proposals
-from gapr_core.tracking import Memory
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.tracking import Memory
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
 
@@ -41,16 +42,16 @@ def is_right(result, pair):
 
 def test_after_the_first_source_only_what_is_remembered_is_asked(tracker, frames, prepared):
     results = [tracker.register(pair.source, prepared) for pair in frames]
-    assert [r.details["proposer"] == "track" for r in results] == [False, True, True, True]
+    assert [r.proposer == "track" for r in results] == [False, True, True, True]
     assert all(is_right(r, pair) for r, pair in zip(results, frames, strict=True))
     assert all(r.confidence >= tracker.registrar.config.sure for r in results[1:])
 
 
-def test_a_jump_is_found_anew(tracker, frames, prepared):
+def test_a_jump_is_found_by_a_full_registration(tracker, frames, prepared):
     tracker.register(frames[0].source, prepared)
     elsewhere = se3.exp([90.0, -60.0, 40.0, 1.2, -0.8, 2.0])
     result = tracker.register(se3.apply(elsewhere, frames[1].source), prepared)
-    assert result.details["proposer"] != "track"
+    assert result.proposer != "track"
     assert result.ok
     shift_mm, turn_deg = se3.pose_error(result.T_target_source @ elsewhere, frames[1].T_target_source, frames[1].source)
     assert shift_mm < 4.0 and turn_deg < 5.0
@@ -59,7 +60,7 @@ def test_a_jump_is_found_anew(tracker, frames, prepared):
 def test_a_wrong_track_is_left(tracker, frames, prepared):
     """Every remembered pose is wrong: none may be followed."""
     first = tracker.register(frames[0].source, prepared)
-    tracker._memory.keep(first.alternatives[-1], first.alternatives[:-1])
+    tracker._memory.keep([*first.alternatives[-1:], *first.alternatives[:-1]])
     result = tracker.register(frames[1].source, prepared)
     assert result.ok and is_right(result, frames[1])
 
@@ -67,20 +68,20 @@ def test_a_wrong_track_is_left(tracker, frames, prepared):
 def test_another_target_and_a_given_pose_start_a_new_track(tracker, frames, prepared, registrar):
     tracker.register(frames[0].source, prepared)
     given = tracker.register(frames[1].source, prepared, initial=frames[1].T_target_source)
-    assert given.ok and given.details["proposer"] != "track"
+    assert given.ok and given.proposer != "track"
     other = tracker.register(frames[2].source, registrar.prepare(frames[0].target))
-    assert other.ok and other.details["proposer"] != "track"
+    assert other.ok and other.proposer != "track"
 
 
 def test_after_a_reset_nothing_is_remembered(tracker, frames, prepared):
     tracker.register(frames[0].source, prepared)
     tracker.reset()
-    assert tracker.register(frames[1].source, prepared).details["proposer"] != "track"
+    assert tracker.register(frames[1].source, prepared).proposer != "track"
 
 
 def test_every_so_many_sources_one_is_registered_in_full(registrar, frames, prepared):
     tracker = Tracker(registrar, recheck=2)
-    tracked = [tracker.register(pair.source, prepared).details["proposer"] == "track" for pair in frames]
+    tracked = [tracker.register(pair.source, prepared).proposer == "track" for pair in frames]
     assert tracked == [False, True, False, True]
     with pytest.raises(ConfigError, match="at least 1"):
         Tracker(registrar, recheck=0)
@@ -91,7 +92,7 @@ def test_a_refused_source_does_not_end_the_track(tracker, frames, prepared):
     noise = np.random.default_rng(0).uniform(-60.0, 60.0, (500, 3))
     assert not tracker.register(noise, prepared).ok
     assert not tracker.register(np.zeros((5, 3)), prepared).ok
-    assert tracker.register(frames[1].source, prepared).details["proposer"] == "track"
+    assert tracker.register(frames[1].source, prepared).proposer == "track"
 
 
 def test_after_a_refused_full_registration_the_next_one_is_full_as_well(registrar, frames, prepared):
@@ -99,7 +100,7 @@ def test_after_a_refused_full_registration_the_next_one_is_full_as_well(registra
     noise = np.random.default_rng(0).uniform(-60.0, 60.0, (500, 3))
     sources = [frames[0].source, frames[1].source, noise, frames[2].source, frames[3].source]
     results = [tracker.register(source, prepared) for source in sources]
-    assert [r.details["proposer"] == "track" for r in results] == [False, True, False, False, True]
+    assert [r.proposer == "track" for r in results] == [False, True, False, False, True]
     assert [r.ok for r in results] == [True, True, False, True, True]
 
 
@@ -115,16 +116,16 @@ def test_a_pose_without_rivals_is_not_followed(frames, prepared):
         def propose(self, source, target, rng):
             return Proposals(frames[0].T_target_source[None], np.ones(1))
 
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1), [Truth()]))
+    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1), [Truth()], [Calibration.shipped("search")]))
     assert tracker.register(frames[0].source, prepared).ok
-    assert tracker.register(frames[0].source, prepared).details["proposer"] == "truth"
+    assert tracker.register(frames[0].source, prepared).proposer == "truth"
 
 
 @pytest.mark.parametrize("answer", [0, 1, 2])
 def test_the_rivals_move_with_the_source_whichever_of_them_is_followed(answer):
     memory, rng = Memory(), np.random.default_rng(2)
     poses = [se3.exp(rng.normal(size=6) * [30, 30, 30, 1, 1, 1]) for _ in range(3)]
-    memory.keep(poses[0], tuple(poses[1:]))
+    memory.keep(poses)
     moved = se3.exp([2.0, -1.0, 0.5, 0.02, 0.01, -0.03])
     memory.follow(poses[answer] @ moved, rng.normal(size=(50, 3)) * 20.0)
     others = [pose for k, pose in enumerate(poses) if k != answer]
@@ -135,7 +136,7 @@ def test_sources_that_cannot_be_registered_do_not_put_off_the_next_full_registra
     tracker = Tracker(registrar, recheck=2)
     found = []
     for pair in frames[:3]:
-        found.append(tracker.register(pair.source, prepared).details["proposer"])
+        found.append(tracker.register(pair.source, prepared).proposer)
         assert not tracker.register(np.zeros((5, 3)), prepared).ok
     assert [name == "track" for name in found] == [False, True, False]
 
@@ -156,3 +157,17 @@ def test_a_bone_that_jumps_is_elsewhere(specimen):
     first, second = simulate(specimen, 1, Motion(frames=2, jump_every=1))
     away = first.T_target_source @ se3.inverse(second.T_target_source)
     assert se3.rotation_angle_deg(away) > 10.0
+
+
+def test_what_a_stream_says_of_the_bone_decides_with_the_frame(tracker, frames, prepared):
+    """A frame that would be accepted alone is refused after many that did not fit."""
+    tracker.reset()
+    alone = tracker.register(frames[0].source, prepared)
+    again = tracker.register(frames[1].source, prepared)
+    assert alone.ok and again.ok
+    for _ in range(40):
+        tracker._evidence.add(1e-3, agrees=True)
+    late = tracker.register(frames[2].source, prepared)
+    assert late.status is RegistrationStatus.LOW_CONFIDENCE and late.confidence < 0.5
+    tracker.reset()
+    assert tracker.register(frames[2].source, prepared).ok

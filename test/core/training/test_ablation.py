@@ -14,7 +14,8 @@ from gapr_core.data.make_pairs import Recipe
 from gapr_core.errors import ConfigError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
-from gapr_core.training import ablation, ablation_table
+from gapr_core.training.ablation import cli as ablation
+from gapr_core.training.ablation import table as ablation_table
 from gapr_core.training.config import TrainConfig, default_plan, read_plan, trained_as
 
 ROOT = Path(__file__).parents[3]
@@ -90,7 +91,7 @@ def test_the_table_has_every_row_with_intervals_and_the_papers_figure_apart(whol
     for row in found.values():
         assert all(0.0 <= row[f"{n}_low"] <= row[n] <= row[f"{n}_high"] <= 1.0 for n in ablation_table.FIGURES)
     text = (whole / "table.md").read_text()
-    assert "compare the order" in text and "5 real train people" in text and "4 training pairs" in text
+    assert "compare the order" in text and "5 real train subjects" in text and "4 training pairs" in text
     assert (whole / "curves_cross.png").exists() and (whole / "curves_transformer.png").exists()
     assert len((whole / "table.csv").read_text().splitlines()) == 1 + len(found)
 

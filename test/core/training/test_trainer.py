@@ -10,9 +10,9 @@ import pytest
 import torch
 import yaml
 
-from gapr_core.clouds import Surface
 from gapr_core.errors import ConfigError
 from gapr_core.model import weights
+from gapr_core.surface import Surface
 from gapr_core.training import trainer
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs

@@ -1,0 +1,104 @@
+"""Is the covariance honest for every kind of sensor? NEES and errors at the bone, by family.
+
+    python benchmarks/uncertainty.py --anatomy DIR [--split val] [--count 24] [--families pointer,ultrasound] [--full]
+
+Poses come from a refinement that starts at the truth, or with --full from the search. 5.35 is the median of chi square
+with six degrees of freedom: a median NEES of 1 in its units means an honest covariance, more means one too small.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.config import SENSOR_KINDS, SensorConfig
+from gapr_core.data.pool import specimens
+from gapr_core.data.protocols import Pair, make_pair
+from gapr_core.geometry import se3
+from gapr_core.geometry.twists import error_twist, nees
+from gapr_core.pages import markdown
+from gapr_core.registration import source as sources
+from gapr_core.registration.covariance import PoseUncertainty, estimate
+from gapr_core.registration.precision import expected_mm
+from gapr_core.registration.refinement import Fit, refine_fully
+from gapr_core.registration.smooth_bias import bias_corrected, corrected_fit
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.results import Refusal
+from gapr_core.runtime.console import say
+
+FAMILIES = "paper,L1,L2,L3,L2-wave,L2-gp,L3-gp,pointer,ultrasound,depth-camera,laser,sweep"
+CHI_SQUARE_MEDIAN = 5.348
+
+
+def main() -> int:
+    """Measure every family, print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
+    parser.add_argument("--split", default="val", choices=("train", "val"))
+    parser.add_argument("--bones", default="femur,tibia,pelvis", help="with commas")
+    parser.add_argument("--count", type=int, default=24, help="pairs of each family")
+    parser.add_argument("--families", default=FAMILIES, help="protocols, with commas")
+    parser.add_argument("--full", action="store_true", help="register, instead of refining from the truth")
+    parser.add_argument("--declared", action="store_true", help="name the kind of sensor to the library")
+    args = parser.parse_args()
+    bones = [s for bone in args.bones.split(",") for s in specimens(bone, args.split, 3, args.anatomy)[:3]]
+    lines = [markdown.head(("family", "pairs", "median NEES / 5.35", "TRE, mm", "predicted, mm"))]
+    for family in args.families.split(","):
+        kind = family.replace("-", "_")
+        sensor = SensorConfig(kind if args.declared and kind in SENSOR_KINDS else "unknown")
+        registrar = Registrar(RegistrarConfig(num_threads=1, sensor=sensor))
+        pairs = (make_pair(family, bones[i % len(bones)], 3000 + i) for i in range(args.count))
+        found = [measure(registrar, pair, args.full) for pair in tqdm(pairs, family, args.count, leave=False)]
+        rows = np.array([row for row in found if row])
+        surprise, true_mm, predicted_mm = np.median(rows, axis=0)
+        cells = (family, len(rows), f"{surprise / CHI_SQUARE_MEDIAN:.2f}", f"{true_mm:.2f}", f"{predicted_mm:.2f}")
+        lines.append(markdown.row(cells))
+    say("\n".join(lines))
+    return 0
+
+
+def measure(registrar: Registrar, pair: Pair, full: bool) -> tuple[float, float, float] | None:
+    """NEES, true and predicted error over the bone, mm; None where the source cannot be used."""
+    target = registrar.prepare(pair.target)
+    found = (assessed if full else refined)(registrar, pair, target)
+    if found is None:
+        return None
+    fit, uncertainty, points = found
+    moved = se3.apply(fit.T @ se3.inverse(pair.T_target_source), target.points) - target.points
+    true_mm = float(np.sqrt((moved**2).sum(axis=1).mean()))
+    twist = error_twist(fit.T, pair.T_target_source, points)
+    centre = fit.moved.mean(axis=0)
+    return nees(twist, uncertainty.covariance), true_mm, expected_mm(uncertainty.covariance, target.points, centre)
+
+
+def refined(registrar: Registrar, pair: Pair, target: PreparedTarget) -> tuple[Fit, PoseUncertainty, np.ndarray] | None:
+    """The pose that a refinement from the truth comes to."""
+    config, source = registrar.config, sources.prepare(pair.source, registrar.config.source)
+    if isinstance(source, Refusal):
+        return None
+    fit = refine_fully(pair.T_target_source, source.points, target, config.refinement, source.neighbours)
+    known = estimate(fit, config.covariance, config.sensor).covariance
+    fit = corrected_fit(fit, known, source, target, config.smooth_bias, config.refinement)
+    return fit, estimate(fit, config.covariance, config.sensor), source.points
+
+
+def assessed(
+    registrar: Registrar, pair: Pair, target: PreparedTarget
+) -> tuple[Fit, PoseUncertainty, np.ndarray] | None:
+    """The best hypothesis of a full registration, refused or not, if it is within 4 mm and 5 deg."""
+    assessment = registrar.assess(pair.source, target)
+    if isinstance(assessment, Refusal):
+        return None
+    assessment = bias_corrected(assessment, registrar.config)
+    rte_mm, rre_deg = se3.pose_error(assessment.fit.T, pair.T_target_source, assessment.source.points)
+    if rte_mm >= 4.0 or rre_deg >= 5.0:
+        return None
+    return assessment.fit, assessment.uncertainty, assessment.source.points
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

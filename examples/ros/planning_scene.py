@@ -1,0 +1,89 @@
+"""The registered bone as an obstacle of MoveIt: its mesh in the planning scene, moved with every trusted pose.
+
+python examples/ros/planning_scene.py femur.stl --ros-args -p min_confidence:=0.9 -p max_tre:=0.002
+
+Needs a ROS installation with moveit_msgs. A refusal leaves the obstacle where it was last: a robot that moves near a
+bone whose pose is no longer known should stop, which is for `hold` to do.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Point, Pose, TransformStamped
+from rclpy.executors import ExternalShutdownException
+from rclpy.utilities import remove_ros_args
+from shape_msgs.msg import Mesh, MeshTriangle
+from trusted_pose import TrustedPose
+
+from gapr_core import load
+
+MM_PER_M = 1000.0
+MOST_TRIANGLES = 20_000
+
+
+class BoneInScene(TrustedPose):
+    """Sends the bone to /planning_scene.
+
+    Args:
+        path: file of the bone, as register_node reads it.
+        types: the module `moveit_msgs.msg`.
+        kwargs: of rclpy's Node.
+    """
+
+    def __init__(self, path: str | Path, types: Any, **kwargs: object) -> None:
+        super().__init__(**kwargs)
+        self._types, self._mesh = types, mesh_of(path)
+        self._scene = self.create_publisher(types.PlanningScene, "/planning_scene", 1)
+
+    def act(self, transform: TransformStamped, values: dict[str, str]) -> None:
+        """Put the bone where it is now."""
+        scene = self._types.PlanningScene(is_diff=True)
+        scene.world.collision_objects = [obstacle(self._types, self._mesh, transform)]
+        self._scene.publish(scene)
+
+
+def mesh_of(path: str | Path) -> Mesh:
+    """A bone's triangles, metres.
+
+    Raises:
+        ValueError: it has none, or more than a planner handles.
+    """
+    surface = load(path)
+    if surface.faces is None or not 0 < len(surface.faces) <= MOST_TRIANGLES:
+        count = 0 if surface.faces is None else len(surface.faces)
+        raise ValueError(f"expected a mesh of at most {MOST_TRIANGLES} triangles, got {count}: decimate it")
+    vertices = [Point(x=x, y=y, z=z) for x, y, z in (surface.points / MM_PER_M).tolist()]
+    triangles = [MeshTriangle(vertex_indices=face.astype(np.uint32)) for face in surface.faces]
+    return Mesh(vertices=vertices, triangles=triangles)
+
+
+def obstacle(types: Any, mesh: Mesh, transform: TransformStamped) -> Any:
+    """The moveit_msgs/CollisionObject of a mesh at a pose; the same id moves the one that is there."""
+    moved, pose = transform.transform, Pose()
+    pose.position.x, pose.position.y, pose.position.z = moved.translation.x, moved.translation.y, moved.translation.z
+    pose.orientation = moved.rotation
+    made = types.CollisionObject(header=transform.header, id=transform.child_frame_id, operation=b"\x00")  # ADD
+    made.pose, made.meshes, made.mesh_poses = pose, [mesh], [Pose()]
+    return made
+
+
+def main() -> None:
+    """Run until it is stopped."""
+    import moveit_msgs.msg
+
+    arguments = remove_ros_args(sys.argv)
+    rclpy.init(args=sys.argv)
+    try:
+        rclpy.spin(BoneInScene(arguments[1], moveit_msgs.msg))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""Method names of the command line: our own, the baselines, and anybody's `module:factory`."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from inspect import signature
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from gapr_core import baselines
+from gapr_core.baselines import RegistrationMethod
+from gapr_core.config import RegistrarConfig
+from gapr_core.errors import ConfigError, GaprError
+from gapr_core.results import RegistrationResult
+
+OURS = "gapr"
+
+
+Maker = Callable[[RegistrarConfig], RegistrationMethod]
+
+
+def _from_pretrained(config: RegistrarConfig) -> RegistrationMethod:
+    from gapr_core import Registrar
+
+    return Registrar.from_pretrained(config)
+
+
+def _search_alone(config: RegistrarConfig) -> RegistrationMethod:
+    from gapr_core import Registrar
+
+    return Registrar(config)
+
+
+def _network_alone(config: RegistrarConfig) -> RegistrationMethod:
+    from gapr_core.registration.registrar import Registrar, network
+
+    return Registrar(config, [network()])
+
+
+def _tracker(config: RegistrarConfig) -> RegistrationMethod:
+    from gapr_core import Tracker
+
+    return Tracker.from_pretrained(config)
+
+
+OWN: dict[str, Maker] = {
+    OURS: _from_pretrained,
+    "gapr_search": _search_alone,
+    "gapr_network": _network_alone,
+    "gapr_tracker": _tracker,
+}
+
+
+def names() -> tuple[str, ...]:
+    """Every method that has a name: ours, then the baselines."""
+    return (*OWN, *sorted(baselines.REGISTRY))
+
+
+def check(wanted: Sequence[str]) -> None:
+    """Raise `ConfigError` where a name is none of `names()` and no module:factory; nothing is loaded."""
+    for name in wanted:
+        if name not in names() and ":" not in name:
+            raise ConfigError(f"one of {', '.join(names())}, or module:factory", repr(name), "name one of them")
+
+
+def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod:
+    """A new instance of a method.
+
+    Args:
+        name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
+            proposers alone), "gapr_tracker", a baseline of `gapr_core.baselines.REGISTRY`, or "package.module:factory"
+            for a callable without arguments that returns a `RegistrationMethod`.
+        config: settings of our own methods.
+
+    Raises:
+        ConfigError: for a name that leads nowhere, and for settings where the method has none.
+        MethodUnavailableError: a library is missing.
+    """
+    if name in OWN:
+        return OWN[name](config or RegistrarConfig())
+    if config not in (None, RegistrarConfig()):
+        raise ConfigError(
+            f"settings for one of {', '.join(OWN)}", f"settings for {name}", "leave --config and --set out"
+        )
+    if ":" in name:
+        return _from_module(*name.split(":", 1))
+    check([name])
+    return baselines.make(name)
+
+
+def register(
+    method: RegistrationMethod, source: ArrayLike, target: Any, viewpoint: ArrayLike | None
+) -> RegistrationResult:
+    """The method's answer; it is given the camera's place, (3,) mm in the source's frame, if it can make use of it."""
+    if viewpoint is None or "viewpoint" not in signature(method.register).parameters:
+        return method.register(source, target)
+    return method.register(source, target, viewpoint=viewpoint)  # type: ignore[call-arg]
+
+
+def _from_module(module: str, factory: str) -> RegistrationMethod:
+    try:
+        method = getattr(importlib.import_module(module), factory)()
+    except GaprError:
+        raise
+    except Exception as error:  # whatever a module does when it is imported, and a factory when it is called
+        raise ConfigError("module:factory of a method", f"{module}:{factory} ({error})", "check the name") from error
+    if not isinstance(method, RegistrationMethod):
+        raise ConfigError("a method with name, prepare and register", repr(method), "return one from the factory")
+    return method

@@ -1,0 +1,1 @@
+"""The confidence: pairs to learn from, records of answers, the fit."""

@@ -1,0 +1,103 @@
+"""Fit what says how sure and how precise an answer is; one command makes the data, the models and their card.
+
+    python -m gapr_core.calibration --anatomy ../shared/anatomy --out runs/calibration --jobs 2 --count 3000
+
+Pairs are drawn on the fly from subjects of the train split; finished ones stay in `records.jsonl`, so a stopped run
+goes on where it was. The fit itself is convex: the same records give the same models.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gapr_core.calibration import conformal
+from gapr_core.calibration.answers import Answers, answers_of
+from gapr_core.calibration.card import as_markdown
+from gapr_core.calibration.collect import collect
+from gapr_core.calibration.fit import ACCEPTED, by_group, fit, of_unseen_families, of_unseen_people
+from gapr_core.calibration.pairs import HELD_OUT, Task
+from gapr_core.registration.additive import FORMAT, Additive, as_dict
+from gapr_core.registration.confidence import CALIBRATIONS
+from gapr_core.runtime import origin
+from gapr_core.runtime.console import say
+from gapr_core.runtime.files import write_json, write_text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Collect, fit, judge and write."""
+    parser = argparse.ArgumentParser(prog="python -m gapr_core.calibration", description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
+    parser.add_argument("--out", required=True, type=Path, help="folder for records, models and their card")
+    parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
+    parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    args = parser.parse_args(arguments)
+    tasks = [Task(str(args.anatomy), args.split, args.seed, number) for number in range(args.count)]
+    records = collect(tasks, args.out / "records.jsonl", args.jobs)
+    given = sys.argv[1:] if arguments is None else arguments
+    made = {"commit": origin.commit(), "command": " ".join(["python -m gapr_core.calibration", *given]),
+            "seed": args.seed, "split": args.split, "held_out_family": HELD_OUT}  # fmt: skip
+    cards = write_models(records, args.out, made)
+    write_text(args.out / "confidence.md", as_markdown(cards, made))
+    say(f"{len(records)} pairs; models and confidence.md are in {args.out}")
+    return 0
+
+
+def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str, Any]) -> dict[str, Any]:
+    """Fit and judge every round's confidence, and the precision; returns their cards by name."""
+    cards, rounds = {}, {}
+    for name, path in CALIBRATIONS.items():
+        answers = answers_of(records, name)
+        if not len(answers):
+            continue
+        known = answers.of(answers.family != HELD_OUT)
+        cards[name] = made | confidence_card(answers)
+        rounds[name] = answers
+        _write(folder / path.name, "confidence", fit(known), {"proposer": name}, cards[name])
+    model, factor, cards["precision"] = fit_precision(accepted(rounds["search"]))
+    _write(folder / "precision.json", "precision", model, {"factor95": round(factor, 4)}, made | cards["precision"])
+    return cards
+
+
+def confidence_card(answers: Answers) -> dict[str, Any]:
+    """Counts, and AUROC, ECE and wrong poses on unseen subjects, and on unseen subjects seen by unseen sensors."""
+    unseen, unseen_too = of_unseen_people(answers), of_unseen_families(answers)
+    return {
+        "pairs": len(answers),
+        "right": int(answers.right.sum()),
+        "unseen_subjects": by_group(answers, unseen, answers.family),
+        "unseen_subjects_by_what": by_group(answers, unseen, answers.what),
+        "unseen_families": by_group(answers, unseen_too, answers.family),
+    }
+
+
+def accepted(answers: Answers) -> Answers:
+    """Those with a truth that a model of unseen subjects accepts and no rule refuses."""
+    return answers.of((of_unseen_people(answers) >= ACCEPTED) & ~answers.refused & np.isfinite(answers.true_mm))
+
+
+def fit_precision(answers: Answers) -> tuple[Additive, float, dict[str, Any]]:
+    """Model, factor and card."""
+    scale = conformal.of_unseen(answers)
+    known = answers.family != HELD_OUT
+    scores = answers.true_mm / (scale * answers.tre95_mm)
+    factor = conformal.conformal_factor(scores[known], answers.family[known])
+    model = conformal.fit_scale(answers.of(answers.right & known))
+    return model, factor, {"accepted": len(answers), "coverage": conformal.coverage(answers, scale, factor)}
+
+
+def _write(path: Path, kind: str, model: Additive, more: dict[str, Any], card: dict[str, Any]) -> None:
+    data = {"format": FORMAT, "kind": kind, **more, **as_dict(model), "card": card}
+    write_json(path, data)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,104 @@
+"""The records of one round as columns, and who may be judged by whom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.registration.features import FEATURES_OF
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+FOLDS = 6
+NO_TRUTH = {
+    "rte_mm": np.nan,
+    "rre_deg": np.nan,
+    "nees": np.nan,
+    "true_mm": np.nan,
+    "tre_mm": np.nan,
+    "tre95_mm": np.nan,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """What one round answered, N pairs.
+
+    Attributes:
+        round_name: a key of `FEATURES_OF`.
+        names: (N,) of the pairs.
+        features: (N, F) in the order of `feature_names`.
+        right: (N,) within 4 mm and 5 deg.
+        refused: (N,) a rule speaks against the pose, whatever the probability.
+        family, seen_as, what, bone: (N,) how and what was seen.
+        people: N tuples, everybody whose bone the points are of, the target's first.
+        true_mm, tre_mm, tre95_mm: (N,) true error over the whole bone, the predicted one and its bound; NaN where no
+            pose is right.
+        nees: (N,) normalised error squared of the pose.
+    """
+
+    round_name: str
+    names: NDArray[np.str_]
+    features: Array
+    right: Mask
+    refused: Mask
+    family: NDArray[np.str_]
+    seen_as: NDArray[np.str_]
+    what: NDArray[np.str_]
+    bone: NDArray[np.str_]
+    people: tuple[tuple[str, ...], ...]
+    true_mm: Array
+    tre_mm: Array
+    tre95_mm: Array
+    nees: Array
+
+    @property
+    def feature_names(self) -> tuple[str, ...]:
+        """(F,) names of the features."""
+        return FEATURES_OF[self.round_name]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def of(self, chosen: Mask) -> Answers:
+        """Only the chosen ones."""
+        columns: dict[str, Any] = {
+            name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        return replace(self, **columns, people=tuple(p for p, is_in in zip(self.people, chosen, strict=True) if is_in))
+
+    def people_folds(self, folds: int = FOLDS) -> Iterator[tuple[Mask, Mask]]:
+        """(fitted on, judged) masks (N,): nobody of a judged target is in any pair that the model is fitted on."""
+        everybody = sorted({person for group in self.people for person in group})
+        drawn = np.random.default_rng(0).permutation(len(everybody)) % folds
+        fold_of = dict(zip(everybody, drawn, strict=True))
+        own = np.array([fold_of[group[0]] for group in self.people])
+        for number in range(folds):
+            is_in = np.array([any(fold_of[person] == number for person in group) for group in self.people])
+            yield ~is_in, own == number
+
+
+def answers_of(records: Sequence[dict[str, Any]], round_name: str) -> Answers:
+    """The answers of one round: "network", "search", "track" or "scene"."""
+    found = [(record, NO_TRUTH | record["answers"][round_name])
+             for record in records if round_name in record["answers"]]  # fmt: skip
+    columns: dict[str, Any] = {
+        key: np.array([record[key if key != "names" else "name"] for record, _ in found], dtype=str)
+        for key in ("names", "family", "seen_as", "what", "bone")
+    }
+    columns |= {key: np.array([answer[key] for _, answer in found], dtype=float)
+                for key in ("true_mm", "tre_mm", "tre95_mm", "nees")}  # fmt: skip
+    names = FEATURES_OF[round_name]
+    features = [[answer["features"][name] for name in names] for _, answer in found]
+    return Answers(
+        round_name,
+        features=np.array(features, dtype=float).reshape(len(found), len(names)),
+        right=np.array([answer["right"] for _, answer in found], dtype=bool),
+        refused=np.array([answer["refusal"] is not None for _, answer in found], dtype=bool),
+        people=tuple(tuple(record["people"]) or (record["name"],) for record, _ in found),
+        **columns,
+    )

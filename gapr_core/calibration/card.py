@@ -1,0 +1,57 @@
+"""The card of the models as a page: what they were fitted on, and how they do on what they have not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gapr_core.calibration.pairs import SEEN_AS, SHAPE_SHARE, WHAT
+from gapr_core.pages.markdown import table
+
+Rows = Mapping[str, Mapping[str, Any]]
+CONFIDENCE = {
+    "pairs": "pairs", "right": "right", "auroc": "AUROC", "ece": "ECE", "wrong": "wrong at .5",
+    "wrong_sure": "wrong at .9", "right_accepted": "right at .5", "right_sure": "right at .9",
+}  # fmt: skip
+PRECISION = {
+    "accepted": "accepted", "covered": "covered", "bound_over_true": "tre95 / true", "true_over_tre": "true / tre",
+    "nees_over_median": "NEES / 5.35", "nees_before": "before",
+}  # fmt: skip
+
+
+def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
+    """The page for all models of one run."""
+    views = {name: share for of_family in SEEN_AS.values() for name, share in of_family.items()}
+    parts = [
+        "# Confidence and precision: card",
+        f"Made by `{made['command']}` at commit {made['commit']}, seed {made['seed']}, {made['split']} subjects.",
+        f"The family {made['held_out_family']} is in no fit, only judged.",
+        f"How a bone is seen: {_shares(views)}.",
+        f"Whose bone it is: {_shares(WHAT)}. {100 * SHAPE_SHARE:.0f} % are shapes without a knowable pose.",
+        "AUROC and ECE (10 equal-width bins) are of all pairs; wrong and right count what a confidence of .5 or .9 "
+        "and the safety rules accept.",
+    ]
+    for name, card in cards.items():
+        if name == "precision":
+            parts += ["## Precision: subjects and families that were not fitted", _table(card["coverage"], PRECISION)]
+        else:
+            parts += [f"## Confidence, {name}: subjects that were not fitted",
+                      _table(card["unseen_subjects"], CONFIDENCE),
+                      "By whose bone the source is of:", _table(card["unseen_subjects_by_what"], CONFIDENCE),
+                      f"## Confidence, {name}: neither the subject nor the sensor family was fitted",
+                      _table(card["unseen_families"], CONFIDENCE)]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def _shares(weights: Mapping[str, float]) -> str:
+    total = sum(weights.values())
+    return ", ".join(f"{name} {100.0 * weight / total:.1f} %" for name, weight in weights.items())
+
+
+def _table(rows: Rows, columns: Mapping[str, str]) -> str:
+    cells = [[name, *(_cell(row[key]) for key in columns)] for name, row in rows.items()]
+    return table(["", *columns.values()], cells)
+
+
+def _cell(value: Any) -> str:
+    return "" if value is None else f"{value:g}"

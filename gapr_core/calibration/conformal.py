@@ -1,0 +1,96 @@
+"""Fit the precision: how predicted errors at the whole bone compare with true ones, and a bound that holds.
+
+The scale of a predicted standard deviation is an additive model of a few features, of the logarithm of what the true
+errors and NEES ask for. The factor of the bound is the conformal quantile of true errors over bounds that models gave
+which had seen neither the subject nor the sensor family: large enough for all families together and for each alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.calibration.additive import fit_centre
+from gapr_core.calibration.answers import Answers, Mask
+from gapr_core.registration.additive import Additive
+from gapr_core.registration.precision_model import PRECISION_FEATURES, SCALE_LIMITS
+
+Array = NDArray[np.float64]
+MEDIAN_NEES = 5.348  # of chi square with six degrees of freedom
+MEDIAN_RATIO = 0.8  # of a true error to its expected root mean square: of two to three directions that matter
+OVERALL, IN_EACH = 0.955, 0.91  # aims of coverage: a little above what is asked for
+FEWEST = 30  # accepted answers of a family that has a say of its own
+
+
+def fit_scale(answers: Answers) -> Additive:
+    """Of the logarithm of the scale that a predicted standard deviation needs."""
+    wanted = 0.5 * np.log(answers.true_mm / (MEDIAN_RATIO * answers.tre_mm)) + 0.25 * np.log(answers.nees / MEDIAN_NEES)
+    return fit_centre(precision_table(answers), wanted, PRECISION_FEATURES)
+
+
+def scales(model: Additive, answers: Answers) -> Array:
+    """(N,) as `Precision.scale` gives them."""
+    return np.clip(np.exp(model.values(precision_table(answers))), *SCALE_LIMITS)
+
+
+def precision_table(answers: Answers) -> Array:
+    """(N, P) in the order of `PRECISION_FEATURES`."""
+    columns = {"log_tre": np.log(np.maximum(answers.tre_mm, 1e-6))}
+    columns |= {name: answers.features[:, number] for number, name in enumerate(answers.feature_names)}
+    return np.column_stack([columns[name] for name in PRECISION_FEATURES])
+
+
+def of_unseen(answers: Answers) -> Array:
+    """(N,) scales by models that have seen neither the subject nor the sensor family."""
+    found = np.full(len(answers), np.nan)
+    for family in np.unique(answers.family):
+        of_it: Mask = answers.family == family
+        for fitted, judged in answers.people_folds():
+            if (judged & of_it).any():
+                model = fit_scale(answers.of(fitted & ~of_it & answers.right))
+                found[judged & of_it] = scales(model, answers.of(judged & of_it))
+    return found
+
+
+def conformal_factor(scores: Array, family: NDArray[np.str_]) -> float:
+    """The smallest factor with which bounds cover their share of all scores, and of those of each family.
+
+    Args:
+        scores: (N,) true errors over their bounds.
+        family: (N,) of the pairs.
+    """
+    levels = [conformal_quantile(scores, OVERALL)]
+    for name in np.unique(family):
+        if (family == name).sum() >= FEWEST:
+            levels.append(conformal_quantile(scores[family == name], IN_EACH))
+    return max(levels)
+
+
+def conformal_quantile(scores: Array, share: float) -> float:
+    """What the next score of the same kind stays below with at least this probability (Vovk et al. 2005).
+
+    The k-th smallest of n scores, k = ceil((n + 1) share): one more than the plain quantile has.
+    """
+    k = int(np.ceil((len(scores) + 1) * share))
+    return float(np.sort(scores)[min(k, len(scores)) - 1])
+
+
+def coverage(answers: Answers, scale: Array, factor: float) -> dict[str, dict[str, Any]]:
+    """How often the bound holds, how wide it is, and what the NEES is; of all and of each family."""
+    rows = {}
+    for name in ("all", *np.unique(answers.family)):
+        of_it = np.full(len(answers), True) if name == "all" else answers.family == name
+        if not of_it.any():
+            continue
+        true, bound = answers.true_mm[of_it], factor * scale[of_it] * answers.tre95_mm[of_it]
+        rows[str(name)] = {
+            "accepted": int(of_it.sum()),
+            "covered": round(float((true <= bound).mean()), 4),
+            "bound_over_true": round(float(np.median(bound / true)), 3),
+            "true_over_tre": round(float(np.median(true / (scale[of_it] * answers.tre_mm[of_it]))), 3),
+            "nees_over_median": round(float(np.median(answers.nees[of_it] / scale[of_it] ** 2) / MEDIAN_NEES), 3),
+            "nees_before": round(float(np.median(answers.nees[of_it]) / MEDIAN_NEES), 3),
+        }
+    return rows

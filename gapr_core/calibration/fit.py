@@ -1,0 +1,80 @@
+"""Fit the confidence of one round, and judge it on subjects and on sensor families that it has not seen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from gapr_core.calibration.additive import fit_log_odds
+from gapr_core.calibration.answers import Answers, Mask
+from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
+from gapr_core.registration.additive import Additive
+from gapr_core.registration.confidence import LARGEST_LOG_ODDS
+from gapr_core.registration.features import SIGNS
+
+Array = NDArray[np.float64]
+ACCEPTED = 0.5  # default of `min_confidence`
+
+
+def fit(answers: Answers) -> Additive:
+    """The log odds that an answer is right; every record counts once."""
+    return fit_log_odds(answers.features, answers.right, answers.feature_names, SIGNS)
+
+
+def probability(model: Additive, answers: Answers) -> Array:
+    """(N,) probabilities as `Calibration.probability` gives them."""
+    return np.asarray(expit(np.clip(model.values(answers.features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
+
+
+def of_unseen_people(answers: Answers) -> Array:
+    """(N,) probabilities, each by a model that was fitted without anybody of the pair's subject."""
+    found = np.full(len(answers), np.nan)
+    for fitted, judged in answers.people_folds():
+        found[judged] = probability(fit(answers.of(fitted)), answers.of(judged))
+    return found
+
+
+def of_unseen_families(answers: Answers) -> Array:
+    """(N,) probabilities, each by a model that has seen neither the subject nor the sensor family."""
+    found = np.full(len(answers), np.nan)
+    for family in np.unique(answers.family):
+        of_it: Mask = answers.family == family
+        for fitted, judged in answers.people_folds():
+            if (judged & of_it).any():
+                found[judged & of_it] = probability(fit(answers.of(fitted & ~of_it)), answers.of(judged & of_it))
+    return found
+
+
+def judged(answers: Answers, confidence: Array) -> dict[str, Any]:
+    """How well confidences (N,) tell right from wrong, and whether they are probabilities.
+
+    `wrong` counts wrong poses that would be accepted at 0.5 or more, `wrong_sure` at 0.9 or more: no rule refuses them.
+    """
+    accepted = (confidence >= ACCEPTED) & ~answers.refused
+    found = [float((accepted & answers.right & (confidence >= least)).sum() / max(answers.right.sum(), 1))
+             for least in (ACCEPTED, SURE)]  # fmt: skip
+    return {
+        "pairs": len(answers),
+        "right": int(answers.right.sum()),
+        "auroc": _rounded(auroc(confidence, answers.right)),
+        "ece": _rounded(expected_calibration_error(confidence, answers.right)),
+        "wrong": false_accepts(accepted, answers.right, confidence),
+        "wrong_sure": false_accepts(accepted, answers.right, confidence, SURE),
+        "right_accepted": _rounded(found[0]),
+        "right_sure": _rounded(found[1]),
+    }
+
+
+def by_group(answers: Answers, confidence: Array, groups: NDArray[np.str_]) -> dict[str, dict[str, Any]]:
+    """`judged` of all, and of each group."""
+    rows = {"all": judged(answers, confidence)}
+    for group in np.unique(groups):
+        rows[str(group)] = judged(answers.of(groups == group), confidence[groups == group])
+    return rows
+
+
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None

@@ -1,0 +1,264 @@
+"""The pairs that the confidence and the precision learn from: who is drawn, how it is seen, and what is wrong with it.
+
+Each pair is a pure function of the folder, the split, a seed and a number. Its bone is of a subject of the split, a
+parametric one, or drawn from the shape models of the subjects of the split. Shares are stated below and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.calibration.other_side import on_own_side
+from gapr_core.calibration.shapes import SHAPES
+from gapr_core.config import SENSOR_KINDS
+from gapr_core.data import anatomy, protocols, scans
+from gapr_core.data import pool as bone_pool
+from gapr_core.data.specimen import Specimen
+from gapr_core.training.dataset import People
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+Bones = Mapping[str, Sequence[Specimen]]
+_KEPT: dict[tuple[str, str], Bones] = {}
+BONES = ("femur", "tibia", "pelvis", "thoracic")
+SYMMETRIC = ("pelvis",)  # a mirrored one is the other side of the same: judged against that side's pose
+PARAMETRIC_PEOPLE = 9  # for each bone, besides the subjects of the folder
+DRAWN_PEOPLE, DRAWN_SEED = {True: 40, False: 8}, 9  # new ones: of shape models, or parametric where there is none
+TWINS = ({"llp26_2008_0054", "llp26_2008_0032", "llp26_2008_0103"}, {"jhu_25", "jhu_15"})  # alike to 1 or 2 mm, not 7
+
+SEEN_AS = {
+    "clean": {"paper": 3.0, "incomplete": 1.5, "L1": 5.0},
+    "L2": {"L2": 7.0, "L2-region": 1.5, "sweep": 3.0},
+    "L3": {"L3": 7.0, "L3-region": 1.5, "patch": 3.0},
+    "wave": {"L2-wave": 3.0, "L3-wave": 3.0},
+    "waves": {"L2-waves": 2.0, "L3-waves": 2.0},
+    "gp": {"L2-gp": 2.0, "L3-gp": 2.0},
+    "mixed": {"mixed": 3.0, "crop": 2.0},
+    "pointer": {"pointer": 6.0},
+    "ultrasound": {"ultrasound": 6.0},
+    "depth-camera": {"depth-camera": 6.0},
+    "laser": {"laser": 5.0},
+    "scene": {"scene-C1": 2.0, "scene-C2": 2.0, "scene-C3": 2.0},
+}  # family: how a bone is seen, and how often
+HELD_OUT = "laser"  # the family that no model is fitted on, only judged
+WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # whose bone the source is of
+SHAPE_SHARE = 0.02  # of all pairs
+TARGETS = {"own": 70.0, "short": 15.0, "scanned": 15.0}  # what the target is: the whole bone, an end, another scan
+DESCRIBED = 0.5  # share of the sensors' sources of which the user says what measured them
+IN_A_ROW = 4  # pairs that share a target
+OWN_TARGET = ("paper", "incomplete")  # whose source is cut out of its own target
+SHORTEST = (0.15, 0.6)  # share of the bone's length that a short scan holds
+SCALES = (0.04, 0.07)  # by which a bone of a wrong scale is larger or smaller
+
+
+@dataclass(frozen=True)
+class Task:
+    """Which pair: number `number` of the list that folder, split and seed define."""
+
+    folder: str
+    split: str
+    seed: int
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A target that some pairs in a row share, since preparing one costs more than registering to it.
+
+    Attributes:
+        specimen: the bone, or one end of it.
+        whole: the bone.
+        end: (share, upper) of the end that a short scan holds; None for the whole bone.
+        cloud: (8192, 3) mm, centred; of another scan of the bone where that was drawn.
+        origin_mm: (3,) what was subtracted from the cloud.
+    """
+
+    specimen: Specimen
+    whole: Specimen
+    end: tuple[float, bool] | None
+    cloud: Array
+    origin_mm: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A pair and how it came to be.
+
+    Attributes:
+        pair: source and target; the truth is all NaN where no pose is right.
+        family: of the sensor or level, by which coverage is judged.
+        seen_as: protocol or view of the source.
+        what: a key of `WHAT`, or "shape".
+        people: everybody whose bone the points are of, the target's first.
+        sensor: what the user says of the sensor: its kind, or "unknown".
+    """
+
+    pair: protocols.Pair
+    family: str
+    seen_as: str
+    what: str
+    people: tuple[str, ...]
+    sensor: str = "unknown"
+
+
+def draw(task: Task) -> Drawn:
+    """The pair of a task; the same task always gives the same pair."""
+    rng = np.random.default_rng([task.seed, task.number, 62])
+    if rng.random() < SHAPE_SHARE:
+        shape = sorted(SHAPES)[int(rng.integers(len(SHAPES)))]
+        return Drawn(SHAPES[shape](int(rng.integers(2**31))), "shape", shape, "shape", ())
+    setting = setting_of(task.folder, task.split, task.seed, task.number // IN_A_ROW)
+    family, seen_as = _choose_view(rng)
+    what = _choose(WHAT, rng)
+    if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
+        what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
+    stranger = _stranger(setting, what, bones_of(task.folder, task.split), rng)
+    seed = int(rng.integers(2**31))
+    pair = view(seen_as, stranger, seed)
+    if what != "own" or seen_as not in OWN_TARGET:
+        pair = _before(setting, stranger, what, pair)
+    sensor = family.replace("-", "_") if rng.random() < DESCRIBED else "unknown"
+    people = tuple(dict.fromkeys((setting.whole.person, stranger.person)))
+    return Drawn(pair, family, seen_as, what, people, sensor if sensor in SENSOR_KINDS else "unknown")
+
+
+@lru_cache(maxsize=2)
+def setting_of(folder: str, split: str, seed: int, number: int) -> Setting:
+    """Target `number` of the list; bones come in turn, so that each has its share."""
+    rng = np.random.default_rng([seed, number, 61])
+    whole = _one_of(bones_of(folder, split)[BONES[number % len(BONES)]], rng)
+    kind = _choose(TARGETS, rng)
+    end = (rng.uniform(*SHORTEST), bool(rng.random() < 0.5)) if kind == "short" else None
+    specimen = whole.end(*end) if end else whole
+    scan = replace(specimen, surface=scans.drawn(rng)(specimen.surface)) if kind == "scanned" else specimen
+    cloud, _ = scan.sample(protocols.TARGET_POINTS, rng)
+    origin_mm = cloud.mean(axis=0)
+    return Setting(specimen, whole, end, cloud - origin_mm, origin_mm)
+
+
+def _stranger(setting: Setting, what: str, bones: Bones, rng: np.random.Generator) -> Specimen:
+    """Whose bone the source is of; only one end of it where the target is short."""
+    others = without_twins(setting.whole, [each for group in bones.values() for each in group])
+    stranger = STRANGERS[what](setting.specimen, others, rng)
+    return stranger.end(*setting.end) if setting.end and what in ("person", "bone") else stranger
+
+
+def without_twins(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:
+    """The others without those who are so nearly the same subject that their bone is no wrong answer."""
+    alike = {person for group in TWINS if specimen.person in group for person in group} - {specimen.person}
+    return [other for other in others if other.person not in alike]
+
+
+def view(seen_as: str, specimen: Specimen, seed: int) -> protocols.Pair:
+    """A bone against itself, seen by a protocol or one of this file's views."""
+    if seen_as in VIEWS:
+        return replace(VIEWS[seen_as](specimen, np.random.default_rng([seed, 11])), protocol=seen_as)
+    return protocols.make_pair(seen_as, specimen, seed)
+
+
+def _before(setting: Setting, stranger: Specimen, what: str, pair: protocols.Pair) -> protocols.Pair:
+    """A source before the setting's target; of another subject's bone no pose is right."""
+    truth = np.full((4, 4), np.nan)
+    if what == "own" or (what == "mirrored" and setting.whole.bone in SYMMETRIC):
+        truth = pair.T_target_source.copy()
+        truth[:3, 3] += pair.metadata["origin_mm"]
+        truth = truth if what == "own" else on_own_side(stranger, setting.whole) @ truth
+        truth[:3, 3] -= setting.origin_mm
+    metadata = pair.metadata | {"origin_mm": setting.origin_mm}
+    return replace(pair, target=setting.cloud, T_target_source=truth, person=setting.whole.person,
+                   bone=setting.whole.bone, metadata=metadata)  # fmt: skip
+
+
+def patch_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
+    """A one-sided view of 1 to 12 % of the bone, of few points."""
+    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.01, 0.12), (60.0, 1500.0)))
+    noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
+    level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
+    return protocols.one_sided(specimen, rng, level)
+
+
+def mixed_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
+    """Between and beyond the protocols: from many clean points to tiny, noisy, biased, dirty views."""
+    share = rng.uniform(0.1, 0.9)
+    noise_mm, bias_mm, outliers = (rng.uniform(0.0, most) * (rng.random() < 0.7) for most in (2.0, 1.5, 0.25))
+    share_of = str(rng.choice(["seen", "region"]))
+    points = int(np.exp(rng.uniform(np.log(300), np.log(6000))))
+    level = protocols.Level((share, share), share_of, noise_mm, bias_mm, outliers, points)
+    return protocols.one_sided(specimen, rng, level)
+
+
+def crop_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
+    """Clean points of a region of the bone, from all sides, as a piece that was cut out of a model."""
+    cloud, _ = specimen.sample(2 * protocols.TARGET_POINTS, rng)
+    distance = ((cloud - cloud[rng.integers(len(cloud))]) ** 2).sum(axis=1)
+    source = cloud[distance <= np.quantile(distance, rng.uniform(0.1, 0.9))]
+    source = source[rng.permutation(len(source))[: rng.integers(300, 6000)]]
+    metadata = {"origin_mm": np.zeros(3)}
+    return protocols.Pair(source, cloud, np.eye(4), "", specimen.bone, specimen.person, "crop", metadata)
+
+
+def _another_person(specimen: Specimen, others: Sequence[Specimen], rng: np.random.Generator) -> Specimen:
+    return _one_of([o for o in others if o.bone == specimen.bone and o.person != specimen.person], rng)
+
+
+def _another_bone(specimen: Specimen, others: Sequence[Specimen], rng: np.random.Generator) -> Specimen:
+    return _one_of([o for o in others if o.bone != specimen.bone], rng)
+
+
+def _scaled(specimen: Specimen, others: Sequence[Specimen], rng: np.random.Generator) -> Specimen:
+    factor = 1.0 + rng.uniform(*SCALES) * rng.choice([-1.0, 1.0])
+    return replace(specimen, surface=scans.of_size(factor)(specimen.surface))
+
+
+def _one_of(specimens: Sequence[Specimen], rng: np.random.Generator) -> Specimen:
+    return specimens[int(rng.integers(len(specimens)))]
+
+
+def _choose_view(rng: np.random.Generator) -> tuple[str, str]:
+    """(family, how the bone is seen)."""
+    shares = {(family, name): share for family, views in SEEN_AS.items() for name, share in views.items()}
+    return _choose(shares, rng)
+
+
+def _choose(shares: Mapping[T, float], rng: np.random.Generator) -> T:
+    weights = np.array(list(shares.values()))
+    return list(shares)[int(rng.choice(len(weights), p=weights / weights.sum()))]
+
+
+def bones_of(folder: str, split: str) -> Bones:
+    """Every bone that pairs are drawn from: of the subjects of the split, parametric, and new ones of shape models."""
+    if (folder, split) not in _KEPT:
+        _KEPT[folder, split] = {bone: _made(bone, folder, split) for bone in BONES}
+    return _KEPT[folder, split]
+
+
+def keep(folder: str, split: str, bones: Bones) -> None:
+    """Draw from these bones: what worker processes start with, since making the bones takes minutes."""
+    _KEPT[folder, split] = bones
+
+
+def _made(bone: str, folder: str, split: str) -> list[Specimen]:
+    drawn = People(bone, Path(folder), split)
+    new = [drawn.draw(number, 1.0, DRAWN_SEED) for number in range(DRAWN_PEOPLE[bool(drawn.real)])]
+    return anatomy.surfaces(folder, bone, split) + bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE) + new
+
+
+VIEWS: dict[str, Callable[[Specimen, np.random.Generator], protocols.Pair]] = {
+    "patch": patch_view,
+    "mixed": mixed_view,
+    "crop": crop_view,
+}
+STRANGERS: dict[str, Callable[[Specimen, Sequence[Specimen], np.random.Generator], Specimen]] = {
+    "own": lambda specimen, others, rng: specimen,
+    "person": _another_person,
+    "bone": _another_bone,
+    "mirrored": lambda specimen, others, rng: anatomy.mirrored(specimen),
+    "scaled": _scaled,
+}

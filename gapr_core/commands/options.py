@@ -1,0 +1,30 @@
+"""Options that several commands share: the method and its settings."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.runtime import settings
+
+
+def add_method(parser: ArgumentParser) -> None:
+    """`--method`, `--config` and `--set`."""
+    parser.add_argument(
+        "--method", default="gapr", help="gapr, gapr_search (needs no torch), gapr_network, gapr_tracker or a baseline"
+    )
+    parser.add_argument("--config", type=Path, help="YAML file of settings; gapr settings lists them")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
+        help="one setting, such as refinement.iterations=5; over --config; may be repeated",
+    )  # fmt: skip
+
+
+def registrar_config(args: Namespace) -> RegistrarConfig:
+    """The settings that the arguments name, the defaults for all others.
+
+    Raises:
+        ConfigError: an unknown setting, a value out of range, or a file that cannot be read.
+    """
+    return settings.load(RegistrarConfig, args.config, args.assignments)

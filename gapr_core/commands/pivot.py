@@ -1,0 +1,32 @@
+"""`gapr pivot`: find the tip of a pointer from a recording in which it was turned on its tip."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from gapr_core.runtime import files
+from gapr_core.runtime.console import say
+
+OK = 0
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """The options of `gapr pivot`."""
+    parser.add_argument("recording", type=Path, help="NDI Track's CSV, or a PLUS sequence (.igs.mha)")
+    parser.add_argument("--tool", type=int, default=0, help="which of the recorded tools, from 0")
+    parser.add_argument("--json", type=Path, help="write tip, pivot and residual here as well")
+
+
+def run(args: Namespace) -> int:
+    """Print the tip in the marker's frame, as `gapr register --tip` takes it, and how well it fits."""
+    from gapr_core.formats import tracker
+    from gapr_core.formats.poses import poses_in
+
+    tip = tracker.pivot(poses_in(args.recording, args.tool))
+    say(f"--tip {','.join(f'{x:.3f}' for x in tip.tip_mm)}")
+    say(f"residual {tip.residual_mm:.3f} mm over {tip.poses} poses")
+    if args.json:
+        found = {"tip_mm": tip.tip_mm.tolist(), "pivot_mm": tip.pivot_mm.tolist()}
+        files.write_json(args.json, found | {"residual_mm": tip.residual_mm, "poses": tip.poses})
+    return OK

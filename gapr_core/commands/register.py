@@ -1,0 +1,172 @@
+"""`gapr register`: lay one partial cloud on one full bone."""
+
+from __future__ import annotations
+
+import logging
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from dataclasses import asdict
+from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gapr_core.commands import options
+from gapr_core.errors import ConfigError
+from gapr_core.results import RegistrationResult
+from gapr_core.runtime import files
+from gapr_core.runtime.console import say
+
+if TYPE_CHECKING:
+    from gapr_core.formats.planning import TargetError
+    from gapr_core.surface import Surface
+
+log = logging.getLogger(__name__)
+
+OK, REFUSED = 0, 2
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """The options of `gapr register`; docs/formats.md explains formats, axes and units."""
+    parser.add_argument(
+        "--source", required=True, type=Path, help="partial cloud, markups, recording, folder of slices"
+    )
+    parser.add_argument("--target", required=True, type=Path, help="full bone: mesh, cloud or label map")
+    parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of meshes and clouds (mm)")
+    parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
+    parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
+    parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
+    parser.add_argument("--viewpoint", type=_point, help="X,Y,Z of the camera in the source's frame, mm")
+    parser.add_argument("--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups, a start")
+    parser.add_argument("--targets", type=Path, help="markups of a plan, target frame: the error to expect there")
+    parser.add_argument("--out", type=Path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
+    parser.add_argument("--residuals", type=Path, help="of every point, as .json or coloured .ply")
+    parser.add_argument("--slicer", type=Path, metavar="FOLDER", help="a scene for 3D Slicer")
+    parser.add_argument("--json", type=Path, help="write the result here as well")
+    options.add_method(parser)
+
+
+def _point(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise ArgumentTypeError(f"three numbers X,Y,Z, not {text!r}") from error
+    return x, y, z
+
+
+def run(args: Namespace) -> int:
+    """Print the result; exit code 0 with a pose, 2 when the data refuse one."""
+    from gapr_core import clouds
+    from gapr_core.benchmark import methods
+    from gapr_core.formats.options import ReadOptions
+
+    _check_outputs(args)
+    method = methods.make(args.method, options.registrar_config(args))
+    plan = _plan(args)
+    target = clouds.load(args.target, args.units, ReadOptions(axes=args.axes, labels=tuple(args.label)))
+    source = clouds.load(args.source, args.units, ReadOptions(tip_mm=args.tip)).points
+    result = method.register(source, method.prepare(target), **_hints(args, method))  # type: ignore[call-arg]
+    errors = _errors(plan, result)
+    if args.json:
+        files.write_json(args.json, as_json(result) | {"targets": [asdict(error) for error in errors]})
+    return _show(args, result, errors, target)
+
+
+def _check_outputs(args: Namespace) -> None:
+    """Before the work, what it could not be written to."""
+    from gapr_core.formats import transforms
+
+    if args.out:
+        transforms.check(args.out)
+        if args.axes == "lps_to_ras":
+            raise ConfigError("--axes lps or ras with --out, which is LPS", "lps_to_ras", "say what the mesh is in")
+    if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
+        raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
+
+
+def _plan(args: Namespace) -> Any:
+    from gapr_core.formats import markups
+
+    return markups.load(args.targets) if args.targets else None
+
+
+def _hints(args: Namespace, method: Any) -> dict[str, Any]:
+    """Start and viewpoint, if they are given; a method that cannot use one says so."""
+    hints: dict[str, Any] = {}
+    if args.landmarks:
+        from gapr_core.formats import planning
+
+        start = planning.start_of(*args.landmarks)
+        say(f"landmarks lie {start.rms_mm:.2f} mm apart (rms) at the start")
+        hints["initial"] = start.T_target_source
+    if args.viewpoint:
+        hints["viewpoint"] = np.array(args.viewpoint)
+    for name in hints.keys() - signature(method.register).parameters.keys():
+        raise ConfigError(f"a method that takes {name}", args.method, "use --method gapr, or leave the option out")
+    return hints
+
+
+def _errors(plan: Any, result: RegistrationResult) -> list[TargetError]:
+    from gapr_core.formats import planning
+
+    return planning.errors_at(plan, result) if plan is not None and result.ok else []
+
+
+def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError], target: Surface) -> int:
+    """The result in words, and in the files that were asked for."""
+    say(str(result))
+    if result.T_target_source is None:
+        for path in filter(None, (args.out, args.residuals, args.slicer)):
+            say(
+                f"no pose: {path} is not written"
+                + (", and what is there is of an earlier run" if path.exists() else "")
+            )
+        return REFUSED
+    say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
+    for error in errors:
+        say(f"{error.label}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")
+    _write(args, result, errors, target)
+    return OK
+
+
+def _write(args: Namespace, result: RegistrationResult, errors: list[TargetError], target: Surface) -> None:
+    from gapr_core.formats import scene, transforms
+
+    if args.out:
+        transforms.write(args.out, result.T_target_source)  # type: ignore[arg-type]
+        _warn_of_axes(args)
+    if (args.residuals or args.slicer) and result.residuals is None:
+        raise ConfigError("a method that says the residuals", result.method, "use --method gapr")
+    if args.residuals and args.residuals.suffix.lower() == ".json":
+        files.write_json(args.residuals, scene.residuals_json(result.residuals))  # type: ignore[arg-type]
+    elif args.residuals:
+        scene.write_coloured(args.residuals, result.apply(result.residuals.points), result.residuals)  # type: ignore
+    if args.slicer:
+        scene.write_slicer(args.slicer, target, result, errors)
+
+
+def _warn_of_axes(args: Namespace) -> None:
+    """A transform file is LPS by definition; a mesh may be anything."""
+    from gapr_core.formats import axes, reading
+
+    unknown = args.axes == "auto" and axes.stated(args.target) is None and not args.target.is_dir()
+    if args.axes == "as_is" or (unknown and not reading.format_of(args.target).in_patient):
+        log.warning("%s is written as LPS: if %s is RAS, give --axes ras", args.out.name, args.target.name)
+
+
+def as_json(result: RegistrationResult) -> dict[str, Any]:
+    """The contract of the JSON output: transform is 4x4 row-major, source -> target, mm; null on a refusal."""
+    pose, covariance = result.T_target_source, result.covariance
+    return {
+        "transform": None if pose is None else pose.tolist(),
+        "confidence": result.confidence,
+        "status": str(result.status),
+        "covariance": None if covariance is None else covariance.tolist(),
+        "centre_mm": None if result.centre_mm is None else np.asarray(result.centre_mm).tolist(),
+        "seconds": result.seconds,
+        "tre_mm": result.tre_mm,
+        "tre95_mm": result.tre95_mm,
+        "inlier_ratio": result.inlier_ratio,
+        "contributions": {name: round(log_odds, 3) for name, log_odds in result.contributions.items()},
+        "reason": result.reason,
+    }

@@ -1,0 +1,1 @@
+"""A camera looks into a wound: bone at the bottom, soft tissue and instruments around it."""

@@ -1,0 +1,99 @@
+"""Points that were placed by hand in 3D Slicer: .mrk.json, and .fcsv of all its versions."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats import axes
+from gapr_core.formats.options import ReadOptions
+from gapr_core.runtime.files import write_json
+from gapr_core.surface import Surface
+
+Array = NDArray[np.float64]
+
+NUMBERED = {"0": "ras", "1": "lps", "ras": "ras", "lps": "lps"}  # Slicer before 4.11 wrote a number
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001}
+SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
+
+
+@dataclass(frozen=True, eq=False)
+class Markups:
+    """Named points.
+
+    Attributes:
+        points: (N, 3) LPS, mm.
+        labels: their N names.
+    """
+
+    points: Array
+    labels: tuple[str, ...]
+
+
+def read(path: Path, options: ReadOptions) -> Surface:
+    """The points alone, LPS mm."""
+    return Surface(load(path, options).points)
+
+
+def load(path: Path, options: ReadOptions | None = None) -> Markups:
+    """Points and names of a .mrk.json or .fcsv file.
+
+    Raises:
+        InvalidPointCloudError: damaged, empty, or without its coordinate system.
+    """
+    text = (options or ReadOptions()).limits.read(path).decode("utf-8-sig")
+    markups = _of_fcsv(text) if path.suffix.lower() == ".fcsv" else _of_json(json.loads(text))
+    if not np.isfinite(markups.points).all():
+        raise InvalidPointCloudError("finite coordinates", f"{path.name} with others", "place the points again")
+    return markups
+
+
+def save(path: Path, markups: Markups, descriptions: list[str] | None = None) -> None:
+    """Write a point list that 3D Slicer loads."""
+    words = descriptions or [""] * len(markups.labels)
+    points = [
+        {"id": str(i), "label": label, "description": said, "position": point.tolist(), "positionStatus": "defined"}
+        for i, (point, label, said) in enumerate(zip(markups.points, markups.labels, words, strict=True), start=1)
+    ]
+    node = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    write_json(path, {"@schema": SCHEMA, "markups": [node]})
+
+
+def _of_json(content: Any) -> Markups:
+    points, labels = [], []
+    for node in content["markups"]:
+        space = _space(node.get("coordinateSystem"))
+        mm = MM_PER_UNIT[node.get("coordinateUnits", "mm")]
+        placed = [p for p in node["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
+        positions = np.array([p["position"] for p in placed], dtype=np.float64).reshape(-1, 3)
+        points.append(axes.to_lps(positions * mm, space))
+        labels += [str(p.get("label", "")) for p in placed]
+    return Markups(np.vstack(points), tuple(labels))
+
+
+def _of_fcsv(text: str) -> Markups:
+    found = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
+    space = _space(found[1] if found else None)
+    columns = re.search(r"^#\s*columns\s*=\s*(.+)$", text, re.MULTILINE)
+    names = [name.strip() for name in (columns[1] if columns else "id,x,y,z").split(",")]
+    rows = [row for row in csv.reader(text.splitlines()) if row and not row[0].startswith("#")]
+    at = [names.index(axis) for axis in "xyz"]
+    points = np.array([[float(row[i]) for i in at] for row in rows]).reshape(-1, 3)
+    label = names.index("label") if "label" in names else 0
+    return Markups(axes.to_lps(points, space), tuple(row[label] if label < len(row) else "" for row in rows))
+
+
+def _space(said: object) -> str:
+    """The axes by their name; never a guess: the wrong one turns every point by 180 deg."""
+    known = NUMBERED.get(str(said).strip().lower())
+    if known is None:
+        raise ValueError(f"coordinateSystem {said!r}, neither LPS nor RAS")
+    return known

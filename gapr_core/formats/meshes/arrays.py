@@ -1,0 +1,54 @@
+"""NPY and NPZ: the size of an array is known before it is unpacked."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy
+
+from gapr_core.formats.limits import FileLimits
+from gapr_core.surface import Surface, as_points
+
+
+def read_npy(path: Path, limits: FileLimits) -> Surface:
+    """An (N, 3) array."""
+    return Surface(as_points(array_of(limits.read(path), limits)))
+
+
+def read_npz(path: Path, limits: FileLimits) -> Surface:
+    """The arrays `points` (N, 3) and, where there is one, `faces` (F, 3) integers."""
+    with zipfile.ZipFile(io.BytesIO(limits.read(path))) as archive:
+        names = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        if "points" not in names:
+            raise ValueError(f"no array named points, only {', '.join(names) or 'nothing'}")
+        wanted = [names[name] for name in ("points", "faces") if name in names]
+        limits.check_unpacked(sum(archive.getinfo(name).file_size for name in wanted))
+        arrays = [array_of(archive.read(name), limits) for name in wanted]
+    if len(arrays) == 1:
+        return Surface(as_points(arrays[0]))
+    if arrays[1].dtype.kind not in "iu":
+        raise ValueError(f"faces of type {arrays[1].dtype}, not integers")
+    return Surface(as_points(arrays[0]), arrays[1].astype(np.int64))
+
+
+def array_of(data: bytes, limits: FileLimits) -> np.ndarray:
+    """The array of an .npy file, whose header says exactly as many bytes as there are.
+
+    Raises:
+        ValueError: a damaged header, Python objects, or another length.
+    """
+    file = io.BytesIO(data)
+    version = npy.read_magic(file)
+    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, fortran_order, dtype = read_header(file)
+    if dtype.hasobject:
+        raise ValueError("Python objects in it")
+    size = math.prod(shape) * dtype.itemsize
+    limits.check_unpacked(size)
+    if size != len(data) - file.tell() or min(shape, default=0) < 0:
+        raise ValueError(f"{len(data) - file.tell()} bytes of data where the header announces {size}")
+    return np.frombuffer(data, dtype, offset=file.tell()).reshape(shape, order="F" if fortran_order else "C")

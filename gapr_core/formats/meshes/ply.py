@@ -1,0 +1,102 @@
+"""PLY, by plyfile, once its header fits the file's length."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.formats import text
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.meshes.polygons import fans
+from gapr_core.surface import Array, Surface
+
+BYTES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+SHORTEST_TEXT = 2  # bytes of a number and what follows it
+FEWEST_CORNERS = 3
+MOST_LISTS = 3  # of one element: vertices, texture coordinates, and one more
+
+
+def read(path: Path, limits: FileLimits) -> Surface:
+    """A mesh, or a cloud with its normals."""
+    data = limits.read(path)
+    _check_header(data, limits)
+    ply = _parse(data)
+    columns = ply["vertex"].data
+    points = _columns(columns, "xyz")
+    if "face" in ply and ply["face"].count:
+        name = next(n for n in ply["face"].data.dtype.names if n in ("vertex_indices", "vertex_index"))
+        return Surface(points, _triangles(ply["face"].data[name]))
+    normals = ("nx", "ny", "nz")
+    return Surface(points, None, _columns(columns, normals) if set(normals) <= set(columns.dtype.names) else None)
+
+
+def _parse(data: bytes) -> Any:
+    from plyfile import PlyData, PlyParseError
+
+    try:  # triangles are read at once, other polygons one by one
+        return PlyData.read(io.BytesIO(data), known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
+    except PlyParseError:
+        return PlyData.read(io.BytesIO(data))
+
+
+def _columns(table: Any, names: Any) -> Array:
+    return np.stack([table[name] for name in names], axis=1).astype(np.float64)
+
+
+def _check_header(data: bytes, limits: FileLimits) -> None:
+    """Every row that the header announces has room in the file.
+
+    Raises:
+        ValueError: no header, or a file that is shorter.
+    """
+    header, found, body = data.partition(b"end_header")
+    if not data.startswith(b"ply") or not found:
+        raise ValueError("no PLY header")
+    is_text = b"format ascii" in header
+    if is_text:
+        text.lines(data)
+    shortest = 0
+    for name, count, properties in _elements(header.decode("ascii", "replace")):
+        limits.check_counts(*((0, count) if name == "face" else (count, 0)))
+        shortest += count * _shortest_row(name, properties, is_text)
+    if shortest > len(body):
+        raise ValueError(f"{len(body)} bytes where the header announces at least {shortest}")
+
+
+def _elements(header: str) -> list[tuple[str, int, list[list[str]]]]:
+    """Name, count and properties (their words) of each element."""
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for words in map(str.split, header.splitlines()):
+        if words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            elements[-1][2].append(words[1:])
+    return elements
+
+
+def _shortest_row(name: str, properties: list[list[str]], is_text: bool) -> int:
+    """Bytes that a row takes at least; a list of corners has three."""
+    lists = [words for words in properties if words[0] == "list"]
+    if (lists and name != "face") or len(lists) > MOST_LISTS:
+        raise ValueError(f"lists in the element {name}, which are not read")
+    size = sum(SHORTEST_TEXT if is_text else BYTES[words[1 if words[0] == "list" else 0]] for words in properties)
+    corners = [words for words in lists if words[-1] in ("vertex_indices", "vertex_index")]
+    size += sum(FEWEST_CORNERS * (SHORTEST_TEXT if is_text else BYTES[words[2]]) for words in corners)
+    return max(size, 1)
+
+
+def _triangles(polygons: Any) -> NDArray[np.int64]:
+    """(F, 3) triangles of an (F, 3) array, or of one array of corners for each polygon."""
+    if polygons.dtype != object:
+        return np.asarray(polygons, dtype=np.int64)
+    ends = np.cumsum([0, *map(len, polygons)])
+    return fans(ends, np.concatenate(polygons).astype(np.int64))

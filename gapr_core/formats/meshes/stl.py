@@ -1,0 +1,55 @@
+"""STL, binary and text: triangles that each repeat their corners."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gapr_core.formats import text
+from gapr_core.formats.limits import FileLimits
+from gapr_core.surface import Array, Surface
+
+HEADER_BYTES, FACET_BYTES = 84, 50
+FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
+
+
+def read(path: Path, limits: FileLimits) -> Surface:
+    """Vertices that facets share become one."""
+    data = limits.read(path)
+    if len(data) < HEADER_BYTES and not data.lstrip().startswith(b"solid"):
+        raise ValueError(f"{len(data)} bytes, less than a header")
+    facets = int.from_bytes(data[80:84], "little")
+    if len(data) == HEADER_BYTES + FACET_BYTES * facets:
+        limits.check_counts(0, facets)
+        corners = np.frombuffer(data, FACET, offset=HEADER_BYTES)["corners"].reshape(-1, 3).astype(np.float64)
+    elif data.lstrip()[:5].lower() == b"solid":
+        corners = _corners_of_text(data)
+    else:
+        expected = HEADER_BYTES + FACET_BYTES * facets
+        raise ValueError(f"{len(data)} bytes where its {facets} facets take {expected}")
+    return share_vertices(corners)
+
+
+def _corners_of_text(data: bytes) -> Array:
+    """(3 F, 3) corners of the facets of a text file that ends as it should."""
+    lower = data.lower()
+    if not lower.rstrip().split(b"\n")[-1].lstrip().startswith(b"endsolid"):
+        raise ValueError("no endsolid at the end: the file is cut")
+    vertices = (line.split("vertex", 1)[1] for line in text.lines(lower + b"\n") if line.lstrip().startswith("vertex"))
+    corners = text.table(vertices, 3)
+    if len(corners) != 3 * lower.count(b"endfacet") or lower.count(b"endfacet") != lower.count(b"facet normal"):
+        raise ValueError("facets that do not have three vertices each")
+    return corners
+
+
+def share_vertices(corners: Array) -> Surface:
+    """The mesh of (3 F, 3) corners, in which equal ones are one vertex."""
+    if len(corners) == 0:
+        raise ValueError("no facets in it")
+    order = np.lexsort(corners.T)
+    new = np.ones(len(corners), dtype=bool)
+    new[1:] = (np.diff(corners[order], axis=0) != 0.0).any(axis=1)
+    vertex = np.empty(len(corners), dtype=np.int64)
+    vertex[order] = np.cumsum(new) - 1
+    return Surface(corners[order[new]], vertex.reshape(-1, 3))

@@ -1,0 +1,129 @@
+"""Legacy VTK files with polygonal data, text and binary, versions 1 to 5.1 (VTK file formats, Kitware)."""
+
+from __future__ import annotations
+
+from array import array
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.meshes.polygons import fans, offsets_of_counted, strips
+from gapr_core.surface import Array, Surface
+
+TYPES = {
+    "char": "i1", "signed_char": "i1", "unsigned_char": "u1", "short": ">i2", "unsigned_short": ">u2", "int": ">i4",
+    "unsigned_int": ">u4", "long": ">i8", "unsigned_long": ">u8", "float": ">f4", "double": ">f8", "vtkidtype": ">i4",
+    "vtktypeint64": ">i8", "vtktypeint32": ">i4",
+}  # fmt: skip
+CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
+DONE = ("POINT_DATA", "CELL_DATA")
+
+
+def read(path: Path, limits: FileLimits) -> Surface:
+    """A mesh; a cloud has its points as VERTICES."""
+    file = _File(limits.read(path), limits)
+    points, cells = np.empty((0, 3)), {}
+    while (words := file.words()) and words[0] not in DONE:
+        if words[0] == "POINTS":
+            limits.check_counts(int(words[1]))
+            points = file.numbers(3 * int(words[1]), words[2]).reshape(-1, 3)
+        elif words[0] in CELLS:
+            cells[words[0]] = file.cells(int(words[1]), int(words[2]))
+        else:
+            file.skip(words)
+    if not cells:
+        raise ValueError("no cells in it: the file is cut; clouds go into PLY or NPY files")
+    faces = [fans(*cells["POLYGONS"])] if "POLYGONS" in cells else []
+    faces += [strips(*cells["TRIANGLE_STRIPS"])] if "TRIANGLE_STRIPS" in cells else []
+    triangles = np.concatenate(faces) if faces else np.empty((0, 3), dtype=np.int64)
+    return Surface(points, triangles if len(triangles) else None)
+
+
+class _File:
+    """Reads on from one place; every number is checked to be there before it is taken."""
+
+    def __init__(self, data: bytes, limits: FileLimits) -> None:
+        self._data, self._limits, self._at = data, limits, 0
+        if not self.line().startswith("# vtk DataFile"):
+            raise ValueError("no VTK header")
+        self.line()  # the title
+        self._is_text = self.line().strip().upper() == "ASCII"
+        if self.words() != ["DATASET", "POLYDATA"]:
+            raise ValueError("no polygonal data in it")
+
+    def line(self) -> str:
+        """The next line; empty at the end of the file."""
+        end = self._data.find(b"\n", self._at)
+        end = len(self._data) if end < 0 else end
+        line, self._at = self._data[self._at : end], end + 1
+        return line.decode("ascii", "replace")
+
+    def words(self) -> list[str]:
+        """Words of the next line that has any; none at the end of the file."""
+        while self._at < len(self._data):
+            if words := self.line().split():
+                return [words[0].upper(), *words[1:]]
+        return []
+
+    def numbers(self, count: int, kind: str) -> Array:
+        """So many numbers of the type named."""
+        dtype = np.dtype(TYPES[kind.lower()])
+        self._limits.check_unpacked(8 * max(count, 0))
+        if self._is_text:
+            return self._numbers_of_text(count)
+        if count < 0 or self._at + count * dtype.itemsize > len(self._data):
+            raise ValueError(f"less data than the {count} numbers announced")
+        values = np.frombuffer(self._data, dtype, count, self._at)
+        self._at += count * dtype.itemsize
+        return values.astype(np.float64)
+
+    def _numbers_of_text(self, count: int) -> Array:
+        values = array("d")
+        while len(values) < count and self._at < len(self._data):
+            values.extend(map(float, self.line().split()))
+        if len(values) != count or self._at > len(self._data):
+            raise ValueError(f"{len(values)} whole numbers where {count} are announced")
+        return np.array(values)
+
+    def cells(self, first: int, second: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Offsets and corners, written with their sizes between them (versions to 4.2) or as two arrays (5.1)."""
+        before = self._at
+        words = self.words()
+        if words[:1] != ["OFFSETS"]:
+            self._at = before
+            return offsets_of_counted(_indices(self.numbers(second, "int")), first)
+        offsets = _indices(self.numbers(first, words[1]))
+        words = self.words()
+        if words[:1] != ["CONNECTIVITY"]:
+            raise ValueError("offsets without corners")
+        return offsets, _indices(self.numbers(second, words[1]))
+
+    def skip(self, words: list[str]) -> None:
+        """Pass over METADATA (to the next empty line) or FIELD arrays."""
+        if words[0] == "METADATA":
+            while self._at < len(self._data) and self.line().strip():
+                pass
+        elif words[0] == "FIELD":
+            for _ in range(int(words[2])):
+                self._skip_array(self.words())
+        else:
+            raise ValueError(f"a section {words[0][:30]!r}")
+
+    def _skip_array(self, words: list[str]) -> None:
+        count = int(words[1]) * int(words[2])
+        if words[3] != "string":
+            self.numbers(count, words[3])
+        elif self._is_text:
+            for _ in range(min(count, len(self._data))):
+                self.line()
+        else:
+            raise ValueError("binary text fields, which are not read")
+
+
+def _indices(values: Array) -> NDArray[np.int64]:
+    indices = values.astype(np.int64)
+    if (indices != values).any():
+        raise ValueError("indices that are no integers")
+    return indices

@@ -1,0 +1,184 @@
+"""VTP, the XML form of polygonal data: inline and appended, text, base64 and raw, zlib and LZMA (VTK file formats)."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import lzma
+import re
+import zlib
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.meshes.polygons import fans, strips
+from gapr_core.surface import Array, Surface
+
+TYPES = {f"{name}{8 * n}": f"{letter}{n}" for name, letter in (("Int", "i"), ("UInt", "u")) for n in (1, 2, 4, 8)}
+TYPES |= {"Float32": "f4", "Float64": "f8"}
+DECOMPRESSORS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor": lzma.LZMADecompressor}
+RAW = re.compile(rb'<AppendedData\s+encoding="raw"\s*>\s*_')
+
+
+def read(path: Path, limits: FileLimits) -> Surface:
+    """A mesh; a cloud has its points as Verts."""
+    file = _File(limits.read(path), limits)
+    points, faces, cells, start = [], [], 0, 0
+    for piece in file.pieces():
+        count = int(piece.get("NumberOfPoints", "0"))
+        points.append(file.numbers(piece.find("Points/DataArray"), 3 * count).reshape(-1, 3))
+        for name, triangles in (("Polys", fans), ("Strips", strips)):
+            faces.append(triangles(*file.cells(piece, name)) + start)
+        cells += sum(int(piece.get(f"NumberOf{name}", "0")) for name in ("Verts", "Lines", "Strips", "Polys"))
+        start += count
+    if not cells:
+        raise ValueError("no cells in it; clouds go into PLY or NPY files")
+    joined = np.concatenate(faces)
+    limits.check_counts(start, len(joined))
+    return Surface(np.concatenate(points), joined if len(joined) else None)
+
+
+class _File:
+    def __init__(self, data: bytes, limits: FileLimits) -> None:
+        if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+            raise ValueError("document types, which are not read")
+        self._limits, self._raw = limits, b""
+        if raw := RAW.search(data):
+            end = data.rfind(b"</AppendedData>")
+            data, self._raw = data[: raw.end()] + data[end:], data[raw.end() : end]
+        self._root = ElementTree.fromstring(data)
+        if self._root.tag != "VTKFile" or self._root.get("type") != "PolyData":
+            raise ValueError("no polygonal data in it")
+        order = "<" if self._root.get("byte_order") == "LittleEndian" else ">"
+        self._order, self._size = order, np.dtype(order + TYPES[self._root.get("header_type", "UInt32")])
+        appended = self._root.find("AppendedData")
+        self._appended = "" if appended is None else (appended.text or "").strip().removeprefix("_")
+
+    def pieces(self) -> list[ElementTree.Element]:
+        return self._root.findall("PolyData/Piece")
+
+    def cells(self, piece: ElementTree.Element, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Offsets, from 0, and corners."""
+        count = int(piece.get(f"NumberOf{name}", "0"))
+        if count == 0:
+            return np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64)
+        arrays = {array.get("Name"): array for array in piece.findall(f"{name}/DataArray")}
+        ends = self.numbers(arrays.get("offsets"), count).astype(np.int64)
+        corners = self.numbers(arrays.get("connectivity"), int(ends[-1])).astype(np.int64)
+        return np.concatenate([[0], ends]), corners
+
+    def numbers(self, element: ElementTree.Element | None, count: int) -> Array:
+        """The so many numbers of a DataArray."""
+        if element is None:
+            raise ValueError("an array that is missing")
+        if count < 0:
+            raise ValueError(f"{count} numbers announced")
+        self._limits.check_unpacked(8 * count)
+        values = self._values(element, count)
+        if len(values) != count:
+            raise ValueError(f"{len(values)} numbers where {count} are announced")
+        return values
+
+    def _values(self, element: ElementTree.Element, count: int) -> Array:
+        if element.get("format") == "ascii":
+            return np.array((element.text or "").split(), dtype=np.float64)
+        dtype = np.dtype(self._order + TYPES[element.get("type", "")])
+        stream = self._stream(element)
+        compressor = self._root.get("compressor")
+        data = stream.block() if compressor is None else self._blocks(stream, compressor, count * dtype.itemsize)
+        return np.frombuffer(data, dtype).astype(np.float64)
+
+    def _stream(self, element: ElementTree.Element) -> Any:
+        if element.get("format") == "binary":
+            return _Base64((element.text or "").strip(), self._size)
+        offset = int(element.get("offset", "0"))
+        if element.get("format") != "appended" or offset < 0:
+            raise ValueError(f"an array of format {str(element.get('format'))[:20]}")
+        return _Raw(self._raw[offset:], self._size) if self._raw else _Base64(self._appended[offset:], self._size)
+
+    def _blocks(self, stream: Any, compressor: str, size: int) -> bytes:
+        """Blocks of known sizes, none of which may unpack to more."""
+        if compressor not in DECOMPRESSORS:
+            raise ValueError(f"compression by {compressor[:40]}, which is not read: save it with zlib")
+        blocks, block_size, last, *packed = stream.block_sizes(size)
+        sizes = [block_size] * (blocks - bool(last)) + [last] * bool(last)
+        if sum(sizes) != size or len(sizes) != blocks:
+            raise ValueError(f"{sum(sizes)} packed bytes where {size} are announced")
+        return b"".join(_unpacked(part, n, compressor) for part, n in zip(stream.parts(packed), sizes, strict=True))
+
+
+def _unpacked(part: bytes, size: int, compressor: str) -> bytes:
+    data = DECOMPRESSORS[compressor]().decompress(part, size)  # type: ignore[operator]
+    if len(data) != size:
+        raise ValueError("packed data that are cut")
+    return data
+
+
+class _Raw:
+    """Sizes, then data."""
+
+    def __init__(self, data: bytes, size: np.dtype) -> None:
+        self._data, self._size = data, size
+
+    def _sizes(self, count: int) -> list[int]:
+        if count * self._size.itemsize > len(self._data):
+            raise ValueError("sizes beyond the end of the file")
+        return [int(n) for n in np.frombuffer(self._data, self._size, count)]
+
+    def _after(self, count: int, length: int) -> bytes:
+        start = count * self._size.itemsize
+        if start + length > len(self._data):
+            raise ValueError("data beyond the end of the file")
+        return self._data[start : start + length]
+
+    def block(self) -> bytes:
+        return self._after(1, self._sizes(1)[0])
+
+    def block_sizes(self, most: int) -> list[int]:
+        blocks = self._sizes(1)[0]
+        if blocks > most:
+            raise ValueError(f"{blocks} blocks of {most} bytes")
+        self._head = 3 + blocks
+        return self._sizes(self._head)
+
+    def parts(self, packed: list[int]) -> list[bytes]:
+        ends = np.cumsum([0, *packed])
+        data = self._after(self._head, int(ends[-1]))
+        return [data[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+
+
+class _Base64(_Raw):
+    """The same in base64; VTK encodes the sizes by themselves, others together with the data."""
+
+    def __init__(self, data: str, size: np.dtype) -> None:
+        super().__init__(b"", size)
+        self._text = data
+
+    def _sizes(self, count: int) -> list[int]:
+        self._data = self._decoded(0, count * self._size.itemsize)
+        return super()._sizes(count)
+
+    def _after(self, count: int, length: int) -> bytes:
+        head = count * self._size.itemsize
+        letters = _letters(head)
+        if head % 3 == 0 or self._text[letters - 1 : letters] == "=":
+            data = self._decoded(letters, length)
+        else:
+            data = self._decoded(0, head + length)[head:]
+        if len(data) != length:
+            raise ValueError("data beyond the end of the file")
+        return data
+
+    def _decoded(self, start: int, length: int) -> bytes:
+        try:
+            return base64.b64decode(self._text[start : start + _letters(length)], validate=True)[:length]
+        except binascii.Error as error:
+            raise ValueError(f"damaged base64 ({error})") from error
+
+
+def _letters(length: int) -> int:
+    return 4 * -(-length // 3)

@@ -1,0 +1,25 @@
+"""What a reader may be given in addition to the path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gapr_core.formats.limits import FileLimits
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How to read a file; each format takes what concerns it.
+
+    Attributes:
+        axes: axes of a mesh or cloud file: "lps", "ras" (turned to LPS), "as_is", "lps_to_ras" (x and y negated, what
+            it did in earlier versions), or "auto": what a `SPACE=` comment in the file says, as_is without one.
+        labels: names or numbers of the segments of a label map that make up one rigid target; none where it has one.
+        tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.
+        limits: how large the file may be.
+    """
+
+    axes: str = "auto"
+    labels: tuple[str, ...] = ()
+    tip_mm: tuple[float, float, float] | None = None
+    limits: FileLimits = field(default_factory=FileLimits.from_environment)

@@ -1,0 +1,62 @@
+"""XYZ, TXT and CSV: a point a line, and NDI Track's recordings of a tool."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from gapr_core.formats import text, tracker
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.options import ReadOptions
+from gapr_core.surface import Surface
+
+DELIMITERS = ",;\t"
+
+
+def read(path: Path, limits: FileLimits) -> Surface:
+    """X y z, or x y z nx ny nz, in the first columns; one line of names and lines that start with # are left out."""
+    return _surface(limits.read(path))
+
+
+def read_csv(path: Path, options: ReadOptions) -> Surface:
+    """Columns named x y z (any case), or the first three; of a recording of a tracked tool, where its tip was.
+
+    Raises:
+        ValueError: a recording of a tracked tool without the tip of the tool.
+    """
+    data = options.limits.read(path)
+    header = next(text.lines(data), "")
+    names = [name.strip().lower() for name in next(csv.reader(io.StringIO(header)), [])]
+    if "q0" in names and "tx" in names and options.tip_mm is not None:
+        return Surface(tracker.tips(tracker.read_poses(path, options.limits), options.tip_mm))
+    if "q0" in names and "tx" in names:
+        raise ValueError("a recording of a tracked tool: give its tip with --tip X,Y,Z (gapr pivot finds it)")
+    return _surface(data, [names.index(axis) for axis in "xyz"] if set("xyz") <= set(names) else None)
+
+
+def _surface(data: bytes, columns: list[int] | None = None) -> Surface:
+    rows = [line for line in text.lines(data) if line.strip() and not line.lstrip().startswith(("#", "//"))]
+    delimiter = next((d for d in DELIMITERS if rows and d in rows[0]), None)
+    if rows and not _is_numbers(rows[0], delimiter):
+        rows = rows[1:]
+    values = text.table(rows, delimiter=delimiter)
+    if values.shape[1] < 3:
+        raise ValueError(f"{values.shape[1]} columns, not x y z")
+    points = values[:, columns or [0, 1, 2]]
+    has_normals = columns is None and values.shape[1] == 6 and _are_units(values[:, 3:])
+    return Surface(points, None, values[:, 3:] if has_normals else None)
+
+
+def _is_numbers(line: str, delimiter: str | None) -> bool:
+    try:
+        [float(word) for word in line.split(delimiter)]
+    except ValueError:
+        return False
+    return True
+
+
+def _are_units(vectors: np.ndarray) -> bool:
+    return bool(np.allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=0.01))

@@ -1,0 +1,115 @@
+"""A surface from a file: one reader for each format, and one sentence for what cannot be read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.formats import axes
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.options import ReadOptions
+from gapr_core.surface import Surface
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file.
+
+    Attributes:
+        reader: `module:function` under `gapr_core.formats`; takes (path, limits) or, of patient data, (path, options).
+        in_patient: whether the file says its own axes and is in mm: it comes out in LPS mm, and units do not apply.
+        with_options: whether the reader of another file takes all options.
+    """
+
+    reader: str
+    in_patient: bool = False
+    with_options: bool = False
+
+    def read(self, path: Path, options: ReadOptions) -> Surface:
+        """The surface, in LPS mm for patient data, otherwise in the file's unit with its axes turned as asked."""
+        module, function = self.reader.split(":")
+        reader: Callable[[Path, FileLimits | ReadOptions], Surface]
+        reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
+        if self.in_patient:
+            return reader(path, options)
+        return axes.turned(reader(path, options if self.with_options else options.limits), path, options.axes)
+
+
+LABEL_MAP = Format("volumes.label_map:read", in_patient=True)
+FORMATS = {
+    ".ply": Format("meshes.ply:read"),
+    ".pcd": Format("meshes.pcd:read"),
+    ".stl": Format("meshes.stl:read"),
+    ".obj": Format("meshes.obj:read"),
+    ".vtk": Format("meshes.vtk:read"),
+    ".vtp": Format("meshes.vtp:read"),
+    ".npy": Format("meshes.arrays:read_npy"),
+    ".npz": Format("meshes.arrays:read_npz"),
+    ".nii": LABEL_MAP,
+    ".nii.gz": LABEL_MAP,
+    ".nrrd": LABEL_MAP,
+    ".mha": LABEL_MAP,
+    ".dcm": LABEL_MAP,
+    ".mrk.json": Format("markups:read", in_patient=True),
+    ".fcsv": Format("markups:read", in_patient=True),
+    ".csv": Format("points_text:read_csv", with_options=True),
+    ".txt": Format("points_text:read"),
+    ".xyz": Format("points_text:read"),
+    ".igs.mha": Format("sweeps:read_igs", in_patient=True),
+}
+FOLDER = Format("sweeps:read_folder", in_patient=True)
+LONGEST_REASON = 160
+
+
+def read(path: Path, options: ReadOptions | None = None) -> Surface:
+    """The points and faces of a file or a folder of tracked slices.
+
+    Raises:
+        InvalidPointCloudError: an unknown format, a missing, damaged, cut or empty file, or one beyond the limits.
+    """
+    options = options or ReadOptions()
+    kind = format_of(path)
+    try:
+        surface = kind.read(path, options)
+    except InvalidPointCloudError as error:
+        raise InvalidPointCloudError(error.expected, f"{path.name}: {error.given}", error.how_to_fix) from error
+    except GaprError:
+        raise
+    except Exception as error:  # whatever a damaged file leads to: the sentence is the same
+        raise unreadable(path, str(error) or type(error).__name__) from error
+    if len(surface.points) == 0:
+        raise unreadable(path, "no points in it")
+    options.limits.check_counts(len(surface.points), 0 if surface.faces is None else len(surface.faces))
+    return surface
+
+
+def format_of(path: Path) -> Format:
+    """The kind of a file, by its name.
+
+    Raises:
+        InvalidPointCloudError: an unknown ending, or nothing there.
+    """
+    if path.is_dir():
+        return FOLDER
+    ending = _ending(path)
+    if ending not in FORMATS:
+        raise InvalidPointCloudError(f"one of {' '.join(FORMATS)}", path.name, "convert the file to one of these")
+    if not path.is_file():
+        raise InvalidPointCloudError("a file that exists", str(path), "check the path")
+    return FORMATS[ending]
+
+
+def unreadable(path: Path, why: str) -> InvalidPointCloudError:
+    """The error for a file that cannot be read, in one line."""
+    kind, reason = _ending(path).lstrip(".").upper(), " ".join(why.split())
+    short = reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
+    return InvalidPointCloudError(f"a readable {kind} file", f"{path.name} ({short})", "export it again")
+
+
+def _ending(path: Path) -> str:
+    """The longest known ending of a name, so that `.igs.mha` is no `.mha`."""
+    name = path.name.lower()
+    return max((end for end in FORMATS if name.endswith(end)), key=len, default=path.suffix.lower())

@@ -1,0 +1,114 @@
+"""What a registration leaves behind for the eye: residuals of every point, and a folder that 3D Slicer opens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.formats import planning, transforms
+from gapr_core.formats.planning import TargetError
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, Residuals
+from gapr_core.runtime import files
+from gapr_core.surface import Surface
+
+Array = NDArray[np.float64]
+
+FULL_COLOUR_MM = 3.0
+GREY = np.array([150, 150, 150])
+
+
+def residuals_json(residuals: Residuals) -> dict[str, object]:
+    """Points (source frame, mm), signed distances (mm; null where no surface is near) and who counts for the pose."""
+    near = np.isfinite(residuals.distance_mm)
+    distances = [float(d) if ok else None for d, ok in zip(residuals.distance_mm, near, strict=True)]
+    return {"points": residuals.points.tolist(), "distance_mm": distances, "inlier": residuals.inlier.tolist()}
+
+
+def write_coloured(path: Path, points: Array, residuals: Residuals) -> None:
+    """A PLY of points (N, 3): blue inside the bone, white on it, red outside, grey where no surface is near."""
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(axis, "f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
+    rows = np.empty(len(points), dtype=[*kinds, ("distance_mm", "f4")])
+    colours = _colours(residuals.distance_mm)
+    for i, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        rows[axis], rows[colour] = points[:, i], colours[:, i]
+    rows["distance_mm"] = residuals.distance_mm
+    with files.replacing(path) as scratch:
+        PlyData([PlyElement.describe(rows, "vertex")], comments=["SPACE=LPS"]).write(str(scratch))
+
+
+def _colours(distance_mm: Array) -> NDArray[np.int64]:
+    share = np.clip(np.nan_to_num(distance_mm) / FULL_COLOUR_MM, -1.0, 1.0)
+    red, blue = 1.0 - np.maximum(-share, 0.0), 1.0 - np.maximum(share, 0.0)
+    colours = (255 * np.stack([red, np.minimum(red, blue), blue], axis=1)).round().astype(np.int64)
+    colours[~np.isfinite(distance_mm)] = GREY
+    return colours
+
+
+def write_slicer(folder: Path, target: Surface, result: RegistrationResult, errors: list[TargetError]) -> None:
+    """A folder with target, source, transform and planned targets, and the scene.mrml that loads them together.
+
+    Args:
+        folder: made if it is not there; files of other names in it stay.
+        target: the bone, LPS mm.
+        result: an accepted pose with residuals.
+        errors: of the planned targets; none without a plan.
+    """
+    if result.T_target_source is None or result.residuals is None:
+        raise ValueError("a scene needs a pose and its residuals")
+    files.write_text(folder / "target.vtk", _vtk(target.points, target.faces))
+    residuals = result.residuals
+    files.write_text(folder / "source.vtk", _vtk(residuals.points, None, np.nan_to_num(residuals.distance_mm)))
+    write_coloured(folder / "registered.ply", se3.apply(result.T_target_source, residuals.points), residuals)
+    transforms.write(folder / "pose.tfm", result.T_target_source)
+    if errors:
+        planning.save_targets(folder / "targets.mrk.json", errors)
+    files.write_text(folder / "scene.mrml", _mrml(bool(errors)))
+
+
+def _vtk(points: Array, faces: NDArray[np.int64] | None, distances: Array | None = None) -> str:
+    """Legacy VTK text, which 3D Slicer colours by its scalars; a cloud has its points as cells."""
+    cells = np.arange(len(points))[:, None] if faces is None or len(faces) == 0 else faces
+    name, size = ("VERTICES", 1) if cells.shape[1] == 1 else ("POLYGONS", 3)
+    lines = ["# vtk DataFile Version 3.0", "SPACE=LPS", "ASCII", "DATASET POLYDATA", f"POINTS {len(points)} float"]
+    lines += ["{:.4f} {:.4f} {:.4f}".format(*point) for point in points]
+    lines += [f"{name} {len(cells)} {len(cells) * (size + 1)}"]
+    lines += [" ".join(map(str, (size, *cell))) for cell in cells.tolist()]
+    if distances is not None:
+        lines += [f"POINT_DATA {len(points)}", "SCALARS distance_mm float 1", "LOOKUP_TABLE default"]
+        lines += [f"{distance:.4f}" for distance in distances]
+    return "\n".join(lines) + "\n"
+
+
+def _mrml(with_targets: bool) -> str:
+    """The scene: each node with its storage, and the source under the transform."""
+    scene = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
+    _node(scene, "LinearTransform", "Transform", "pose", "pose.tfm", {})
+    _model(scene, "target", "0.9 0.85 0.75", {"opacity": "0.6"}, {})
+    shown = {"scalarVisibility": "true", "activeScalarName": "distance_mm", "pointSize": "4"}
+    _model(scene, "source", "0.9 0.2 0.2", shown, {"transformNodeRef": "vtkMRMLLinearTransformNodepose"})
+    if with_targets:
+        _node(scene, "MarkupsFiducial", "MarkupsFiducial", "targets", "targets.mrk.json", {})
+    return ElementTree.tostring(scene, encoding="unicode", xml_declaration=False) + "\n"
+
+
+def _model(
+    scene: ElementTree.Element, name: str, colour: str, display: dict[str, str], references: dict[str, str]
+) -> None:
+    shown = f"vtkMRMLModelDisplayNode{name}"
+    ElementTree.SubElement(scene, "ModelDisplay", {"id": shown, "name": f"{name} display", "color": colour} | display)
+    _node(scene, "Model", "Model", name, f"{name}.vtk", {"displayNodeRef": shown} | references)
+
+
+def _node(
+    scene: ElementTree.Element, kind: str, storage: str, name: str, file: str, references: dict[str, str]
+) -> None:
+    place = f"vtkMRML{storage}StorageNode{name}"
+    ElementTree.SubElement(scene, f"{storage}Storage", id=place, name=f"{name} storage", fileName=file)
+    wanted = {"storageNodeRef": place} | references
+    ElementTree.SubElement(scene, kind, {"id": f"vtkMRML{kind}Node{name}", "name": name} | wanted)

@@ -1,0 +1,118 @@
+"""Recordings of tracked tools: poses out of NDI Track's CSV, points of a pointer's tip, and its calibration."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats.limits import FileLimits
+
+Array = NDArray[np.float64]
+
+POSE = ("q0", "qx", "qy", "qz", "tx", "ty", "tz")
+SEEN = ("ok", "enabled", "valid")
+FEWEST_POSES = 10
+SMALLEST_TURN_DEG = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Tip:
+    """What a pivot calibration finds.
+
+    Attributes:
+        tip_mm: (3,) the tip in the frame of the tool's marker.
+        pivot_mm: (3,) the point it stood on, in the tracker's frame.
+        residual_mm: root-mean-square distance of the tips to that point.
+        poses: how many were used.
+    """
+
+    tip_mm: Array
+    pivot_mm: Array
+    residual_mm: float
+    poses: int
+
+
+def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> Array:
+    """(N, 4, 4) poses of one tool in the tracker's frame, mm, of the rows in which it was seen.
+
+    Args:
+        path: NDI Track's CSV: for each tool columns State, Q0 Qx Qy Qz (the scalar first) and Tx Ty Tz.
+        limits: how large it may be.
+        tool: which of the recorded tools, from 0.
+
+    Raises:
+        InvalidPointCloudError: no such columns, or no row in which the tool was seen.
+    """
+    text = (limits or FileLimits.from_environment()).read(path).decode("utf-8-sig", "replace")
+    rows = list(csv.reader(io.StringIO(text)))
+    names = [name.strip().lower() for name in rows[0]] if rows else []
+    starts = [i for i, name in enumerate(names) if name == "q0"]
+    if tool >= len(starts) or [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
+        given = f"{path.name} with {len(starts)} tools"
+        raise InvalidPointCloudError(f"columns {' '.join(POSE)} of tool {tool}", given, "export it from NDI Track")
+    start = starts[tool]
+    state = max((i for i, name in enumerate(names[:start]) if name.startswith("state")), default=None)
+    seen = [row for row in rows[1:] if len(row) >= start + 7 and (state is None or _is_seen(row[state]))]
+    values = np.array([[float(value) for value in row[start : start + 7]] for row in seen]).reshape(-1, 7)
+    if len(values) == 0:
+        raise InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
+    return poses_of(values[:, :4], values[:, 4:])
+
+
+def _is_seen(state: str) -> bool:
+    return state.strip().lower() in SEEN
+
+
+def poses_of(quaternions: ArrayLike, translations: ArrayLike) -> Array:
+    """(N, 4, 4) of quaternions (N, 4), the scalar first, and translations (N, 3)."""
+    quaternions = np.asarray(quaternions, dtype=np.float64)
+    norms = np.linalg.norm(quaternions, axis=1)
+    if not np.allclose(norms, 1.0, atol=0.05):
+        raise ValueError(f"quaternions of length {norms.min():.2f} to {norms.max():.2f}")
+    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+    poses[:, :3, 3] = translations
+    return poses
+
+
+def tips(poses: Array, tip_mm: ArrayLike) -> Array:
+    """(N, 3) where the tip was in the tracker's frame."""
+    return poses[:, :3, :3] @ np.asarray(tip_mm, dtype=np.float64) + poses[:, :3, 3]
+
+
+def pivot(poses: Array) -> Tip:
+    """The tip of a tool that was turned about it: least squares of R_i tip + t_i = pivot (Yaniv 2015, algebraic).
+
+    Args:
+        poses: (N, 4, 4) of the tool's marker, mm.
+
+    Raises:
+        InvalidPointCloudError: fewer than ten poses, or too little turning to know the tip.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    if len(poses) < FEWEST_POSES:
+        expected = f"at least {FEWEST_POSES} poses"
+        raise InvalidPointCloudError(expected, f"{len(poses)}", "turn the tool on its tip longer")
+    _check_turning(poses)
+    A = np.hstack([poses[:, :3, :3].reshape(-1, 3), np.tile(-np.eye(3), (len(poses), 1))])
+    both = np.linalg.lstsq(A, -poses[:, :3, 3].reshape(-1), rcond=None)[0]
+    residual = np.linalg.norm(tips(poses, both[:3]) - both[3:], axis=1)
+    tip_mm, pivot_mm = np.asarray(both[:3]), np.asarray(both[3:])
+    return Tip(tip_mm, pivot_mm, float(np.sqrt((residual**2).mean())), len(poses))
+
+
+def _check_turning(poses: Array) -> None:
+    """Turned about at least two axes: about one, the tip may be anywhere along it."""
+    turns = Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).as_rotvec(degrees=True)
+    spread = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False)[1] * 2.0 / np.sqrt(len(poses))
+    if spread < 0.25 * SMALLEST_TURN_DEG:
+        given = f"turns of {spread:.1f} deg about the second axis"
+        how = f"tilt it {SMALLEST_TURN_DEG:g} deg each way"
+        raise InvalidPointCloudError("a tool turned about two axes", given, how)

@@ -1,0 +1,1 @@
+"""Label maps: voxels in, one rigid bone surface in LPS millimetres out."""

@@ -1,0 +1,125 @@
+"""The process that reads a label map with native libraries: `python -m gapr_core.formats.volumes.child REQUEST OUT`.
+
+What it finds goes to OUT as .npz: the voxels of the segments (cropped), where they lie, and notes. When ITK or a codec
+dies of a damaged file, only this process ends.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.formats.limits import MB, FileLimits
+from gapr_core.formats.volumes import names, nifti
+from gapr_core.formats.volumes.names import Segment
+
+Array = NDArray[np.float64]
+MARGIN = 6  # voxels around the segments: what smoothing reaches
+
+
+def main(request: str, out: str) -> int:
+    """Read what the request names; a refusal goes to stdout as JSON, with exit code 1."""
+    asked = json.loads(request)
+    limits = FileLimits(**asked["limits"])
+    _limit_memory(limits)
+    path = Path(asked["path"])
+    try:
+        read = _read_dicom if path.suffix.lower() == ".dcm" else _read_itk
+        voxels, affine, named = read(path, limits)
+        present = {layer: {int(v) for v in np.unique(volume) if v} for layer, volume in enumerate(voxels)}
+        chosen, notes = names.choose(asked["labels"], named, present)
+        mask, start = _cropped(np.logical_or.reduce([voxels[s.layer] == s.value for s in chosen]))
+    except GaprError as error:
+        sys.stdout.write(json.dumps([error.expected, error.given, error.how_to_fix]))
+        return 1
+    np.savez(out, mask=mask, affine=affine, start=start, notes=np.frombuffer(json.dumps(notes).encode(), np.uint8))
+    return 0
+
+
+def _limit_memory(limits: FileLimits) -> None:
+    """No more than a load is allowed, so that a damaged size ends this process and takes nothing from others."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return
+    most = int(20 * limits.unpacked_mb * MB) + (4 << 30)  # address space, of which libraries reserve much
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:
+    """Layers [k, j, i], the affine of (i, j, k) to LPS mm, and the segments that the header lists."""
+    import SimpleITK
+
+    is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
+    if is_nifti:
+        nifti.check_length(path, limits)
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(path))
+    reader.ReadImageInformation()
+    size = int(np.prod(reader.GetSize(), dtype=np.float64)) * reader.GetNumberOfComponents()
+    limits.check_unpacked(size * 8)
+    image = reader.Execute()
+    if image.GetDimension() != 3:
+        raise InvalidPointCloudError("a volume", f"{image.GetDimension()} dimensions", "export one time step")
+    voxels = SimpleITK.GetArrayFromImage(image)
+    layers = list(np.moveaxis(voxels, 3, 0)) if voxels.ndim == 4 else [voxels]
+    metadata = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}
+    named = names.of_seg_nrrd(metadata)
+    if is_nifti:
+        named = [Segment(name, value) for value, name in nifti.label_names(path).items()]
+    direction = np.reshape(image.GetDirection(), (3, 3))
+    return [_integers(layer) for layer in layers], _affine(direction * image.GetSpacing(), image.GetOrigin()), named
+
+
+def _read_dicom(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:
+    """A DICOM segmentation: each segment is a layer, since segments may overlap."""
+    import highdicom
+
+    seg = highdicom.seg.segread(path)
+    named = [Segment(str(d.SegmentLabel), 1, layer) for layer, d in enumerate(seg.SegmentSequence)]
+    limits.check_unpacked(int(seg.Rows) * int(seg.Columns) * int(seg.get("NumberOfFrames", 1)) * 8)
+    numbers = [int(d.SegmentNumber) for d in seg.SegmentSequence]
+    volume = seg.get_volume(segment_numbers=numbers, combine_segments=False, rescale_fractional=False)
+    voxels = np.asarray(volume.array)
+    threshold = 0.5 * int(seg.MaximumFractionalValue) if str(seg.SegmentationType) == "FRACTIONAL" else 0
+    layers = [voxels[..., n] > threshold for n in range(len(numbers))]
+    affine = np.array(volume.affine)  # of the axes in the order of the array: the first goes through the slices
+    affine[:3, 3] -= MARGIN * affine[:3, 0]
+    layers = [np.pad(layer, [(MARGIN, MARGIN), (0, 0), (0, 0)]) for layer in layers]  # empty slices are not written
+    return [layer.transpose(2, 1, 0).astype(np.int64) for layer in layers], affine, named
+
+
+def _integers(voxels: NDArray[Any]) -> NDArray[np.int64]:
+    whole = voxels.astype(np.int64)
+    if voxels.dtype.kind == "f" and (whole != voxels).any():
+        raise InvalidPointCloudError("a label map: whole numbers", "fractions", "give the segmentation, not the image")
+    if whole.min() < 0:
+        given = f"values from {whole.min()} to {whole.max()}"
+        raise InvalidPointCloudError("a label map: numbers from 0", given, "give the segmentation, not the image")
+    return whole
+
+
+def _affine(columns: Array, origin: Any) -> Array:
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = columns, origin
+    return affine
+
+
+def _cropped(mask: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The mask around its voxels, [k, j, i], and the (i, j, k) where it starts."""
+    spans = []
+    for axis in range(3):
+        used = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
+        spans.append((max(int(used[0]) - MARGIN, 0), int(used[-1]) + 1 + MARGIN))
+    block = tuple(slice(*span) for span in spans)
+    return mask[block].astype(np.uint8), np.array([span[0] for span in reversed(spans)])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(*sys.argv[1:3]))

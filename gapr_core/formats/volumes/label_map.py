@@ -1,0 +1,71 @@
+"""NIfTI, NRRD, MHA and DICOM SEG: the surface of one or several labels, LPS mm."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.errors import InvalidPointCloudError, MethodUnavailableError
+from gapr_core.formats.options import ReadOptions
+from gapr_core.formats.volumes import contour
+from gapr_core.surface import Surface
+
+Mask = NDArray[np.uint8]
+log = logging.getLogger(__name__)
+
+NEEDS = ("SimpleITK", "skimage", "highdicom")
+LONGEST_READ_S = 300
+PACKAGES = str(Path(__file__).parents[3])
+
+
+def read(path: Path, options: ReadOptions) -> Surface:
+    """The surface of the labels, in patient coordinates (LPS, mm), whatever the file's own axes are.
+
+    Raises:
+        InvalidPointCloudError: a file that is damaged or too large, or a label that is not in it.
+        MethodUnavailableError: the libraries of the extra `medical` are missing.
+    """
+    if missing := [name for name in NEEDS if find_spec(name) is None]:
+        raise MethodUnavailableError("label maps", f"no {' '.join(missing)}", "pip install 'gapr_ros[medical]'")
+    if path.stat().st_size > options.limits.file_mb * (1 << 20):
+        options.limits.read(path)
+    with tempfile.TemporaryDirectory() as folder:
+        mask, affine, notes = _in_a_child(path, options, Path(folder) / "mask.npz")
+    for note in notes:
+        log.warning("%s: %s", path.name, note)
+    return contour.surface_of(mask, affine)
+
+
+def _in_a_child(path: Path, options: ReadOptions, out: Path) -> tuple[Mask, NDArray[np.float64], list[str]]:
+    """The cropped mask [k, j, i], the affine of its own indices (i, j, k), and what there is to say."""
+    request = {"path": str(path), "labels": list(options.labels), "limits": asdict(options.limits)}
+    command = [sys.executable, "-m", "gapr_core.formats.volumes.child", json.dumps(request), str(out)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_READ_S, env=environment)
+    except subprocess.TimeoutExpired as error:
+        raise ValueError(f"not read in {LONGEST_READ_S} s") from error
+    if done.returncode != 0:
+        raise _refusal(done)
+    with np.load(out, allow_pickle=False) as data:
+        affine, notes = data["affine"].copy(), json.loads(data["notes"].tobytes())
+        affine[:3, 3] += affine[:3, :3] @ data["start"]
+        return data["mask"], affine, notes
+
+
+def _refusal(done: subprocess.CompletedProcess[str]) -> Exception:
+    """What the child said, or how it ended."""
+    if done.returncode == 1 and done.stdout.startswith("["):
+        return InvalidPointCloudError(*json.loads(done.stdout))
+    lines = done.stderr.strip().splitlines() or [f"its reader ended with {done.returncode}"]
+    return ValueError(lines[-1])

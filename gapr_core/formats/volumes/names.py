@@ -1,0 +1,138 @@
+"""Which segment is meant: names out of headers, numbers with what they stand for."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from gapr_core.errors import InvalidPointCloudError
+
+MOST_LISTED = 12
+SIDES = ("left", "right")
+SPINE = [f"vertebrae_{name}" for name in (*(f"L{n}" for n in range(5, 0, -1)), *(f"T{n}" for n in range(12, 0, -1)),
+                                          *(f"C{n}" for n in range(7, 0, -1)))]  # fmt: skip
+LIMBS = [f"{bone}_{side}" for bone in ("humerus", "scapula", "clavicula", "femur", "hip") for side in SIDES]
+RIBS = [f"rib_{side}_{n}" for side in SIDES for n in range(1, 13)]
+TOTALSEGMENTATOR = {  # its bones: totalsegmentator/map_to_binary.py
+    "TotalSegmentator v1": {
+        **dict(enumerate(SPINE, 18)), **dict(enumerate(RIBS, 58)), **dict(enumerate(LIMBS, 82)), 92: "sacrum"
+    },
+    "TotalSegmentator v2 total": {
+        25: "sacrum", 26: "vertebrae_S1", **dict(enumerate(SPINE, 27)), **dict(enumerate(LIMBS, 69)), 91: "skull",
+        **dict(enumerate(RIBS, 92)), 116: "sternum", 117: "costal_cartilages"
+    },
+    "TotalSegmentator v2 total_mr": {18: "sacrum", 19: "vertebrae", **dict(enumerate(LIMBS, 30))},
+    "TotalSegmentator v2 appendicular_bones": dict(
+        enumerate(("patella", "tibia", "fibula", "tarsal", "metatarsal", "phalanges_feet", "ulna", "radius"), 1)
+    ),
+}  # fmt: skip
+
+Present = Mapping[int, set[int]]  # of each layer, the numbers that some voxel has
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One segment: its name (empty where the file has none), the number of its voxels, and its layer."""
+
+    name: str
+    value: int
+    layer: int = 0
+
+
+def of_seg_nrrd(metadata: Mapping[str, str]) -> list[Segment]:
+    """Segments of 3D Slicer's .seg.nrrd: keys Segment0_Name, Segment0_LabelValue, Segment0_Layer."""
+    segments = []
+    for key, name in metadata.items():
+        if found := re.fullmatch(r"(Segment\d+)_Name", key):
+            number = [
+                int(metadata.get(f"{found[1]}_{what}", default)) for what, default in (("LabelValue", 1), ("Layer", 0))
+            ]
+            segments.append(Segment(name.strip(), *number))
+    return segments
+
+
+def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tuple[list[Segment], list[str]]:
+    """The segments that are meant, and notes on what numbers were taken for.
+
+    Args:
+        wanted: names or numbers; none for the only segment of a file.
+        named: what the file's header lists.
+        present: of each layer, the numbers that some voxel has.
+
+    Raises:
+        InvalidPointCloudError: a name or number that is not there, or a choice that was not made.
+    """
+    wanted = tuple(wanted)
+    if not wanted:
+        return [_only(named, present)], []
+    chosen, notes = [], []
+    for label in wanted:
+        segment = _by_number(int(label), named, present) if label.isdigit() else _by_name(label, named, present)
+        if segment.value not in present.get(segment.layer, ()):
+            raise InvalidPointCloudError(f"voxels of {label}", "none", "choose another label, or segment it again")
+        chosen.append(segment)
+        if label.isdigit():
+            notes.append(f"label {label} is {_meaning(segment)}")
+    return chosen, notes
+
+
+def _only(named: list[Segment], present: Present) -> Segment:
+    segments = [_by_number(value, named, {layer: {value}}) for layer in present for value in sorted(present[layer])]
+    if len(segments) == 1:
+        return segments[0]
+    given = f"{len(segments)} of them ({_listed([s.name or str(s.value) for s in segments])})" if segments else "none"
+    raise InvalidPointCloudError("one label", given, "name one with --label, or labels= in Python")
+
+
+def _by_number(value: int, named: list[Segment], present: Present) -> Segment:
+    layers = [layer for layer in present if value in present[layer]]
+    if len(layers) > 1:
+        raise InvalidPointCloudError("one segment", f"{value} in {len(layers)} layers", "choose it by its name")
+    layer = layers[0] if layers else 0
+    return next((s for s in named if (s.value, s.layer) == (value, layer)), Segment("", value, layer))
+
+
+def _by_name(label: str, named: list[Segment], present: Present) -> Segment:
+    found = [segment for segment in named if _key(segment.name) == _key(label)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        given = f"{len(found)} of the name {label}"
+        raise InvalidPointCloudError("one segment", given, "rename one, or give its number")
+    if named:
+        raise InvalidPointCloudError(f"a segment {label}", _listed(_nearest(label, named)), "choose one of these")
+    raise _nameless(label, present)
+
+
+def _nearest(label: str, named: list[Segment]) -> list[str]:
+    """Names like the one that is not there, or all."""
+    names = {_key(segment.name): segment.name for segment in named}
+    return [names[key] for key in difflib.get_close_matches(_key(label), names, n=3) or names]
+
+
+def _nameless(label: str, present: Present) -> InvalidPointCloudError:
+    """The error for a name where the file has none, with its numbers in TotalSegmentator's versions."""
+    entries = [(version, item) for version, table in TOTALSEGMENTATOR.items() for item in table.items()]
+    numbers = [f"{value} in {version}" for version, (value, name) in entries if _key(name) == _key(label)]
+    known = f" ({', '.join(numbers)}; TotalSegmentator writes names with --ml)" if numbers else ""
+    values = _listed([str(value) for layer in present.values() for value in sorted(layer)])
+    given = f"a file without names, with {values}"
+    return InvalidPointCloudError(f"a segment {label}", given, f"give its number{known}")
+
+
+def _meaning(segment: Segment) -> str:
+    if segment.name:
+        return f"{segment.name}, says the file"
+    tables = [(version, table) for version, table in TOTALSEGMENTATOR.items() if segment.value in table]
+    names = [f"{table[segment.value]} in {version}" for version, table in tables]
+    return "without a name in the file" + (f": {', '.join(names)}" if names else "")
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[\s_-]+", "_", name.strip().lower())
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:MOST_LISTED]) + (" ..." if len(names) > MOST_LISTED else "")

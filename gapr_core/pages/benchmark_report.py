@@ -1,0 +1,76 @@
+"""The report of a benchmark: one HTML file with tables, plots and the worst cases; needs no network and no script."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from gapr_core.benchmark.record import Record
+from gapr_core.benchmark.records import Plan
+from gapr_core.benchmark.table import Row
+from gapr_core.pages import pictures, plots
+from gapr_core.pages.report import Image, Report
+from gapr_core.pages.sections import LEGEND, Section, sections, where_beaten
+from gapr_core.runtime import files
+
+
+def write(out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan, notes: Sequence[str]) -> None:
+    """`report.html` and the folder `plots` with its pictures as PNG."""
+    report = Report("Benchmark", f"{len(plan.pairs)} pairs, {len(plan.methods)} methods.")
+    for note in notes:
+        report.note(note)
+    report.heading(f"Where another method beats {plan.ours}")
+    report.bullets(where_beaten(rows, plan.ours))
+    report.heading("Tables")
+    for section in sections(rows):
+        _add_table(report, section)
+    report.paragraph(LEGEND)
+    report.heading("Plots")
+    report.images([Image(_saved(out, name, figure), name) for name, figure in _plots(records, plan)])
+    worst = pictures.worst(records, plan.ours)
+    report.heading(f"The worst {len(worst)} cases of {plan.ours}")
+    report.images([_case(out, number, record, plan) for number, record in enumerate(worst, 1)])
+    made = {"command": plan.command, "commit": plan.commit, "machine": plan.machine, "threads": plan.threads}
+    report.note(" · ".join(f"{name}: {value}" for name, value in (made | {"started": plan.started}).items()))
+    report.write(out / "report.html")
+
+
+def _plots(records: Sequence[Record], plan: Plan) -> list[tuple[str, Figure]]:
+    methods = [plan.ours, *(m for m in plan.methods if m != plan.ours)]
+    tiles = {
+        "recall_threshold": plots.recall_against_threshold(records, methods),
+        "recall_overlap": plots.recall_against(records, methods, "overlap", "overlap, share of the surface"),
+        "recall_noise": plots.recall_against(records, methods, "noise_mm", "noise, mm"),
+        "reliability": plots.reliability_diagram(records, methods),
+        "risk_coverage": plots.risk_coverage(records, methods),
+        "error_ellipsoids": plots.error_ellipsoids(records, plan.ours),
+    }
+    return [(name, value) for name, value in tiles.items() if value is not None]
+
+
+def _case(out: Path, number: int, record: Record, plan: Plan) -> Image:
+    """One case; without its picture when its pair is not on this machine."""
+    folder = Path(plan.folder)
+    is_here = (folder / record.file).is_file()
+    png = _saved(out, f"worst_{number:02d}", pictures.picture(record, folder)) if is_here else None
+    return Image(png, record.pair, pictures.caption(record), record.false_accept)
+
+
+def _saved(out: Path, name: str, figure: Figure) -> bytes:
+    """The PNG, which is written into the folder `plots` as well."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    with files.replacing(out / "plots" / f"{name}.png") as path:
+        path.write_bytes(buffer.getvalue())
+    return buffer.getvalue()
+
+
+def _add_table(report: Report, section: Section) -> None:
+    firsts = [i == 0 or line[0] != section.cells[i - 1][0] for i, line in enumerate(section.cells)]
+    marks = ["aside" if "paper's number" in line[1] else "first" if is_first else ""
+             for line, is_first in zip(section.cells, firsts, strict=True)]  # fmt: skip
+    report.subheading(section.title)
+    report.table(section.header, section.cells, marks, section.header[:2], section.best)

@@ -1,0 +1,114 @@
+"""Pictures of what a camera saw, and of which points were taken for bone: for a page, and as one poster."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.data.scenes.figure import BONE, OTHER, paint
+from gapr_core.pages.poster import draw_bone, draw_chart
+from gapr_core.surface import Surface
+
+Array = NDArray[np.float64]
+NOT_LOOKED_AT = np.array([0.72, 0.75, 0.78])
+KEY = "light: taken for bone, red: looked at and not taken, grey: not looked at"
+POSTER_VIEWS, COLOURS = 5, 256
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """One image.
+
+    Attributes:
+        title: the line above.
+        cloud: (N, 3) mm, in the camera's own frame.
+        looked_at: (N,) which points the registration looked at; the others lay outside of its region of interest.
+        is_taken: (N,) which of these it took for bone.
+    """
+
+    title: str
+    cloud: Array
+    looked_at: NDArray[np.bool_]
+    is_taken: NDArray[np.bool_]
+
+
+def views_as_png(views: Sequence[CameraView], columns: int = 4) -> bytes:
+    """All images in rows, as a PNG."""
+    rows = -(-len(views) // columns)
+    figure = _figure(2.6 * columns, 2.75 * rows)
+    _draw_views(figure, views, rows, columns)
+    out = BytesIO()
+    figure.savefig(out, format="png")
+    return _smaller(out)
+
+
+def save_scene_poster(
+    path: str | Path,
+    target: Surface,
+    views: Sequence[CameraView],
+    points: Array,
+    distances_mm: Array,
+    title: str,
+    charts: Mapping[str, tuple[Sequence[float], float | None]],
+    facing: Array | None = None,
+) -> None:
+    """Writes a PNG: some of the images, the bone with the points taken for it in one of them, and charts.
+
+    Args:
+        path: where to.
+        target: the bone, mm.
+        views: every image, in the order of time.
+        points: (N, 3) mm in the target's frame, laid on it.
+        distances_mm: (N,) their distances from the surface.
+        title: the line above.
+        charts: name to (values, limit); not finite where there is no value.
+        facing: (3,) direction in the target's frame to the camera; from the front where it is None.
+    """
+    figure = _figure(11.0, 8.6)
+    figure.suptitle(title, fontsize=13)
+    above, bone, below = figure.subfigures(3, 1, height_ratios=[1.0, 1.25, 0.85])
+    count = min(POSTER_VIEWS, len(views))
+    chosen = np.linspace(0, len(views) - 1, count).round().astype(int)
+    _draw_views(above, [views[k] for k in chosen], 1, count)
+    above.supxlabel(KEY, fontsize=9)
+    draw_bone(bone, target, points, distances_mm, facing)
+    all_axes = np.ravel(below.subplots(1, len(charts)))
+    for axes, (name, (values, limit)) in zip(all_axes, charts.items(), strict=True):
+        draw_chart(axes, name, values, limit, "frame")
+    out = BytesIO()
+    figure.savefig(out, format="png")
+    Path(path).write_bytes(_smaller(out))
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _draw_views(figure: Any, views: Sequence[CameraView], rows: int, columns: int) -> None:
+    all_axes = np.ravel(figure.subplots(rows, columns))
+    for axes, view in zip(all_axes, views, strict=False):
+        colours = np.where(view.looked_at[:, None], OTHER, NOT_LOOKED_AT)
+        paint(axes, view.cloud, np.zeros(3), np.where(view.is_taken[:, None], BONE, colours))
+        axes.set_title(view.title, fontsize=8)
+    for axes in all_axes[len(views) :]:
+        axes.axis("off")
+
+
+def _smaller(png: BytesIO) -> bytes:
+    """The same picture with few colours: about half of the bytes."""
+    from PIL import Image
+
+    out = BytesIO()
+    Image.open(png).convert("RGB").quantize(COLOURS).save(out, format="png", optimize=True)
+    return out.getvalue()

@@ -1,0 +1,20 @@
+"""Tables for pages and terminals, as Markdown; whole, or line by line where rows come one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+
+def table(header: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
+    """All lines of a table; a cell is what `str` says of it."""
+    return "\n".join([head(header), *map(row, rows)])
+
+
+def head(header: Sequence[object]) -> str:
+    """The two lines above the rows."""
+    return f"{row(header)}\n{row(['---'] * len(header))}"
+
+
+def row(cells: Iterable[object]) -> str:
+    """One line."""
+    return f"| {' | '.join(map(str, cells))} |"

@@ -1,0 +1,1 @@
+"""The algorithm: prepare, propose, verify, refine, assess."""

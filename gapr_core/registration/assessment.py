@@ -1,0 +1,184 @@
+"""The last step: how sure is the best pose? A typed answer on its way to the caller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.registration import covariance, kernels, precision, rules
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.features import measure
+from gapr_core.registration.precision_model import Precision
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import Candidates
+from gapr_core.results import Hypothesis, Refusal, RegistrationResult, RegistrationStatus, Residuals
+
+Array = NDArray[np.float64]
+
+RULED_OUT = 0.4  # the confidence is at most this where a rule says that the pose may be another one
+INDEPENDENT_POINTS = 30.0  # as many independent witnesses a source counts for when hypotheses are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """The best pose of a source on a target, and all that is known about it.
+
+    Attributes:
+        fit: the refined pose with its residuals.
+        candidates: the distinct poses that were compared, best first.
+        uncertainty: covariance of the pose.
+        features: what the probability was computed from.
+        probability: 0 to 1 that the pose is within 4 mm and 5 deg of the truth.
+        refusal: what a safety rule says against the pose; None when none does.
+        source, target: what was registered to what.
+        proposer: name of the last proposer that was asked.
+        rounds: how many were asked.
+        seen: the whole cloud, where `source` is only the part of it that the pose explains; else None.
+        members: (N,) mask of that part in `seen`; None with it.
+        contributions: log odds that each feature adds to the probability's.
+        factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
+    """
+
+    fit: Fit
+    candidates: Candidates
+    uncertainty: PoseUncertainty
+    features: Mapping[str, float]
+    probability: float
+    refusal: Refusal | None
+    source: PreparedSource
+    target: PreparedTarget
+    proposer: str = ""
+    rounds: int = 0
+    seen: PreparedSource | None = None
+    members: NDArray[np.bool_] | None = None
+    contributions: Mapping[str, float] = field(default_factory=dict)
+    factor95: float = 1.0
+
+    @property
+    def centre_mm(self) -> Array:
+        """(3,) mean of the source points in the target frame: what the covariance's rotation turns about."""
+        return np.asarray(self.fit.moved.mean(axis=0))
+
+    @property
+    def tre_mm(self) -> float:
+        """Expected error, root mean square over the bone, mm."""
+        return precision.expected_mm(self.uncertainty.covariance, self.target.points, self.centre_mm)
+
+    @property
+    def tre95_mm(self) -> float:
+        """95 % bound of the error over the bone, mm."""
+        return self.bound_mm(self.target.points)
+
+    def bound_mm(self, points: Array) -> float:
+        """95 % bound of the error over points (M, 3) of the target frame, mm; one point for one named target."""
+        return self.factor95 * precision.bound_mm(self.uncertainty.covariance, points, self.centre_mm)
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """All distinct poses, best first; the first one is the refined one."""
+        poses = (self.fit.T, *self.candidates.poses[1:])
+        return tuple(map(Hypothesis, poses, shared_probability(self.probability, self.candidates.scores)))
+
+    @property
+    def residuals(self) -> Residuals:
+        """Of every source point under the best pose."""
+        inlier = self.fit.weights > 0.0
+        if self.seen is None or self.members is None:
+            return Residuals(self.source.points, self.fit.signed_mm, inlier)
+        distance_mm = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
+        counts = np.zeros(len(self.members), dtype=bool)
+        counts[self.members] = inlier
+        return Residuals(self.seen.points, distance_mm, counts)
+
+    def is_sure(self, limit: float) -> bool:
+        """True when no rule speaks against the pose and its probability reaches `limit`."""
+        return self.refusal is None and self.probability >= limit
+
+    def corrected(self, learned: Precision) -> Assessment:
+        """The same with the covariance, and the bound, as errors of known size say that they have to be."""
+        variance_scale = learned.scale(self.features, self.tre_mm) ** 2
+        covariance = variance_scale * self.uncertainty.covariance
+        return replace(self, uncertainty=replace(self.uncertainty, covariance=covariance), factor95=learned.factor95)
+
+    def limited(self, most: float) -> Assessment:
+        """The same with a probability of at most `most`."""
+        return replace(self, probability=min(self.probability, most))
+
+
+def assess(
+    fit: Fit,
+    candidates: Candidates,
+    source: PreparedSource,
+    target: PreparedTarget,
+    calibration: Calibration,
+    config: RegistrarConfig,
+) -> Assessment:
+    """Covariance, features, probability, and what the safety rules say."""
+    uncertainty = covariance.estimate(fit, config.covariance, config.sensor)
+    features = measure(fit, candidates, uncertainty, source, target, config)
+    probability = calibration.probability(features)
+    refusal = rules.by_geometry(fit, candidates, uncertainty, probability, source, target, config)
+    if refusal is not None:
+        probability = min(probability, RULED_OUT)
+    return Assessment(
+        fit,
+        candidates,
+        uncertainty,
+        features,
+        probability,
+        refusal,
+        source,
+        target,
+        contributions=calibration.contributions(features),
+    )
+
+
+def shared_probability(best: float, scores: Array) -> tuple[float, ...]:
+    """Probabilities of ranked hypotheses.
+
+    A rival's likelihood relative to the best is exp(-n / 2 (s / s_best - 1)): that of n independent residuals whose
+    variance is the best one's mean square. What the best leaves of 1 is shared in these proportions, but no rival gets
+    more than its likelihood times the best one's probability.
+
+    Args:
+        best: probability of the best, 0 to 1.
+        scores: (K,) mean squares of the residuals, mm^2, best first.
+    """
+    likelihood = np.exp(-0.5 * INDEPENDENT_POINTS * np.maximum(scores[1:] / scores[0] - 1.0, 0.0))
+    share = min(best, (1.0 - best) / max(float(likelihood.sum()), 1e-12))
+    return (best, *(share * likelihood))
+
+
+def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResult:
+    """What the caller gets: a pose where neither a rule nor a threshold refuses, else the reason."""
+    a, tre95_mm = assessment, assessment.tre95_mm
+    refusal = a.refusal or rules.by_threshold(a.probability, tre95_mm, config)
+    common = RegistrationResult(
+        status=RegistrationStatus.LOW_CONFIDENCE,
+        confidence=a.probability,
+        inlier_ratio=a.features["inlier_ratio"],
+        hypotheses=a.hypotheses,
+        proposer=a.proposer,
+        rounds=a.rounds,
+        features=a.features,
+        contributions=a.contributions,
+        residuals=a.residuals,
+    )
+    if refusal is not None:
+        return replace(common, status=refusal.status, reason=refusal.reason)
+    return replace(
+        common,
+        status=RegistrationStatus.OK,
+        T_target_source=a.fit.T,
+        covariance=a.uncertainty.covariance,
+        tre_mm=a.tre_mm,
+        tre95_mm=tre95_mm,
+        centre_mm=a.centre_mm,
+    )

@@ -1,0 +1,201 @@
+"""Registration of a cloud that a camera took of a wound: most of it may be something else than the bone.
+
+Regions propose, lines of sight decide. Every region of the cloud proposes poses as if it were bone; all of them are
+ranked by what the camera would have seen of the target, first roughly, then, refined on more and more points, at the
+scale of the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.config import ClutterConfig
+from gapr_core.geometry import sampling
+from gapr_core.registration import free_space
+from gapr_core.registration.clutter_kernels import refine_agreeing
+from gapr_core.registration.free_space import DepthImage, Visible
+from gapr_core.registration.kernels import distinct
+from gapr_core.registration.proposals import regions
+from gapr_core.registration.proposals.regions import Region
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import Candidates
+from gapr_core.runtime.parallel import thread_count
+
+Array = NDArray[np.float64]
+
+NAME = "scene"
+MARKERS = 16  # points by which two poses are compared
+SMALLEST_SCORE = 1e-4  # share of the surface; a score below counts as this
+LEVELLED_BY = 12  # neighbours over which the noise of a measured depth is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a camera saw.
+
+    Attributes:
+        source: the cloud, with normals towards the camera.
+        image: the same as its camera saw it.
+        viewpoint: (3,) mm, source frame: where the camera was.
+        regions: parts of it that may be bone alone.
+    """
+
+    source: PreparedSource
+    image: DepthImage
+    viewpoint: Array
+    regions: list[Region]
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Hypotheses on their way.
+
+    Attributes:
+        poses: (K, 4, 4) T_target_source, mm.
+        region: (K,) index of the region that proposed each; -1 for a pose that was given.
+        scores: (K,) share of the target's surface, large is good; comparable within one stage.
+    """
+
+    poses: Array
+    region: NDArray[np.int64]
+    scores: Array
+
+
+def look(source: PreparedSource, viewpoint: Array) -> Scene:
+    """The scene that a camera at `viewpoint` (3,), mm, source frame, saw; no regions yet."""
+    source = source.facing(viewpoint)
+    around = source.points[source.neighbours[:, :LEVELLED_BY]].mean(axis=1) - source.points
+    levelled = source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]
+    image = free_space.see(levelled, source.normals, viewpoint)
+    return Scene(source, image, viewpoint, [])
+
+
+def with_regions(scene: Scene, config: ClutterConfig, number: int) -> Scene:
+    """The same scene with the regions of round `number`, 0 the first; no region comes twice."""
+    return replace(scene, regions=regions.regions(scene.source, config, number))
+
+
+def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
+    """Hypotheses of all regions, each refined on its own region; and those that are given (K, 4, 4)."""
+    limits = np.linspace(*config.region_limits_mm)
+
+    def work(region: Region) -> Array:
+        poses = regions.search(region, target, config).poses
+        return _refined(poses, region.source, region.source.order[: config.region_points], target, limits)
+
+    found = _in_threads(work, scene.regions, num_threads)
+    label = np.repeat(np.arange(-1, len(found)), [len(given), *map(len, found)])
+    return Pool(np.concatenate([given, *found]), label, np.zeros(len(label)))
+
+
+def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Candidates:
+    """From all hypotheses to a few distinct ones, refined and ranked.
+
+    Their scores are 1 / the share of the surface, so that small is good, as for `verification.verify`.
+    """
+    crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
+    best = _best_distinct(crowd, scene, config.same_pose_mm, config.final_poses)
+    best = refine_on_all(best, scene, target, config, num_threads)
+    gaps = np.linalg.norm(_moved_markers(best, scene)[:, None] - _moved_markers(crowd, scene)[None], axis=3)
+    support = (np.sqrt((gaps**2).mean(axis=2)) < config.same_pose_mm).mean(axis=1)
+    return Candidates(best.poses, 1.0 / np.maximum(best.scores, SMALLEST_SCORE), support)
+
+
+def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Pool:
+    """The best distinct ones by what the camera would have seen, at the scale of what a region leaves open."""
+    pool = _scored(pool, scene, target, config.coarse_points, config.coarse_on_mm, config.coarse_front_mm, num_threads)
+    return _best_distinct(pool, scene, config.same_pose_mm, config.middle_poses)
+
+
+def refine_around(
+    pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
+) -> Pool:
+    """Each refined on what lies around its region, and scored again."""
+    limits = np.linspace(*config.middle_limits_mm)
+    tree = cKDTree(scene.source.points[scene.source.order])
+    poses = pool.poses.copy()
+
+    def work(label: int) -> None:
+        of_it = np.flatnonzero(pool.region == label)
+        near = _around(tree, scene.regions[label].centre, config) if label >= 0 else np.arange(config.middle_points)
+        some = scene.source.order[near[near < len(scene.source.order)]]
+        poses[of_it] = _refined(pool.poses[of_it], scene.source, some, target, limits)
+
+    _in_threads(work, np.unique(pool.region), num_threads)
+    pool = replace(pool, poses=poses)
+    return _scored(pool, scene, target, config.middle_target_points, config.middle_on_mm, config.front_mm, num_threads)
+
+
+def refine_on_all(
+    pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
+) -> Pool:
+    """Each refined on all points whose normals agree, ranked at the scale of the noise."""
+    limits, some = np.linspace(*config.final_limits_mm), scene.source.order[: config.final_points]
+    pieces = [p for p in np.array_split(pool.poses, 4 * thread_count(num_threads)) if len(p)]
+    work = partial(_refined, source=scene.source, some=some, target=target, limits=limits)
+    pool = replace(pool, poses=np.concatenate(_in_threads(work, pieces, num_threads)))
+    pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
+    return _best_distinct(pool, scene, config.same_pose_mm, config.kept_poses)
+
+
+def seen_of(poses: Array, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Visible:
+    """What the camera saw of the target under poses (K, 4, 4), at the scale of the noise."""
+    points, normals = spread(target, config.final_target_points)
+    return free_space.compare(poses, points, normals, scene.image, config.on_mm, config.front_mm, num_threads)
+
+
+def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.int64]:
+    near = np.sort(tree.query_ball_point(centre, config.middle_reach_mm))
+    return near[:: max(1, len(near) // config.middle_points)]
+
+
+def _refined(
+    poses: Array, source: PreparedSource, some: NDArray[np.int64], target: PreparedTarget, limits: Array
+) -> Array:
+    """Poses refined on some of the points."""
+    points, normals = source.points[some], source.normals[some]
+    return refine_agreeing(np.ascontiguousarray(poses), points, normals, source.oriented, *target.kernel_view, limits)[
+        0
+    ]
+
+
+def _scored(
+    pool: Pool, scene: Scene, target: PreparedTarget, count: int, on_mm: float, front_mm: float, num_threads: int
+) -> Pool:
+    points, normals = spread(target, count)
+    seen = free_space.compare(pool.poses, points, normals, scene.image, on_mm, front_mm, num_threads)
+    return replace(pool, scores=seen.score)
+
+
+def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
+    """At most `count` evenly spread points of the target and their normals; kept with it."""
+    key = "spread", count
+    if key not in target.cache:
+        some = sampling.thin(target.points, count)
+        target.cache[key] = target.points[some], target.normals[some]
+    return target.cache[key]  # type: ignore[no-any-return]
+
+
+def _best_distinct(pool: Pool, scene: Scene, tolerance_mm: float, most: int) -> Pool:
+    kept = distinct(_moved_markers(pool, scene), np.argsort(-pool.scores, kind="stable"), tolerance_mm, most)
+    return Pool(pool.poses[kept], pool.region[kept], pool.scores[kept])
+
+
+def _moved_markers(pool: Pool, scene: Scene) -> Array:
+    """(K, MARKERS, 3) the same spread source points under every pose."""
+    markers = scene.source.subset(MARKERS)
+    return np.asarray(np.einsum("kij,nj->kni", pool.poses[:, :3, :3], markers) + pool.poses[:, None, :3, 3])
+
+
+def _in_threads(work: Callable[[Any], Any], items: Iterable[Any], num_threads: int) -> list[Any]:
+    with ThreadPoolExecutor(thread_count(num_threads)) as pool:
+        return list(pool.map(work, items))

@@ -1,0 +1,124 @@
+"""Compiled inner loops for clouds that are mostly not bone: lines of sight, and refinement where normals agree."""
+
+# mypy: ignore-errors
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from gapr_core.registration.kernels import FAST, element_near, moved, residual, step
+
+FACING = 0.2  # cosine of the angle to the line of sight from which a surface is steep enough to be measured
+HIDDEN_MM = 3.0  # behind what was measured on its line of sight a point is hidden
+SLANT_MM = 9.0  # largest difference in depth to the measured point in whose plane a point lies
+SAME_SURFACE = 0.6  # cosine of the angle between two normals up to which they are of one surface
+
+
+@numba.njit(**FAST)
+def compare_with_image(poses, cloud, pixels, left, top, per_pixel, on_mm, front_mm):
+    """Shares of a target (M, 6: points, normals) explained, violating, compared, under poses (K, 3, 4) T_camera_target.
+
+    All float32. A point is explained when it faces the camera, lies within `on_mm` of the plane measured on its line
+    of sight and has its normal; it violates when it lies `front_mm` in front of all that was measured around there.
+    """
+    rows, columns = pixels.shape[0], pixels.shape[1]
+    out = np.zeros((len(poses), 3), dtype=np.float32)
+    for k in range(len(poses)):
+        T = poses[k]
+        explained, violating, compared = np.float32(0.0), 0, 0
+        for m in range(len(cloud)):
+            x, y, z = cloud[m, 0], cloud[m, 1], cloud[m, 2]
+            depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            if depth < np.float32(1.0):
+                continue
+            ahead = np.float32(1.0) / depth
+            right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+            j = int(np.floor((right * ahead - left) * per_pixel + np.float32(0.5)))
+            if j < 0 or j >= columns:
+                continue
+            down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+            i = int(np.floor((down * ahead - top) * per_pixel + np.float32(0.5)))
+            if i < 0 or i >= rows:
+                continue
+            seen = pixels[i, j]
+            if seen[4] == np.float32(0.0):
+                continue
+            if depth < seen[5] - front_mm:
+                violating += 1
+            x, y, z = cloud[m, 3], cloud[m, 4], cloud[m, 5]
+            nx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
+            ny = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
+            nz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+            towards = nx * right + ny * down + nz * depth
+            if towards > -np.float32(FACING) * depth:
+                continue
+            off = seen[0] * right + seen[1] * down + seen[2] * depth - seen[3]
+            if depth < seen[4] + np.float32(HIDDEN_MM) and depth > seen[5] - front_mm:
+                compared += 1
+            if abs(off) < on_mm and abs(depth - seen[4]) < np.float32(SLANT_MM):
+                same = nx * seen[0] + ny * seen[1] + nz * seen[2]
+                if same > np.float32(SAME_SURFACE):
+                    off /= on_mm
+                    explained += np.float32(1.0) - off * off
+        out[k, 0], out[k, 1], out[k, 2] = explained, violating, compared
+    return out / np.float32(len(cloud))
+
+
+@numba.njit(**FAST)
+def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits):
+    """Gauss-Newton from every pose (K, 4, 4) on the points (N, 3) whose normals (N, 3) agree with the surface's.
+
+    One iteration per entry of `limits` (Tukey scale). Returns the poses and the mean Tukey weight at the last limit:
+    the share of the points that each explains.
+    """
+    out, shares = poses.copy(), np.empty(len(poses))
+    surface = elements, nearest, origin, per_cell, spacing
+    H, g = np.empty((6, 6)), np.empty(6)
+    middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
+    for k in range(len(poses)):
+        T = out[k]
+        for i in range(len(limits)):
+            weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], middle, H, g)
+            if weight > 0.0:
+                step(T, middle, H, g, weight)
+        shares[k] = accumulate_agreeing(T, points, normals, signed, *surface, limits[-1], middle, H, g) / len(points)
+    return out, shares
+
+
+@numba.njit(**FAST)
+def accumulate_agreeing(T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limit, middle, H, g):
+    """Normal equations H twist = g about the moved `middle` (3,), filled in place; returns the sum of the weights."""
+    H[:] = 0.0
+    g[:] = 0.0
+    J = np.empty(6)
+    total = 0.0
+    mx, my, mz = moved(T, middle)
+    for p in range(len(points)):
+        x, y, z = moved(T, points[p])
+        q = element_near(x, y, z, nearest, origin, per_cell)
+        if q < 0:
+            continue
+        n = normals[p]
+        ux = T[0, 0] * n[0] + T[0, 1] * n[1] + T[0, 2] * n[2]
+        uy = T[1, 0] * n[0] + T[1, 1] * n[1] + T[1, 2] * n[2]
+        uz = T[2, 0] * n[0] + T[2, 1] * n[1] + T[2, 2] * n[2]
+        same = ux * elements[q, 3] + uy * elements[q, 4] + uz * elements[q, 5]
+        if same < SAME_SURFACE and (signed or same > -SAME_SURFACE):
+            continue
+        r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, 0.0)
+        square = (r * r + aside * aside) / (limit * limit)
+        if square >= 1.0:
+            continue
+        w = (1.0 - square) ** 2
+        total += w
+        x, y, z = x - mx, y - my, z - mz
+        J[0], J[1], J[2] = nx, ny, nz
+        J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+        for a in range(6):
+            g[a] -= w * J[a] * r
+            for b in range(a + 1):
+                H[a, b] += w * J[a] * J[b]
+    for a in range(6):
+        for b in range(a):
+            H[b, a] = H[a, b]
+    return total

@@ -1,0 +1,57 @@
+"""Regions of interest: a box around the wound, or what lies around the last pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+from gapr_core.registration.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+
+def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, highest: ArrayLike) -> Array:
+    """The points in a box.
+
+    Args:
+        points: (N, 3), mm, in their own frame.
+        T_box_points: (4, 4) pose of that frame in the box's frame, mm.
+        lowest, highest: (3,) two opposite corners, mm, box frame; both belong to the box.
+
+    Returns:
+        (K, 3) in the points' own frame; none of those that are not finite.
+
+    Raises:
+        ConfigError: when a corner is not (3,) or `lowest` is not below `highest`.
+    """
+    low, high = np.asarray(lowest, dtype=np.float64), np.asarray(highest, dtype=np.float64)
+    if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
+        raise ConfigError("two corners x y z, the lowest first", f"{low} and {high}", "correct the box")
+    points = np.asarray(points, dtype=np.float64)
+    placed = se3.apply(T_box_points, points)
+    return np.asarray(points[((placed >= low) & (placed <= high)).all(axis=1)])
+
+
+def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: PreparedTarget, margin_mm: float) -> Array:
+    """The points within `margin_mm` of the bone as it lay last.
+
+    Args:
+        points: (N, 3), mm, source frame.
+        T_target_source: (4, 4) last accepted pose, mm.
+        target: from `Registrar.prepare`.
+        margin_mm: how far the bone may have moved, and a little more.
+
+    Returns:
+        (K, 3), mm, source frame; none of those that are not finite.
+
+    Raises:
+        ConfigError: for a margin that is not positive.
+    """
+    if not margin_mm > 0.0:
+        raise ConfigError("a positive margin in mm", f"{margin_mm:g}", "30 mm suits a bone that moves slowly")
+    cloud = np.asarray(points, dtype=np.float64)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    gaps = target.tree.query(se3.apply(T_target_source, cloud), distance_upper_bound=margin_mm)[0]
+    return np.asarray(cloud[np.isfinite(gaps)])

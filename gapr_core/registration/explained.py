@@ -1,0 +1,175 @@
+"""What a pose explains of a scene: the part of the cloud that is bone, and how well it is separated from the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.registration import clutter, covariance, kernels, rules
+from gapr_core.registration import source as sources
+from gapr_core.registration.assessment import RULED_OUT, Assessment
+from gapr_core.registration.clutter import Scene
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.features import of_another_bone
+from gapr_core.registration.free_space import Visible
+from gapr_core.registration.refinement import Fit, refine_fully
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import Candidates
+from gapr_core.results import Refusal, RegistrationStatus
+
+Array = NDArray[np.float64]
+
+AGREEING = 0.7  # cosine of the angle between normals up to which a point may lie on the surface
+CROWD, MOST_ALONE = 12, 0.5  # a point counts when less than this share of so many neighbours is off the surface
+FEWEST_POINTS = 30  # of a part that a pose can be refined on
+ROUNDS = 2  # of choosing the part and refining on it
+MOSTLY_CLUTTER = 0.5  # share of a cloud that counts for the pose below which a refusal names the rest as its reason
+MOSTLY_OFF = 0.4  # the same for the share on the surface; a fifth of outliers and 1.5 mm of noise and bias leave 0.5
+LARGEST_MARGIN = 3.0  # log of a ratio of scores
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """The part of a scene that a pose explains.
+
+    Attributes:
+        source: the part, as a source of its own.
+        members: (N,) mask of the scene's points that are in it.
+        fit: the pose, refined on the part alone.
+    """
+
+    source: PreparedSource
+    members: NDArray[np.bool_]
+    fit: Fit
+
+    @property
+    def share(self) -> float:
+        """Of the scene's points that count for the pose, 0 to 1."""
+        return float((self.fit.weights > 0.0).sum() / len(self.members))
+
+
+def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> Explained:
+    """Refine a pose (4, 4) on what it explains; on the whole cloud where that is next to nothing."""
+    for _ in range(ROUNDS):
+        members = _on_surface(T, scene.source, target, config.clutter.part_mm)
+        if members.sum() < FEWEST_POINTS:
+            members[:] = True
+        part = _described(scene, members, config)
+        fit = refine_fully(T, part.points, target, config.refinement, part.neighbours)
+        T = fit.T
+    return Explained(part, members, fit)
+
+
+def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, on_mm: float) -> NDArray[np.bool_]:
+    """(N,) mask of the points that lie on the surface with most of their neighbours, normals agreeing."""
+    signed, gradients, aside, _ = kernels.residuals_at(T, source.points, *target.kernel_view, 0.0)
+    near = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < on_mm
+    same = np.einsum("ni,ni->n", source.normals @ T[:3, :3].T, gradients)
+    near &= (same if source.oriented else np.abs(same)) > AGREEING
+    return near & (near[source.neighbours[:, :CROWD]].mean(axis=1) > MOST_ALONE)
+
+
+def _described(scene: Scene, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
+    return sources.describe(scene.source.points[members], config.source).facing(scene.viewpoint)
+
+
+def assess(
+    explained: Explained,
+    candidates: Candidates,
+    scene: Scene,
+    target: PreparedTarget,
+    calibration: Calibration,
+    config: RegistrarConfig,
+) -> Assessment:
+    """As `assessment.assess`, for a pose that explains a part of a scene."""
+    fit, part = explained.fit, explained.source
+    uncertainty = covariance.estimate(fit, config.covariance, config.sensor)
+    features = measure(explained, candidates, uncertainty, scene, target, config)
+    probability = calibration.probability(features)
+    refusal = rules.by_geometry(fit, candidates, uncertainty, probability, part, target, config)
+    if refusal is not None:
+        probability = min(probability, RULED_OUT)
+    if probability < config.min_confidence and explained.share < MOSTLY_CLUTTER:
+        refusal = _clutter(explained.share, refusal)
+    return Assessment(
+        fit,
+        candidates,
+        uncertainty,
+        features,
+        probability,
+        refusal,
+        part,
+        target,
+        seen=scene.source,
+        members=explained.members,
+        contributions=calibration.contributions(features),
+    )
+
+
+def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
+    """The same; a refusal of a dense cloud of no known viewpoint says so where most of the cloud lies off the bone."""
+    source, judged = assessment.source, assessment.seen is not None
+    if judged or assessment.is_sure(config.min_confidence) or len(source.points) < sources.FEWEST_DENSE:
+        return assessment
+    share = _on_surface(assessment.fit.T, source, assessment.target, config.clutter.part_mm).mean()
+    if share >= MOSTLY_OFF:
+        return assessment
+    return replace(assessment, refusal=_clutter(float(share), assessment.refusal, "say where the camera was, "))
+
+
+def _clutter(share: float, other: Refusal | None, more: str = "") -> Refusal:
+    why = "no pose of it is certain" if other is None else other.reason
+    return Refusal(
+        RegistrationStatus.CLUTTER,
+        f"at most {100.0 * share:.0f} % of the cloud is this bone, and {why}: {more}crop the cloud with a box around "
+        "the wound or around the last pose (crop_to_track), or expose more of the bone",
+    )
+
+
+def measure(
+    explained: Explained,
+    candidates: Candidates,
+    uncertainty: PoseUncertainty,
+    scene: Scene,
+    target: PreparedTarget,
+    config: RegistrarConfig,
+) -> dict[str, float]:
+    """The features behind the confidence in a scene (`features.SCENE_FEATURES`); every one is finite."""
+    fit, part = explained.fit, explained.source
+    seen = clutter.seen_of(fit.T[None], scene, target, config.clutter)
+    inlier = fit.weights > 0.0
+    agreement = np.abs(np.einsum("ni,ni->n", part.normals @ fit.T[:3, :3].T, fit.gradients))
+    reach_mm = np.linalg.norm(part.points - part.points.mean(axis=0), axis=1).max()
+    return _visible_features(seen, candidates, target) | {
+        "log_sigma": float(np.log(fit.sigma_mm)),
+        "log_excess": float(np.log(fit.sigma_mm / max(scene.source.noise_mm, 0.1))),
+        "smooth_misfit": uncertainty.smooth_mm,
+        "short_misfit": uncertainty.short_mm,
+        "inlier_ratio": explained.share,
+        "support": float(candidates.support[0]),
+        "log_shift_sd": float(np.log(uncertainty.largest_shift_mm)),
+        "log_turn_sd": float(np.log(uncertainty.largest_turn_deg)),
+        "normal_agreement": float(np.median(agreement[inlier])) if inlier.any() else 0.0,
+        "log_points": float(np.log(len(part.points))),
+        "extent": float(reach_mm / target.half_extent_mm),
+        **of_another_bone(fit, uncertainty, part, target, config),
+    }
+
+
+def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:
+    """What lines of sight say: shares of the surface, and the margin to the best distinct rival."""
+    explained, violating, compared = (float(x[0]) for x in (seen.explained, seen.violating, seen.compared))
+    area_mm2 = explained * len(target.points) * target.spacing_mm**2
+    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else np.inf
+    return {
+        "free_space_score": float(seen.score[0]),
+        "log_explained_mm2": float(np.log(area_mm2 + 1.0)),
+        "explained_of_compared": explained / max(compared, 1e-6),
+        "violating_of_compared": min(violating / max(compared, 1e-6), 1.0),
+        "rival_margin": float(np.clip(np.log(max(rival, 1e-3)), -LARGEST_MARGIN, LARGEST_MARGIN)),
+    }

@@ -1,0 +1,110 @@
+"""What speaks for a pose and what against it: the features of the confidence."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import CovarianceConfig, RegistrarConfig
+from gapr_core.registration import mirror
+from gapr_core.registration.bias_field import fields
+from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import Candidates
+
+Array = NDArray[np.float64]
+
+OTHER_BONE = ("scale_off", "log_scale_sd", "mirror_margin")
+FEATURES = (
+    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "residual", "margin", "support",
+    "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
+)  # fmt: skip
+SCENE_FEATURES = (
+    "free_space_score", "log_explained_mm2", "explained_of_compared", "violating_of_compared", "rival_margin",
+    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "support", "log_shift_sd",
+    "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
+)  # fmt: skip  # of `explained.measure`
+FEATURES_OF = {"network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES}
+SIGNS = {
+    "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1, "log_shift_sd": -1,
+    "log_turn_sd": -1, "normal_agreement": 1, "scale_off": -1, "mirror_margin": 1, "free_space_score": 1,
+    "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
+}  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
+USUAL_SCALE_SD = 0.05  # prior of how much larger or smaller a source may be than the bone
+
+
+def measure(
+    fit: Fit,
+    candidates: Candidates,
+    uncertainty: PoseUncertainty,
+    source: PreparedSource,
+    target: PreparedTarget,
+    config: RegistrarConfig,
+) -> dict[str, float]:
+    """The features of a refined pose among its rivals; every one is finite.
+
+    Args:
+        fit: the refined pose and its residuals.
+        candidates: the distinct poses, best first.
+        uncertainty: of the pose.
+        source: what was registered.
+        target: the bone.
+        config: how a mirrored source is refined, and how far a smooth bias reaches.
+    """
+    second = candidates.scores[1] if len(candidates.scores) > 1 else 2.0 * candidates.scores[0]
+    inlier = fit.weights > 0.0
+    agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
+    return {
+        "log_sigma": float(np.log(fit.sigma_mm)),
+        "log_excess": float(np.log(fit.sigma_mm / max(source.noise_mm, 0.1))),
+        "smooth_misfit": uncertainty.smooth_mm,
+        "short_misfit": uncertainty.short_mm,
+        "inlier_ratio": float(inlier.mean()),
+        "residual": float(np.sqrt(candidates.scores[0])),
+        "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
+        "support": float(candidates.support[0]),
+        "log_shift_sd": float(np.log(uncertainty.largest_shift_mm)),
+        "log_turn_sd": float(np.log(uncertainty.largest_turn_deg)),
+        "normal_agreement": float(np.median(agreement[inlier])) if inlier.any() else 0.0,
+        "log_points": float(np.log(len(source.points))),
+        "extent": float(
+            np.linalg.norm(source.points - source.points.mean(axis=0), axis=1).max() / target.half_extent_mm
+        ),
+        **of_another_bone(fit, uncertainty, source, target, config),
+    }
+
+
+def of_another_bone(
+    fit: Fit, uncertainty: PoseUncertainty, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
+) -> dict[str, float]:
+    """What tells a bone of another size or of the other side of the body; `OTHER_BONE` are the names."""
+    scale, scale_sd = scale_of(fit, uncertainty.bias_mm, config.covariance)
+    return {
+        "scale_off": abs(scale) * USUAL_SCALE_SD**2 / (USUAL_SCALE_SD**2 + scale_sd**2),
+        "log_scale_sd": float(np.log(scale_sd)),
+        "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),
+    }
+
+
+def scale_of(fit: Fit, bias_mm: float, config: CovarianceConfig) -> tuple[float, float]:
+    """How much larger the source would have to be to fit best, and the standard deviation of that.
+
+    One Gauss-Newton step of a similarity: the pose's six columns and, for the scale, the residuals' derivative
+    n . (p - c). The standard deviation is that of the same least squares under noise and smooth bias.
+
+    Returns:
+        The scale less 1 (0.05: the source is 5 % too small), and its standard deviation, at most 1.
+    """
+    inlier = np.flatnonzero(fit.weights > 0.0)
+    if len(inlier) < 8:
+        return 0.0, 1.0
+    offsets = (fit.moved - fit.moved.mean(axis=0))[inlier]
+    grows = np.einsum("ni,ni->n", fit.gradients[inlier], offsets)
+    J, w = np.column_stack([fit.jacobian[inlier], grows]), fit.weights[inlier]
+    H = (J * w[:, None]).T @ J + np.diag([1e-6] * 3 + [1e-3] * 4)
+    gain = np.linalg.inv(H)[6] @ (J * w[:, None]).T
+    of_bias = gain @ fields(fit, config.correlation_mm, config.centres)[inlier]
+    variance = fit.sigma_mm**2 * gain @ gain + bias_mm**2 * of_bias @ of_bias
+    return float(np.clip(-gain @ fit.signed_mm[inlier], -1.0, 1.0)), float(np.clip(np.sqrt(variance), 1e-5, 1.0))

@@ -1,0 +1,155 @@
+"""Light travels straight: what a camera saw says where the bone is and where it cannot be.
+
+Between the camera and a measured point there is nothing. A pose that puts bone there is impossible, whatever else it
+explains; bone behind a measured point may be hidden, and outside the image nothing is known. So each point of the
+target's surface is compared with what was measured on its own line of sight.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import minimum_filter
+from scipy.spatial import cKDTree
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import quadrics, se3
+from gapr_core.registration.clutter_kernels import compare_with_image
+from gapr_core.runtime.parallel import thread_count
+
+Array = NDArray[np.float64]
+
+SMALLEST_PIXEL, MOST_PIXELS = 0.003, 160_000  # tangent of an angle; of the whole image
+REACH = 0.006  # tangent of the angle up to which a measured point speaks for a line of sight; at least 1.5 pixels
+VIOLATION_COSTS, MISFIT_COSTS = 2.0, 0.2  # of a share of the surface that cannot be, or is not, where a pose puts it
+WIDEST_COS = 0.25  # of the angle to the middle of the view up to which points are in the image
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """The source as its camera saw it: a pinhole image that looks at the middle of the cloud.
+
+    Attributes:
+        T_camera_source: (4, 4), mm; the camera looks along its z.
+        pixels: (rows, columns, 6) float32: unit normal (3) of the measured surface towards the camera and its offset
+            n . p, depth z of the measured point, smallest depth of the 3 x 3 pixels around. Camera frame, mm; the depth
+            is 0 where nothing was measured.
+        origin: (2,) x / z and y / z of the middle of pixel (0, 0).
+        pixel: edge of a pixel as a difference of x / z.
+    """
+
+    T_camera_source: Array
+    pixels: NDArray[np.float32]
+    origin: Array
+    pixel: float
+
+
+@dataclass(frozen=True, eq=False)
+class Visible:
+    """How poses explain an image, as shares of the target's surface.
+
+    Attributes:
+        explained: (K,) share that faces the camera and lies on what was measured.
+        violating: (K,) share that lies clearly in front of what was measured.
+        compared: (K,) share that faces the camera and could have been seen: neither outside the image nor hidden.
+    """
+
+    explained: Array
+    violating: Array
+    compared: Array
+
+    @property
+    def score(self) -> Array:
+        """(K,) explained share, less what the camera saw otherwise and, dearer, what it saw through."""
+        otherwise = np.maximum(self.compared - self.explained, 0.0)
+        return np.asarray(self.explained - MISFIT_COSTS * otherwise - VIOLATION_COSTS * self.violating)
+
+
+def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
+    """The image of a cloud.
+
+    Args:
+        points: (N, 3), mm, source frame.
+        normals: (N, 3), unit; the sign does not matter.
+        viewpoint: (3,), mm, source frame.
+
+    Raises:
+        InvalidPointCloudError: when the viewpoint lies in the middle of the points, so that no camera sees them.
+    """
+    eye = np.asarray(viewpoint, dtype=np.float64)
+    T = _looking_at(eye, points)
+    seen = se3.apply(T, points)
+    in_view = seen[:, 2] > WIDEST_COS * np.linalg.norm(seen, axis=1)
+    if in_view.sum() < quadrics.FEWEST_NEIGHBOURS:
+        raise InvalidPointCloudError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
+    seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
+    turned = quadrics.orient(turned, -seen)
+    rays = seen[:, :2] / seen[:, 2:]
+    tree = cKDTree(rays)
+    pixel = max(SMALLEST_PIXEL, float(np.median(tree.query(rays, k=2)[0][:, 1])))
+    pixel = max(pixel, float(np.sqrt(np.prod(np.ptp(rays, axis=0)) / MOST_PIXELS)))
+    origin = rays.min(axis=0)
+    columns, rows = (int(n) for n in np.ceil(np.ptp(rays, axis=0) / pixel) + 1)
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    centres = origin + pixel * np.stack([x.ravel(), y.ravel()], axis=1)
+    _, nearest = tree.query(centres, distance_upper_bound=max(REACH, 1.5 * pixel))
+    return DepthImage(T, _pixels(nearest.reshape(rows, columns), seen, turned), origin, pixel)
+
+
+def _looking_at(eye: Array, points: Array) -> Array:
+    """T_camera_source of a camera at `eye` that looks at the middle of the points."""
+    ahead = points.mean(axis=0) - eye
+    length = float(np.linalg.norm(ahead))
+    ahead = ahead / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    R = np.concatenate([quadrics.tangent_basis(ahead[None])[0], ahead[None]])
+    return se3.from_rotation_translation(R, -R @ eye)
+
+
+def _pixels(nearest: NDArray[np.int64], points: Array, normals: Array) -> NDArray[np.float32]:
+    """Pixels (rows, columns, 6) from the index of each one's point; the index behind the last one means none."""
+    offsets = np.einsum("ni,ni->n", points, normals)
+    rows = np.vstack([np.column_stack([normals, offsets, points[:, 2], points[:, 2]]), np.zeros(6)])
+    pixels = rows[nearest].astype(np.float32)
+    depth = np.where(pixels[..., 4] > 0.0, pixels[..., 4], np.inf)
+    pixels[..., 5] = np.where(pixels[..., 4] > 0.0, minimum_filter(depth, size=3), 0.0)
+    return pixels
+
+
+def compare(
+    poses: Array,
+    points: Array,
+    normals: Array,
+    image: DepthImage,
+    on_mm: float = 3.0,
+    front_mm: float = 4.0,
+    num_threads: int = 0,
+) -> Visible:
+    """Compare a target under many poses with an image.
+
+    Args:
+        poses: (K, 4, 4) T_target_source, mm.
+        points: (M, 3) of the target, evenly spread, mm.
+        normals: (M, 3) unit, outward.
+        image: what the camera saw.
+        on_mm: how far from a measured surface a point is explained by it.
+        front_mm: how far in front of what was measured there can be no bone.
+        num_threads: 0 for all cores.
+    """
+    inverse = poses[:, :3, :3].transpose(0, 2, 1)
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = inverse, -np.einsum("kij,kj->ki", inverse, poses[:, :3, 3])
+    T = (image.T_camera_source @ T)[:, :3].astype(np.float32)
+    cloud = np.hstack([points, normals]).astype(np.float32)
+    view = image.pixels, np.float32(image.origin[0]), np.float32(image.origin[1]), np.float32(1.0 / image.pixel)
+
+    def work(piece: NDArray[np.float32]) -> NDArray[np.float32]:
+        return compare_with_image(piece, cloud, *view, np.float32(on_mm), np.float32(front_mm))  # type: ignore[no-any-return]
+
+    threads = thread_count(num_threads)
+    pieces = [p for p in np.array_split(T, 4 * threads) if len(p)]
+    with ThreadPoolExecutor(threads) as pool:
+        shares = np.concatenate(list(pool.map(work, pieces)))
+    return Visible(*shares.astype(np.float64).T)

@@ -1,0 +1,144 @@
+"""Where to look next: which patch of the bone would make the answer most precise and exclude the rivals.
+
+A look at a patch of m points with residual Jacobians J, white noise of variance s^2 and a bias of variance b^2 that is
+common to the patch adds the Fisher information J^T (s^2 I + b^2 1 1^T)^-1 J to the inverse covariance C^-1 of the pose
+(Sherman and Morrison 1950 for the inverse). What then remains is the 95 % bound of the error over the bone, to which
+every rival pose that the look would not exclude adds its own distance, weighted with its probability.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.config import GuidanceConfig
+from gapr_core.geometry import sampling, se3
+from gapr_core.registration import precision
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.results import Guidance, Hypothesis, Patch
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Candidate patches of a target.
+
+    Attributes:
+        centres: (K,) indices of target points.
+        members: for each patch the indices of its target points.
+    """
+
+    centres: NDArray[np.int64]
+    members: list[NDArray[np.int64]]
+
+
+def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
+    """Patches of the target ranked by what a look there would gain; None where the whole bone was seen.
+
+    Args:
+        assessment: the best pose so far, its covariance and its rivals.
+        config: size of a patch, points and bias of a look.
+    """
+    target, hypotheses = assessment.target, assessment.hypotheses
+    patches = _unseen(_patches(target, config), assessment, config)
+    if not len(patches.centres):
+        return None
+    bounds = _bounds_mm(assessment, patches, config)
+    distances = np.array([_apart_mm(hypotheses[0], rival, target) for rival in hypotheses[1:]])
+    weights = np.array([rival.probability for rival in hypotheses[1:]])
+    excluded = np.array([_excluded(assessment, members, config) for members in patches.members])
+    open_mm2 = (weights * distances**2) @ (1.0 - excluded).T if len(weights) else np.zeros(len(bounds))
+    now_mm = float(np.sqrt(assessment.tre95_mm**2 + weights @ distances**2))
+    after_mm = np.sqrt(bounds**2 + open_mm2)
+    order = np.argsort(after_mm, kind="stable")
+    share = excluded @ weights / max(float(weights.sum()), 1e-12) if len(weights) else np.ones(len(bounds))
+    ranked = tuple(
+        Patch(target.points[i], target.normals[i], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k]))
+        for k, i in zip(order, patches.centres[order], strict=True)
+    )
+    return Guidance(target.points, _spread(target, patches, now_mm - after_mm), now_mm, ranked)
+
+
+def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array:
+    """(..., 6, 6) Fisher information of a look at patches.
+
+    Args:
+        J: (..., n, 6) Jacobians of the residuals at places spread over a patch.
+        points: m, how many points the look gives, evenly over these places.
+        noise_mm: s, white noise of a point.
+        bias_mm: b, standard deviation of the bias that all of them share.
+    """
+    inner = points * np.einsum("...na,...nb->...ab", J, J) / J.shape[-2]
+    total = points * J.mean(axis=-2)
+    common = bias_mm**2 / (noise_mm**2 * (noise_mm**2 + points * bias_mm**2))
+    return np.asarray(inner / noise_mm**2 - common * total[..., :, None] * total[..., None, :])
+
+
+def _patches(target: PreparedTarget, config: GuidanceConfig) -> Patches:
+    """Balls around evenly spread points, less what faces another way than the centre."""
+    centres = sampling.thin(target.points, config.patches)
+    balls = target.tree.query_ball_point(target.points[centres], config.patch_mm / 2.0)
+    members = [
+        np.array(ball)[target.normals[ball] @ target.normals[i] > 0.3] for i, ball in zip(centres, balls, strict=True)
+    ]
+    return Patches(centres, members)
+
+
+def _unseen(patches: Patches, assessment: Assessment, config: GuidanceConfig) -> Patches:
+    """Those of which the source shows less than half."""
+    seen = assessment.fit.moved[assessment.fit.weights > 0.0]
+    if not len(seen):
+        return patches
+    near = cKDTree(seen).query(assessment.target.points)[0] < config.seen_mm
+    kept = [k for k, members in enumerate(patches.members) if near[members].mean() < 0.5]
+    return Patches(patches.centres[kept], [patches.members[k] for k in kept])
+
+
+def _bounds_mm(assessment: Assessment, patches: Patches, config: GuidanceConfig) -> Array:
+    """(K,) 95 % bound of the error over the bone after a look at each patch."""
+    target, centre = assessment.target, assessment.centre_mm
+    noise_mm, bias_mm = (
+        max(assessment.fit.sigma_mm, config.noise_mm),
+        max(assessment.uncertainty.bias_mm, config.bias_mm),
+    )
+    known = np.linalg.inv(assessment.uncertainty.covariance)
+    bounds = []
+    for members in patches.members:
+        normals = target.normals[members]
+        J = np.hstack([normals, np.cross(target.points[members] - centre, normals)])
+        covariance = np.asarray(np.linalg.inv(known + information(J, config.points, noise_mm, bias_mm)), np.float64)
+        bound_mm = precision.bound_mm(covariance, target.points[target.anchors], centre)
+        bounds.append(assessment.factor95 * bound_mm)
+    return np.array(bounds)
+
+
+def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> float:
+    """Root-mean-square distance over the bone between where two hypotheses put it."""
+    points = target.points[target.anchors]
+    gap = points - se3.apply(best.T_target_source @ se3.inverse(rival.T_target_source), points)
+    return float(np.sqrt((gap**2).sum(axis=1).mean()))
+
+
+def _excluded(assessment: Assessment, members: NDArray[np.int64], config: GuidanceConfig) -> Array:
+    """(R,) share of each rival's probability that a look at the patch would take.
+
+    Under a rival the patch of the best pose lies d off the surface; its likelihood falls by exp(-d^2 / 2 (s^2 + b^2)).
+    """
+    target, (best, *rivals) = assessment.target, assessment.hypotheses
+    variance = max(assessment.fit.sigma_mm, config.noise_mm) ** 2 + config.bias_mm**2
+    points = se3.apply(se3.inverse(best.T_target_source), target.points[members])
+    off = [target.tree.query(se3.apply(rival.T_target_source, points))[0] for rival in rivals]
+    return np.array([1.0 - np.exp(-0.5 * (d**2).mean() / variance) for d in off])
+
+
+def _spread(target: PreparedTarget, patches: Patches, gain: Array) -> Array:
+    """(M,) the gain at every target point: that of the nearest patch; 0 for what was seen."""
+    distance, nearest = cKDTree(target.points[patches.centres]).query(target.points)
+    inside = np.zeros(len(target.points), dtype=bool)
+    inside[np.concatenate(patches.members)] = True
+    return np.where(inside, np.maximum(gain[nearest], 0.0), 0.0)

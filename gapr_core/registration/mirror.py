@@ -1,0 +1,80 @@
+"""Left for right: does the mirrored source fit the bone as well?
+
+The bone of the other side of the body is the mirror image of this one. Where a patch is nearly its own mirror image no
+residual tells the two apart; where it is not, the mirrored source fits badly. A bone that is its own mirror image as a
+whole (a pelvis, a rib cage) has no other side: those images are not counted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import VerificationConfig
+from gapr_core.geometry import se3
+from gapr_core.registration.refinement import refine_many
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+LIMITS = (-1.5, 4.0)  # of the margin: what is clearer decides nothing more
+PLANES = 6  # through the bone's long axis, evenly turned
+OWN_IMAGE_SHARE = 0.02  # of the half extent: a bone whose image lies so near, as a median, is its own mirror image
+POINTS = 400  # of the bone, for that
+FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+def margin(
+    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+) -> float:
+    """Log of the mean square residual that the mirrored source reaches over that of the source itself.
+
+    Args:
+        T: (4, 4) T_target_source of the pose, mm.
+        source: what was registered.
+        target: the bone.
+        config: how hypotheses are refined.
+        num_threads: 0 for all cores.
+
+    Returns:
+        Below 0 where the mirrored source fits better, about 0 where nothing tells left from right, at most 4.
+    """
+    some, limits_mm = source.subset(config.middle_points), np.linspace(*config.middle_limits_mm)
+    reflections = np.array(_reflections(T, some, target))
+    own = refine_many(T[None], some, target, limits_mm, num_threads)[1][0]
+    poses, scores = refine_many(reflections @ T @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
+    for number in np.argsort(scores):
+        if not _is_own_image(poses[number] @ FLIP @ se3.inverse(T), target):
+            return float(np.clip(np.log(scores[number] / own), *LIMITS))
+    return LIMITS[1]
+
+
+def _reflections(T: Array, points: Array, target: PreparedTarget) -> list[Array]:
+    """(4, 4) reflections, target frame: at planes through the bone's long axis and at the source's own main planes."""
+    axes, centre = _axes(target.points), target.points.mean(axis=0)
+    angles = np.arange(PLANES) * np.pi / PLANES
+    of_bone = [np.cos(angle) * axes[0] + np.sin(angle) * axes[1] for angle in angles]
+    moved = se3.apply(T, points)
+    own = [(normal, moved.mean(axis=0)) for normal in _axes(moved)]
+    return [_reflection(normal, at) for normal, at in [*((normal, centre) for normal in of_bone), *own]]
+
+
+def _axes(points: Array) -> Array:
+    """(3, 3) principal axes as rows, the longest last."""
+    return np.asarray(np.linalg.eigh(np.cov(points.T))[1].T)
+
+
+def _reflection(normal: Array, through: Array) -> Array:
+    """(4, 4) p -> p - 2 n (n . (p - c))."""
+    H = np.eye(4)
+    H[:3, :3] -= 2.0 * np.outer(normal, normal)
+    H[:3, 3] = 2.0 * normal * (normal @ through)
+    return H
+
+
+def _is_own_image(image: Array, target: PreparedTarget) -> bool:
+    """True when a motion with a reflection lays the whole bone on itself."""
+    some = target.points[:: max(1, len(target.points) // POINTS)]
+    gaps_mm = target.tree.query(some @ image[:3, :3].T + image[:3, 3])[0]
+    return bool(np.median(gaps_mm) < OWN_IMAGE_SHARE * target.half_extent_mm)

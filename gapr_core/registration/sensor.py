@@ -1,0 +1,72 @@
+"""What is known of a sensor before its residuals are seen: its stand-off, noise, smooth bias and scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gapr_core.config import SensorConfig
+from gapr_core.registration.target import PreparedTarget
+
+SPARSE_POINTS = 400  # a source of more is the less likely touched or sliced: its stand-off falls as 1 / N
+KNOWN_STANDOFF_MM = 0.15  # standard deviation of a stand-off that the user states: contact is never full
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Standard deviations of what no residual shows, or few points cannot.
+
+    Attributes:
+        offset_mm: mean stand-off, outwards; it is subtracted.
+        standoff_mm: of the stand-off about that mean, the same in all points.
+        noise_mm: of a point.
+        bias_mm: typical size of the smooth bias.
+        scale: of the relative error of the size.
+    """
+
+    offset_mm: float
+    standoff_mm: float
+    noise_mm: float
+    bias_mm: float
+    scale: float
+
+
+KINDS = {
+    "unknown": Errors(offset_mm=0.0, standoff_mm=0.5, noise_mm=0.5, bias_mm=0.1, scale=0.001),
+    "pointer": Errors(offset_mm=0.5, standoff_mm=0.35, noise_mm=0.4, bias_mm=0.15, scale=0.0),
+    "ultrasound": Errors(offset_mm=0.0, standoff_mm=0.6, noise_mm=0.5, bias_mm=0.2, scale=0.02),
+    "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.0),
+    "laser": Errors(offset_mm=0.0, standoff_mm=0.05, noise_mm=0.15, bias_mm=0.05, scale=0.002),
+}
+"""What is usual: a real pointer lies .34 to .62 mm outside, sound is 1 to 3 % faster or slower than assumed."""
+
+
+def errors(sensor: SensorConfig, points: int) -> Errors:
+    """The errors to expect of a source of so many points; what the user states replaces what is usual.
+
+    Who names no sensor and brings few points has touched or sliced the bone; a dense cloud has hardly a stand-off.
+    """
+    usual = KINDS[sensor.kind]
+    if sensor.kind == "unknown":
+        usual = replace(usual, standoff_mm=usual.standoff_mm * min(1.0, SPARSE_POINTS / max(points, 1)))
+    stated = {name: getattr(sensor, name) for name in ("noise_mm", "bias_mm", "scale")}
+    usual = replace(usual, **{name: value for name, value in stated.items() if value is not None})
+    if sensor.standoff_mm is None:
+        return usual
+    return replace(usual, offset_mm=sensor.standoff_mm, standoff_mm=KNOWN_STANDOFF_MM)
+
+
+def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarget:
+    """The target whose surface elements lie where the sensor sees them: farther out by the stand-off.
+
+    The residual of a point becomes its signed distance to the bone less the stand-off. Everything else of the target
+    stays, and so does the target itself where the stand-off is 0.
+    """
+    offset_mm = errors(sensor, 0).offset_mm
+    if offset_mm == 0.0:
+        return target
+    elements = target.elements.copy()
+    elements[:, :3] += offset_mm * elements[:, 3:6]
+    both = None if target.both_cortices is None else offset_surface(target.both_cortices, sensor)
+    return replace(target, elements=np.ascontiguousarray(elements), both_cortices=both)

@@ -1,0 +1,78 @@
+"""The pose corrected for a smooth bias: soft tissue, a warped scan, a badly calibrated probe.
+
+Such a bias moves whole regions along their normals. Plain least squares treats their points as independent witnesses
+and lets the regions pull the pose along. Here the bias is a nuisance: a Gaussian process over the surface with
+correlation exp(-d^2 / 2 l^2), and the pose is that of generalised least squares, which leans on what varies faster than
+the bias can. How large the bias is, and whether there is one, the residuals say themselves by restricted maximum
+likelihood, in which the pose is integrated out (Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig
+from gapr_core.geometry import se3
+from gapr_core.geometry.twists import error_twist, nees
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square
+from gapr_core.registration.covariance import estimate
+from gapr_core.registration.refinement import Fit, evaluate_with_patches
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+
+def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessment:
+    """The assessment with its pose, and what follows from it, moved to where a smooth bias does not pull it.
+
+    Without evidence of a bias the same object comes back.
+    """
+    a = assessment
+    fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config.smooth_bias, config.refinement)
+    return a if fit is a.fit else replace(a, fit=fit, uncertainty=estimate(fit, config.covariance, config.sensor))
+
+
+def corrected_fit(
+    fit: Fit,
+    covariance: Array,
+    source: PreparedSource,
+    target: PreparedTarget,
+    config: SmoothBiasConfig,
+    refinement: RefinementConfig,
+) -> Fit:
+    """The fit after some steps of generalised least squares; `fit` itself where its residuals show no bias.
+
+    A move that the covariance all but rules out is not made: an answer must stay near what was assessed.
+
+    Args:
+        fit: from `refine_fully`.
+        covariance: (6, 6) of `fit`, as `gapr_core.registration.covariance.estimate` gives it.
+        source, target: what was refined, and on what.
+        config: of the bias.
+        refinement: as `fit` was refined with.
+    """
+    if np.count_nonzero(fit.weights) < config.fewest_points:
+        return fit
+    spanned, corrected = fields(fit, config.correlation_mm, config.centres), fit
+    for _ in range(config.iterations):
+        equations = NormalEquations.of(corrected, spanned)
+        size_mm = believed_size_mm(equations, config)
+        if size_mm == 0.0:
+            break
+        T = se3.exp(equations.step(size_mm), corrected.moved.mean(axis=0)) @ corrected.T
+        corrected = evaluate_with_patches(T, source.points, target, refinement, source.neighbours)
+        corrected = replace(corrected, bias_mm=size_mm)
+    is_plausible = nees(error_twist(corrected.T, fit.T, source.points), covariance) < config.largest_move
+    return corrected if is_plausible else fit
+
+
+def believed_size_mm(equations: NormalEquations, config: SmoothBiasConfig) -> float:
+    """Standard deviation of the bias: its posterior root mean square over `config.sizes_mm`; 0 without evidence."""
+    sizes_mm = np.array(config.sizes_mm)
+    log_likelihood = equations.log_likelihood(sizes_mm, config.smallest_share)
+    return 0.0 if log_likelihood.max() < config.evidence else root_mean_square(sizes_mm, log_likelihood)

@@ -1,0 +1,69 @@
+"""Files that appear whole or not at all, and one sentence where they cannot be read or written."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gapr_core.errors import ConfigError
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A hidden file in the folder of `path`, to be written; it takes the place of `path` when the block ends well.
+
+    After an error the old file is as it was. Missing folders are made.
+
+    Raises:
+        ConfigError: the file cannot be written: no such folder, no permission, a full disk.
+    """
+    path = Path(path)
+    if not path.name or path.is_dir():
+        raise ConfigError("a path of a file", f"{path}, a folder", "add the name of the file")
+    scratch = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield scratch
+        os.replace(scratch, path)
+    except OSError as error:
+        raise unwritable(path, error) from error
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a whole UTF-8 file; see `replacing`."""
+    with replacing(path) as scratch:
+        scratch.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write plain values as a whole JSON file; see `replacing`."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def read_json(path: str | Path, what: str) -> Any:
+    """The content of a JSON file.
+
+    Args:
+        path: where it is.
+        what: what the file should be, in words, for the error.
+
+    Raises:
+        ConfigError: it cannot be read, or is no JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise ConfigError(what, f"{path} ({why})", "check the path, or make the file again") from error
+
+
+def unwritable(path: str | Path, error: OSError) -> ConfigError:
+    """What to say of a path that cannot be written."""
+    why = error.strerror or str(error)
+    return ConfigError("a path that can be written", f"{path} ({why})", "choose another path, or free some space")

@@ -1,0 +1,229 @@
+"""Settings as frozen dataclasses: default, range, unit and help in one place, the same from file, command line and ROS.
+
+    @dataclass(frozen=True)
+    class Search(Settings):
+        spins: int = setting(36, "turns about the normal that are tried", low=1, high=360)
+
+`Search(spins=0)` raises; `from_dict`, `load` and `table` work for every such class, nested ones too.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from gapr_core.errors import ConfigError
+
+T = TypeVar("T")
+S = TypeVar("S", bound="Settings")
+
+
+def setting(
+    default: Any, text: str, *, low: float | None = None, high: float | None = None, unit: str = "",
+    choices: Iterable[str] = (), **more: Any,
+) -> Any:  # fmt: skip
+    """A field of a settings class.
+
+    Args:
+        default: also decides nothing about the type, which is the annotation's.
+        text: help, a phrase without the unit and the range.
+        low, high: ends of the range, both included; None where there is no end.
+        unit: of the value; empty for counts and shares.
+        choices: of a text; empty for any.
+        more: what another reader of the field needs, such as whether a ROS parameter may change at run time.
+    """
+    metadata = {"text": text, "low": low, "high": high, "unit": unit, "choices": tuple(choices), **more}
+    if isinstance(default, dict | list):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of settings: values out of range cannot be made."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            problem = why_not(each, getattr(self, each.name))
+            if problem:
+                raise ConfigError(f"{each.name} {problem}", repr(getattr(self, each.name)), "correct the setting")
+
+    @classmethod
+    def from_dict(cls: type[S], values: Any) -> S:
+        """The defaults with a nested mapping over them; see the function `from_dict`."""
+        return from_dict(cls, values)
+
+    @classmethod
+    def from_yaml(cls: type[S], path: str | Path) -> S:
+        """The defaults with a file's entries over them; see `load`."""
+        return load(cls, path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested dictionaries, as `from_dict` takes them."""
+        return asdict(self)
+
+
+def why_not(of: Field, value: Any) -> str:
+    """What a value of a field must be, where it is not; empty where it is."""
+    choices, low, high = (of.metadata.get(key) for key in ("choices", "low", "high"))
+    if choices and value not in choices:
+        return f"one of {', '.join(choices)}"
+    if (low is None and high is None) or (value is None and of.default is None):
+        return ""
+    numbers = value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else (value,)
+    if all(_is_within(number, low, high) for number in numbers):
+        return ""
+    return f"of {range_text(of)}"
+
+
+def range_text(of: Field) -> str:
+    """The range of a field in words, with its unit; empty where it has none."""
+    low, high, unit = (of.metadata.get(key) for key in ("low", "high", "unit"))
+    ends = [f"at least {low:g}" if low is not None else "", f"at most {high:g}" if high is not None else ""]
+    text = f"{low:g} to {high:g}" if low is not None and high is not None else "".join(ends)
+    return f"{text} {unit}".strip() if text else ""
+
+
+def from_dict(cls: type[T], values: Any, path: str = "") -> T:
+    """A dataclass from nested mappings; what is absent keeps its default.
+
+    Args:
+        cls: the dataclass; its annotations decide what a value may be. Lists become tuples, whole numbers floats.
+        values: a mapping of names to values.
+        path: what stands before the names in an error.
+
+    Raises:
+        ConfigError: a name that the dataclass does not have, a value of another type or out of range, or a missing one.
+    """
+    if not isinstance(values, Mapping):
+        where = f" under {path}" if path else ""
+        raise ConfigError(f"a mapping of settings{where}", repr(values), "write `name: value` lines")
+    known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
+    unknown = [str(name) for name in values if name not in known]
+    if unknown:
+        raise ConfigError(f"one of {', '.join(known)}", f"{path}{unknown[0]}", f"correct the name in {cls.__name__}")
+    missing = [f"{path}{name}" for name, f in known.items() if name not in values and not _has_default(f)]
+    if missing:
+        raise ConfigError(f"{', '.join(missing)} for {cls.__name__}", "none", "add it")
+    hints = _hints(cls)  # type: ignore[arg-type]
+    return cls(**{name: _converted(hints[name], value, f"{path}{name}") for name, value in values.items()})
+
+
+def load(cls: type[T], file: str | Path | None = None, assignments: Sequence[str] = ()) -> T:
+    """Settings from a YAML file, with `name.name=value` over them; what is named nowhere keeps its default.
+
+    Raises:
+        ConfigError: the file cannot be read, or see `from_dict`.
+    """
+    values = read_yaml(file) if file is not None else {}
+    for text in assignments:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError("name=value, such as refinement.iterations=5", repr(text), "write it with an =")
+        _put(values, name.strip().split("."), _parsed(value))
+    return from_dict(cls, values)
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """The mapping in a YAML file; an empty file is an empty mapping.
+
+    Raises:
+        ConfigError: it cannot be read, is no YAML, or holds something else than a mapping.
+    """
+    import yaml
+
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        why = " ".join(str(getattr(error, "strerror", None) or error).split())
+        raise ConfigError("a YAML file", f"{path} ({why})", "check the path and the file") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"a mapping in {path}", type(values).__name__, "write `name: value` lines")
+    return values
+
+
+class Row(NamedTuple):
+    """One setting as a reader sees it."""
+
+    name: str
+    default: Any
+    range: str
+    text: str
+
+
+def table(cls: type, prefix: str = "") -> Iterator[Row]:
+    """Every setting of a class and of those nested in it, with dotted names."""
+    hints = _hints(cls)
+    for f in fields(cls):
+        hint = hints[f.name]
+        if isinstance(hint, type) and is_dataclass(hint):
+            yield from table(hint, f"{prefix}{f.name}.")
+            continue
+        default = f.default_factory() if f.default_factory is not MISSING else f.default
+        of_range = ", ".join(f.metadata.get("choices", ())) or range_text(f) or f.metadata.get("unit", "")
+        yield Row(f"{prefix}{f.name}", default, of_range, f.metadata.get("text", ""))
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _has_default(of: Field) -> bool:
+    return of.default is not MISSING or of.default_factory is not MISSING
+
+
+def _is_within(number: Any, low: float | None, high: float | None) -> bool:
+    """NaN, and what is no number, is not."""
+    if not isinstance(number, int | float):
+        return False
+    return number >= (float("-inf") if low is None else low) and number <= (float("inf") if high is None else high)
+
+
+def _converted(hint: Any, value: Any, path: str) -> Any:
+    """The value as its annotation wants it."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):  # only X | None is used
+        return None if value is None else _converted(arguments[0], value, path)
+    if is_dataclass(hint):
+        return from_dict(hint, value, f"{path}.")  # type: ignore[arg-type]
+    if origin is tuple and isinstance(value, tuple | list):
+        each = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
+        if len(each) == len(value):
+            return tuple(_converted(h, v, path) for h, v in zip(each, value, strict=True))
+    if origin is dict and isinstance(value, Mapping):
+        return {name: _converted(arguments[1], v, f"{path}.{name}") for name, v in value.items()}
+    if origin is list and isinstance(value, list):
+        return [_converted(arguments[0], v, path) for v in value]
+    if hint is Any or (hint is not float and type(value) is hint):
+        return value
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    raise ConfigError(f"{path} of type {getattr(hint, '__name__', hint)}", repr(value), "correct the value")
+
+
+def _put(values: dict[str, Any], names: list[str], value: Any) -> None:
+    for name in names[:-1]:
+        inner = values.setdefault(name, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"a mapping under {name}", repr(inner), "correct the name")
+        values = inner
+    values[names[-1]] = value
+
+
+def _parsed(text: str) -> Any:
+    """A value as YAML reads it, 1e-3 included."""
+    import yaml
+
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError("a value such as 5, 0.5, true, [1, 2]", repr(text), "correct the value") from error
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value

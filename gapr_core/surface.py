@@ -1,0 +1,114 @@
+"""What is registered: a cloud or a triangle mesh in one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gapr_core.errors import InvalidPointCloudError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A cloud or a triangle mesh in one frame.
+
+    Attributes:
+        points: (N, 3) float64, mm; the vertices when there are faces.
+        faces: (F, 3) int64 vertex indices, or None for a cloud.
+        normals: (N, 3) float64 unit normals as read, or None.
+    """
+
+    points: Array
+    faces: NDArray[np.int64] | None = None
+    normals: Array | None = None
+
+    @classmethod
+    def from_open3d(cls, mesh: Any) -> Surface:
+        """Vertices and triangles of an `open3d.geometry.TriangleMesh`, in its unit; normals stay behind."""
+        return cls(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
+
+    def to_open3d(self) -> Any:
+        """The mesh as an `open3d.geometry.TriangleMesh`, mm, without normals.
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
+        import open3d as o3d
+
+        points, faces = o3d.utility.Vector3dVector(self.points), o3d.utility.Vector3iVector(self.triangles)
+        return o3d.geometry.TriangleMesh(points, faces)
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """(F, 3) the faces of a mesh.
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
+        if self.faces is None:
+            raise InvalidPointCloudError("a triangle mesh", "a cloud without faces", "give a mesh")
+        return self.faces
+
+    @property
+    def extent_mm(self) -> float:
+        """Diagonal of the axis-aligned bounding box, mm."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
+    def face_areas_mm2(self) -> Array:
+        """(F,) triangle areas, mm^2."""
+        return 0.5 * np.asarray(np.linalg.norm(self._face_crosses(), axis=1))
+
+    def mirrored(self) -> Surface:
+        """The mesh of the other side of the body: x negated, faces turned so that normals stay outward.
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
+        mirror = np.array([-1.0, 1.0, 1.0])
+        normals = None if self.normals is None else self.normals * mirror
+        return Surface(self.points * mirror, self.triangles[:, ::-1].copy(), normals)
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Random points on the faces, uniform in area.
+
+        Returns:
+            (count, 3) points, mm, and the (count, 3) unit normals of their faces (by the winding order).
+
+        Raises:
+            InvalidPointCloudError: for a cloud without faces.
+        """
+        crosses = self._face_crosses()
+        areas = np.linalg.norm(crosses, axis=1)
+        face = rng.choice(len(areas), size=count, p=areas / areas.sum())
+        u, v = rng.random((2, count, 1))
+        u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
+        a, b, c = self._corners(face)
+        return a + u * (b - a) + v * (c - a), crosses[face] / areas[face, None]
+
+    def _corners(self, face: NDArray[np.int64] | slice = slice(None)) -> tuple[Array, Array, Array]:
+        faces = self.triangles
+        return tuple(self.points[faces[face, i]] for i in range(3))  # type: ignore[return-value]
+
+    def _face_crosses(self) -> Array:
+        a, b, c = self._corners()
+        return np.cross(b - a, c - a)
+
+
+def as_points(array: ArrayLike) -> Array:
+    """An (N, 3) float64 array from anything of that shape.
+
+    Raises:
+        InvalidPointCloudError: for another shape or for entries that are not real numbers.
+    """
+    points = np.asarray(array)
+    if points.dtype.kind not in "fiu":
+        raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InvalidPointCloudError("an array of shape (N, 3)", f"shape {points.shape}", "pass x y z in columns")
+    return points.astype(np.float64)

@@ -1,0 +1,1 @@
+"""rosbag2 bags: reading, writing, replay."""

@@ -1,0 +1,1 @@
+"""`gapr demo`: a bag, the node, poses, a report."""

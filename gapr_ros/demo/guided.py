@@ -1,0 +1,166 @@
+"""A probe that follows the guidance: small looks at a bone, each where the node says that it would help most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core import metrics
+from gapr_core.data.looks import LookingProbe
+from gapr_core.data.pool import parametric_specimen
+from gapr_core.geometry import se3
+from gapr_core.pages.guidance import GuidedStep, guidance_figure
+from gapr_core.pages.report import Report, timeline_figure
+from gapr_ros.demo.act import Act, write_stl
+from gapr_ros.demo.report import Row, add_frames, facts, judge
+from gapr_ros.demo.running import STARTING, Sender, running
+
+if TYPE_CHECKING:
+    from gapr_ros.demo.observer import Advice, Answer, Observer
+
+Array = NDArray[np.float64]
+GOAL_MM = 2.0  # bound of the error over the bone (95 %) with which the probe has seen enough
+PARAMETERS = {"guide": True, "track": False, "min_points": 30}
+TITLE = "A probe that follows the guidance"
+LEAD = (
+    "The probe sees 30 mm of a {bone} at a time. After every look register_node says what it knows by now and where "
+    f"another look would help most; the probe goes there, until the 95 % bound of the error over the whole bone is "
+    f"{GOAL_MM:g} mm."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One look and what the node said.
+
+    Attributes:
+        cloud: (N, 3) mm, tracker frame: all points so far.
+        newest: how many of them, at the end, are of this look.
+        answer: to the cloud; None where none came.
+        advice: where to look next; None where the node did not say.
+    """
+
+    cloud: Array
+    newest: int
+    answer: Answer | None
+    advice: Advice | None
+
+    @property
+    def is_enough(self) -> bool:
+        """The bone is known as well as asked for."""
+        bound = self.answer.tre95_mm if self.answer and self.answer.T_target_source is not None else None
+        return bound is not None and bound <= GOAL_MM
+
+
+def make_probe(bone: str, seed: int) -> LookingProbe:
+    """A probe in front of a parametric bone."""
+    return LookingProbe(parametric_specimen(bone, seed), seed)
+
+
+def follow(probe: LookingProbe, observer: Observer, most: int, folder: Path, console: Any) -> list[Look]:
+    """Look, ask the node, look where it says; until it is enough, most looks are done, or it does not say where.
+
+    Raises:
+        DemoError: the node did not start, or ended too early.
+    """
+    path, looks = folder / f"{probe.specimen.bone}.stl", []
+    write_stl(probe.specimen.surface, path)
+    with running(observer, folder, {"model_path": path.resolve(), "model_unit": "mm", **PARAMETERS}) as node:
+        sender = Sender(node, "tracker")
+        with console.status(STARTING):
+            node.wait_until_ready()
+        cloud, centre = np.empty((0, 3)), probe.anywhere
+        for number in range(most):
+            newest = probe.look(centre, number)
+            cloud = np.vstack([cloud, newest])
+            observer.forget_advice()
+            answer = sender.ask(cloud, 1000 * (1 + number))
+            looks.append(Look(cloud, len(newest), answer, observer.advice))
+            console.print(f"   {_line(1 + number, looks[-1])}", highlight=False)
+            if looks[-1].is_enough or observer.advice is None:
+                break
+            centre = observer.advice.centre
+    return looks
+
+
+def _line(number: int, look: Look) -> str:
+    """What came of a look, for the terminal."""
+    answer, points = look.answer, len(look.cloud)
+    if answer is None:
+        return f"look {number}, {points} points: no answer"
+    if answer.T_target_source is None:
+        return shorten(f"look {number}, {points} points: refused: {answer.refusal}", 104, placeholder=" ...")
+    bound = "" if answer.tre95_mm is None else f", error over the bone below {answer.tre95_mm:.1f} mm (95 %)"
+    return f"look {number}, {points} points: pose, confidence {answer.confidence:.2f}{bound}"
+
+
+def judged(probe: LookingProbe, looks: Sequence[Look]) -> list[Row]:
+    """Every look against the truth."""
+    act = Act(
+        probe.specimen.bone, probe.specimen.surface, Path(), tuple(look.cloud for look in looks),
+        (probe.T_target_source,) * len(looks), 1.0, TITLE, LEAD,
+    )  # fmt: skip
+    return judge(act, {act.stamp_ms(k): look.answer for k, look in enumerate(looks) if look.answer is not None})
+
+
+def write(probe: LookingProbe, looks: Sequence[Look], rows: Sequence[Row], folder: Path) -> None:
+    """report.html."""
+    report = Report(TITLE, LEAD.format(bone=probe.specimen.bone))
+    report.facts(_facts(looks, rows))
+    report.heading("Where to look next")
+    report.paragraph(
+        "The bone is coloured by how much a look there would lower the bound of the error over the bone, rival poses "
+        "included. Black: the points so far, where they really are. Red: the newest look. Green: where the node sends "
+        "the probe. Below: that bound, and the true error, root mean square over the bone."
+    )
+    report.figure(guidance_figure(probe.specimen.surface, _steps(probe, looks)))
+    bounds = [_bound_mm(look) for look in looks]
+    errors = [_error_over_bone_mm(probe, look) for look in looks]
+    curves = {"95 % bound, mm": bounds, "true error, mm": errors}
+    report.figure(timeline_figure(range(1, len(looks) + 1), curves, "look", dict.fromkeys(curves, GOAL_MM)))
+    add_frames(report, rows)
+    report.write(folder / "report.html")
+
+
+def verdict(looks: Sequence[Look], rows: Sequence[Row]) -> str:
+    """The outcome in a sentence."""
+    return "  ".join(f"{name}: {value}." for name, value in _facts(looks, rows).items())
+
+
+def _facts(looks: Sequence[Look], rows: Sequence[Row]) -> dict[str, str]:
+    arrived = f"after {len(looks)} looks" if looks[-1].is_enough else "not reached"
+    own = {f"{GOAL_MM:g} mm over the bone (95 %)": arrived, "points": str(len(looks[-1].cloud))}
+    return own | facts(rows)
+
+
+def _steps(probe: LookingProbe, looks: Sequence[Look]) -> list[GuidedStep]:
+    return [
+        GuidedStep(
+            str(number),
+            _line(number, look),
+            se3.apply(probe.T_target_source, look.cloud),
+            look.newest,
+            look.advice and (look.advice.points, look.advice.gain_mm, look.advice.centre),
+        )
+        for number, look in enumerate(looks, 1)
+    ]
+
+
+def _bound_mm(look: Look) -> float:
+    answer = look.answer
+    posed = answer is not None and answer.T_target_source is not None and answer.tre95_mm is not None
+    return float(answer.tre95_mm) if posed else float("nan")
+
+
+def _error_over_bone_mm(probe: LookingProbe, look: Look) -> float:
+    """Root mean square over the bone of how far the pose puts it off; not finite without a pose."""
+    if look.answer is None or look.answer.T_target_source is None:
+        return float("nan")
+    bone = probe.specimen.surface.points
+    return metrics.whole_bone_rmse_mm(look.answer.T_target_source, probe.T_target_source, bone)

@@ -1,0 +1,34 @@
+"""What is wrong around the node and not in a cloud: said once, and shown in the diagnostics while it lasts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+
+class Conflicts:
+    """Sentences by kind; the executor's thread only.
+
+    Args:
+        write: logs a sentence when it is new.
+    """
+
+    def __init__(self, write: Callable[[str], None]) -> None:
+        self._write = write
+        self._texts: dict[str, str] = {}
+        self._until: dict[str, float] = {}
+
+    def note(self, kind: str, text: str, for_s: float = float("inf")) -> None:
+        """There is one of this kind, seen again or for the first time; it lasts `for_s` unless it is seen again.
+
+        An empty text: there is none any more.
+        """
+        if text and text != self._texts.get(kind):
+            self._write(text)
+        self._texts[kind], self._until[kind] = text, time.monotonic() + for_s
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Those that last, in the order in which their kinds were first seen."""
+        now = time.monotonic()
+        return tuple(text for kind, text in self._texts.items() if text and now < self._until[kind])

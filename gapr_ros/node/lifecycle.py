@@ -1,0 +1,269 @@
+"""The node: its lifecycle, parameters and clock; partial clouds in, poses of the pre-operative bone out.
+
+The executor's thread takes clouds in, decides on outcomes and sends. What takes time has threads of its own: a worker
+registers, a loader reads bones.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lifecycle_msgs.msg import Transition
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle.node import LifecycleNodeMixin
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+
+from gapr_ros import parameters
+from gapr_ros.node import frames
+from gapr_ros.node.diagnostics import Counters, Input, Snapshot
+from gapr_ros.node.guard import RosLogHandler, guarded, transition
+from gapr_ros.node.loader import Loader
+from gapr_ros.node.method import default_method
+from gapr_ros.node.model import make_ready
+from gapr_ros.node.reporter import Reporter
+from gapr_ros.node.services import Services
+from gapr_ros.node.session import Session
+from gapr_ros.node.subscription import Subscriptions
+from gapr_ros.parameters import NodeParameters
+
+LIBRARIES = ("gapr_core", "gapr_ros")  # whose logs go to the node's log
+
+
+class RegisterNode(LifecycleNodeMixin, Node):
+    """Lifecycle, parameters and clock of the node; a `Session` does the rest.
+
+    Args:
+        method_factory: makes the registration method from the parameters when the node is configured.
+        kwargs: of rclpy's Node (context, parameter_overrides, ...).
+
+    Raises:
+        ParameterError: a parameter of the wrong type or out of range; the text says what to write.
+    """
+
+    def __init__(self, method_factory: Callable[[NodeParameters], Any] = default_method, **kwargs: Any) -> None:
+        Node.__init__(self, "register_node", **kwargs)
+        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())  # one that waits stops no other
+        self.parameters = parameters.declare(self)
+        self._method_factory = method_factory
+        self.counters, self.failure = Counters(), ""
+        self.session: Session | None = None
+        self.subscriptions_in: Subscriptions | None = None
+        self._calls: deque[Callable[[], None]] = deque()
+        self._bell = self.create_guard_condition(self._on_bell)
+        self._watch_parameters()
+        self._watch_clock()
+        self._forward_logs()
+        self._reporter = Reporter(self, self._look)
+        self._loader, self._loaded = Loader(self, method_factory), None
+        self._services_offered = Services(self, self._loader, lambda: self.state, lambda: self.session)
+        self._load_before_configuring()
+        self._diagnosing = self.create_timer(self.parameters.diagnostics_period, self.report, clock=_steady_clock())
+        if self.parameters.autostart:
+            self.call_soon(self._autostart)
+
+    @property
+    def ros(self) -> RegisterNode:
+        """The node itself, as its rooms advertise and subscribe with it."""
+        return self
+
+    @property
+    def state(self) -> str:
+        """unconfigured, inactive, active or finalized."""
+        return str(self._state_machine.current_state[1])
+
+    def now_ns(self) -> int:
+        """The node's time, ns; 0 while simulated time has not started."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def call_soon(self, call: Callable[[], None]) -> None:
+        """Run in the executor's thread; from any thread."""
+        self._calls.append(call)
+        self._bell.trigger()
+
+    def report_failure(self, text: str) -> None:
+        """A transition failed: keep its reason for log and diagnostics."""
+        self.failure = text
+        self.get_logger().error(text)
+        self.call_soon(self.report)
+
+    def report(self) -> None:
+        """Send the diagnostics now."""
+        self._reporter.send()
+
+    def close(self, timeout_s: float = 0.0) -> bool:
+        """Destroy the node. False when a registration or a loading still runs after `timeout_s`."""
+        worker = None if self.session is None else self.session.worker
+        self._end_session()
+        ended = (worker is None or worker.stop(timeout_s)) and not self._loader.busy
+        for name in LIBRARIES:
+            logging.getLogger(name).removeHandler(self._log_handler)
+        self.destroy_node()
+        return ended
+
+    # --- lifecycle ---
+
+    def _load_before_configuring(self) -> None:
+        """Who asks to configure waits until the bone is read, the executor does not; then the state changes."""
+        service = self._service_change_state
+        service.callback = partial(self._on_change_asked, service.callback)
+
+    async def _on_change_asked(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
+        try:
+            if self._is_to_configure(request.transition):
+                if self._loader.busy:
+                    raise RuntimeError(f"{self._loader}: one bone at a time")
+                self._loaded = await self._loader.load()
+            return change(request, response)
+        except Exception as error:  # rclpy raises where the state does not allow the transition
+            self.get_logger().error(f"a change of state was refused: {error}")
+            response.success = False
+            return response
+
+    def _is_to_configure(self, asked: Transition) -> bool:
+        named = asked.label == "configure" if asked.label else asked.id == Transition.TRANSITION_CONFIGURE
+        return named and self.state == "unconfigured"
+
+    @transition
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take the bone that was read, or read it now where nobody did, and advertise."""
+        loaded, self._loaded = self._loaded, None
+        self.failure, self.parameters = "", parameters.read(self)
+        frames.check_names(self.parameters)
+        if isinstance(loaded, BaseException):
+            raise loaded
+        ready = loaded or make_ready(self._method_factory, self.parameters)
+        self.session = Session(self, ready, self._method_factory)
+        for sentence in parameters.remarks(self.parameters):
+            self.get_logger().info(sentence)
+        self.get_logger().info(str(ready.model))
+        return super().on_configure(state)
+
+    @transition
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen to clouds."""
+        result = super().on_activate(state)
+        self.session.send_model()
+        self.subscriptions_in = Subscriptions(self, self.session)
+        return result
+
+    @transition
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen no more; clouds on their way are refused."""
+        self._stop_listening()
+        return super().on_deactivate(state)
+
+    @transition
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the bone."""
+        self._end_session()
+        return TransitionCallbackReturn.SUCCESS
+
+    @transition
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give everything back."""
+        self._end_session()
+        return TransitionCallbackReturn.SUCCESS
+
+    @transition
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Back to unconfigured, from where it can be configured again."""
+        self._end_session()
+        return TransitionCallbackReturn.SUCCESS
+
+    @guarded
+    def _autostart(self) -> None:
+        self._loader.load().add_done_callback(self._start)
+
+    @guarded
+    def _start(self, loading: Future) -> None:
+        self._loaded = loading.result()
+        if self.state == "unconfigured" and self.trigger_configure() is TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def _stop_listening(self) -> None:
+        listening, self.subscriptions_in = self.subscriptions_in, None
+        if listening is not None:
+            listening.close()
+            self.session.stop_waiting("the node stopped listening")
+
+    def _end_session(self) -> None:
+        self._stop_listening()
+        session, self.session = self.session, None
+        if session is not None:
+            session.close()
+
+    def _look(self) -> Snapshot:
+        session, listening = self.session, self.subscriptions_in
+        return Snapshot(
+            name=self.get_fully_qualified_name(),
+            state=self.state,
+            loading=str(self._loader),
+            failure=self.failure,
+            counters=self.counters,
+            model=None if session is None else session.model,
+            last=None if session is None else session.last_outcome,
+            source=Input() if listening is None else listening.describe(),
+            listening=listening is not None,
+            conflicts=() if session is None else session.conflicts.texts,
+            hardware_id=Path(self.parameters.model_path).name or "no model",
+            child_frame=self.parameters.model_frame if self.parameters.publish_tf else "",
+        )
+
+    # --- what the node watches ---
+
+    def _watch_parameters(self) -> None:
+        for sentence in parameters.unknown_names(self):
+            self.get_logger().warning(sentence)
+        self.add_on_set_parameters_callback(self._on_change)
+        self.add_post_set_parameters_callback(self._on_changed)
+
+    def _watch_clock(self) -> None:
+        threshold = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
+        self._jump_handle = self.get_clock().create_jump_callback(threshold, post_callback=self._on_jump)
+
+    def _forward_logs(self) -> None:
+        self._log_handler = RosLogHandler(self.get_logger())
+        for name in LIBRARIES:
+            logging.getLogger(name).addHandler(self._log_handler)
+
+    def _on_change(self, changes: list[Parameter]) -> SetParametersResult:
+        why = parameters.check_change(changes, configured=self.session is not None or self._loader.busy)
+        return SetParametersResult(successful=not why, reason=why)
+
+    @guarded
+    def _on_changed(self, changes: list[Parameter]) -> None:
+        self.parameters = parameters.read(self)
+        if any(change.name == "diagnostics_period" for change in changes):
+            self._diagnosing.timer_period_ns = int(self.parameters.diagnostics_period * 1e9)
+            self._diagnosing.reset()
+        if self.session is not None:
+            self.session.parameters_changed()
+
+    @guarded
+    def _on_jump(self, jump: Any) -> None:
+        if self.session is not None:
+            self.session.clock_jumped()
+
+    def _on_bell(self) -> None:
+        while self._calls:
+            self._run_call(self._calls.popleft())
+
+    @guarded
+    def _run_call(self, call: Callable[[], None]) -> None:
+        call()
+
+
+def _steady_clock() -> Clock:
+    """For diagnostics, which must not stop with simulated time."""
+    return Clock(clock_type=ClockType.STEADY_TIME)

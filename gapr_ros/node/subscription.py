@@ -1,0 +1,134 @@
+"""The subscriptions: clouds serialised, newest first; reliable, and best effort too for publishers with only that."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+
+from gapr_ros.node.diagnostics import Gaps, Input
+from gapr_ros.node.guard import guarded
+from gapr_ros.node.host import Host
+from gapr_ros.node.session import Session
+from msg_adapters import INPUTS
+
+CLOUDS, SEEDS = "points", "initialpose"
+LOOK_S = 1.0  # between two looks at who publishes
+GRACE_S = 3.0  # the graph may know of a publisher later than the event of its QoS
+MOST_QUEUED = 100  # clouds in the middleware's queue
+REMEMBERED = 256  # clouds, to know the same one from the other subscription
+
+
+class Subscriptions:
+    """Listens to `points` and `initialpose` while the node is active.
+
+    Clouds stay serialised until the worker takes one: a dropped cloud costs nothing, and damaged bytes cannot end the
+    executor. Reliable publishers are heard by a reliable subscription, always. While there are publishers that offer
+    best effort only, a second subscription hears them; what both bring is taken once.
+    """
+
+    def __init__(self, host: Host, session: Session) -> None:
+        self._host, self._session = host, session
+        self._asked = host.parameters.cloud_reliability
+        self._mismatch, self._closed, self._gaps = "", False, Gaps()
+        self._taken: deque[tuple[int, int | None]] = deque(maxlen=REMEMBERED)
+        self._needed_at = 0.0
+        first = ReliabilityPolicy.BEST_EFFORT if self._asked == "best_effort" else ReliabilityPolicy.RELIABLE
+        self._clouds, self._second = self._subscribe(first), None
+        self._seeds = host.ros.create_subscription(PoseWithCovarianceStamped, SEEDS, self._on_seed, 1)
+        self._looking = host.ros.create_timer(LOOK_S, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def describe(self) -> Input:
+        """For /diagnostics."""
+        publishers = self._host.ros.count_publishers(self._clouds.topic_name)
+        mismatch = self._mismatch if publishers else ""
+        qos = "best_effort" if self._asked == "best_effort" else "reliable"
+        return Input(qos if self._second is None else "reliable and best_effort", publishers, mismatch)
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._closed = True
+        self._host.ros.destroy_timer(self._looking)
+        for subscription in (self._clouds, self._second, self._seeds):
+            if subscription is not None:
+                self._host.ros.destroy_subscription(subscription)
+
+    def get_logger(self) -> Any:
+        """The node's logger (for `guarded`)."""
+        return self._host.ros.get_logger()
+
+    @guarded
+    def look(self) -> None:
+        """See who publishes: how many, and whether somebody still needs best effort."""
+        publishers = self._host.ros.get_publishers_info_by_topic(self._clouds.topic_name)
+        best_effort = [p for p in publishers if p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT]
+        names = ", ".join(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
+        many = (
+            f"{len(publishers)} publishers on {self._clouds.topic_name} ({names}): a node follows one source of clouds"
+        )
+        self._session.conflicts.note("publishers", many if len(publishers) > 1 else "")
+        if best_effort:
+            self._needed_at = time.monotonic()
+        elif time.monotonic() - self._needed_at > GRACE_S:
+            self._mismatch = ""
+            self._hear_reliable_only()
+
+    def _subscribe(self, reliability: ReliabilityPolicy) -> Any:
+        depth = min(self._host.parameters.accumulate, MOST_QUEUED)  # every cloud counts where clouds are collected
+        return self._host.ros.create_subscription(
+            INPUTS[self._host.parameters.cloud_type].message, CLOUDS, self._on_cloud,
+            QoSProfile(depth=depth, reliability=reliability), raw=True,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch),
+        )  # fmt: skip
+
+    @guarded
+    def _on_cloud(self, data: bytes, info: dict[str, Any]) -> None:
+        number = info["publication_sequence_number"]  # None where the middleware has none
+        if self._is_taken((info["source_timestamp"], number)):
+            return
+        if number is not None:
+            self._host.counters.lost += self._gaps.note(number)
+        self._session.take_cloud(data)
+
+    def _is_taken(self, key: tuple[int, int | None]) -> bool:
+        """Whether the other subscription brought this cloud already."""
+        if self._second is None or not key[0]:
+            return False
+        if key in self._taken:
+            return True
+        self._taken.append(key)
+        return False
+
+    @guarded
+    def _on_seed(self, message: PoseWithCovarianceStamped) -> None:
+        self._session.take_seed(message)
+
+    @guarded
+    def _on_mismatch(self, event: Any) -> None:
+        self._needed_at = time.monotonic()
+        if self._asked == "auto" and event.last_policy_kind == QoSPolicyKind.RELIABILITY:
+            self._host.call_soon(self._hear_best_effort)
+            return
+        kind = qos_policy_name_from_kind(event.last_policy_kind)
+        topic = self._clouds.topic_name
+        self._mismatch = f"a publisher of {topic} offers an incompatible {kind}: none of its clouds come"
+        self.get_logger().error(self._mismatch)
+
+    def _hear_best_effort(self) -> None:
+        if self._closed or self._second is not None:
+            return
+        topic = self._clouds.topic_name
+        text = f"a publisher of {topic} is best effort: it is heard as such; its clouds above 0.5 MB may be lost"
+        self.get_logger().warning(text)
+        self._second = self._subscribe(ReliabilityPolicy.BEST_EFFORT)
+
+    def _hear_reliable_only(self) -> None:
+        second, self._second = self._second, None
+        if second is not None:
+            self.get_logger().info(f"every publisher of {self._clouds.topic_name} is reliable again")
+            self._host.ros.destroy_subscription(second)

@@ -1,0 +1,24 @@
+"""What a message type must offer to bring partial clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Input(NamedTuple):
+    """How one type of message is read. The message begins with a `std_msgs/Header`.
+
+    Attributes:
+        message: the type.
+        points: (N, 3) float64 points of a message, in its own unit and frame; rows that are not finite are dropped.
+            Raises `InvalidMessageError` for a message that contradicts itself.
+        count: how many points the message has, usable or not.
+    """
+
+    message: type
+    points: Callable[[Any], NDArray[np.float64]]
+    count: Callable[[Any], int]

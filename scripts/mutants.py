@@ -1,0 +1,226 @@
+"""Mutation tests: change one operator or number of a formula, and see whether a test notices.
+
+    make mutants                                          # every file of TESTS
+    python scripts/mutants.py --files covariance,rules    # some of them
+    python scripts/mutants.py --jobs 2 --out mutants.json
+
+cosmic-ray finds and makes the mutations. Each runs in a forked process that has NumPy, SciPy and pytest loaded already
+and imports the mutated text instead of the file; no file changes. Kernels run without Numba's compiler, so that theirs
+count, too. Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the
+mutants of `mutants_equivalent.txt`, which change nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.abc
+import importlib.util
+import json
+import os
+import resource
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+os.environ |= {
+    "NUMBA_DISABLE_JIT": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MPLBACKEND": "Agg",
+    "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+}
+sys.path.insert(0, str(ROOT))
+
+LIMIT_S = 30  # of processor time: a mutant that takes longer hangs, and the tests noticed
+SKIPPED = ("BitOr", "BitAnd", "BitXor", "RShift", "LShift", "FloorDiv", "_Mod", "Mod_")  # no formula has them
+REPLACED = ("core/Number", "core/ReplaceTrue", "core/ReplaceFalse", "core/RemoveDecorator")
+FORMULAS = "test/formulas"
+REGISTRATION, METRICS, GEOMETRY = "gapr_core/registration/", "gapr_core/metrics/", "gapr_core/geometry/"
+TESTS = {
+    REGISTRATION + "kernels.py": [f"{FORMULAS}/test_kernels.py"],
+    REGISTRATION + "refinement.py": [f"{FORMULAS}/test_refinement.py"],
+    REGISTRATION + "verification.py": [f"{FORMULAS}/test_verification.py"],
+    REGISTRATION + "rules.py": [f"{FORMULAS}/test_rules.py"],
+    REGISTRATION + "precision.py": [f"{FORMULAS}/test_precision.py"],
+    REGISTRATION + "covariance.py": ["test/core/registration/test_covariance.py"],
+    REGISTRATION + "evidence.py": [f"{FORMULAS}/test_evidence.py"],
+    GEOMETRY + "twists.py": ["test/core/test_twists.py"],
+    GEOMETRY + "se3.py": ["test/core/test_se3.py"],
+    GEOMETRY + "extent.py": ["test/core/test_extent.py"],
+    METRICS + "pose.py": ["test/core/metrics/test_pose_metrics.py"],
+    METRICS + "confidence.py": ["test/core/metrics/test_confidence_metrics.py"],
+    METRICS + "surfaces.py": ["test/core/metrics/test_surface_metrics.py"],
+    METRICS + "cramer_rao.py": ["test/core/test_twists.py"],
+    METRICS + "bootstrap.py": ["test/core/metrics/test_confidence_metrics.py"],
+}
+
+
+@dataclass
+class Mutant:
+    """One mutation and what became of it: killed, survived, setting or equivalent."""
+
+    file: str
+    line: int
+    operator: str
+    occurrence: int
+    text: str
+    fate: str = ""
+
+    @property
+    def key(self) -> str:
+        """What `mutants_equivalent.txt` names it by; line numbers would not last."""
+        return f"{self.file}: {self.operator}: {self.text}"
+
+
+def mutants_of(file: str) -> Iterator[tuple[Mutant, str]]:
+    """Every mutation of a file with the mutated text."""
+    import cosmic_ray.plugins
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.mutating import mutate_code
+
+    source = (ROOT / file).read_text(encoding="utf-8")
+    lines, settings = source.splitlines(), _lines_of_settings(source)
+    for name in cosmic_ray.plugins.operator_names():
+        operator_class = cosmic_ray.plugins.get_operator(name)
+        if operator_class.arguments() or any(part in name for part in SKIPPED) or name == "core/NoOp":
+            continue
+        operator = operator_class()
+        tree = get_ast(source)
+        places = [place for node in ast_nodes(tree) for place in operator.mutation_positions(node)]
+        for occurrence, ((line, _), _) in enumerate(places):
+            mutated = mutate_code(source, operator, occurrence)
+            if mutated is None or ast.dump(ast.parse(mutated)) == ast.dump(ast.parse(source)):
+                continue
+            changed = next((b for a, b in zip(lines, mutated.splitlines(), strict=False) if a != b), "").strip()
+            fate = "setting" if line in settings and name.startswith(REPLACED) else ""
+            yield Mutant(file, line, name.removeprefix("core/"), occurrence, changed, fate), mutated
+
+
+def _lines_of_settings(source: str) -> set[int]:
+    """Lines of NAMES_IN_CAPITALS, of decorators, and of the defaults of parameters."""
+    found: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        parts: list[ast.expr] = []
+        if isinstance(node, ast.Assign) and all(_is_setting(target) for target in node.targets):
+            parts = [node.value]
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            parts = [*node.decorator_list, *(node.args.defaults if isinstance(node, ast.FunctionDef) else [])]
+        for part in parts:
+            found |= set(range(part.lineno, (part.end_lineno or part.lineno) + 1))
+    return found
+
+
+def _is_setting(target: ast.expr) -> bool:
+    return all(name.id.isupper() for name in ast.walk(target) if isinstance(name, ast.Name))
+
+
+class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
+    """Imports one module from a text."""
+
+    def __init__(self, file: str, text: str) -> None:
+        self.name, self.path, self.text = file.removesuffix(".py").replace("/", "."), str(ROOT / file), text
+
+    def find_spec(self, name, path=None, target=None):  # type: ignore[no-untyped-def]
+        return importlib.util.spec_from_loader(name, self, origin=self.path) if name == self.name else None
+
+    def get_filename(self, fullname: str) -> str:
+        return self.path
+
+    def get_data(self, path: str) -> bytes:
+        return self.text.encode()
+
+    def path_stats(self, path: str):  # type: ignore[no-untyped-def]
+        raise OSError  # no cached bytecode
+
+
+def run(file: str, text: str, tests: list[str]) -> bool:
+    """True when the tests fail with this text in place of the file."""
+    child = os.fork()
+    if child == 0:
+        _run_tests(file, text, tests)
+    return os.waitpid(child, 0)[1] != 0
+
+
+def _run_tests(file: str, text: str, tests: list[str]) -> None:
+    """In the forked process; never returns."""
+    import pytest
+
+    code = 1
+    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(1, 2)
+        sys.meta_path.insert(0, _Mutated(file, text))
+        options = [
+            "-x",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-p",
+            "no:timeout",
+            "-o",
+            "addopts=",
+            "--import-mode=importlib",
+        ]
+        code = int(pytest.main([*options, "-m", "not slow", *(str(ROOT / test) for test in tests)]))
+    finally:
+        os._exit(1 if code else 0)
+
+
+def main() -> int:
+    """Run every mutant, print the table and the survivors."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--files", help="parts of names, with commas; all when not given")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=ROOT / "mutants.json", help="every mutant and its fate")
+    parser.add_argument("--least", type=float, default=0.85, help="share that must be killed")
+    args = parser.parse_args()
+    import numba  # noqa: F401  loaded once, before the forks
+    import pytest  # noqa: F401
+    import scipy.spatial.transform
+    import scipy.stats  # noqa: F401
+    from tqdm import tqdm
+
+    wanted = [file for file in TESTS if not args.files or any(part in file for part in args.files.split(","))]
+    for file in wanted:
+        if run(file, (ROOT / file).read_text(encoding="utf-8"), TESTS[file]):
+            sys.stderr.write(f"mutants: the tests of {file} fail without any mutation: {' '.join(TESTS[file])}\n")
+            return 1
+    equivalent = set((ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines())
+    everything = [pair for file in wanted for pair in mutants_of(file)]
+
+    def decide(pair: tuple[Mutant, str]) -> Mutant:
+        mutant, text = pair
+        if not mutant.fate and mutant.key in equivalent:
+            mutant.fate = "equivalent"
+        if not mutant.fate:
+            mutant.fate = "killed" if run(mutant.file, text, TESTS[mutant.file]) else "survived"
+        return mutant
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        done = list(tqdm(pool.map(decide, everything), total=len(everything), unit="mutant"))
+    args.out.write_text(json.dumps([asdict(mutant) for mutant in done], indent=1), encoding="utf-8")
+    return report(done, args.least)
+
+
+def report(done: list[Mutant], least: float) -> int:
+    """The table by file, and every survivor; 1 when a smaller share than `least` was killed."""
+    write = sys.stdout.write
+    write("\n| file | killed | of | % | settings | equivalent |\n|---|---|---|---|---|---|\n")
+    for file in [*dict.fromkeys(mutant.file for mutant in done), "all"]:
+        fates = [mutant.fate for mutant in done if file in (mutant.file, "all")]
+        killed, of = fates.count("killed"), fates.count("killed") + fates.count("survived")
+        share = 100.0 * killed / max(of, 1)
+        write(f"| {file} | {killed} | {of} | {share:.0f} | {fates.count('setting')} | {fates.count('equivalent')} |\n")
+    for mutant in done:
+        if mutant.fate == "survived":
+            write(f"{mutant.file}:{mutant.line}: {mutant.operator}: {mutant.text}\n")
+    return int(share < 100.0 * least)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

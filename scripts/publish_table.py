@@ -1,0 +1,50 @@
+"""Put a table that a command wrote into docs/results/tables, with its command, commit and machine.
+
+    python scripts/publish_table.py recall out            # the output folder of `gapr benchmark`
+    python scripts/publish_table.py scanners table.md --command "python benchmarks/scanners.py --count 10"
+
+The pages of docs/results show the file as it is. Paths of this machine are shortened to their last part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import re
+from pathlib import Path
+
+from gapr_core.runtime import origin
+
+TABLES = Path(__file__).resolve().parents[1] / "docs" / "results" / "tables"
+ABSOLUTE = re.compile(r"(?<![\w.])/(?:[\w.+-]+/)*([\w.+-]+)/?")
+
+
+def main() -> None:
+    """Write one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", help="of the file in docs/results/tables, without .md")
+    parser.add_argument("made", type=Path, help="folder of gapr benchmark, or a file with what a script printed")
+    parser.add_argument("--command", help="that printed it; a folder of gapr benchmark knows its own")
+    parser.add_argument("--commit", help="that ran it (this one)")
+    parser.add_argument("--folder", type=Path, default=TABLES, help="where the tables are")
+    args = parser.parse_args()
+    if args.made.is_dir():
+        text = (args.made / "table.md").read_text(encoding="utf-8").removeprefix("# Benchmark\n\n")
+    elif args.command:
+        text = printed(args.made.read_text(encoding="utf-8"), args.command, args.commit or origin.commit() or "unknown")
+    else:
+        parser.error("--command is needed for a file")
+    args.folder.mkdir(parents=True, exist_ok=True)
+    (args.folder / f"{args.name}.md").write_text(ABSOLUTE.sub(r"\1", text), encoding="utf-8")
+
+
+def printed(text: str, command: str, commit: str) -> str:
+    """The table lines of an output, and a line on where they come from."""
+    table = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    machine = f"{origin.cpu_name()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    return f"{table}\n\nMade by `{command}` at commit {commit}, {machine}.\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""Hook of MkDocs: what the site takes from outside docs/.
+
+Pages that live elsewhere, the help of every command, and tables: a link to results/tables alone on its line is replaced
+by the table, as the command wrote it. So the same Markdown reads well in the repository and on the site.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from posixpath import dirname, join, normpath, relpath
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+from gapr_core.cli import modules
+from gapr_core.config import RegistrarConfig
+from gapr_core.runtime.settings import Row
+from gapr_core.runtime.settings import table as table_of
+
+ROOT = Path(__file__).resolve().parents[1]
+ELSEWHERE = {"contributing.md": "CONTRIBUTING.md", "weights.md": "gapr_core/weights/README.md"}  # page: where it lives
+LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+TABLE = re.compile(r"^\[[^\]]*\]\((\S*tables/\w+\.md)\)$", re.MULTILINE)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that live elsewhere, and the one with the help of the commands."""
+    for page, path in ELSEWHERE.items():
+        files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
+    files.append(File.generated(config, "reference/commands.md", content=help_of_commands()))
+    files.append(File.generated(config, "reference/settings.md", content=settings_of_the_library()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Put tables in their places, and lead links to where the site has what they name."""
+    name = page.file.src_uri
+    here = dirname(ELSEWHERE.get(name, f"docs/{name}"))
+    markdown = TABLE.sub(lambda found: table(ROOT / here / found[1]), markdown)
+    return LINK.sub(lambda found: link(found, here, dirname(name), files), markdown)
+
+
+def table(path: Path) -> str:
+    """A table that a command wrote; its headings go below those of the page."""
+    return re.sub(r"^#+ ", lambda found: f"##{found[0]}", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+
+
+def link(found: re.Match[str], here: str, folder: str, files: Files) -> str:
+    """A link of the repository as a link of the site; plain text where the site does not have the file."""
+    path = normpath(join(here, found[2]))
+    pages = {where: page for page, where in ELSEWHERE.items()}
+    page = pages.get(path, path.removeprefix("docs/"))
+    if files.get_file_from_path(page) is None and (ROOT / path).exists():
+        return f"{found[1]} (`{path}`)"
+    return f"[{found[1]}]({relpath(page, folder or '.')}{found[3] or ''})"
+
+
+def settings_of_the_library() -> str:
+    """Every setting with its default, unit, range and help."""
+    intro = "Each can be set in Python (`RegistrarConfig(min_confidence=0.8)`), in a file or on the command line."
+    lines = [
+        f"# Parameters of the library\n\n{intro}\n",
+        f"| {' | '.join(Row._fields)} |",
+        "|---" * len(Row._fields) + "|",
+    ]
+    lines += [f"| `{row[0]}` | {' | '.join(map(str, row[1:]))} |" for row in table_of(RegistrarConfig)]
+    return "\n".join(lines)
+
+
+def help_of_commands() -> str:
+    """What `gapr` and each of its commands says with --help."""
+    env = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
+    parts = ["# Command line"]
+    for command in ("", *modules()):
+        run = [sys.executable, "-m", "gapr_core.cli", *command.split(), "--help"]
+        text = subprocess.run(run, capture_output=True, text=True, check=True, env=env).stdout
+        parts.append(f"## {f'gapr {command}'.strip()}\n\n```text\n{text}```")
+    return "\n\n".join(parts)

@@ -1,0 +1,219 @@
+"""What the documentation shows is true: its code runs, its links lead somewhere, its words exist."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from textwrap import dedent
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Point32, Polygon
+
+from gapr_core import baselines
+from gapr_core.benchmark import methods
+from gapr_core.cli import main
+from gapr_core.data import parametric, pool
+from gapr_core.data.protocols import PROTOCOLS, make_pair
+from gapr_core.geometry import se3
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.encoding import TRANSFORMERS
+from gapr_core.model.network import GAPRNet
+from gapr_core.results import RegistrationStatus
+from gapr_ros.demo.act import write_stl
+from gapr_ros.node.refusal import Reason
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+MADE = "reference/settings.md"  # by scripts/site_pages.py, while the site is built
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+PAGES = [README, CONTRIBUTING, *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"(?:^<!-- not run: ([^>]+) -->\n)?^ *```(python|bash)\n(.*?)^ *```", flags=re.MULTILINE | re.DOTALL)
+OURS = re.compile(r"^(?:gapr|python) ", flags=re.MULTILINE)  # what a bash block must start a line with to be ours
+EXAMPLES = {"overfit_two_bones.py": ["--steps", "2"]}  # arguments that keep an example short; the others have none
+
+
+class Block(NamedTuple):
+    """A block of code of a page; `reason` says why it is not run."""
+
+    reason: str
+    language: str
+    code: str
+
+
+def blocks(page):
+    """The Python blocks of a page, and those for the shell that use `gapr` or Python."""
+    matches = BLOCK.findall(page.read_text(encoding="utf-8"))
+    found = [Block(reason, language, dedent(code)) for reason, language, code in matches]
+    return [block for block in found if block.language == "python" or OURS.search(block.code)]
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """What the examples name: a femur, a view of it from the front, moved, and meshes of five subjects."""
+    folder, bone, rng = tmp_path_factory.mktemp("files"), parametric.make_bone("femur", 1), np.random.default_rng(0)
+    points, normals = bone.sample(9000, rng)
+    seen = points[normals[:, 1] < -0.2] + rng.normal(0.0, 0.3, (int((normals[:, 1] < -0.2).sum()), 3))
+    T_source_target = se3.exp([30.0, -20.0, 50.0, 0.5, -0.4, 1.0])
+    partial = se3.apply(T_source_target, seen)
+    for name in ("femur_ct.stl", "full.stl", *(f"my_bones/subject_{k}.stl" for k in range(5))):
+        (folder / name).parent.mkdir(exist_ok=True)
+        write_stl(bone, folder / name)
+    np.save(folder / "partial.npy", partial)
+    np.save(folder / "seen.npy", seen)
+    np.save(folder / "truth.npy", np.linalg.inv(T_source_target))
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(partial)}\n"
+    np.savetxt(folder / "partial.ply", partial, "%.6f", header=f"{header}property float x\nproperty float y\n"
+               "property float z\nend_header", comments="")  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def here(files, tmp_path, monkeypatch):
+    """A folder with these files, to run in."""
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(block, names):
+    if block.language == "python":
+        exec(compile(block.code, "example", "exec"), names)
+    else:
+        shell(["bash", "-euo", "pipefail", "-c", block.code])
+
+
+def shell(command):
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    env = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.timeout(400)  # whole commands, on a machine that may be busy
+@pytest.mark.parametrize("page", [p for p in PAGES if any(not b.reason for b in blocks(p))], ids=name_of)
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, here):
+    names = {}
+    for block in blocks(page):
+        if not block.reason:
+            run(block, names)
+    if page is README:
+        assert names["result"].ok, names["result"]
+        assert np.linalg.norm(names["aligned"] - np.load("seen.npy"), axis=1).max() < 2.0
+
+
+def test_the_recipes_of_contributing_work(here, monkeypatch):
+    names = {}
+    for block in blocks(CONTRIBUTING):
+        run(block, names)
+    monkeypatch.setitem(TRANSFORMERS, "distance", names["layer"])
+    monkeypatch.setitem(baselines.REGISTRY, "principal_axes", names["PrincipalAxes"])
+    monkeypatch.setitem(PROTOCOLS, "spot", names["spot"])
+    assert GAPRNet(ModelConfig(encoding="distance"))
+    pair = make_pair("spot", pool.parametric_specimen("femur", 1), 0)
+    for method in (methods.make("principal_axes"), names["registrar"]()):
+        result = method.register(pair.source, method.prepare(pair.target))
+        assert result.ok or result.reason
+    assert result.proposer == "centroids"
+    message = names["INPUT"].message(polygon=Polygon(points=[Point32(x=1.0), Point32(y=2.0)]))
+    assert names["INPUT"].points(message).tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+    assert names["INPUT"].count(message) == 2
+
+
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=name_of)
+def test_an_example_runs(path, here):
+    shell([sys.executable, str(path), *EXAMPLES.get(path.name, [])])
+
+
+def test_every_example_in_a_folder_has_a_test_of_its_own():
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "test").rglob("test_examples.py"))
+    examples = [path for path in (ROOT / "examples").glob("*/*") if path.is_file() and path.suffix != ".pyc"]
+    assert len(examples) >= 3
+    assert not [name_of(path) for path in examples if path.stem not in tests]
+
+
+def test_no_code_hides_in_a_block_without_a_language():
+    plain = re.compile(r"^ *```(?:sh|shell|console|text)?\n(.*?)^ *```", flags=re.MULTILINE | re.DOTALL)
+    for page in PAGES:
+        others = BLOCK.sub("", page.read_text(encoding="utf-8"))
+        assert not [code for code in plain.findall(others) if re.search(r"^(gapr |python |import |from )", code, re.M)]
+
+
+def commands():
+    """(page, words) of every line in a block that starts with `gapr` or `python`, run or not."""
+    for page in PAGES:
+        for block in blocks(page):
+            if block.language == "bash":
+                for line in block.code.replace("\\\n", " ").splitlines():
+                    if OURS.match(line):
+                        yield name_of(page), shlex.split(line, comments=True)
+
+
+def source_of(module):
+    """The file that `python -m module` runs."""
+    path = Path(*module.split("."))
+    return path / "__main__.py" if (ROOT / path).is_dir() else path.with_suffix(".py")
+
+
+def test_the_options_that_the_pages_show_exist(capsys):
+    helps = {}
+    for page, (program, name, *words) in commands():
+        if program == "gapr" and name not in helps:
+            with pytest.raises(SystemExit, match="0"):
+                main([name, "--help"])
+            helps[name] = capsys.readouterr().out
+        script = source_of(words[0]) if name == "-m" else name
+        text = helps[name] if program == "gapr" else (ROOT / script).read_text(encoding="utf-8")
+        missing = {word for word in words if word.startswith("--") and not re.search(rf"{word}\b", text)}
+        assert not missing, f"{page}: {program} {name}"
+    assert {"register", "evaluate", "benchmark", "make-pairs"} <= set(helps)
+
+
+def test_every_link_leads_to_a_file_of_the_repository():
+    for page in PAGES:
+        for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / link).exists() or link.endswith(MADE), f"{name_of(page)}: {link}"
+
+
+def test_every_page_is_on_the_site():
+    listed = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = [page.relative_to(ROOT / "docs") for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "tables"]
+    assert len(pages) > 20
+    assert not [str(page) for page in pages if not re.search(rf"\b{re.escape(str(page))}$", listed, re.MULTILINE)]
+
+
+def test_every_table_of_the_results_is_on_a_page():
+    folder = ROOT / "docs" / "results"
+    text = "\n".join(page.read_text(encoding="utf-8") for page in folder.glob("*.md"))
+    assert not [path.name for path in (folder / "tables").glob("*.md") if f"(tables/{path.name})" not in text]
+
+
+def test_the_page_of_results_has_at_most_600_words():
+    assert len((ROOT / "docs" / "results.md").read_text(encoding="utf-8").split()) <= 600
+
+
+def test_every_status_and_every_reason_is_explained():
+    conventions = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    for word in [*RegistrationStatus, *Reason]:
+        assert f"`{word}`" in conventions, f"{word} is not in docs/conventions.md"
+
+
+def test_every_make_target_that_is_named_exists():
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    named = set(re.findall(r"(?:^|`)make ([a-z]+)", text, flags=re.MULTILINE))
+    assert {"demo", "test", "lint", "docs"} <= named <= targets
+
+
+def test_the_python_versions_are_those_of_setup_py():
+    assert 'python_requires=">=3.10,<3.14"' in (ROOT / "setup.py").read_text()
+    assert "Python from 3.10 to 3.13" in README.read_text(encoding="utf-8")

@@ -1,0 +1,140 @@
+"""Records: each pair registered in every way, judged against the truth, and kept."""
+
+import json
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from gapr_core.calibration import collect, pairs
+from gapr_core.calibration import shapes as odd_shapes
+from gapr_core.calibration.answers import answers_of
+from gapr_core.calibration.pairs import Drawn, Task
+from gapr_core.data.pool import parametric_specimen
+from gapr_core.data.protocols import make_pair
+from gapr_core.geometry import se3
+from gapr_core.registration.features import FEATURES
+from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.tracking import Memory
+from gapr_core.results import Hypothesis
+
+TASK = Task("folder", "train", 0, 1)
+
+
+class Truth:
+    """Proposes the pose that it was made with, and counts how often it is asked."""
+
+    def __init__(self, pose, name="network"):
+        self.pose, self.name, self.asked = pose, name, 0
+
+    def prepare(self, target):
+        """Nothing is needed."""
+
+    def propose(self, source, target, rng):
+        self.asked += 1
+        return Proposals(self.pose[None], np.zeros(1))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return make_pair("L1", parametric_specimen("femur", 0), 1)
+
+
+@pytest.fixture
+def truth(pair, monkeypatch):
+    """Both rounds know the truth; the pair is drawn as the subject's own bone, seen by a pointer."""
+    proposer = collect.AskedOnce(Truth(pair.T_target_source))
+    monkeypatch.setattr(collect, "_proposers", lambda: (proposer, Truth(pair.T_target_source, "search")))
+    drawn = Drawn(pair, "pointer", "pointer", "own", ("p0",), "pointer")
+    monkeypatch.setattr(pairs, "draw", lambda task: drawn)
+    monkeypatch.setattr(collect, "FOLLOWED", 1.0)
+    collect._registrars.cache_clear()
+    yield proposer.proposer
+    collect._registrars.cache_clear()
+
+
+def test_a_record_holds_every_round_with_its_features_and_its_true_error(truth, pair):
+    record = collect.record_of(TASK)
+    assert json.loads(json.dumps(record)) == record
+    assert {"network", "search"} <= set(record["answers"]) <= {"network", "search", "track"}
+    assert (record["family"], record["what"], record["sensor"], record["people"]) == (
+        "pointer",
+        "own",
+        "pointer",
+        ["p0"],
+    )
+    answer = record["answers"]["search"]
+    assert answer["right"] and tuple(answer["features"]) == FEATURES
+    assert 0.0 < answer["true_mm"] < 2.0 and answer["rte_mm"] < 2.0 and 0.0 < answer["nees"] < 1000.0
+    assert 0.0 < answer["tre_mm"] < answer["tre95_mm"]
+    assert answers_of([record], "search").right.tolist() == [True]
+
+
+def test_a_pose_without_a_truth_is_wrong_and_has_no_error(truth, monkeypatch):
+    shape = odd_shapes.box_pair(3)
+    truth.pose = np.eye(4)
+    monkeypatch.setattr(pairs, "draw", lambda task: Drawn(shape, "shape", "box", "shape", ()))
+    answers = collect.record_of(TASK)["answers"]
+    assert answers and all(not answer["right"] and "true_mm" not in answer for answer in answers.values())
+
+
+def test_the_network_is_asked_once_for_both_rounds(truth):
+    collect.record_of(TASK)
+    assert truth.asked == 1
+
+
+def test_records_know_nothing_of_the_models_that_ship(truth, monkeypatch):
+    for model in (
+        "gapr_core.registration.confidence.Calibration.shipped",
+        "gapr_core.registration.registrar.Precision.load",
+    ):
+        monkeypatch.setattr(model, lambda *_: pytest.fail("a model that ships was asked for"))
+    assert collect.record_of(TASK)["answers"]["search"]["right"]
+
+
+def test_the_next_source_of_a_stream_is_a_part_of_the_view_and_the_memory_is_off_by_a_small_motion(pair):
+    rng = np.random.default_rng(3)
+    truth = pair.T_target_source
+    rival = se3.exp(rng.normal(size=6) * 30.0) @ truth
+    hypotheses = [Hypothesis(pose, 0.3) for pose in (truth, rival, rival @ rival)]
+    forgotten = 0
+    for seed in range(40):
+        moved, memory = collect.moved_on(pair, hypotheses, np.random.default_rng(seed))
+        assert isinstance(memory, Memory) and 0.45 * len(pair.source) < len(moved.source) <= len(pair.source)
+        kept = {tuple(point) for point in pair.source}
+        assert all(tuple(point) in kept for point in moved.source)
+        forgotten += len(memory.poses) == 2
+        best = truth if len(memory.poses) == 3 else rival
+        error = se3.pose_error(memory.poses[0], best, moved.source)
+        assert error.rte_mm <= collect.STEP_MM + 1e-6 and error.rre_deg <= collect.STEP_DEG + 1e-6
+    assert 3 <= forgotten <= 18
+
+
+def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tmp_path, monkeypatch):
+    features = dict.fromkeys(FEATURES, 0.5)
+    old = {name: value for name, value in features.items() if name != "mirror_margin"}
+    answer = {"refusal": None, "right": True}
+    path = tmp_path / "records.jsonl"
+    lines = [json.dumps({"name": f"0-{number}", "answers": {"search": answer | {"features": values}}}) + "\n"
+             for number, values in enumerate((features, old, features))]  # fmt: skip
+    path.write_text("".join(lines) + '{"name": "0-3", "answ')
+    asked = []
+    monkeypatch.setattr(pairs, "bones_of", lambda folder, split: {})
+    monkeypatch.setattr(collect, "ProcessPoolExecutor", lambda *_: nullcontext(_Pool(asked)))
+    tasks = [Task("folder", "train", 0, number) for number in (1, 2, 3)]
+    found = collect.collect(tasks, path, 1)
+    assert [record["name"] for record in found] == ["0-2", "0-1", "0-3"]
+    assert [task.number for task in asked] == [1, 3]
+    assert collect.collect(tasks, path, 1) and len(asked) == 2
+
+
+class _Pool:
+    """A pool that registers nothing."""
+
+    def __init__(self, asked):
+        self.asked = asked
+
+    def map(self, _, tasks):
+        for task in tasks:
+            self.asked.append(task)
+            yield {"name": f"{task.seed}-{task.number}", "answers": {}}

@@ -1,0 +1,76 @@
+"""The bound of the error: conformal coverage on data whose answer is known."""
+
+import numpy as np
+import pytest
+from answer_cases import made_answers
+
+from gapr_core.calibration import conformal
+from gapr_core.registration.features import FEATURES
+
+
+def test_the_conformal_quantile_covers_the_next_score_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    covered = [rng.exponential() <= conformal.conformal_quantile(rng.exponential(size=19), 0.9) for _ in range(4000)]
+    assert np.mean(covered) == pytest.approx(0.9, abs=0.015)  # the plain quantile of 19 covers .86
+
+
+def test_the_conformal_quantile_is_the_next_larger_score():
+    scores = np.arange(1.0, 20.0)
+    assert conformal.conformal_quantile(scores, 0.9) == 18.0
+    assert conformal.conformal_quantile(scores, 0.95) == 19.0
+    assert conformal.conformal_quantile(scores[:5], 0.95) == 5.0  # too few: the largest
+
+
+def test_errors_three_times_the_predicted_ones_triple_the_scale():
+    answers = made_answers(3000, error_scale=3.0)
+    scale = conformal.scales(conformal.fit_scale(answers), answers)
+    assert np.median(scale) == pytest.approx(3.0, rel=0.1)
+
+
+def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_families():
+    def doubled_where_smooth(features, family):
+        return np.exp(0.7 * features[:, FEATURES.index("smooth_misfit")])
+
+    answers = made_answers(3000, error_scale=doubled_where_smooth)
+    scale = conformal.of_unseen(answers)
+    factor = conformal.conformal_factor(answers.true_mm / (scale * answers.tre95_mm), answers.family)
+    rows = conformal.coverage(answers, scale, factor)
+    assert 0.945 < rows["all"]["covered"] < 0.975
+    assert 0.8 < rows["all"]["nees_over_median"] < 1.2
+    assert factor < 1.3  # were the feature not followed, the factor would have to be 2
+    new = made_answers(2000, seed=5, error_scale=doubled_where_smooth)
+    rows = conformal.coverage(new, conformal.scales(conformal.fit_scale(answers), new), factor)
+    assert all(row["covered"] > 0.93 for row in rows.values())
+
+
+def test_a_family_with_larger_errors_has_a_say_of_its_own():
+    def tripled_for_pointers(features, family):
+        return np.where(family == "pointer", 3.0, 1.0)
+
+    answers = made_answers(3000, error_scale=tripled_for_pointers)
+    even = conformal.conformal_factor(answers.true_mm / answers.tre95_mm, np.full(3000, "one"))
+    scores = answers.true_mm / answers.tre95_mm
+    factor = conformal.conformal_factor(scores, answers.family)
+    assert factor > even
+    rows = conformal.coverage(answers, np.ones(3000), factor)
+    assert rows["pointer"]["covered"] == pytest.approx(conformal.IN_EACH, abs=0.01)
+
+
+def test_a_family_of_a_few_answers_does_not_decide_for_all():
+    family = np.array(["many"] * 500 + ["few"] * 10)
+    scores = np.r_[np.linspace(0.0, 1.0, 500), np.full(10, 9.0)]
+    assert conformal.conformal_factor(scores, family) < 1.0
+
+
+def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):
+    answers, seen = made_answers(300), []
+
+    def fit_nothing(known):
+        seen.append(set(known.family))
+        assert known.right.all()
+        return len(seen)
+
+    monkeypatch.setattr(conformal, "fit_scale", fit_nothing)
+    monkeypatch.setattr(conformal, "scales", lambda model, judged: np.full(len(judged), float(model)))
+    for family, model in zip(answers.family, conformal.of_unseen(answers).astype(int), strict=True):
+        assert family not in seen[model - 1]

@@ -1,0 +1,75 @@
+"""The confidence's fit and its judges."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from answer_cases import made_answers
+
+from gapr_core.calibration import fit as fits
+from gapr_core.calibration.answers import answers_of
+from gapr_core.registration.additive import Additive, Curve
+from gapr_core.registration.features import FEATURES
+
+
+@pytest.fixture(scope="module")
+def answers():
+    return made_answers()
+
+
+def test_the_fit_learns_what_separates_right_from_wrong(answers):
+    confidence = fits.of_unseen_people(answers)
+    rows = fits.by_group(answers, confidence, answers.family)
+    assert rows["all"]["auroc"] > 0.96 and rows["all"]["ece"] < 0.03
+    assert set(rows) == {"all", "laser", "pointer", "ultrasound"}
+    assert sum(rows[name]["pairs"] for name in rows if name != "all") == len(answers)
+
+
+def test_no_model_judges_a_subject_whose_bone_is_in_any_pair_that_it_was_fitted_on(answers):
+    judged = np.zeros(len(answers), dtype=int)
+    for fitted, held_out in answers.people_folds():
+        known = {person for group, is_in in zip(answers.people, fitted, strict=True) if is_in for person in group}
+        own = {group[0] for group, is_in in zip(answers.people, held_out, strict=True) if is_in}
+        assert fitted.any() and not known & own
+        judged += held_out
+    assert (judged == 1).all()
+
+
+def test_no_model_judges_a_family_that_it_was_fitted_on(answers, monkeypatch):
+    seen = []
+
+    def fit_nothing(known):
+        seen.append(set(known.family))
+        return Additive(float(len(seen)), ())
+
+    monkeypatch.setattr(fits, "fit", fit_nothing)
+    monkeypatch.setattr(fits, "probability", lambda model, judged: np.full(len(judged), model.constant))
+    for family, model in zip(answers.family, fits.of_unseen_families(answers).astype(int), strict=True):
+        assert family not in seen[model - 1]
+
+
+def test_a_wrong_pose_counts_where_it_is_accepted_and_no_rule_refuses_it(answers):
+    four = answers.of(np.arange(len(answers)) < 4)
+    four = replace(four, right=np.array([True, False, False, False]), refused=np.array([False, False, True, False]))
+    row = fits.judged(four, np.array([0.95, 0.92, 0.99, 0.6]))
+    assert (row["wrong"], row["wrong_sure"], row["right_accepted"], row["right_sure"]) == (2, 1, 1.0, 1.0)
+    assert row["auroc"] == pytest.approx(2 / 3, abs=1e-4)
+
+
+def test_the_probability_ends_where_so_few_records_say_nothing(answers):
+    certain = Additive(50.0, tuple(Curve(name, np.zeros(1), np.zeros(1)) for name in FEATURES))
+    assert 0.999 < fits.probability(certain, answers)[0] < 0.9999
+
+
+def test_records_become_the_answers_of_a_round():
+    features = {name: float(number) for number, name in enumerate(FEATURES)}
+    record = {"name": "0-1", "family": "L2", "seen_as": "L2", "what": "person", "bone": "tibia", "people": ["a", "b"]}
+    wrong = {"features": features, "refusal": "DEGENERATE", "right": False}
+    right = wrong | {"refusal": None, "right": True, "nees": 5.0, "true_mm": 1.0, "tre_mm": 2.0, "tre95_mm": 3.0}
+    shape = record | {"name": "0-2", "people": [], "answers": {"search": right}}
+    answers = answers_of([record | {"answers": {"search": wrong, "track": right}}, shape], "search")
+    assert answers.right.tolist() == [False, True] and answers.refused.tolist() == [True, False]
+    assert answers.people == (("a", "b"), ("0-2",))
+    assert np.isnan(answers.true_mm[0]) and answers.tre95_mm[1] == 3.0
+    assert answers.features[0].tolist() == list(range(len(FEATURES)))
+    assert len(answers_of([shape], "track")) == 0

@@ -1,0 +1,150 @@
+"""What the models learn from."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gapr_core.calibration import pairs
+from gapr_core.calibration.other_side import on_own_side
+from gapr_core.calibration.pairs import Task
+from gapr_core.calibration.shapes import SHAPES, turned_pair
+from gapr_core.data import anatomy
+from gapr_core.data.pool import parametric_specimen
+from gapr_core.geometry import se3
+
+FOLDER = "folder"
+
+
+@pytest.fixture(scope="module")
+def bones():
+    return {bone: [parametric_specimen(bone, number) for number in (0, 1, 2)] for bone in ("femur", "tibia")}
+
+
+@pytest.fixture
+def people(bones, monkeypatch):
+    monkeypatch.setattr(pairs, "BONES", ("femur", "tibia"))
+    monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones})
+    monkeypatch.setattr(pairs, "SHAPE_SHARE", 0.0)
+    return bones
+
+
+def draw(monkeypatch, seen_as, what, target="own", number=5):
+    monkeypatch.setattr(pairs, "SEEN_AS", {"family": {seen_as: 1.0}})
+    monkeypatch.setattr(pairs, "WHAT", {what: 1.0})
+    monkeypatch.setattr(pairs, "TARGETS", {target: 1.0})
+    pairs.setting_of.cache_clear()
+    return pairs.draw(Task(FOLDER, "train", 0, number))
+
+
+@pytest.mark.parametrize("seen_as", [name for views in pairs.SEEN_AS.values() for name in views])
+def test_every_view_is_a_function_of_its_task_and_its_truth_lays_the_source_on_the_bone(people, monkeypatch, seen_as):
+    drawn, again = draw(monkeypatch, seen_as, "own"), draw(monkeypatch, seen_as, "own")
+    np.testing.assert_array_equal(drawn.pair.source, again.pair.source)
+    np.testing.assert_array_equal(drawn.pair.target, again.pair.target)
+    assert drawn.pair.has_truth and drawn.what == "own" and drawn.people == (drawn.pair.person,)
+    bone = next(s for s in people["tibia"] if s.person == drawn.pair.person)
+    placed = se3.apply(drawn.pair.T_target_source, drawn.pair.source) + drawn.pair.metadata["origin_mm"]
+    on_bone = drawn.pair.metadata.get("is_bone", np.full(len(placed), True))
+    assert np.median(bone.distance(placed[on_bone])) < 3.0
+    other = draw(monkeypatch, seen_as, "own", number=6).pair
+    assert len(other.source) != len(drawn.pair.source) or not np.array_equal(other.source, drawn.pair.source)
+
+
+def test_pairs_in_a_row_share_a_target(people, monkeypatch):
+    first, second, next_row = (draw(monkeypatch, "L2", "own", number=n).pair for n in (4, 7, 8))
+    np.testing.assert_array_equal(first.target, second.target)
+    assert first.person == second.person and not np.array_equal(first.source, second.source)
+    assert not np.array_equal(first.target, next_row.target)
+
+
+@pytest.mark.parametrize("what", ["person", "bone", "mirrored", "scaled"])
+@pytest.mark.parametrize("target", ["own", "short"])
+def test_of_another_bone_no_pose_is_right(people, monkeypatch, what, target):
+    drawn = draw(monkeypatch, "L2", what, target)
+    assert not drawn.pair.has_truth and drawn.what == what and drawn.pair.bone == "tibia"
+    assert (len(drawn.people) == 2) == (what in ("person", "bone")) or what == "bone"
+    right = draw(monkeypatch, "L2", "own", target)
+    np.testing.assert_array_equal(drawn.pair.target, right.pair.target)
+
+
+def test_a_bone_of_a_wrong_scale_is_four_to_seven_percent_larger_or_smaller(people):
+    rng, bone = np.random.default_rng(0), people["femur"][0]
+    sizes = [np.ptp(pairs._scaled(bone, (), rng).surface.points, axis=0) / np.ptp(bone.surface.points, axis=0)
+             for _ in range(40)]  # fmt: skip
+    off = np.abs(np.array(sizes) - 1.0)
+    assert np.ptp(sizes, axis=1).max() < 1e-9
+    assert off.min() >= pairs.SCALES[0] - 1e-9 and off.max() <= pairs.SCALES[1] + 1e-9
+    assert {bool(size[0] > 1.0) for size in sizes} == {True, False}
+
+
+def test_a_mirrored_pelvis_is_judged_against_the_pose_of_its_other_side(people, monkeypatch):
+    monkeypatch.setattr(pairs, "SYMMETRIC", ("tibia",))
+    monkeypatch.setattr(
+        pairs, "on_own_side", lambda mirrored, bone: se3.from_rotation_translation(np.eye(3), [9, 8, 7])
+    )
+    drawn = draw(monkeypatch, "L2", "mirrored")
+    placed = se3.apply(drawn.pair.T_target_source, drawn.pair.source) + drawn.pair.metadata["origin_mm"]
+    bone = next(s for s in people["tibia"] if s.person == drawn.pair.person)
+    assert np.median(anatomy.mirrored(bone).distance(placed - [9.0, 8.0, 7.0])) < 2.0
+
+
+def test_a_rib_cage_and_half_a_pelvis_are_not_mirrored(people, monkeypatch):
+    monkeypatch.setattr(pairs, "SYMMETRIC", ("tibia",))
+    assert draw(monkeypatch, "L2", "mirrored", "short").what == "own"
+    assert draw(monkeypatch, "L2", "mirrored").what == "mirrored"
+
+
+def test_the_other_side_of_a_bone_that_is_its_own_image_lies_on_the_bone():
+    rng = np.random.default_rng(0)
+    bone = parametric_specimen("pelvis", 0)
+    mirrored = anatomy.mirrored(bone)
+    T = on_own_side(mirrored, bone)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    assert np.median(bone.distance(se3.apply(T, mirrored.sample(500, rng)[0]))) < 3.0
+
+
+def test_a_scanned_target_is_of_the_bone_but_not_on_its_surface(people, monkeypatch):
+    own, scanned = (draw(monkeypatch, "L2", "own", target).pair for target in ("own", "scanned"))
+    bone = next(s for s in people["tibia"] if s.person == scanned.person)
+    off = [np.median(bone.distance(pair.target + pair.metadata["origin_mm"])) for pair in (own, scanned)]
+    assert off[0] < 1e-3 < 0.05 < off[1] < 2.0
+    placed = se3.apply(scanned.T_target_source, scanned.source) + scanned.metadata["origin_mm"]
+    assert np.median(bone.distance(placed)) < 3.0
+
+
+def test_twins_are_no_wrong_answer_to_each_other():
+    femur = parametric_specimen("femur", 0)
+    own, twin, stranger = (replace(femur, person=who) for who in ("jhu_15", "jhu_25", "jhu_1"))
+    assert pairs.without_twins(own, [own, twin, stranger]) == [own, stranger]
+    assert pairs.without_twins(stranger, [own, twin, stranger]) == [own, twin, stranger]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_of_a_shape_no_pose_can_be_known(shape):
+    assert not SHAPES[shape](5).has_truth
+
+
+def test_a_solid_of_revolution_is_one():
+    pair = turned_pair(5)
+    radii = np.linalg.norm(pair.target[:, :2], axis=1)
+    order = np.argsort(pair.target[:, 2])
+    assert np.abs(np.diff(radii[order])).mean() < 0.2  # the radius depends on the height alone
+
+
+def test_the_shares_hold(people, monkeypatch):
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "_before", lambda setting, stranger, what, pair: pair)
+    monkeypatch.setattr(pairs, "setting_of", lambda *_: _NoView("none"))
+    monkeypatch.setattr(pairs, "_stranger", lambda setting, what, bones, rng: setting.whole)
+    drawn = [pairs.draw(Task(FOLDER, "train", 3, number)) for number in range(400)]
+    what = [each.what for each in drawn]
+    assert what.count("own") / 400 == pytest.approx(0.66, abs=0.07)
+    assert set(what) == set(pairs.WHAT)
+    assert len({each.family for each in drawn}) == len(pairs.SEEN_AS)
+
+
+class _NoView:
+    def __init__(self, seen_as):
+        self.seen_as, self.whole, self.person = seen_as, self, "nobody"
+        self.bone, self.end = "femur", None

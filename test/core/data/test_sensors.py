@@ -1,0 +1,117 @@
+"""Each simulator on a ball, whose distances are known exactly."""
+
+import numpy as np
+import pytest
+from shapes import ball_specimen
+
+from gapr_core.data import protocols
+from gapr_core.data.sensors import SENSORS
+from gapr_core.geometry import se3
+
+RADIUS = 60.0
+CENTRE = np.array([300.0, -200.0, 900.0])
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return ball_specimen(RADIUS)
+
+
+def heights(acquired):
+    return np.linalg.norm(acquired.points - CENTRE, axis=1) - RADIUS
+
+
+def drawn(simulate, ball, count=12):
+    return [simulate(ball, np.random.default_rng(seed)) for seed in range(count)]
+
+
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_the_same_seed_gives_the_same_cloud_and_the_parameters_are_stated(name, ball):
+    first, again, other = (SENSORS[name](ball, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.points, again.points)
+    assert first.points.shape != other.points.shape or np.abs(first.points - other.points).max() > 1.0
+    assert first.parameters["family"] == name
+    assert {"noise_mm", "bias", "bias_mm", "standoff_mm", "scale", "outlier_share"} <= set(first.parameters)
+
+
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_a_sensor_sees_one_side(name, ball):
+    for acquired in drawn(SENSORS[name], ball, 6):
+        towards = np.asarray(acquired.parameters["view_direction"])
+        assert ((acquired.points - CENTRE) @ towards > -0.1 * RADIUS).mean() > 0.97
+
+
+def test_a_pointer_gives_12_to_200_points_that_lie_outside_by_the_standoff(ball):
+    clouds = drawn(SENSORS["pointer"], ball, 24)
+    assert {12 <= len(cloud.points) <= 200 for cloud in clouds} == {True}
+    assert len({len(cloud.points) for cloud in clouds}) > 20
+    off = np.array([np.median(heights(c)) - c.parameters["standoff_mm"] for c in clouds])
+    assert abs(np.median(off)) < 0.1
+    assert np.mean([c.parameters["standoff_mm"] for c in clouds]) > 0.3
+
+
+def test_a_pointer_strokes_in_rows(ball):
+    clouds = [c for c in drawn(SENSORS["pointer"], ball, 24) if len(c.points) > 60]
+    nearest = [np.sort(np.linalg.norm(c.points[:, None] - c.points[None], axis=2), axis=1)[:, 1] for c in clouds]
+    assert min(np.median(gaps) for gaps in nearest) < 2.5  # dots alone would lie 5 mm apart and more
+
+
+def test_ultrasound_sees_the_bone_deeper_where_sound_is_slower_than_assumed(ball):
+    too_high, depth_error = [], []
+    for cloud in drawn(SENSORS["ultrasound"], ball, 16):
+        drawn_speed = cloud.parameters["speed_of_sound"] - 1.0
+        assert abs(drawn_speed) == pytest.approx(0.02, abs=0.0101)
+        too_high.append(np.median(heights(cloud)) - cloud.parameters["thickness_mm"])
+        depth_error.append(drawn_speed * (cloud.parameters["tissue_mm"] + 3.0))
+        assert np.median(heights(cloud)) == pytest.approx(cloud.parameters["standoff_mm"], abs=0.2)
+    assert np.corrcoef(too_high, depth_error)[0, 1] < -0.8
+
+
+def test_ultrasound_points_lie_in_few_planes(ball):
+    cloud = next(c for c in drawn(SENSORS["ultrasound"], ball, 12) if c.parameters["slices"] <= 8)
+    gaps = np.sort(np.linalg.norm(cloud.points[:, None] - cloud.points[None], axis=2), axis=1)[:, 1]
+    spread = np.sqrt(4.0 * np.pi * RADIUS**2 * cloud.parameters["share"] / len(cloud.points))
+    assert np.median(gaps) < 0.6 * spread  # crowded within the slices, nothing between them
+
+
+def test_a_depth_camera_is_noisy_along_its_rays_only(ball):
+    cloud = next(c for c in drawn(SENSORS["depth_camera"], ball) if c.parameters["noise_mm"] > 0.7)
+    rays = cloud.viewpoint - cloud.points
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    slant = np.einsum("ni,ni->n", rays, (cloud.points - CENTRE) / RADIUS)
+    assert np.quantile(slant, 0.01) > 0.1  # what faces away is not seen
+    frontal = np.abs(heights(cloud))[slant > 0.9]
+    assert np.median(frontal) == pytest.approx(0.67 * cloud.parameters["noise_mm"], rel=0.6)
+
+
+def test_a_depth_camera_throws_pixels_behind_the_rim(ball):
+    cloud = max(drawn(SENSORS["depth_camera"], ball), key=lambda c: c.parameters["outlier_share"])
+    rays = cloud.viewpoint - cloud.points
+    distance = np.linalg.norm(rays, axis=1)
+    from_axis = np.linalg.norm(np.cross(cloud.points - CENTRE, rays / distance[:, None]), axis=1)
+    off = np.abs(heights(cloud)) > 4.0
+    assert off.any()
+    assert np.median(from_axis[off]) > np.median(from_axis[~off])
+
+
+def test_the_noise_of_a_depth_camera_grows_with_the_distance(ball):
+    clouds = drawn(SENSORS["depth_camera"], ball, 16)
+    by_distance = np.array([[c.parameters["distance_mm"], c.parameters["noise_mm"]] for c in clouds])
+    far, near = (by_distance[chosen, 1].mean() for chosen in (by_distance[:, 0] > 500.0, by_distance[:, 0] < 400.0))
+    assert far > 1.5 * near
+
+
+def test_a_laser_is_accurate_and_lights_stripes(ball):
+    for cloud in drawn(SENSORS["laser"], ball, 8):
+        expected = cloud.parameters["noise_mm"] + cloud.parameters["bias_mm"] + 0.15
+        assert np.median(np.abs(heights(cloud))) < 1.5 * expected
+
+
+@pytest.mark.parametrize("name", ["depth-camera", "laser"])
+def test_the_viewpoint_of_a_pair_is_in_the_frame_of_its_source(name, ball):
+    pair = protocols.make_pair(name, ball, 3)
+    in_bone = se3.apply(pair.T_target_source, pair.metadata["viewpoint"][None])[0] + pair.metadata["origin_mm"]
+    away = in_bone - CENTRE
+    assert np.linalg.norm(away) > RADIUS + 50.0
+    assert away @ pair.metadata["view_direction"] > 0.95 * np.linalg.norm(away)
+    assert "viewpoint" not in protocols.make_pair("pointer", ball, 3).metadata

@@ -1,0 +1,299 @@
+"""Label maps: the right segment, in LPS, where the surface is."""
+
+import gzip
+import logging
+
+import numpy as np
+import pytest
+
+from gapr_core import clouds
+from gapr_core.data.solid import is_closed, volume_mm3
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats.options import ReadOptions
+from gapr_core.formats.volumes import names, nifti
+from gapr_core.formats.volumes.contour import surface_of
+from gapr_core.formats.volumes.names import Segment
+
+sitk = pytest.importorskip("SimpleITK")
+
+RADII = np.array([22.0, 15.0, 30.0])
+CENTRE = np.array([12.0, -40.0, 7.0])
+
+
+def affine_of(spacing, turn=None, flip=(1, 1, 1)):
+    """Index to LPS mm of a grid around the ellipsoid."""
+    from scipy.spatial.transform import Rotation
+
+    rotation = np.eye(3) if turn is None else Rotation.from_rotvec(turn).as_matrix()
+    affine = np.eye(4)
+    affine[:3, :3] = rotation @ np.diag(flip) @ np.diag(spacing)
+    size = np.ceil(2.0 * 45.0 / np.asarray(spacing)).astype(int)
+    affine[:3, 3] = CENTRE - affine[:3, :3] @ ((size - 1) / 2.0) + 0.3
+    return affine, size
+
+
+def voxels_of(affine, size, centre=CENTRE, radii=RADII):
+    """[k, j, i] of the voxels whose centre is inside the ellipsoid."""
+    index = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1)
+    inside = np.linalg.norm((index @ affine[:3, :3].T + affine[:3, 3] - centre) / radii, axis=-1) < 1.0
+    return inside.transpose(2, 1, 0)
+
+
+def image_of(voxels, affine):
+    image = sitk.GetImageFromArray(voxels.astype(np.uint8))
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection((affine[:3, :3] / spacing).ravel().tolist())
+    image.SetOrigin(affine[:3, 3].tolist())
+    return image
+
+
+def write(path, voxels, affine, **metadata):
+    image = image_of(voxels, affine)
+    for key, value in metadata.items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(path))
+    return path
+
+
+def error_mm(points, centre=CENTRE, radii=RADII):
+    """Signed distance to the ellipsoid to first order: f / |grad f|."""
+    x = (points - centre) / radii
+    f = np.linalg.norm(x, axis=1)
+    return (f - 1.0) * f / np.linalg.norm(x / radii, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("ending", "spacing", "turn", "flip"),
+    [("nii", (1.0, 1.4, 2.5), (0.3, -0.5, 0.8), (1, 1, 1)), ("nii.gz", (1.5, 1.5, 2.0), None, (-1, 1, 1)),
+     ("nrrd", (1.5, 1.5, 2.0), (0.0, 0.4, 0.0), (1, -1, -1)), ("mha", (1.5, 1.5, 1.5), None, (1, 1, 1))],
+)  # fmt: skip
+def test_a_label_comes_out_in_lps_mm_at_sub_voxel_accuracy(tmp_path, ending, spacing, turn, flip):
+    affine, size = affine_of(spacing, turn, flip)
+    path = write(tmp_path / f"seg.{ending}", voxels_of(affine, size), affine)
+    surface = clouds.load(path, units="m")  # units are of files that do not say theirs
+    assert np.sqrt((error_mm(surface.points) ** 2).mean()) < 0.15 * max(spacing)
+    assert abs(error_mm(surface.points).mean()) < 0.03 * max(spacing)
+    assert is_closed(surface.triangles)
+    assert volume_mm3(surface) == pytest.approx(4.0 / 3.0 * np.pi * RADII.prod(), rel=0.02)
+
+
+def test_the_smoothed_surface_does_not_shrink_where_a_gaussian_alone_does():
+    from scipy.ndimage import gaussian_filter
+    from skimage.measure import marching_cubes
+
+    radius, affine = 6.0, np.eye(4)
+    grid = np.stack(np.meshgrid(*[np.arange(-12.0, 13.0)] * 3, indexing="ij"), axis=-1)
+    ball = (np.linalg.norm(grid - [0.2, 0.3, -0.1], axis=-1) < radius).astype(np.uint8)
+    affine[:3, 3] = -12.0
+    off = np.linalg.norm(surface_of(ball, affine).points - [-0.1, 0.3, 0.2], axis=1) - radius
+    plain = marching_cubes(gaussian_filter(ball.astype(float), 1.0), 0.5)[0] - 12.0
+    shrunk = np.linalg.norm(plain - [0.2, 0.3, -0.1], axis=1) - radius
+    assert abs(off.mean()) < 0.04 and shrunk.mean() < -0.12  # s^2 / R = .17
+
+
+def test_a_plate_of_one_voxel_is_kept():
+    plate = np.zeros((20, 20, 20), dtype=np.uint8)
+    plate[4:16, 4:16, 10] = 1
+    thickness = np.ptp(surface_of(plate, np.eye(4)).points[:, 0])
+    assert 0.5 < thickness < 1.5
+
+
+def test_a_bone_that_the_image_cuts_is_open_there():
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    surface = surface_of(voxels_of(affine, size)[: size[2] // 2].astype(np.uint8), affine)
+    assert not is_closed(surface.triangles)
+    assert np.sqrt((error_mm(surface.points) ** 2).mean()) < 0.3
+
+
+def two_bones(tmp_path, ending, **metadata):
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    one = voxels_of(affine, size, CENTRE + [0, 0, 25], [12, 12, 12]).astype(np.uint8)
+    other = voxels_of(affine, size, CENTRE - [0, 0, 25], [10, 10, 10]).astype(np.uint8)
+    return write(tmp_path / f"two.{ending}", 75 * one + 76 * other, affine, **metadata)
+
+
+def options(*labels):
+    return ReadOptions(labels=labels)
+
+
+def mean_z(path, *labels):
+    return clouds.load(path, options=options(*labels)).points[:, 2].mean() - CENTRE[2]
+
+
+def totalsegmentator(path):
+    """A NIfTI file with the extended header of `TotalSegmentator --ml`."""
+    import nibabel
+
+    image = nibabel.load(path)
+    xml = ('<?xml version="1.0" encoding="UTF-8"?> <CaretExtension> <VolumeInformation Index="0"> <LabelTable>'
+           '<Label Key="75" Red="1" Alpha="1"><![CDATA[femur_left]]></Label>\n'
+           '<Label Key="76" Red="1" Alpha="1"><![CDATA[femur_right]]></Label>\n'
+           '<Label Key="77" Red="1" Alpha="1"><![CDATA[hip_left]]></Label>\n'
+           "</LabelTable></VolumeInformation></CaretExtension>\n   ")  # fmt: skip
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, xml.encode()))
+    nibabel.save(image, path)
+    return path
+
+
+def test_names_come_out_of_totalsegmentators_header(tmp_path, caplog):
+    path = totalsegmentator(two_bones(tmp_path, "nii.gz"))
+    assert mean_z(path, "femur_left") == pytest.approx(25.0, abs=0.3)
+    assert mean_z(path, "Femur Right") == pytest.approx(-25.0, abs=0.3)
+    assert mean_z(path, "76") == pytest.approx(-25.0, abs=0.3) and "label 76 is femur_right" in caplog.text
+    assert mean_z(path, "femur_left", "femur_right") == pytest.approx(4.5, abs=5.0)
+    with pytest.raises(InvalidPointCloudError, match="femur_left, femur_right"):
+        clouds.load(path, options=options("femur"))
+    with pytest.raises(InvalidPointCloudError, match="voxels of hip_left"):
+        clouds.load(path, options=options("hip_left"))
+    with pytest.raises(InvalidPointCloudError, match="2 of them .femur_left, femur_right.; name one"):
+        clouds.load(path)
+
+
+def test_versions_of_totalsegmentator_are_named_where_the_file_has_no_names(tmp_path, caplog):
+    path = two_bones(tmp_path, "nii.gz")
+    with pytest.raises(InvalidPointCloudError, match="89 in TotalSegmentator v1, 76 in TotalSegmentator v2 total"):
+        clouds.load(path, options=options("femur_right"))
+    mean_z(path, "76")
+    assert "rib_right_7 in TotalSegmentator v1, femur_right in TotalSegmentator v2 total" in caplog.text
+    with pytest.raises(InvalidPointCloudError, match="voxels of 88; got two.nii.gz: none|got two.nii.gz: none"):
+        clouds.load(path, options=options("88"))
+
+
+def test_the_tables_of_totalsegmentator_are_its_own():
+    v1, v2, mr, limbs = names.TOTALSEGMENTATOR.values()
+    assert [v1[n] for n in (18, 41, 58, 81, 82, 88, 89, 91)] == [
+        "vertebrae_L5", "vertebrae_C1", "rib_left_1", "rib_right_12",
+        "humerus_left", "femur_left", "femur_right", "hip_right",
+    ]  # fmt: skip
+    assert [v2[n] for n in (27, 50, 69, 75, 76, 78, 92, 115)] == [
+        "vertebrae_L5", "vertebrae_C1", "humerus_left", "femur_left",
+        "femur_right", "hip_right", "rib_left_1", "rib_right_12",
+    ]  # fmt: skip
+    assert (mr[36], mr[37], limbs[2], limbs[3]) == ("femur_left", "femur_right", "tibia", "fibula")
+
+
+def test_segments_of_slicer_have_names_values_and_layers(tmp_path):
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    layers = [voxels_of(affine, size, CENTRE + [0, 0, z], [12, 12, 12]).astype(np.uint8) for z in (20, -20)]
+    image = sitk.Compose([image_of(layer, affine) for layer in layers])
+    for i, name in enumerate(("Femur", "Tibia")):
+        image.SetMetaData(f"Segment{i}_Name", name)
+        image.SetMetaData(f"Segment{i}_LabelValue", "1")
+        image.SetMetaData(f"Segment{i}_Layer", str(i))
+    sitk.WriteImage(image, str(tmp_path / "a.seg.nrrd"))
+    assert mean_z(tmp_path / "a.seg.nrrd", "Femur") == pytest.approx(20.0, abs=0.3)
+    assert mean_z(tmp_path / "a.seg.nrrd", "Tibia") == pytest.approx(-20.0, abs=0.3)
+    with pytest.raises(InvalidPointCloudError, match="2 layers; choose it by its name"):
+        clouds.load(tmp_path / "a.seg.nrrd", options=options("1"))
+
+
+def test_one_name_twice_is_no_choice():
+    with pytest.raises(InvalidPointCloudError, match="2 of the name bone"):
+        names.choose(["bone"], [Segment("bone", 1), Segment("Bone", 2)], {0: {1, 2}})
+
+
+def test_a_dicom_segmentation_is_read_by_the_name_of_its_segment(tmp_path):
+    path = dicom_seg(tmp_path)
+    assert mean_z(path, "femur") == pytest.approx(20.0, abs=0.3)
+    assert mean_z(path, "tibia") == pytest.approx(-20.0, abs=0.3)
+    surface = clouds.load(path, options=options("femur"))
+    assert np.sqrt((error_mm(surface.points, CENTRE + [0, 0, 20], [12, 12, 12]) ** 2).mean()) < 0.3
+
+
+def dicom_seg(tmp_path):
+    """Two balls of radius 12, written by highdicom against a CT of slices."""
+    highdicom = pytest.importorskip("highdicom")
+    import pydicom
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+    affine, size = affine_of((1.5, 1.5, 2.0))
+    study, series, frame = generate_uid(), generate_uid(), generate_uid()
+    slices = []
+    for k in range(size[2]):
+        s = pydicom.Dataset()
+        s.file_meta = pydicom.dataset.FileMetaDataset()
+        s.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        s.SOPClassUID, s.SOPInstanceUID = CTImageStorage, generate_uid()
+        s.StudyInstanceUID, s.SeriesInstanceUID, s.FrameOfReferenceUID = study, series, frame
+        s.PatientName, s.PatientID, s.PatientBirthDate, s.PatientSex = "Doe^Jane", "4711", "19500101", "F"
+        s.StudyID, s.StudyDate, s.StudyTime = "1", "20200101", "000000"
+        s.AccessionNumber, s.ReferringPhysicianName = "", ""
+        s.Modality, s.SeriesNumber, s.InstanceNumber = "CT", 1, k + 1
+        s.Rows, s.Columns, s.PixelSpacing, s.SliceThickness = int(size[1]), int(size[0]), [1.5, 1.5], 2.0
+        s.ImageOrientationPatient, s.ImagePositionPatient = (
+            [1, 0, 0, 0, 1, 0],
+            (affine[:3, 3] + [0, 0, 2.0 * k]).tolist(),
+        )
+        s.BitsAllocated, s.BitsStored, s.HighBit, s.PixelRepresentation, s.SamplesPerPixel = 16, 16, 15, 0, 1
+        s.PhotometricInterpretation = "MONOCHROME2"
+        slices.append(s)
+    balls = np.stack([voxels_of(affine, size, CENTRE + [0, 0, z], [12, 12, 12]) for z in (20, -20)], axis=-1)
+    from pydicom.sr.codedict import codes
+
+    kind = (codes.SCT.Bone, codes.SCT.Bone, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL)
+    segments = [highdicom.seg.SegmentDescription(n, name, *kind) for n, name in ((1, "femur"), (2, "tibia"))]
+    seg = highdicom.seg.Segmentation(
+        slices, balls.astype(np.uint8), highdicom.seg.SegmentationTypeValues.BINARY, segments, generate_uid(), 2,
+        generate_uid(), 1, "GAPR", "test", "1", "1",
+    )  # fmt: skip
+    seg.save_as(tmp_path / "seg.dcm")
+    return tmp_path / "seg.dcm"
+
+
+def test_specks_are_left_out_and_said(tmp_path, caplog):
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    voxels = voxels_of(affine, size)
+    voxels[2, 2, 2] = True
+    surface = clouds.load(write(tmp_path / "a.nrrd", voxels, affine))
+    assert np.abs(error_mm(surface.points)).max() < 1.5 and "1 specks" in caplog.text
+
+
+def test_images_and_empty_and_cut_label_maps_are_refused_in_one_line(tmp_path, caplog):
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    image = sitk.Cast(image_of(voxels_of(affine, size), affine), sitk.sitkInt16) - 1000
+    sitk.WriteImage(image, str(tmp_path / "ct.nii.gz"))
+    with pytest.raises(InvalidPointCloudError, match="a label map: numbers from 0"):
+        clouds.load(tmp_path / "ct.nii.gz")
+    with pytest.raises(InvalidPointCloudError, match="one label; got empty.nrrd: none"):
+        clouds.load(write(tmp_path / "empty.nrrd", np.zeros((9, 9, 9)), affine))
+    for ending in ("nii", "nii.gz", "nrrd", "mha"):
+        whole = write(tmp_path / f"whole.{ending}", voxels_of(affine, size), affine).read_bytes()
+        cut = tmp_path / f"cut.{ending}"
+        for length in (0, 100, len(whole) - 40):
+            cut.write_bytes(whole[:length])
+            with pytest.raises(InvalidPointCloudError, match=f"cut.{ending}") as caught:
+                clouds.load(cut)
+            assert "\n" not in str(caught.value)
+
+
+def test_a_label_map_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    path = write(tmp_path / "a.nii.gz", voxels_of(affine, size), affine)
+    monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", "1")
+    with pytest.raises(InvalidPointCloudError, match="at most 1 MB of unpacked data"):
+        clouds.load(path)
+
+
+def test_a_reader_that_dies_takes_nobody_along(tmp_path, monkeypatch):
+    from gapr_core.formats.volumes import label_map
+
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    path = write(tmp_path / "a.nrrd", voxels_of(affine, size), affine)
+    monkeypatch.setattr(label_map.sys, "executable", "/bin/false")
+    with pytest.raises(InvalidPointCloudError, match="its reader ended with 1"):
+        clouds.load(path)
+
+
+def test_names_of_patients_stay_in_their_file(tmp_path, caplog):
+    caplog.set_level(logging.DEBUG)
+    path = dicom_seg(tmp_path)
+    with pytest.raises(InvalidPointCloudError) as caught:
+        clouds.load(path, options=options("skull"))
+    clouds.load(path, options=options("femur"))
+    assert "Doe" not in str(caught.value) + caplog.text and "4711" not in str(caught.value) + caplog.text
+
+
+def test_a_header_with_a_document_type_has_no_names(tmp_path):
+    (tmp_path / "a.nii.gz").write_bytes(gzip.compress(b"<CaretExtension><!DOCTYPE a></CaretExtension>"))
+    assert nifti.label_names(tmp_path / "a.nii.gz") == {}

@@ -1,0 +1,204 @@
+"""From a CT mask to files that other tools read the right way round."""
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gapr_core import clouds
+from gapr_core.cli import main
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.formats import markups, planning, scene, transforms
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
+
+sitk = pytest.importorskip("SimpleITK")
+
+T = se3.from_rotation_translation(Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix(), [10.0, -70.0, 200.0])
+POINTS = np.random.default_rng(0).uniform(-100.0, 100.0, (20, 3))
+
+
+@pytest.mark.parametrize("ending", ["tfm", "h5"])
+def test_a_written_transform_maps_target_points_to_the_source_in_itk(tmp_path, ending):
+    transforms.write(tmp_path / f"pose.{ending}", T)
+    read = sitk.ReadTransform(str(tmp_path / f"pose.{ending}"))
+    for point, moved in zip(POINTS, se3.apply(T, POINTS), strict=True):
+        np.testing.assert_allclose(read.TransformPoint(moved.tolist()), point, atol=1e-9)
+        np.testing.assert_allclose(read.GetInverse().TransformPoint(point.tolist()), moved, atol=1e-9)
+
+
+def test_a_matrix_as_text_is_the_pose_itself(tmp_path):
+    transforms.write(tmp_path / "pose.txt", T)
+    assert np.array_equal(np.loadtxt(tmp_path / "pose.txt"), T)
+    with pytest.raises(ConfigError, match=".tfm .h5 .txt"):
+        transforms.write(tmp_path / "pose.mat", T)
+
+
+def voxelised(surface, spacing, turn, flip):
+    """The mask [k, j, i] of a closed mesh on an oblique grid, and the image with its place."""
+    import open3d as o3d
+
+    axes = Rotation.from_rotvec(turn).as_matrix() @ np.diag(flip)
+    inside = surface.points @ axes / spacing
+    low, high = np.floor(inside.min(axis=0)) - 5.4, np.ceil(inside.max(axis=0)) + 5
+    size = (high - low).astype(int)
+    index = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1)
+    points = np.ascontiguousarray((((index + low) * spacing) @ axes.T).astype(np.float32))
+    rays = o3d.t.geometry.RaycastingScene()
+    rays.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(surface.to_open3d()))
+    image = sitk.GetImageFromArray(
+        rays.compute_occupancy(o3d.core.Tensor(points)).numpy().astype(np.uint8).transpose(2, 1, 0)
+    )
+    image.SetSpacing([float(s) for s in spacing])
+    image.SetDirection(axes.ravel().tolist())
+    image.SetOrigin((axes @ (low * spacing)).tolist())
+    return image
+
+
+GRIDS = [
+    ((2.0, 2.0, 2.0), (0.0, 0.0, 0.0), (-1, -1, 1), "nii.gz", False),
+    ((1.0, 1.4, 3.0), (0.2, -0.3, 0.5), (1, 1, -1), "nrrd", True),
+]
+FINE = [
+    ((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), (1, 1, 1), "nii.gz", False),
+    ((1.0, 1.0, 1.0), (0.1, 0.6, 0.0), (-1, 1, 1), "nii.gz", True),
+    ((3.0, 3.0, 3.0), (0.1, 0.6, 0.0), (-1, 1, 1), "mha", False),
+]
+
+
+@pytest.mark.parametrize(
+    ("spacing", "turn", "flip", "ending", "mirrored"), GRIDS + [pytest.param(*g, marks=pytest.mark.slow) for g in FINE]
+)
+def test_a_mask_becomes_a_transform_that_itk_maps_the_right_way_round(
+    tmp_path, femur, spacing, turn, flip, ending, mirrored
+):
+    bone = femur.mirrored() if mirrored else femur
+    image = voxelised(bone, np.array(spacing), turn, flip)
+    sitk.WriteImage(image * 76, str(tmp_path / f"seg.{ending}"))
+    on_bone = bone.sample(6000, np.random.default_rng(1))[0]
+    distal = on_bone[on_bone[:, 2] < np.percentile(on_bone[:, 2], 55)]
+    source = se3.apply(se3.inverse(T), distal)
+    np.save(tmp_path / "source.npy", source)
+    command = ["register", "--source", str(tmp_path / "source.npy"), "--target", str(tmp_path / f"seg.{ending}")]
+    command += ["--label", "76", "--method", "gapr_search", "--out", str(tmp_path / "pose.tfm")]
+    assert main(command) == 0
+    inverse = sitk.ReadTransform(str(tmp_path / "pose.tfm")).GetInverse()
+    mapped = np.array([inverse.TransformPoint(point.tolist()) for point in source[::20]])
+    off = np.linalg.norm(mapped - distal[::20], axis=1)
+    assert off.max() < 0.3 * max(spacing) + 0.5, off.max()
+
+
+def result_with(covariance=None, residuals=None):
+    centre, status = np.array([5.0, 0.0, 0.0]), RegistrationStatus.OK
+    return RegistrationResult(status, T, covariance, 0.99, 0.5, 1.0, 0.9, centre_mm=centre, residuals=residuals)
+
+
+def test_the_error_at_a_target_grows_with_its_distance_from_the_pose_centre():
+    covariance = np.diag([0.04, 0.01, 0.01, 1e-4, 4e-4, 9e-4])
+    plan = markups.Markups(np.array([[5.0, 0.0, 0.0], [105.0, 0.0, 0.0], [5.0, 100.0, 0.0]]), ("c", "x", "y"))
+    at = {error.label: error for error in planning.errors_at(plan, result_with(covariance))}
+    assert at["c"].expected_mm == pytest.approx(np.sqrt(0.06))
+    assert at["x"].expected_mm == pytest.approx(np.sqrt(0.06 + 1e4 * (4e-4 + 9e-4)))
+    assert at["y"].expected_mm == pytest.approx(np.sqrt(0.06 + 1e4 * (1e-4 + 9e-4)))
+
+
+def test_95_of_100_poses_stay_below_the_bound_at_a_target():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6)) * np.array([0.3, 0.3, 0.3, 0.003, 0.003, 0.003])[:, None]
+    covariance, target = root @ root.T, np.array([[80.0, -30.0, 40.0]])
+    bound = planning.errors_at(markups.Markups(target, ("a",)), result_with(covariance))[0].bound95_mm
+    twists = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
+    off = [np.linalg.norm(se3.apply(se3.exp(twist, [5.0, 0.0, 0.0]), target) - target) for twist in twists]
+    assert np.mean(np.array(off) < bound) == pytest.approx(0.95, abs=0.015)
+
+
+def test_landmarks_are_paired_by_name_and_else_in_their_order(tmp_path):
+    points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 30, 0], [0, 0, 20]])
+    moved, order = se3.apply(T, points), [2, 0, 3, 1]
+    names = ("a", "b", "c", "d")
+    markups.save(tmp_path / "s.mrk.json", markups.Markups(points, names))
+    markups.save(tmp_path / "t.mrk.json", markups.Markups(moved[order], tuple(names[i] for i in order)))
+    start = planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
+    np.testing.assert_allclose(start.T_target_source, T, atol=1e-9)
+    markups.save(tmp_path / "t.mrk.json", markups.Markups(moved, ("1", "2", "3", "4")))
+    np.testing.assert_allclose(
+        planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json").T_target_source, T, atol=1e-9
+    )
+    markups.save(tmp_path / "t.mrk.json", markups.Markups(moved[:3], ("1", "2", "3")))
+    with pytest.raises(InvalidPointCloudError, match="4 in s.mrk.json and 3 in t.mrk.json"):
+        planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
+
+
+def residuals():
+    return Residuals(
+        POINTS, np.r_[[-3.0, 0.0, 3.0, np.nan], np.zeros(16)], np.r_[[True, True, False, False], [True] * 16]
+    )
+
+
+def test_residuals_are_written_as_json_and_as_colours(tmp_path):
+    from plyfile import PlyData
+
+    content = json.loads(json.dumps(scene.residuals_json(residuals())))
+    assert content["distance_mm"][:4] == [-3.0, 0.0, 3.0, None] and content["inlier"][:3] == [True, True, False]
+    scene.write_coloured(tmp_path / "a.ply", POINTS, residuals())
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    colours = np.stack([rows[c] for c in ("red", "green", "blue")], axis=1)[:4].tolist()
+    assert colours == [[0, 0, 255], [255, 255, 255], [255, 0, 0], [150, 150, 150]]
+    np.testing.assert_allclose(clouds.load(tmp_path / "a.ply").points, POINTS, atol=1e-4)
+
+
+def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_other(tmp_path, femur):
+    errors = [planning.TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)]
+    (tmp_path / "mine.txt").write_text("stays")
+    scene.write_slicer(tmp_path, femur, result_with(np.eye(6), residuals()), errors)
+    nodes = list(ElementTree.parse(tmp_path / "scene.mrml").getroot())
+    names = {node.get("id") for node in nodes}
+    for node in nodes:
+        if node.get("fileName"):
+            assert (tmp_path / node.get("fileName")).is_file()
+        for key in ("storageNodeRef", "displayNodeRef", "transformNodeRef"):
+            assert node.get(key) is None or node.get(key) in names
+    assert sum(node.get("transformNodeRef") is not None for node in nodes) == 1
+    np.testing.assert_allclose(clouds.load(tmp_path / "target.vtk").points, femur.points, atol=1e-3)
+    np.testing.assert_allclose(clouds.load(tmp_path / "source.vtk").points, POINTS, atol=1e-3)
+    assert "0.50 mm" in (tmp_path / "targets.mrk.json").read_text() and (tmp_path / "mine.txt").read_text() == "stays"
+
+
+def test_a_refused_registration_writes_no_pose_and_says_that_the_old_one_is_old(tmp_path, femur, capsys):
+    np.save(tmp_path / "few.npy", femur.points[:40] - femur.points[0])
+    np.savez(tmp_path / "bone.npz", points=femur.points, faces=femur.faces)
+    (tmp_path / "pose.tfm").write_text("old")
+    named = ["--source", str(tmp_path / "few.npy"), "--target", str(tmp_path / "bone.npz")]
+    code = main(["register", *named, "--method", "gapr_search", "--out", str(tmp_path / "pose.tfm")])
+    assert code == 2 and (tmp_path / "pose.tfm").read_text() == "old"
+    assert "of an earlier run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "option",
+    [["--out", "pose.mat"], ["--residuals", "a.csv"], ["--tip", "1,2"], ["--axes", "up"]]
+    + [["--landmarks", "none.fcsv", "none.fcsv"], ["--targets", "none.mrk.json"]],
+)
+def test_options_that_cannot_work_are_refused_in_one_line(tmp_path, capsys, option):
+    np.save(tmp_path / "a.npy", POINTS)
+    files = ["--source", str(tmp_path / "a.npy"), "--target", str(tmp_path / "a.npy"), "--method", "gapr_search"]
+    try:
+        code = main(["register", *files, *option])
+    except SystemExit as stop:
+        code = stop.code
+    assert code == 1 and capsys.readouterr().err.count("\n") == 1
+
+
+def test_gapr_pivot_prints_what_register_takes(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    rows = ["State,Q0,Qx,Qy,Qz,Tx,Ty,Tz"]
+    for rotation in Rotation.from_rotvec(rng.normal(0.0, 0.4, (30, 3))):
+        x, y, z, w = rotation.as_quat()
+        rows.append(",".join(map(str, ["OK", w, x, y, z, *(-rotation.apply([1.0, 2.0, 150.0]))])))
+    (tmp_path / "pivot.csv").write_text("\n".join(rows) + "\n")
+    assert main(["pivot", str(tmp_path / "pivot.csv"), "--json", str(tmp_path / "tip.json")]) == 0
+    assert "--tip 1.000,2.000,150.000" in capsys.readouterr().out
+    assert json.loads((tmp_path / "tip.json").read_text())["poses"] == 30
+    assert main(["pivot", str(tmp_path / "none.csv")]) == 1

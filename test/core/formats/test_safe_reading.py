@@ -1,0 +1,269 @@
+"""What damaged files did to the process once: it died, took memory as points, or asked for gigabytes."""
+
+import io
+import resource
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+
+from gapr_core import clouds
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.options import ReadOptions
+from gapr_core.registration.target import prepare
+
+PCD = "VERSION .7\nFIELDS {}\nSIZE {}\nTYPE {}\nCOUNT {}\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\nDATA {how}\n"
+XYZ = ("x y z", "4 4 4", "F F F", "1 1 1")
+CORNERS = np.array([[0, 0, 0], [40, 0, 0], [0, 30, 0], [0, 0, 20]], dtype=np.float32)
+TETRAHEDRON = "0 0 0 40 0 0 0 30 0 0 0 20\n"
+
+
+def refusal(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InvalidPointCloudError) as caught:
+        clouds.load(path)
+    assert path.name in str(caught.value) and "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_normals_of_a_pcd_with_a_component_missing_are_left_out(tmp_path):
+    fields = ("x y z normal_x foo normal_z", "4 4 4 4 4 4", "F F F F F F", "1 1 1 1 1 1")
+    rows = np.hstack([CORNERS, np.ones((4, 3), dtype=np.float32)])
+    (tmp_path / "a.pcd").write_bytes(PCD.format(*fields, n=4, how="binary").encode() + rows.tobytes())
+    surface = clouds.load(tmp_path / "a.pcd")
+    assert surface.normals is None and np.array_equal(surface.points, CORNERS)
+
+
+@pytest.mark.parametrize("lines", ["0 0 0\n40 0 0\n0 30\n0 0 20\n", "0 0 0\n40 0 0\n", "0 0 0\n40 0 0\n0 30 0\n0 0 2"])
+def test_short_lines_and_missing_points_of_a_text_pcd_are_no_points(tmp_path, lines):
+    refusal(tmp_path / "a.pcd", PCD.format(*XYZ, n=4, how="ascii") + lines)
+
+
+@pytest.mark.parametrize("change", [-1, -12, 1])
+def test_a_binary_pcd_has_exactly_the_bytes_that_it_announces(tmp_path, change):
+    body = (CORNERS.tobytes() + b"x")[: 48 + change]
+    assert "48" in refusal(tmp_path / "a.pcd", PCD.format(*XYZ, n=4, how="binary").encode() + body)
+
+
+def test_a_compressed_pcd_may_refer_back_and_never_before_its_beginning(tmp_path):
+    head = PCD.format(*XYZ, n=4, how="binary_compressed").encode()
+    planes = np.repeat(np.array([[10.0], [20.0], [30.0]], dtype="<f4"), 4, axis=1)
+    planes[:, 0] = 0.0
+    literal = planes.tobytes()
+    run = bytes([3]) + literal[4:8] + bytes([(6 << 5), 3])  # four bytes, then eight that repeat them
+    packed = b"".join(bytes([3]) + bytes(4) + bytes([3]) + plane[4:8] + bytes([6 << 5, 3])
+                      for plane in (literal[:16], literal[16:32], literal[32:]))  # fmt: skip
+    (tmp_path / "a.pcd").write_bytes(head + struct.pack("<II", len(packed), 48) + packed)
+    assert np.array_equal(clouds.load(tmp_path / "a.pcd").points.astype("<f4"), planes.T)
+    broken = bytes([6 << 5, 3]) + packed[2:]
+    refusal(tmp_path / "b.pcd", head + struct.pack("<II", len(broken), 48) + broken)
+    assert len(run) == 7
+
+
+@pytest.mark.parametrize(
+    "polygons",
+    ["4 5\n4 0 1 2 9\n", "1 5\n4 0 1 2 900000000\n", "1 5\n900 0 1 2 3\n", "1 5\n-4 0 1 2 3\n"]
+    + ["1000000000000 5\n4 0 1 2 3\n", "1 5000000000000\n4 0 1 2 3\n"],
+)
+def test_polygons_of_a_vtk_file_stay_within_their_points_and_their_list(tmp_path, polygons):
+    head = f"# vtk DataFile Version 3.0\nbone\nASCII\nDATASET POLYDATA\nPOINTS 4 float\n{TETRAHEDRON}"
+    refusal(tmp_path / "a.vtk", f"{head}POLYGONS {polygons}")
+
+
+def test_a_vtk_file_cut_inside_its_points_or_before_its_polygons_is_refused(tmp_path):
+    head = "# vtk DataFile Version 3.0\nbone\n{}\nDATASET POLYDATA\nPOINTS 4 float\n"
+    big_endian = CORNERS.astype(">f4").tobytes()
+    refusal(tmp_path / "a.vtk", head.format("BINARY").encode() + big_endian[:-1])
+    refusal(tmp_path / "b.vtk", head.format("ASCII") + "0 0 0 40 0 0 0 30\n")
+    refusal(tmp_path / "c.vtk", head.format("BINARY").encode() + big_endian + b"\n")
+
+
+def vtp(points=4, polys=2, corners="0 1 2 1 2 3", ends="3 6"):
+    return (
+        '<VTKFile type="PolyData"><PolyData>'
+        f'<Piece NumberOfPoints="{points}" NumberOfVerts="0" NumberOfPolys="{polys}">'
+        f'<Points><DataArray type="Float32" NumberOfComponents="3" format="ascii">{TETRAHEDRON}</DataArray></Points>'
+        f'<Polys><DataArray type="Int64" Name="connectivity" format="ascii">{corners}</DataArray>'
+        f'<DataArray type="Int64" Name="offsets" format="ascii">{ends}</DataArray></Polys>'
+        "</Piece></PolyData></VTKFile>\n"
+    )
+
+
+def test_counts_and_corners_of_a_vtp_file_are_checked(tmp_path):
+    (tmp_path / "good.vtp").write_text(vtp())
+    assert clouds.load(tmp_path / "good.vtp").faces.tolist() == [[0, 1, 2], [1, 2, 3]]
+    for bad in (vtp(points=1000000000000), vtp(corners="0 1 2 1 2 9"), vtp(corners="0 1 2 1 2 -3"), vtp(ends="3 900"),
+                vtp(ends="6 3"), vtp(polys=10**12), vtp(points=-4), vtp(corners="0 1 2")):  # fmt: skip
+        refusal(tmp_path / "bad.vtp", bad)
+
+
+def test_entities_of_xml_are_never_unfolded(tmp_path):
+    bomb = '<!DOCTYPE a [<!ENTITY b "lol"><!ENTITY c "&b;&b;&b;&b;">]>'
+    assert "document types" in refusal(tmp_path / "a.vtp", bomb + vtp())
+
+
+@pytest.mark.parametrize("text", [
+    "v 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 3",
+    "v 0 0 0\nv 40 0 0\nv 0 30 0\nv 0 0 20\n",
+    "v 0 0 0\nv 40 0 0\nv 0 30 0\nv 0 0 20\nf 1 2 3\n",
+    "# number of vertices: 3\n# number of triangles: 2\nv 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 3\n",
+    "v 0 0 0\nv 40 0\nv 0 30 0\nf 1 2 3\n",
+    "v 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 7\n",
+    "v 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 -9\n",
+])  # fmt: skip
+def test_an_obj_file_that_ends_too_early_is_refused(tmp_path, text):
+    refusal(tmp_path / "a.obj", text)
+
+
+@pytest.mark.parametrize("text", [
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 40 0 0\nvertex 0 30 0\nendloop\nendfacet\n",
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 40 0 0\nendloop\nendfacet\nendsolid a\n",
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 40 0 0\nvertex 0 30\nendloop\nendfacet\nendsolid\n",
+])  # fmt: skip
+def test_a_text_stl_file_that_ends_too_early_is_refused(tmp_path, text):
+    refusal(tmp_path / "a.stl", text)
+
+
+def test_a_binary_stl_file_is_as_long_as_its_facets(tmp_path):
+    refusal(tmp_path / "a.stl", bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(50))
+
+
+def npz(**members):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(f"{name}.npy", content)
+    return file.getvalue()
+
+
+def npy_header(shape):
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+def test_an_npz_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked(tmp_path):
+    (tmp_path / "a.npz").write_bytes(npz(points=npy_header((1_500_000, 3)) + bytes(36_000_000)))
+    with pytest.raises(InvalidPointCloudError, match="at most 20 MB of unpacked.* 34 MB.*MAX_UNPACKED"):
+        clouds.load(tmp_path / "a.npz", options=ReadOptions(limits=FileLimits(unpacked_mb=20.0)))
+
+
+@pytest.mark.parametrize("shape", [(10**12, 3), (5, 3), (3, 3), (-4, 3), (-4, -3)])
+def test_an_array_has_exactly_the_numbers_that_its_header_announces(tmp_path, shape):
+    content = npy_header(shape) + bytes(96)
+    for path, data in ((tmp_path / "a.npy", content), (tmp_path / "a.npz", npz(points=content))):
+        path.write_bytes(data)
+        with pytest.raises(InvalidPointCloudError):
+            clouds.load(path)
+
+
+def test_objects_in_arrays_are_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([{}, {}, {}], dtype=object), allow_pickle=True)
+    assert "objects" in refusal(tmp_path / "a.npy", (tmp_path / "a.npy").read_bytes())
+
+
+@pytest.mark.parametrize(
+    "limits", [FileLimits(file_mb=0.0001), FileLimits(unpacked_mb=0.00001), FileLimits(vertices=3)]
+)
+def test_each_limit_refuses_by_itself_and_says_how_to_raise_it(tmp_path, limits):
+    np.save(tmp_path / "a.npy", np.vstack([CORNERS] * 3))
+    assert len(clouds.load(tmp_path / "a.npy").points) == 12
+    with pytest.raises(InvalidPointCloudError, match="at most .* raise GAPR_MAX_"):
+        clouds.load(tmp_path / "a.npy", options=ReadOptions(limits=limits))
+
+
+def test_limits_come_from_the_environment(tmp_path, monkeypatch):
+    np.save(tmp_path / "a.npy", CORNERS)
+    monkeypatch.setenv("GAPR_MAX_VERTICES", "3")
+    with pytest.raises(InvalidPointCloudError, match="at most 3 points"):
+        clouds.load(tmp_path / "a.npy")
+    monkeypatch.setenv("GAPR_MAX_VERTICES", "many")
+    with pytest.raises(ConfigError, match="GAPR_MAX_VERTICES"):
+        clouds.load(tmp_path / "a.npy")
+
+
+def test_a_ply_header_that_announces_more_than_the_file_holds_reserves_nothing(tmp_path):
+    for count, what in ((10**9, "vertex"), (10**7, "vertex"), (10**7, "face")):
+        text = (
+            "ply\nformat binary_little_endian 1.0\n"
+            f"element vertex {count if what == 'vertex' else 4}\nproperty float x\nproperty float y\nproperty float z\n"
+            f"element face {count if what == 'face' else 1}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        refusal(tmp_path / "a.ply", text.encode() + CORNERS.tobytes() + bytes(13))
+
+
+MEMORY = """
+import resource, sys
+import numpy, numba, plyfile
+from gapr_core import clouds
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+surface = clouds.load(sys.argv[1])
+unpacked = surface.points.nbytes + (0 if surface.faces is None else surface.faces.nbytes)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024, unpacked)
+"""
+
+
+def grid(n):
+    """(n^2, 3) points and (2 (n - 1)^2, 3) faces of a square of 100 mm."""
+    x, y = np.meshgrid(np.linspace(0, 100, n), np.linspace(0, 100, n))
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
+    points = np.stack([x.ravel(), y.ravel(), np.sin(x.ravel())], axis=1).astype("<f4")
+    return points, np.vstack([i + [0, 1, n], i + [1, n + 1, n]])
+
+
+def large(kind):
+    points, faces = grid(300)
+    rows = "".join("{} {} {}\n".format(*p) for p in points)
+    if kind == "stl":
+        facets = np.zeros(len(faces), dtype=np.dtype("12<f4,<u2"))
+        facets["f0"][:, 3:] = points[faces].reshape(-1, 9)
+        return bytes(80) + struct.pack("<I", len(faces)) + facets.tobytes()
+    if kind == "obj":
+        vertices = "".join("v {} {} {}\n".format(*p) for p in points)
+        return (vertices + "".join("f {} {} {}\n".format(*f) for f in faces + 1)).encode()
+    if kind == "pcd":
+        return (
+            PCD.format(*XYZ, n=len(points), how="ascii") + "".join("{} {} {}\n".format(*p) for p in points)
+        ).encode()
+    quads = np.column_stack([faces[: len(faces) // 2], faces[: len(faces) // 2, :1] + 301])
+    return (
+        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(quads)}\nproperty list uchar int vertex_indices\nend_header\n"
+        + rows + "".join("4 {} {} {} {}\n".format(*q) for q in quads)
+    ).encode()  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj", "pcd", "ply"])
+def test_a_load_takes_at_most_20_times_the_unpacked_data_and_200_mb(tmp_path, kind):
+    (tmp_path / f"a.{kind}").write_bytes(large(kind))
+    command = [sys.executable, "-c", MEMORY, str(tmp_path / f"a.{kind}")]
+    taken, unpacked = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert 2e6 < unpacked and taken < 20 * unpacked + 200e6
+
+
+def test_points_in_pairs_need_no_finer_buffer_than_the_bone(tmp_path):
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(2250, 3))
+    ball *= 40.0 / np.linalg.norm(ball, axis=1)[:, None]
+    pairs = np.vstack([ball, ball + 0.001 / np.sqrt(3.0)])
+    limit, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, hard))
+    try:
+        target = prepare(pairs)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    assert 0.5 < target.spacing_mm < 5.0
+
+
+def test_a_vtp_block_that_unpacks_to_more_than_it_says_is_stopped():
+    from gapr_core.formats.meshes.vtp import _unpacked
+
+    bomb = zlib.compress(bytes(50_000_000))
+    assert len(_unpacked(bomb, 100, "vtkZLibDataCompressor")) == 100  # and the array has the 100 bytes announced
+    with pytest.raises(ValueError, match="cut"):
+        _unpacked(zlib.compress(bytes(10)), 100, "vtkZLibDataCompressor")

@@ -1,0 +1,189 @@
+"""Points of pointers, probes and markups, with the traps of each format."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gapr_core import clouds
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats import markups, reading, tracker
+from gapr_core.formats.options import ReadOptions
+
+POINTS = np.array([[10.0, 20.0, 30.0], [-40.0, 5.0, 60.0], [7.0, -8.0, 90.0]])
+LPS_RAS = [-1.0, -1.0, 1.0]
+
+
+def fcsv(path, said, points=POINTS):
+    rows = "".join(f"p{i},{x},{y},{z},0,0,0,1,1,1,0,F-{i},,\n" for i, (x, y, z) in enumerate(points))
+    columns = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+    path.write_text(f"# Markups fiducial file version = 4.6\n{said}{columns}{rows}")
+    return path
+
+
+@pytest.mark.parametrize(("said", "factors"), [
+    ("0", LPS_RAS), ("1", [1, 1, 1]), ("RAS", LPS_RAS), ("LPS", [1, 1, 1]),
+])  # fmt: skip
+def test_old_fcsv_files_write_their_axes_as_a_number_and_0_is_ras(tmp_path, said, factors):
+    read = markups.load(fcsv(tmp_path / "a.fcsv", f"# CoordinateSystem = {said}\n"))
+    np.testing.assert_allclose(read.points, POINTS * factors)
+    assert read.labels == ("F-0", "F-1", "F-2")
+    np.testing.assert_allclose(clouds.load(tmp_path / "a.fcsv", units="m").points, POINTS * factors)
+
+
+@pytest.mark.parametrize("said", ["", "# CoordinateSystem = 2\n"])
+def test_axes_of_markups_are_never_guessed(tmp_path, said):
+    with pytest.raises(InvalidPointCloudError, match="neither LPS nor RAS"):
+        reading.read(fcsv(tmp_path / "a.fcsv", said))
+
+
+@pytest.mark.parametrize(("space", "factors"), [("LPS", [1, 1, 1]), ("RAS", LPS_RAS)])
+def test_mrk_json_points_come_in_lps_and_undefined_ones_stay_behind(tmp_path, space, factors):
+    points = [{"label": f"L{i}", "position": p.tolist()} for i, p in enumerate(POINTS)]
+    points.append({"label": "later", "position": [0, 0, 0], "positionStatus": "undefined"})
+    node = {"type": "Fiducial", "coordinateSystem": space, "coordinateUnits": "mm", "controlPoints": points}
+    (tmp_path / "a.mrk.json").write_text(json.dumps({"markups": [node]}))
+    read = markups.load(tmp_path / "a.mrk.json")
+    np.testing.assert_allclose(read.points, POINTS * factors)
+    assert read.labels == ("L0", "L1", "L2")
+
+
+def test_written_markups_come_back(tmp_path):
+    markups.save(tmp_path / "a.mrk.json", markups.Markups(POINTS, ("a", "b", "c")), ["1.2 mm", "", ""])
+    read = markups.load(tmp_path / "a.mrk.json")
+    assert np.array_equal(read.points, POINTS) and read.labels == ("a", "b", "c")
+
+
+DAMAGED = ["", "{}", "nonsense", '{"markups": []}', '{"markups": [{"coordinateSystem": "LPS"}]}']
+
+
+@pytest.mark.parametrize("content", DAMAGED)
+def test_damaged_and_empty_markups_are_refused_in_one_line(tmp_path, content):
+    for name in ("a.mrk.json", "a.fcsv"):
+        (tmp_path / name).write_text(content)
+        with pytest.raises(InvalidPointCloudError, match=name):
+            reading.read(tmp_path / name)
+
+
+@pytest.mark.parametrize(("name", "content"), [
+    ("a.xyz", "10 20 30\n-40 5 60\n7 -8 90\n"),
+    ("a.txt", "# from a probe\nx;y;z\n10;20;30\n-40;5;60\n7;-8;90\n"),
+    ("a.csv", "10,20,30\n-40,5,60\n7,-8,90\n"),
+    ("b.csv", "Time,Z,X,Y\n0,30,10,20\n1,60,-40,5\n2,90,7,-8\n"),
+])  # fmt: skip
+def test_text_clouds_have_a_point_a_line(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
+
+
+@pytest.mark.parametrize("content", ["", "1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "1 2 3\n4 5 6"])
+def test_cut_and_ragged_text_clouds_are_refused(tmp_path, content):
+    (tmp_path / "a.xyz").write_text(content)
+    with pytest.raises(InvalidPointCloudError, match="a.xyz"):
+        reading.read(tmp_path / "a.xyz")
+
+
+TIP = np.array([3.0, -5.0, 150.0])
+PIVOT = np.array([100.0, -50.0, -1200.0])
+
+
+def turned_poses(count=40, noise=0.0, axis=None):
+    """Poses of a tool that stands on its tip and is turned."""
+    rng = np.random.default_rng(0)
+    turns = rng.normal(0.0, 0.4, (count, 3)) if axis is None else rng.normal(0.0, 0.4, (count, 1)) * axis
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    poses[:, :3, 3] = PIVOT - poses[:, :3, :3] @ TIP + noise * rng.normal(size=(count, 3))
+    return poses
+
+
+def ndi_csv(path, poses, lost=()):
+    """As NDI Track writes it: the scalar of the quaternion first; a tool that is not seen has no numbers of use."""
+    rows = ["Tools,Port,Frame,Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,Markers\n"]
+    for i, T in enumerate(poses):
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        values = [0.0] * 7 if i in lost else [w, x, y, z, *T[:3, 3]]
+        state = "Missing" if i in lost else "OK"
+        rows.append(",".join(["1", "A", str(i), "0", state, *map(str, values), "0.1", "4"]) + "\n")
+    path.write_text("".join(rows))
+    return path
+
+
+def test_a_pivot_calibration_finds_the_tip_and_says_how_well(tmp_path):
+    path = ndi_csv(tmp_path / "pivot.csv", turned_poses(), lost=(3, 7))
+    tip = tracker.pivot(tracker.read_poses(path))
+    np.testing.assert_allclose(tip.tip_mm, TIP, atol=1e-6)
+    np.testing.assert_allclose(tip.pivot_mm, PIVOT, atol=1e-6)
+    assert tip.residual_mm < 1e-6 and tip.poses == 38
+    noisy = tracker.pivot(turned_poses(400, noise=0.3))
+    assert noisy.residual_mm == pytest.approx(0.3 * np.sqrt(3.0), rel=0.1)
+    np.testing.assert_allclose(noisy.tip_mm, TIP, atol=0.3)
+
+
+def test_a_tool_turned_about_one_axis_has_no_tip():
+    with pytest.raises(InvalidPointCloudError, match="two axes"):
+        tracker.pivot(turned_poses(axis=np.array([0.0, 0.0, 1.0])))
+    with pytest.raises(InvalidPointCloudError, match="at least 10 poses"):
+        tracker.pivot(turned_poses(5))
+
+
+def test_a_recorded_pointer_becomes_the_points_of_its_tip(tmp_path):
+    path = ndi_csv(tmp_path / "probe.csv", turned_poses())
+    with pytest.raises(InvalidPointCloudError, match="--tip"):
+        reading.read(path)
+    surface = reading.read(path, ReadOptions(tip_mm=(3.0, -5.0, 150.0)))
+    np.testing.assert_allclose(surface.points, np.tile(PIVOT, (40, 1)), atol=1e-6)
+
+
+def igs(path, poses, statuses):
+    head = "ObjectType = Image\nNDims = 3\nDimSize = 1 1 2\n"
+    for i, (T, status) in enumerate(zip(poses, statuses, strict=True)):
+        numbers = " ".join(map(str, T.ravel()))
+        head += f"Seq_Frame{i:04d}_ProbeToTrackerTransform = {numbers}\n"
+        head += f"Seq_Frame{i:04d}_ProbeToTrackerTransformStatus = {status}\n"
+    path.write_bytes(head.encode() + b"ElementDataFile = LOCAL\n\x00\x00")
+    return path
+
+
+def test_poses_of_a_plus_sequence_are_read_where_they_are_valid(tmp_path):
+    path = igs(tmp_path / "a.igs.mha", turned_poses(4), ["OK", "INVALID", "OK", "OK"])
+    surface = reading.read(path, ReadOptions(tip_mm=tuple(TIP)))
+    np.testing.assert_allclose(surface.points, np.tile(PIVOT, (3, 1)), atol=1e-6)
+    with pytest.raises(InvalidPointCloudError, match="no valid transform"):
+        reading.read(igs(tmp_path / "b.igs.mha", turned_poses(1), ["INVALID"]), ReadOptions(tip_mm=tuple(TIP)))
+
+
+def test_a_folder_of_tracked_slices_is_one_cloud(tmp_path):
+    poses = turned_poses(2)
+    for i in range(2):
+        np.savetxt(tmp_path / f"slice{i}.xyz", POINTS)
+    np.testing.assert_allclose(reading.read(tmp_path).points, np.vstack([POINTS, POINTS]))
+    np.savetxt(tmp_path / "poses.csv", poses.reshape(2, 16), delimiter=",")
+    moved = [POINTS @ T[:3, :3].T + T[:3, 3] for T in poses]
+    np.testing.assert_allclose(reading.read(tmp_path).points, np.vstack(moved))
+    np.savetxt(tmp_path / "slice2.xyz", POINTS)
+    with pytest.raises(InvalidPointCloudError, match="2 poses of 3 slices"):
+        reading.read(tmp_path)
+
+
+MESH = (
+    "# vtk DataFile Version 3.0\n{}\nASCII\nDATASET POLYDATA\n"
+    "POINTS 3 float\n10 20 30 -40 5 60 7 -8 90\nPOLYGONS 1 4\n3 0 1 2\n"
+)
+
+
+@pytest.mark.parametrize(("title", "axes", "factors"), [
+    ("bone", "auto", [1, 1, 1]), ("SPACE=LPS", "auto", [1, 1, 1]), ("SPACE=RAS", "auto", LPS_RAS),
+    ("bone", "ras", LPS_RAS), ("bone", "lps_to_ras", LPS_RAS), ("bone", "lps", [1, 1, 1]),
+    ("SPACE=RAS", "as_is", [1, 1, 1]), ("SPACE=RAS", "lps", [1, 1, 1]),
+])  # fmt: skip
+def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title, axes, factors):
+    (tmp_path / "a.vtk").write_text(MESH.format(title))
+    np.testing.assert_allclose(reading.read(tmp_path / "a.vtk", ReadOptions(axes=axes)).points, POINTS * factors)
+
+
+def test_a_contradiction_of_axes_is_said(tmp_path, caplog):
+    (tmp_path / "a.vtk").write_text(MESH.format("SPACE=RAS"))
+    reading.read(tmp_path / "a.vtk", ReadOptions(axes="lps"))
+    assert "says SPACE=RAS and is read as LPS" in caplog.text

@@ -1,0 +1,95 @@
+"""A camera looks at a bone between things that are not bone."""
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import se3, visibility
+from gapr_core.registration import clutter
+from gapr_core.registration.additive import Additive
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.features import SCENE_FEATURES
+from gapr_core.registration.source import prepare
+
+T_SOURCE_TARGET = se3.exp(np.array([80.0, -40.0, 25.0, 0.4, -1.1, 0.7]), np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def scene(femur):
+    """(N, 3) one end of a femur and a tilted cloth around it, both as a camera sees them; and the camera."""
+    rng = np.random.default_rng(2)
+    points, normals = femur.sample(60_000, rng)
+    middle = points[points[:, 2] < np.quantile(points[:, 2], 0.2)].mean(axis=0)
+    ahead = np.array([0.0, 1.0, 0.0])
+    seen = visibility.seen_from(-ahead, points, normals, 1.5) & (np.linalg.norm(points - middle, axis=1) < 60.0)
+    bone = points[seen & (rng.random(len(points)) < 0.2)]
+    x, z = rng.uniform(-90.0, 90.0, (2, 3500))
+    cloth = middle + np.stack([x, -5.0 + 0.3 * x + 6.0 * np.sin(z / 20.0), z], axis=1)
+    gap = np.hypot(*(cloth - middle)[:, [0, 2]].T) > 62.0
+    cloud = np.vstack([bone, cloth[gap]])
+    cloud += rng.normal(0.0, 0.4, cloud.shape)
+    return se3.apply(T_SOURCE_TARGET, cloud), se3.apply(T_SOURCE_TARGET, (middle - 450.0 * ahead)[None])[0], len(bone)
+
+
+@pytest.fixture(scope="module")
+def method():
+    return Registrar(RegistrarConfig(num_threads=1, min_confidence=0.0))
+
+
+@pytest.fixture(scope="module")
+def result(method, target, scene):
+    return method.register(scene[0], target, viewpoint=scene[1])
+
+
+def test_the_bone_is_found_between_what_is_not_bone(result, scene):
+    assert len(result.hypotheses) > 1 and result.proposer == clutter.NAME
+    shift_mm, turn_deg = se3.pose_error(
+        result.hypotheses[0].T_target_source, se3.inverse(T_SOURCE_TARGET), scene[0][: scene[2]]
+    )
+    assert shift_mm < 2.0 and turn_deg < 2.0
+
+
+def test_residuals_say_which_points_were_taken_for_bone(result, scene):
+    points, _, count = scene
+    bone = {tuple(p) for p in points[:count]}
+    is_bone = np.array([tuple(p) in bone for p in result.residuals.points])
+    assert result.residuals.inlier[is_bone].mean() > 0.8 and result.residuals.inlier[~is_bone].mean() < 0.1
+
+
+def test_every_feature_of_the_confidence_model_is_measured_and_finite(result):
+    assert set(result.features) == set(SCENE_FEATURES) and np.isfinite(list(result.features.values())).all()
+
+
+def test_without_the_bone_what_is_mostly_clutter_is_refused_as_such(target, scene):
+    undecided = Calibration("scene", Additive(0.0, ()), {})
+    limited = Registrar(RegistrarConfig(num_threads=1, min_confidence=0.6), scene_calibration=undecided)
+    result = limited.register(scene[0][scene[2] :], target, viewpoint=scene[1])
+    assert result.status is RegistrationStatus.CLUTTER and result.T_target_source is None
+    assert "crop" in result.reason and result.hypotheses
+
+
+def test_without_a_viewpoint_a_refusal_of_clutter_asks_for_one(target, scene):
+    result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0][scene[2] :], target)
+    assert result.status is RegistrationStatus.CLUTTER and "where the camera was" in result.reason
+
+
+def test_a_refused_cloud_that_lies_on_the_bone_is_not_called_clutter(target, femur):
+    shaft = femur.sample(4000, np.random.default_rng(5))[0]
+    along = np.abs(shaft[:, 2] - shaft[:, 2].mean())
+    result = Registrar(RegistrarConfig(num_threads=1)).register(shaft[along < 40.0], target)
+    assert not result.ok and result.status is not RegistrationStatus.CLUTTER
+
+
+@pytest.mark.parametrize("viewpoint", [[0.0, 1.0], [np.nan, 0.0, 0.0]])
+def test_a_viewpoint_that_is_no_place_is_refused(method, target, scene, viewpoint):
+    with pytest.raises(InvalidPointCloudError, match="viewpoint"):
+        method.register(scene[0], target, viewpoint=viewpoint)
+
+
+def test_normals_of_a_camera_point_to_it(scene):
+    points, viewpoint, _ = scene
+    facing = prepare(points).facing(viewpoint)
+    assert facing.oriented and (np.einsum("ni,ni->n", facing.normals, viewpoint - facing.points) >= 0.0).all()
+    frames = np.linalg.det(facing.axes)
+    assert frames == pytest.approx(np.ones(len(frames)))

@@ -1,0 +1,192 @@
+"""Every term of the pose covariance against errors drawn at random, and every rule for how large they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.geometry.twists import error_twist, nees
+from gapr_core.registration import bias_field, covariance, refinement
+from gapr_core.registration.sensor import Errors
+
+CONFIG = CovarianceConfig()
+NOTHING = Errors(offset_mm=0.0, standoff_mm=0.0, noise_mm=1e-6, bias_mm=0.0, scale=0.0)
+
+
+def curved_fit(count=300, sigma_mm=0.5, bias_mm=0.0, seed=0):
+    """A fit of a one-sided, unevenly curved surface: residuals 0, weights of a robust fit, some of them 0."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-40.0, 40.0, (2, count))
+    z = -(x**2) / 90.0 - y**2 / 50.0 + x * y / 140.0 + 5.0 * np.sin(x / 12.0)
+    slopes = np.stack([2 * x / 90.0 - y / 140.0 - 5.0 / 12.0 * np.cos(x / 12.0), 2 * y / 50.0 - x / 140.0], axis=1)
+    normals = np.column_stack([slopes, np.ones(count)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    weights = np.where(rng.random(count) < 0.1, 0.0, rng.uniform(0.5, 1.0, count))
+    points = np.stack([x, y, z], axis=1) + [100.0, -30.0, 5.0]
+    elements = np.zeros(count, dtype=np.int64)
+    return refinement.Fit(np.eye(4), sigma_mm, np.zeros(count), weights, normals, elements, points, bias_mm)
+
+
+def solved(fit, errors_mm, noise_mm, fields):
+    """(K, 6) twists of dense (generalised) least squares under errors (K, N) of the residuals."""
+    inlier = fit.weights > 0.0
+    J, F = fit.jacobian[inlier], fields[inlier]
+    V = np.diag(noise_mm**2 / fit.weights[inlier]) + fit.bias_mm**2 * F @ F.T
+    VJ = np.linalg.solve(V, J)
+    H = J.T @ VJ + bias_field.POSE_PRIOR / noise_mm**2
+    return -np.linalg.solve(H, VJ.T @ errors_mm[:, inlier].T).T
+
+
+def drawn(kind, fit, rng, count=4000):
+    """(count, N) errors of one kind, of unit size."""
+    points, inlier = fit.moved, fit.weights > 0.0
+    if kind == "noise_mm":
+        return rng.normal(size=(count, len(points)))
+    if kind == "standoff_mm":
+        return np.tile(rng.normal(size=(count, 1)), (1, len(points)))
+    if kind == "scale":  # the source is larger by this factor about its centroid: points move along p - c
+        away = points - points[inlier].mean(axis=0)
+        return rng.normal(size=(count, 1)) * (away * fit.gradients).sum(axis=1)
+    correlation = bias_field.smooth_correlation(points, points, CONFIG.correlation_mm)
+    return rng.multivariate_normal(np.zeros(len(points)), correlation, count, method="eigh")
+
+
+def arms(fit):
+    """(6,) mm per mm and mm per rad, so that shifts and turns compare."""
+    return np.array([1.0] * 3 + [40.0] * 3)
+
+
+@pytest.mark.parametrize("corrected_mm", [0.0, 0.8])
+@pytest.mark.parametrize(("kind", "size"), [("noise_mm", 0.7), ("bias_mm", 0.3), ("standoff_mm", 0.3), ("scale", 0.03)])
+def test_each_error_spreads_the_pose_as_its_term_says(kind, size, corrected_mm):
+    """Sizes other than 1: entering as b instead of b^2, or not at all, fails. So does another sign of the gain."""
+    fit = curved_fit(bias_mm=corrected_mm)
+    noise_mm = size if kind == "noise_mm" else 0.5
+    fields = bias_field.fields(fit, CONFIG.correlation_mm, 80)
+    twists = solved(fit, size * drawn(kind, fit, np.random.default_rng(1)), noise_mm, fields) * arms(fit)
+    errors = replace(NOTHING, **{"noise_mm": noise_mm, kind: size})
+    predicted = covariance.sandwich(fit, fields, errors)
+    if kind != "noise_mm":
+        predicted = predicted - covariance.sandwich(fit, fields, replace(NOTHING, noise_mm=noise_mm))
+    predicted = predicted * np.outer(arms(fit), arms(fit))
+    sampled = twists.T @ twists / len(twists)
+    assert np.abs(sampled - predicted).max() < 0.08 * np.abs(predicted).max()
+    assert np.trace(sampled) == pytest.approx(np.trace(predicted), rel=0.08)
+
+
+def test_noise_counts_by_the_weights_of_the_fit():
+    """Of two points that say the same, one of weight 1 and one of weight 1/2, least squares takes 2 to 1."""
+    fit = curved_fit()
+    fields = bias_field.fields(fit, CONFIG.correlation_mm, 80)
+    gain, _ = covariance.gain_of(fit, fields, 0.5)
+    inlier = fit.weights > 0.0
+    even, _ = covariance.gain_of(replace(fit, weights=np.where(inlier, 1.0, 0.0)), fields, 0.5)
+    assert gain.shape == (6, inlier.sum())
+    H = fit.jacobian.T @ (fit.weights[:, None] * fit.jacobian) + bias_field.POSE_PRIOR
+    np.testing.assert_allclose(gain, np.linalg.solve(H, (fit.weights[:, None] * fit.jacobian)[inlier].T), rtol=1e-6)
+    assert np.abs(gain - even).max() > 1e-3 * np.abs(gain).max()
+
+
+def test_a_motion_of_which_nothing_is_seen_has_the_variance_of_the_prior():
+    flat = curved_fit()
+    up = np.tile([0.0, 0.0, 1.0], (300, 1))
+    flat = replace(flat, gradients=up, moved=flat.moved * [1.0, 1.0, 0.0])
+    C = covariance.sandwich(flat, bias_field.fields(flat, 20.0, 80), replace(NOTHING, noise_mm=0.5))
+    assert C[0, 0] == pytest.approx(0.25 / 1e-6, rel=0.01)  # noise variance over the prior's information
+    assert C[5, 5] == pytest.approx(0.25 / 1e-3, rel=0.01)
+    assert C[2, 2] < 0.01
+
+
+def test_a_standoff_does_not_move_a_pose_that_is_held_from_all_sides():
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(2000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.concatenate([normals, -normals])
+    points = normals * [40.0, 25.0, 60.0]
+    zeros = np.zeros(4000)
+    around = refinement.Fit(np.eye(4), 0.5, zeros, zeros + 1.0, normals, zeros.astype(np.int64), points)
+    one_sided = replace(around, weights=(normals[:, 2] > 0.2).astype(float))
+    errors = replace(NOTHING, standoff_mm=0.5)
+    shifts = [
+        np.sqrt(np.trace(covariance.sandwich(fit, np.zeros((4000, 1)), errors)[:3, :3])) for fit in (around, one_sided)
+    ]
+    assert shifts[0] < 0.01 < 0.4 < shifts[1]
+
+
+def test_the_noise_of_few_points_is_larger_than_their_residuals_say():
+    """Six unknowns take up six points' residuals, and the sensor's own noise speaks as four points."""
+    assert covariance.expected_noise_mm(0.3, 12, 0.5, 4.0) == pytest.approx(np.sqrt((4 * 0.25 + 12 * 0.09) / 10))
+    assert covariance.expected_noise_mm(0.3, 4000, 0.5, 4.0) == pytest.approx(0.3, rel=0.01)
+    assert np.isfinite(covariance.expected_noise_mm(0.3, 0, 0.5, 4.0))
+
+
+@pytest.mark.parametrize("size_mm", [0.0, 0.3, 0.9])
+def test_the_bias_is_as_large_as_the_residuals_say(size_mm):
+    """`bias_gain` is for what robust weights hide; without it the size is that which was drawn."""
+    config, sizes = replace(CONFIG, bias_gain=1.0), []
+    for seed in range(6):
+        fit = curved_fit(2500, sigma_mm=0.4, seed=seed)
+        rng = np.random.default_rng(100 + seed)
+        fields = bias_field.fields(fit, config.correlation_mm, config.centres)
+        signed = size_mm * fields @ rng.normal(size=fields.shape[1]) + rng.normal(size=2500) * 0.4
+        fit = replace(fit, signed_mm=signed)
+        equations = bias_field.NormalEquations.of(fit, fields)
+        sizes.append(covariance.expected_bias_mm(equations, 0.1, config))
+    assert np.mean(sizes) == pytest.approx(size_mm, rel=0.25, abs=0.04)
+
+
+def test_without_points_the_bias_is_what_the_sensor_is_known_for():
+    fit = replace(curved_fit(), weights=np.zeros(300))
+    equations = bias_field.NormalEquations.of(fit, bias_field.fields(fit, 20.0, 80))
+    config = replace(CONFIG, bias_spread=0.05, no_bias_mm=0.0)
+    assert covariance.expected_bias_mm(equations, 0.2, config) == pytest.approx(0.2, rel=0.1)
+    assert covariance.expected_bias_mm(equations, 1.0, config) == pytest.approx(1.0, rel=0.1)
+
+
+def test_what_is_known_of_the_sensor_reaches_the_covariance():
+    fit = curved_fit(100)
+    fit = replace(fit, signed_mm=np.random.default_rng(0).normal(0.0, 0.5, 100))
+
+    def spread(**sensor):
+        return np.trace(covariance.estimate(fit, CONFIG, SensorConfig(**sensor)).covariance[:3, :3])
+
+    unknown, known = spread(kind="pointer"), spread(kind="pointer", standoff_mm=0.5)
+    assert known < 0.7 * unknown
+    assert spread(kind="pointer", standoff_mm=0.5, bias_mm=2.0) > 1.5 * known
+    assert spread(kind="pointer", standoff_mm=0.5, scale=0.1) > 1.5 * known
+    assert spread(kind="pointer", standoff_mm=0.5, noise_mm=5.0) > 1.2 * known
+    assert spread(kind="laser") < 0.5 * spread(kind="ultrasound")
+    assert spread() == spread(kind="unknown")
+
+
+def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target):
+    """Over draws of noise without bias, refined from the truth: the mean of NEES / 6 is about 1."""
+    ratios = []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        points, normals = femur.sample(6000, rng)
+        source = points[normals @ [0.0, 1.0, 0.0] > 0.2][:1000]
+        source = source + rng.normal(0.0, 0.8, source.shape)
+        fit = refinement.refine_fully(np.eye(4), source, target, refinement.RefinementConfig())
+        C = covariance.estimate(fit, replace(CONFIG, bias_gain=0.0), SensorConfig("laser", 0.0, scale=0.0)).covariance
+        ratios.append(nees(error_twist(fit.T, np.eye(4), source), C) / 6.0)
+    assert 0.4 < np.mean(ratios) < 1.6
+
+
+def test_the_bias_in_two_points_is_alike_by_a_normal_curve_of_their_distance():
+    points = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 40.0, 0.0]])
+    expected = np.exp(-0.5 * np.array([0.0, 1.0, 4.0]))
+    np.testing.assert_allclose(bias_field.smooth_correlation(points[:1], points, 20.0)[0], expected)
+
+
+def test_a_share_of_the_bias_moves_all_points_together():
+    fit = curved_fit(400)
+    fields = bias_field.fields(fit, CONFIG.correlation_mm, CONFIG.centres)
+    noise = np.random.default_rng(0).normal(0.0, 0.5, 400)
+    fit = replace(fit, signed_mm=0.6 * fields @ np.random.default_rng(1).normal(size=fields.shape[1]) + noise)
+    without, with_it = (covariance.estimate(fit, replace(CONFIG, long_share=share)) for share in (0.0, 2.0))
+    noise_mm = covariance.expected_noise_mm(0.5, np.count_nonzero(fit.weights), 0.5, CONFIG.noise_points)
+    together = covariance.gain_of(fit, fields, noise_mm)[0].sum(axis=1)
+    expected = (2.0 * without.bias_mm) ** 2 * np.outer(together, together)
+    np.testing.assert_allclose(with_it.covariance - without.covariance, expected, rtol=1e-4, atol=1e-9)

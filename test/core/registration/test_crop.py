@@ -1,0 +1,64 @@
+"""Regions of interest in a cloud."""
+
+import numpy as np
+import pytest
+
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+from gapr_core.registration.crop import crop_box, crop_to_pose
+from gapr_core.registration.source import prepare, without_isolated
+
+
+def test_a_box_is_read_in_its_own_frame():
+    T_box_points = se3.from_rotation_translation([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [100.0, 0.0, 0.0])
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 95.0, 0.0], [np.nan, 0.0, 0.0]])
+    kept = crop_box(points, T_box_points, [0.0, -10.0, -10.0], [10.0, 10.0, 10.0])
+    assert kept == pytest.approx(np.array([[0.0, 95.0, 0.0]]))
+
+
+@pytest.mark.parametrize("corners", [([0, 0, 0], [1, 1, 0]), ([0, 0], [1, 1])])
+def test_a_box_without_volume_is_refused(corners):
+    with pytest.raises(ConfigError, match="corners"):
+        crop_box(np.zeros((1, 3)), np.eye(4), *corners)
+
+
+def test_what_is_far_from_the_bone_under_the_last_pose_is_dropped(target):
+    T = se3.exp(np.array([20.0, -5.0, 60.0, 0.3, 0.2, -1.0]), np.zeros(3))
+    on, off = target.points[:50], target.points[:50] + 25.0 * target.normals[:50]
+    source = se3.apply(se3.inverse(T), np.vstack([on, off]))
+    kept = crop_to_pose(np.vstack([source, [[np.nan] * 3]]), T, target, margin_mm=8.0)
+    assert kept[:50] == pytest.approx(source[:50]) and len(kept) < 75
+
+
+def test_a_margin_that_is_not_positive_is_refused(target):
+    with pytest.raises(ConfigError, match="margin"):
+        crop_to_pose(target.points, np.eye(4), target, margin_mm=0.0)
+
+
+def test_uniform_far_clutter_is_removed_and_the_bone_stays(femur):
+    rng = np.random.default_rng(0)
+    points = femur.sample(3000, rng)[0]
+    points = points[points[:, 2] < np.quantile(points[:, 2], 0.4)]
+    low, high = points.min(axis=0) - 150.0, points.max(axis=0) + 150.0
+    clutter = rng.uniform(low, high, (len(points) // 3, 3))
+    kept = {tuple(p) for p in without_isolated(np.vstack([points, clutter]))}
+    assert all(tuple(p) in kept for p in points) and len(kept) < len(points) + 0.1 * len(clutter)
+
+
+@pytest.mark.parametrize("count", [12, 40, 200])
+def test_a_few_digitised_points_all_count(count):
+    points = np.random.default_rng(0).uniform(0.0, 200.0, (count, 3))
+    assert len(without_isolated(points)) == count
+
+
+def test_slices_of_ultrasound_stay_whole():
+    line = np.stack([np.arange(0.0, 40.0, 0.5), np.zeros(80), np.zeros(80)], axis=1)
+    slices = np.vstack([line + [0.0, 30.0 * i, 0.0] for i in range(8)])
+    assert len(without_isolated(slices)) == len(slices)
+
+
+def test_a_source_is_prepared_without_its_isolated_points(femur):
+    points = femur.sample(1000, np.random.default_rng(1))[0]
+    far = points.mean(axis=0) + [[0.0, 400.0, 0.0]]
+    prepared = prepare(np.vstack([points, far]))
+    assert np.abs(prepared.points - far).sum(axis=1).min() > 100.0

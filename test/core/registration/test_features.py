@@ -1,0 +1,92 @@
+"""Features that unmask other bones: a scale that is off, and a mirrored source that fits as well."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.geometry import se3
+from gapr_core.registration import mirror
+from gapr_core.registration import source as sources
+from gapr_core.registration import target as targets
+from gapr_core.registration.features import FEATURES_OF, SIGNS, scale_of
+from gapr_core.registration.refinement import refine_fully
+
+CONFIG = RegistrarConfig(num_threads=1)
+
+
+@pytest.fixture(scope="module")
+def bone(femur_cloud):
+    return targets.prepare(femur_cloud)
+
+
+@pytest.fixture(scope="module")
+def end(femur_cloud, femur):
+    """Points of the upper third of the femur with 0.3 mm of noise, in the target's frame."""
+    rng = np.random.default_rng(1)
+    points = femur.sample(9000, rng)[0]
+    points = points[points[:, 2] > np.quantile(points[:, 2], 0.67)]
+    return points + rng.normal(0.0, 0.3, points.shape)
+
+
+def fit_of(points, bone):
+    return refine_fully(np.eye(4), points, bone, CONFIG.refinement)
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.0, 1.03])
+def test_the_scale_says_how_much_larger_the_source_would_have_to_be(bone, end, factor):
+    centre = end.mean(axis=0)
+    scale, sd = scale_of(fit_of(centre + factor * (end - centre), bone), 0.1, CONFIG.covariance)
+    assert scale == pytest.approx(1.0 / factor - 1.0, abs=0.008)
+    assert 1e-4 < sd < 0.02
+
+
+def test_the_scale_of_a_small_patch_is_hardly_known(bone, end):
+    patch = end[np.argsort(np.linalg.norm(end - end[0], axis=1))[:250]]
+    small, large = (scale_of(fit_of(points, bone), 0.1, CONFIG.covariance)[1] for points in (patch, end))
+    assert small > 3.0 * large
+
+
+def test_a_larger_bias_makes_the_scale_less_certain(bone, end):
+    fit = fit_of(end, bone)
+    assert scale_of(fit, 1.0, CONFIG.covariance)[1] > 3.0 * scale_of(fit, 0.1, CONFIG.covariance)[1]
+
+
+def test_without_inliers_nothing_is_known_of_the_scale():
+    nothing = SimpleNamespace(weights=np.zeros(9))
+    assert scale_of(nothing, 0.1, CONFIG.covariance) == (0.0, 1.0)
+
+
+def test_the_mirrored_source_of_a_whole_end_fits_badly(bone, end):
+    prepared = sources.prepare(end)
+    assert mirror.margin(np.eye(4), prepared, bone, CONFIG.verification, 1) > 1.0
+
+
+def test_a_mirrored_bone_is_seen_to_fit_better_mirrored(bone, end):
+    flipped = end * [1.0, 1.0, -1.0]
+    through = bone.points.mean(axis=0)
+    T = mirror._reflection(np.array([1.0, 0.0, 0.0]), through) @ mirror.FLIP  # rigid: the mirrored end beside the bone
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    assert mirror.margin(T, sources.prepare(flipped), bone, CONFIG.verification, 1) < 0.0
+
+
+def test_a_bone_that_is_its_own_mirror_image_has_no_other_side():
+    rng = np.random.default_rng(2)
+    ball = rng.normal(size=(6000, 3))
+    egg = ball / np.linalg.norm(ball, axis=1, keepdims=True) * [30.0, 40.0, 80.0]
+    target = targets.prepare(egg)
+    seen = egg[(egg[:, 0] > 0.0) & (egg[:, 2] > 10.0)]
+    assert mirror.margin(np.eye(4), sources.prepare(seen), target, CONFIG.verification, 1) == mirror.LIMITS[1]
+
+
+def test_a_reflection_turns_the_normal_round_and_keeps_its_plane():
+    H = mirror._reflection(np.array([0.0, 0.6, 0.8]), np.array([1.0, 2.0, 3.0]))
+    assert np.linalg.det(H[:3, :3]) == pytest.approx(-1.0)
+    across = np.array([[1.0, 2.0, 3.0], [5.0, 2.0, 3.0], [1.0, 2.6, 3.8]])
+    np.testing.assert_allclose(se3.apply(H, across), [[1.0, 2.0, 3.0], [5.0, 2.0, 3.0], [1.0, 1.4, 2.2]], atol=1e-12)
+
+
+def test_signs_are_of_features():
+    known = {name for names in FEATURES_OF.values() for name in names}
+    assert set(SIGNS) <= known and set(SIGNS.values()) == {1, -1}

@@ -1,0 +1,94 @@
+"""What a camera saw says where the bone is and where it cannot be."""
+
+import numpy as np
+import pytest
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.registration.free_space import MISFIT_COSTS, VIOLATION_COSTS, compare, see
+
+EYE = np.array([0.0, 0.0, 400.0])
+
+
+def wall(height_mm=0.0, half_mm=40.0, step_mm=2.0):
+    """A square wall that looks up to the camera."""
+    x, y = np.meshgrid(*[np.arange(-half_mm, half_mm + 1e-6, step_mm)] * 2)
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, height_mm)], axis=1)
+    return points, np.tile([0.0, 0.0, 1.0], (len(points), 1))
+
+
+def moved(z_mm=0.0, x_mm=0.0):
+    T = np.eye(4)
+    T[:3, 3] = [x_mm, 0.0, z_mm]  # T_target_source: the target moves by the opposite
+    return T
+
+
+@pytest.fixture(scope="module")
+def image():
+    points, normals = wall(half_mm=60.0)
+    return see(points, -normals, EYE)
+
+
+def seen(image, pose, cloud=None, **limits):
+    found = compare(pose[None], *(cloud or wall()), image, num_threads=1, **limits)
+    return float(found.explained[0]), float(found.violating[0]), float(found.compared[0])
+
+
+def test_a_target_that_lies_on_what_was_measured_is_explained_in_full(image):
+    assert seen(image, np.eye(4)) == pytest.approx((1.0, 0.0, 1.0), abs=1e-3)
+
+
+def test_a_target_in_front_of_what_was_measured_violates_free_space(image):
+    assert seen(image, moved(z_mm=-10.0)) == pytest.approx((0.0, 1.0, 0.0), abs=1e-3)
+
+
+def test_a_target_behind_what_was_measured_may_be_hidden(image):
+    assert seen(image, moved(z_mm=10.0)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+
+
+def test_a_target_outside_the_image_is_neither_explained_nor_impossible(image):
+    assert seen(image, moved(x_mm=200.0)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+
+
+def test_a_surface_that_turns_its_back_is_not_explained(image):
+    points, normals = wall()
+    assert seen(image, np.eye(4), (points, -normals)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+
+
+def test_a_surface_of_another_direction_is_not_explained_where_it_crosses(image):
+    points, normals = wall()
+    tilted = normals + [1.5, 0.0, 0.0]
+    assert seen(image, np.eye(4), (points, tilted / np.linalg.norm(tilted, axis=1, keepdims=True)))[0] == 0.0
+
+
+def test_the_nearer_to_the_measured_surface_the_better_it_is_explained(image):
+    one, two = (seen(image, moved(z_mm=z), on_mm=3.0)[0] for z in (1.0, 2.0))
+    assert one == pytest.approx(1.0 - 1.0 / 9.0, abs=1e-3) and two == pytest.approx(1.0 - 4.0 / 9.0, abs=1e-3)
+
+
+def test_a_score_takes_off_what_was_seen_otherwise_and_what_was_seen_through(image):
+    found = compare(np.stack([moved(z_mm=-2.0), moved(z_mm=-10.0)]), *wall(), image, on_mm=1.0, front_mm=4.0)
+    assert found.score == pytest.approx([-MISFIT_COSTS, -VIOLATION_COSTS], abs=1e-3)
+
+
+def test_a_step_in_depth_forbids_nothing_at_its_edge():
+    near, far = wall(height_mm=0.0), wall(height_mm=-60.0, half_mm=80.0)
+    points = np.vstack([near[0], far[0][np.abs(far[0][:, :2]).max(axis=1) > 48.0]])
+    image = see(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), EYE)
+    wider = wall(half_mm=42.0)
+    assert seen(image, np.eye(4), wider)[1] == 0.0
+
+
+def test_lines_of_sight_follow_the_cloud_wherever_it_is_and_however_it_is_turned(image):
+    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    points, normals = wall(half_mm=60.0)
+    shift = np.array([10.0, -300.0, 70.0])
+    other = see(points @ turn.T + shift, normals @ turn.T, turn @ EYE + shift)
+    back = np.eye(4)
+    back[:3, :3], back[:3, 3] = turn.T, -turn.T @ shift
+    assert seen(other, moved(z_mm=-1.0) @ back) == pytest.approx(seen(image, moved(z_mm=-1.0)), abs=0.02)
+
+
+def test_a_camera_in_the_middle_of_the_cloud_is_refused():
+    points, normals = wall()
+    with pytest.raises(InvalidPointCloudError, match="viewpoint"):
+        see(points, normals, [0.0, 0.0, 0.0])

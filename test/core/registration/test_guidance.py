@@ -1,0 +1,96 @@
+"""Where to look next: the information of a look, what it excludes, and what it is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.config import GuidanceConfig
+from gapr_core.geometry import se3
+from gapr_core.registration import guidance, precision
+from gapr_core.registration.guidance import guide, information
+
+CONFIG = GuidanceConfig(patches=120)
+
+
+def test_the_information_of_a_look_is_that_of_its_noise_and_of_the_bias_that_its_points_share():
+    rng = np.random.default_rng(0)
+    J, noise_mm, bias_mm = rng.normal(size=(40, 6)), 1.5, 0.7
+    R = noise_mm**2 * np.eye(40) + bias_mm**2
+    assert np.allclose(information(J, 40, noise_mm, bias_mm), J.T @ np.linalg.solve(R, J))
+
+
+def test_more_points_than_places_count_as_more_points():
+    rng = np.random.default_rng(1)
+    J = rng.normal(size=(20, 6))
+    R = 1.5**2 * np.eye(60) + 0.7**2
+    tripled = np.vstack([J, J, J])
+    assert np.allclose(information(J, 60, 1.5, 0.7), tripled.T @ np.linalg.solve(R, tripled))
+
+
+@pytest.fixture(scope="module")
+def distal(femur, registrar, target):
+    """A third of the femur from one end: its far end is known badly."""
+    rng = np.random.default_rng(2)
+    points, normals = femur.sample(16_000, rng)
+    seen = (normals[:, 1] < -0.2) & (points[:, 2] < np.quantile(points[:, 2], 0.3))
+    source = points[seen][:1500] + rng.normal(0.0, 0.8, (min(1500, int(seen.sum())), 3))
+    return registrar.assess(source, target)
+
+
+def test_the_far_end_of_the_bone_is_where_a_look_helps_most(distal):
+    found = guide(distal, CONFIG)
+    best, seen = found.patches[0], distal.fit.moved
+    assert best.centre[2] > seen[:, 2].max() + 30.0
+    assert best.tre95_mm < 0.8 * distal.tre95_mm
+    gains = [patch.gain_mm for patch in found.patches]
+    assert gains == sorted(gains, reverse=True)
+    assert found.gain_mm.shape == (len(found.points),) and found.gain_mm.min() >= 0.0
+    assert str(found).startswith("look at (")
+
+
+def test_what_was_seen_is_not_looked_at_again(distal):
+    found = guide(distal, CONFIG)
+    tree = guidance.cKDTree(distal.fit.moved)
+    for patch in found.patches:
+        members = distal.target.tree.query_ball_point(patch.centre, 5.0)
+        assert np.median(tree.query(distal.target.points[members])[0]) > 3.0
+    everything = replace(
+        distal, fit=replace(distal.fit, moved=distal.target.points, weights=np.ones(len(distal.target.points)))
+    )
+    assert guide(everything, CONFIG) is None
+
+
+def test_the_expected_bound_is_that_of_the_updated_covariance(distal):
+    found = guide(distal, CONFIG)
+    target, centre = distal.target, distal.centre_mm
+    patch = found.patches[0]
+    members = np.array(target.tree.query_ball_point(patch.centre, CONFIG.patch_mm / 2.0))
+    members = members[target.normals[members] @ patch.normal > 0.3]
+    normals = target.normals[members]
+    J = np.hstack([normals, np.cross(target.points[members] - centre, normals)])
+    noise_mm, bias_mm = max(distal.fit.sigma_mm, CONFIG.noise_mm), max(distal.uncertainty.bias_mm, CONFIG.bias_mm)
+    after = np.linalg.inv(distal.uncertainty.covariance)
+    after = np.linalg.inv(after + information(J, CONFIG.points, noise_mm, bias_mm))
+    bound_mm = precision.bound_mm(after, target.points[target.anchors], centre)
+    assert patch.tre95_mm == pytest.approx(distal.factor95 * bound_mm)
+
+
+def test_a_rival_sends_the_probe_to_where_it_differs(distal):
+    """A rival turned about the shaft leaves the shaft where it is and moves the head."""
+    turn = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 1.5], distal.fit.moved.mean(axis=0))
+    poses = np.stack([distal.candidates.poses[0], turn @ distal.fit.T])
+    scores = np.repeat(distal.candidates.scores[0], 2)
+    rival = replace(distal, candidates=replace(distal.candidates, poses=poses, scores=scores), probability=0.4)
+    found = guide(rival, CONFIG)
+    assert found.now_mm > 2.0 * distal.tre95_mm
+    assert found.patches[0].rivals_excluded > 0.95
+    assert min(patch.rivals_excluded for patch in found.patches) < 0.9
+
+
+def test_the_registrar_says_where_to_look_only_when_asked(target, distal):
+    for asked in (False, True):
+        registrar = Registrar(RegistrarConfig(num_threads=1, guide=asked, guidance=CONFIG))
+        result = registrar.register(distal.source.points, target)
+        assert (result.guidance is not None) is asked

@@ -1,0 +1,180 @@
+"""Whatever is wrong with a command line or its files: one line on stderr, exit code 1, and no file is harmed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gapr_core import cli
+from gapr_core.benchmark import methods
+from gapr_core.commands import options
+
+CLOUD = np.random.default_rng(0).normal(size=(400, 3)) * [60.0, 20.0, 12.0]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The files that the command lines below name, as the working folder."""
+    monkeypatch.chdir(tmp_path)
+    np.save("cloud.npy", CLOUD)
+    for name in ("pairs", "bad", "flat", "text", "empty", "run", "torn", "other", "full"):
+        (tmp_path / name).mkdir()
+    np.savez("pairs/a.npz", source=CLOUD[:100], target=CLOUD, transform=np.eye(4))
+    (tmp_path / "bad" / "a.npz").write_bytes(b"PK\x03\x04 no archive")
+    np.savez("flat/a.npz", source=CLOUD[:, 0], target=CLOUD)
+    np.savez("text/a.npz", source=np.array(["a", "b"]), target=CLOUD, transform="no matrix")
+    (tmp_path / "broken.yaml").write_text("a: [")
+    (tmp_path / "list.yaml").write_text("- 1")
+    (tmp_path / "range.yaml").write_text("min_confidence: 7")
+    (tmp_path / "answers.json").write_text('{"a": 3}')
+    (tmp_path / "run" / "plan.json").write_text('{"pairs": 3}')
+    (tmp_path / "torn" / "plan.json").write_text("{")
+    (tmp_path / "other" / "records.jsonl").write_text('{"pair": 1}\n')
+    (tmp_path / "full" / "records.jsonl").symlink_to("/dev/full")
+    return tmp_path
+
+
+REGISTER = "register --source cloud.npy --target cloud.npy"
+WRONG = """
+nothing
+register
+register --source cloud.npy
+REGISTER --units inch
+register --source none.ply --target cloud.npy
+register --source cloud.npy --target empty
+REGISTER --method gpr
+REGISTER --method os:system
+REGISTER --method os:nothing
+REGISTER --method no_such_module:make
+REGISTER --method json:JSONDecoder
+REGISTER --method :
+REGISTER --config none.yaml
+REGISTER --config broken.yaml
+REGISTER --config list.yaml
+REGISTER --config range.yaml
+REGISTER --config .
+REGISTER --set min_confidence=7
+REGISTER --set min_confidence
+REGISTER --set nothing=1
+REGISTER --set search.keep=1.5
+REGISTER --method icp --set seed=1
+REGISTER --method icp --json .
+REGISTER --method icp --json cloud.npy/a.json
+REGISTER --method icp --json /proc/a.json
+evaluate --pairs none --out o.json
+evaluate --pairs empty --out o.json
+evaluate --pairs cloud.npy --out o.json
+evaluate --pairs pairs --out answers.json --method icp
+evaluate --pairs pairs --out . --method icp
+evaluate --pairs pairs --out o.json --limit 0
+evaluate --pairs pairs --out o.json --limit x
+evaluate --pairs pairs --out o.json --method gpr
+benchmark --out o
+benchmark --pairs empty --out o
+benchmark --pairs bad --out o
+benchmark --pairs flat --out o
+benchmark --pairs text --out o
+benchmark --methods icp --pairs pairs --out o --jobs 0
+benchmark --methods icp --pairs pairs --out o --threads 0
+benchmark --methods icp --pairs pairs --out o --shard 0/2
+benchmark --methods icp --pairs pairs --out o --methods gpr
+benchmark --methods icp --pairs pairs --out o --methods ,
+benchmark --methods icp --pairs pairs --out other
+benchmark --methods icp --pairs pairs --out cloud.npy
+benchmark merge --out o
+benchmark merge none --out o
+benchmark merge run --out o
+benchmark merge torn --out o
+benchmark join run --out o
+make-pairs --protocol L9 --out o
+make-pairs --protocol L1 --count 0 --out o
+make-pairs --protocol L1 --bones skull --out o
+make-pairs --protocol L1 --meshes none --out o
+make-pairs --protocol L1 --anatomy none --out o
+make-pairs --protocol L1 --out cloud.npy
+make-pairs --protocol L1 --out torn_pairs
+train
+train --out o --config none.yaml
+train --out o --config broken.yaml
+train --out o --config range.yaml
+train --plot none
+train --plot pairs pairs
+ablate --out o --pairs x
+ablate --out o --pairs 4 --plan broken.yaml
+ablate --out o --pairs 4 --plan list.yaml
+ablate --out o --pairs 4 --plan none.yaml
+ablate --out o --pairs 4 --jobs 0
+ablate --out o --pairs 0
+"""
+
+
+def run(line):
+    """Exit code, as a shell sees it."""
+    try:
+        return cli.main(line.split())
+    except SystemExit as exit:
+        return exit.code
+
+
+@pytest.mark.parametrize("line", ["", *WRONG.replace("REGISTER", REGISTER).split("\n")[1:-1]])
+def test_a_wrong_command_line_is_one_line_and_exit_code_1(folder, capsys, line):
+    (folder / "torn_pairs").mkdir()
+    (folder / "torn_pairs" / "manifest.json").write_text('{"recipe"')
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert run(line) == 1
+    said = capsys.readouterr().err
+    assert said.count("gapr: ") == 1 and "Traceback" not in said, said
+    assert said.endswith("\n") and "\n" not in said[said.index("gapr: ") :].rstrip("\n")
+    assert {path: path.read_bytes() for path in before} == before
+
+
+@pytest.mark.parametrize("command", ["register --source cloud.npy --target cloud.npy --method",
+                                     "evaluate --pairs pairs --out o.json --method",
+                                     "benchmark --pairs pairs --out o --methods"])  # fmt: skip
+def test_an_unknown_method_is_answered_with_the_same_list_everywhere(folder, capsys, command):
+    assert run(f"{command} gpr") == 1
+    said = capsys.readouterr().err
+    listed = ", ".join(methods.names())
+    assert listed in said and {"gapr", "gapr_search", "gapr_network", "gapr_tracker", "icp"} <= set(methods.names())
+
+
+def test_a_full_disk_is_one_line(folder, capsys, monkeypatch):
+    from gapr_core.benchmark import runner
+
+    monkeypatch.setattr(runner, "_methods", {})
+    monkeypatch.setattr(runner, "_run_pool", lambda tasks, *_: (runner.run_task(tasks.pop(0)) for _ in list(tasks)))
+    assert run("benchmark --methods icp --pairs pairs --out full") == 1
+    assert "No space left" in capsys.readouterr().err
+
+
+def test_settings_lists_every_setting(capsys):
+    assert run("settings") == 0
+    assert "| min_confidence | 0.5 | 0 to 1 |" in capsys.readouterr().out
+
+
+def test_a_setting_from_a_file_and_one_from_the_command_line_reach_the_method(folder):
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    options.add_method(parser)
+    (folder / "mine.yaml").write_text("min_confidence: 0.75\nseed: 1\n")
+    args = parser.parse_args(["--method", "gapr_search", "--config", "mine.yaml", "--set", "seed=7"])
+    method = methods.make(args.method, options.registrar_config(args))
+    assert method.config.min_confidence == 0.75 and method.config.seed == 7
+
+
+def test_a_missing_library_names_the_extra_that_installs_it(capsys, monkeypatch):
+    def absent(args):
+        raise ModuleNotFoundError("No module named 'plotly'", name="plotly.graph_objects")
+
+    monkeypatch.setattr("gapr_core.commands.settings.run", absent)
+    assert run("settings") == 1
+    assert "pip install 'gapr_ros[reports]'" in capsys.readouterr().err
+
+
+def test_json_of_a_refusal_holds_no_error_of_a_pose(folder):
+    np.save("few.npy", CLOUD[:5])
+    assert run("register --source few.npy --target cloud.npy --method gapr_search --json out.json") in (1, 2)
+    if (folder / "out.json").exists():
+        answer = json.loads((folder / "out.json").read_text())
+        assert answer["tre_mm"] is None and answer["tre95_mm"] is None and answer["covariance"] is None

@@ -1,0 +1,48 @@
+"""What the frames of a stream say together."""
+
+import numpy as np
+import pytest
+from scipy.special import expit, logit
+
+from gapr_core.config import EvidenceConfig
+from gapr_core.registration.evidence import Evidence
+
+
+def test_a_single_frame_keeps_its_probability():
+    for probability in (1e-6, 0.2, 0.7, 0.999):
+        assert Evidence().add(probability, agrees=False) == pytest.approx(probability, rel=1e-6)
+
+
+def test_frames_that_agree_raise_the_confidence_up_to_what_their_correlation_allows():
+    evidence = Evidence(EvidenceConfig(correlation=0.5, memory=1e6))
+    answers = [evidence.add(0.8, agrees=True) for _ in range(200)]
+    assert all(a <= b for a, b in zip(answers, answers[1:], strict=False))
+    part = np.sqrt(0.8)
+    assert answers[1] == pytest.approx(expit(2 / 1.5 * logit(part)) * part)  # n / (1 + (n - 1) rho)
+    assert answers[-1] == pytest.approx(expit(2.0 * logit(part)) * part, rel=1e-2)  # 1 / rho
+    repeated = Evidence(EvidenceConfig(correlation=1.0))
+    assert [repeated.add(0.8, agrees=True) for _ in range(9)] == pytest.approx([0.8] * 9)
+
+
+def test_a_wrong_bone_is_detected_by_the_other_frames():
+    """One frame in five fits by chance."""
+    evidence = Evidence()
+    answers = [evidence.add(0.7 if i % 5 == 4 else 0.05, agrees=True) for i in range(50)]
+    assert max(answers) < 0.5
+
+
+def test_a_jump_makes_the_frames_count_for_one():
+    evidence = Evidence(EvidenceConfig(memory=1e6))
+    for _ in range(20):
+        before = evidence.add(0.8, agrees=True)
+    assert evidence.add(0.8, agrees=False) == pytest.approx(0.8) and before > 0.85
+
+
+def test_old_frames_are_forgotten():
+    evidence = Evidence(EvidenceConfig(memory=5.0))
+    for _ in range(30):
+        evidence.add(0.02, agrees=True)
+    answers = [evidence.add(0.95, agrees=True) for _ in range(30)]
+    assert answers[0] < 0.5 < 0.95 < answers[-1]
+    evidence.reset()
+    assert evidence.add(0.7, agrees=True) == pytest.approx(0.7)

@@ -1,0 +1,52 @@
+"""A small share of `files.py` in the default suite, and every case that was ever found."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import files
+from mesh_samples import samples
+from mutations import mutated
+from reader import verdict
+
+NAMES = sorted(samples())
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(name=st.sampled_from(NAMES), seed=st.integers(0, 2**32 - 1))
+def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path, name, seed):
+    kind, damaged = mutated(samples()[name], seed)
+    (tmp_path / name).write_bytes(samples()[name])
+    whole = verdict(tmp_path / name)
+    (tmp_path / name).write_bytes(damaged)
+    assert not files.is_finding(kind, verdict(tmp_path / name), whole), kind
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_that_is_cut_anywhere_is_refused_or_read_whole(tmp_path, name):
+    data, path = samples()[name], tmp_path / name
+    path.write_bytes(data)
+    whole = verdict(path)
+    assert whole.startswith("read")
+    for length in range(0, len(data), max(1, len(data) // 60)):
+        path.write_bytes(data[:length])
+        assert verdict(path) in ("refused", whole) or "warning" in verdict(path), length
+
+
+@pytest.mark.parametrize("case", sorted((Path(__file__).parent / "cases").glob("*-*")), ids=lambda path: path.name)
+def test_what_was_found_once_is_refused_or_read_with_a_warning(case):
+    assert verdict(case) == "refused" or verdict(case).endswith("with a warning")
+
+
+def test_the_fuzzer_reports_a_dead_process_and_goes_on(tmp_path, monkeypatch):
+    child = files.Child()
+    assert child.ask(tmp_path / "none.ply") == "refused"
+    child._process.kill()
+    assert child.ask(tmp_path / "none.ply").startswith("process died")
+    assert child.ask(tmp_path / "none.ply") == "refused"
+    child.close()

@@ -1,0 +1,190 @@
+"""The ROS examples: run where they can be, and compared with the node where they need a full ROS installation."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import signal
+import sys
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bones
+import numpy as np
+import pytest
+import yaml
+from geometry_msgs.msg import Pose, PoseArray, TransformStamped
+from harness import NodeProcess, Spinner, accepted, context, node_in_thread, pose_mm, wait_until
+from rclpy.parameter import Parameter
+from std_msgs.msg import Header
+
+from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.node.publishers import TOPICS
+from msg_adapters import matrix_to_transform
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples" / "ros"
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+
+
+def loaded(name, monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def consumer(monkeypatch):
+    """The example as a node that notes what it does."""
+    module, spinner = loaded("trusted_pose", monkeypatch), Spinner(context())
+    done = []
+
+    class Noting(module.TrustedPose):
+        def act(self, transform, values):
+            done.append((transform.header.stamp.sec, round(transform.transform.translation.x, 6)))
+
+        def hold(self, why):
+            done.append(why)
+
+    given = [Parameter("min_confidence", value=0.8), Parameter("max_tre", value=0.002)]
+    node = Noting(context=spinner.context, parameter_overrides=given)
+    spinner.start(node)
+    yield node, done
+    spinner.close()
+
+
+def test_the_consumer_acts_on_sure_and_bounded_poses_of_the_right_stamp_only(blob_path, client, method, consumer):
+    node, done = consumer
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        wait_until(lambda: node.count_publishers("/register_node/transform"))
+        wait_until(lambda: client.node.count_subscribers("/register_node/status"))
+        wait_until(lambda: client.ask(GOOD, stamp_s=10.0) and done, what="discovery")
+        done.clear()
+        answers = [
+            accepted(pose_mm([0, 0, 0], [50.0, 0, 0]), confidence=0.9, tre95_mm=1.0),
+            accepted(confidence=0.7, tre95_mm=1.0),
+            accepted(confidence=0.9, tre95_mm=3.0),
+            accepted(confidence=0.9),
+            RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.9),
+            accepted(pose_mm([0, 0, 0], [60.0, 0, 0]), confidence=0.9, tre95_mm=1.0),
+        ]
+        for second, method.answer in enumerate(answers, 100):
+            client.ask(GOOD, stamp_s=float(second))
+        wait_until(lambda: len(done) == 6, what=done)
+    assert (done[0], done[5]) == ((100, -0.05), (105, -0.06))
+    assert done[1].startswith("confidence 0.7") and "0.003 m only" in done[2] and "nothing" in done[3]
+    assert done[4] == "ambiguous"
+
+
+def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):
+    bone = bones.bone()
+    node = NodeProcess(tmp_path, model_path=bones.save(bone, tmp_path / "bone.npz"), model_unit="mm", timeout=60.0)
+    arguments = ("--ros-args", "-p", "min_confidence:=0.5", "-p", "max_tre:=0.01")
+    program = NodeProcess(tmp_path, *arguments, script=EXAMPLES / "trusted_pose.py")
+    try:
+        client.wait_for_state("active", 60.0)
+        wait_until(lambda: client.node.count_subscribers("/register_node/status"), 30.0)
+        wait_until(
+            lambda: client.ask(bones.partial(bone, np.eye(4)), timeout_s=60.0) and "bone at" in program.log, 60.0
+        )
+    finally:
+        assert program.stop(signal.SIGINT) == 0, program.log
+        node.stop()
+    assert "Traceback" not in program.log
+
+
+# --- MoveIt: moveit_msgs is part of a ROS installation, so its messages are stood in for here ---
+
+
+@dataclass
+class CollisionObject:
+    header: Header
+    id: str
+    operation: bytes
+    pose: Pose = field(default_factory=Pose)
+    meshes: list = field(default_factory=list)
+    mesh_poses: list = field(default_factory=list)
+
+
+class MoveIt:
+    CollisionObject = CollisionObject
+    PlanningScene = PoseArray  # only advertised here
+
+
+def test_the_obstacle_is_the_bone_in_metres_at_its_pose(tmp_path, monkeypatch):
+    loaded("trusted_pose", monkeypatch)
+    module = loaded("planning_scene", monkeypatch)
+    bone = bones.bone()
+    monkeypatch.setattr(module, "MOST_TRIANGLES", len(bone.faces))
+    mesh = module.mesh_of(bones.save(bone, tmp_path / "bone.npz"))
+    found = np.array([[p.x, p.y, p.z] for p in mesh.vertices])
+    corners = found[np.array([t.vertex_indices for t in mesh.triangles])]
+    np.testing.assert_allclose(corners, bone.points[bone.faces] / 1000.0, atol=1e-9)
+    T = pose_mm([0.1, 0.2, 0.3], [0.5, 0.1, 0.2])  # metres
+    transform = TransformStamped(header=Header(frame_id="tracker"), child_frame_id="femur")
+    transform.transform = matrix_to_transform(T)
+    made = module.obstacle(MoveIt, mesh, transform)
+    assert (made.id, made.header.frame_id, made.meshes) == ("femur", "tracker", [mesh])
+    assert (made.pose.position.x, made.pose.orientation) == (0.5, transform.transform.rotation)
+    monkeypatch.setattr(module, "MOST_TRIANGLES", 10)
+    with pytest.raises(ValueError, match="decimate"):
+        module.mesh_of(tmp_path / "bone.npz")
+
+
+def test_the_filter_hears_the_pose_with_its_covariance_and_sends_the_frame_that_the_node_then_does_not():
+    given = yaml.safe_load((EXAMPLES / "robot_localization.yaml").read_text())["ekf_filter_node"]["ros__parameters"]
+    assert given["pose0"] == "/register_node/pose" and not given["pose0_differential"]
+    assert given["pose0_config"] == [True] * 6 + [False] * 9
+    assert given["world_frame"] == given["odom_frame"] != given["base_link_frame"]
+    noise = np.reshape(given["process_noise_covariance"], (15, 15))
+    assert (np.linalg.eigvalsh(noise) > 0.0).all()
+    assert "publish_tf:=false" in (EXAMPLES / "robot_localization.yaml").read_text()
+
+
+# --- what ships for the operating room ---
+
+
+@pytest.fixture(scope="module")
+def graph(blob_path):
+    """Topics and services of a node, by what it does with them."""
+    from harness import StandIn
+
+    with node_in_thread(StandIn(), blob_path) as node:
+        wait_until(lambda: node.state == "active")
+        of = {"publish": node.get_publisher_names_and_types_by_node,
+              "subscribe": node.get_subscriber_names_and_types_by_node,
+              "reply": node.get_service_names_and_types_by_node}  # fmt: skip
+        yield {kind: {name for name, _ in names("register_node", "/")} for kind, names in of.items()}
+
+
+def test_the_security_policy_allows_what_the_node_does_and_names_nothing_else(graph):
+    (profile,) = ElementTree.parse(ROOT / "deploy" / "sros2_policy.xml").getroot().iter("profile")
+    optional = {"/tf", "/tf_static", "/clock", "/register_node/detection", "/diagnostics", "/parameter_events",
+                "/register_node/get_type_description"}  # fmt: skip
+    for kind, does in graph.items():
+        allowed = {
+            entry.text.replace("~", "/register_node") if entry.text.startswith("~") else f"/{entry.text}"
+            for group in profile if group.get(kind) == "ALLOW" for entry in group
+        }  # fmt: skip
+        assert does <= allowed, kind
+        assert allowed - does <= optional, kind
+
+
+def test_the_foxglove_layout_shows_topics_that_the_node_has():
+    layout = json.loads((ROOT / "deploy" / "foxglove.json").read_text())
+    text = json.dumps(layout["configById"])
+    names = [part for part in text.split('"') if part.startswith("/register_node/")]
+    shown = {name.split("/")[2].split(".")[0] for name in names}
+    assert shown <= {"pose", *TOPICS} and "residuals" in shown and "status" in shown
+
+
+def test_the_service_and_the_container_start_the_program_and_stop_it_in_time():
+    unit = (ROOT / "deploy" / "register_node.service").read_text()
+    assert "exec ros2 run gapr_ros register_node" in unit and "KillSignal=SIGTERM" in unit
+    container = (ROOT / "deploy" / "Containerfile").read_text()
+    assert "ros:jazzy" in container and "exec /gapr/venv/bin/register_node" in container

@@ -1,0 +1,180 @@
+"""What is around the node: names, other publishers, other frames, other bones, quality of service."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from harness import Client, Collecting, StandIn, node_in_thread, wait_until
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from gapr_core.errors import ConfigError
+from gapr_ros.node import frames, subscription
+from gapr_ros.node.conflicts import Conflicts
+from gapr_ros.parameters import NodeParameters
+
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+
+
+def statuses(client):
+    """Every status of the newest round of diagnostics, by its name."""
+    return {entry.name: entry for array in client.diagnostics for entry in array.status}
+
+
+def message_of(client, side):
+    entry = statuses(client).get(f"/{side}/register_node: input")
+    return "" if entry is None else entry.message
+
+
+def test_diagnostics_carry_the_full_name_and_the_model_as_hardware(blob_path, client, method):
+    with node_in_thread(method, blob_path, namespace="/left"):
+        wait_until(lambda: "/left/register_node: input" in statuses(client))
+        assert "/left/register_node: registration" in statuses(client)
+        assert {entry.hardware_id for entry in statuses(client).values()} == {"blob.npy"}
+
+
+def test_two_nodes_that_publish_one_bone_frame_say_so_and_stop_when_one_has_gone(blob_path, client, capfd):
+    with node_in_thread(StandIn(), blob_path, namespace="/left", publish_tf=True):
+        with node_in_thread(StandIn(), blob_path, namespace="/right", publish_tf=True):
+            text = "publishes 'bone_preop' on /tf too"
+            for own, other in (("left", "right"), ("right", "left")):
+                wait_until(lambda own=own: text in message_of(client, own))
+                assert message_of(client, own).startswith(f"/{other}/register_node publishes")
+        wait_until(lambda: text not in message_of(client, "left"), 10.0)
+    said = [line for line in capfd.readouterr().err.splitlines() if text in line]
+    assert len(said) == 2, "each says it once"
+
+
+def test_nodes_with_frames_of_their_own_have_no_conflict(blob_path, client):
+    with node_in_thread(StandIn(), blob_path, namespace="/left", publish_tf=True, model_frame="left"):
+        with node_in_thread(StandIn(), blob_path, namespace="/right", publish_tf=True, model_frame="right"):
+            names = {f"/{side}/register_node: input" for side in ("left", "right")}
+            wait_until(lambda: names <= set(statuses(client)))
+            time.sleep(0.5)
+            assert not [name for name in names if "too" in statuses(client)[name].message]
+
+
+def test_a_transform_of_somebody_else_with_this_child_is_a_conflict_and_an_own_one_is_not(blob_path, client, method):
+    with node_in_thread(method, blob_path, publish_tf=True) as node:
+        client.wait_for_state("active")
+        shared = node.session._shared
+        own = TransformStamped(header=Header(frame_id="probe"), child_frame_id="bone_preop")
+        shared.note_own(own)
+        shared._on_tf(SimpleNamespace(transforms=[own]))
+        assert not node.session.conflicts.texts
+        foreign = TransformStamped(header=Header(frame_id="map"), child_frame_id="/bone_preop")
+        shared._on_tf(SimpleNamespace(transforms=[foreign]))
+        (text,) = node.session.conflicts.texts
+        assert text.startswith("another node, as child of 'map', publishes 'bone_preop' on /tf too")
+
+
+def test_a_second_publisher_is_named_until_it_goes(blob_path, client, method):
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        second = client.node.create_publisher(PointCloud2, "points", 1)
+        wait_until(lambda: "2 publishers on /points" in client.values("input")["message"])
+        assert "(/client, /client)" in client.values("input")["message"]
+        assert client.values("input")["level"] == 1
+        client.forget(second)
+        wait_until(lambda: "2 publishers" not in client.values("input")["conflicts"])
+
+
+def test_clouds_in_two_frames_are_a_conflict_unless_they_meet_in_an_output_frame(blob_path, client, method, capfd):
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        for frame in ("left_camera", "right_camera", "left_camera", "right_camera"):
+            assert client.ask(GOOD, frame=frame)["level"] == 0
+        wait_until(lambda: "clouds come in 2 frames (left_camera, right_camera)" in client.values("input")["message"])
+        client.call("reset")
+        wait_until(lambda: client.ask(GOOD) and not client.values("input")["conflicts"])
+        assert not node.session.conflicts.texts
+    assert capfd.readouterr().err.count("clouds come in 2 frames") == 1
+
+
+def test_a_leading_slash_of_a_cloud_is_taken_away(blob_path, client, method):
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        assert client.ask(GOOD, frame="/probe")["cloud_frame"] == "probe"
+        wait_until(lambda: client.poses)
+        assert client.poses[0].header.frame_id == "probe"
+
+
+@pytest.mark.parametrize(
+    ("given", "hint"),
+    [
+        ({"model_frame": ""}, "expected a model_frame"),
+        ({"model_frame": "/bone"}, "write bone"),
+        ({"output_frame": "/tracker"}, "write tracker"),
+        ({"output_frame": "bone_preop"}, "for both"),
+    ],
+)
+def test_frames_that_tf2_would_not_take_fail_configure_with_what_to_write(given, hint):
+    with pytest.raises(ConfigError, match=hint):
+        frames.check_names(NodeParameters(**given))
+
+
+def test_a_conflict_is_said_once_and_ends_with_its_time(monkeypatch):
+    said, now = [], [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    conflicts = Conflicts(said.append)
+    for _ in range(3):
+        conflicts.note("frame", "two of them", 5.0)
+        conflicts.note("publishers", "")
+    assert said == ["two of them"] and conflicts.texts == ("two of them",)
+    now[0] = 6.0
+    assert conflicts.texts == ()
+    conflicts.note("frame", "")
+    conflicts.note("frame", "two of them")
+    assert len(said) == 2 and conflicts.texts == ("two of them",)
+
+
+# --- quality of service ---
+
+
+def test_a_best_effort_publisher_takes_nothing_from_a_reliable_one_and_is_forgotten_when_it_goes(
+    blob_path, client, method, monkeypatch
+):
+    monkeypatch.setattr(subscription, "GRACE_S", 0.5)
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        assert client.values()["cloud_qos"] == "reliable"
+        qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        weak = client.node.create_publisher(PointCloud2, "points", qos)
+        wait_until(lambda: client.values()["cloud_qos"] == "reliable and best_effort")
+        wait_until(weak.get_subscription_count)
+        large = np.random.default_rng(0).normal(size=(200_000, 3)).astype(np.float32) * 0.02
+        for _ in range(5):  # as best effort, most of such clouds are lost
+            assert client.ask(large, timeout_s=30.0)["level"] == 0
+        assert node.counters.received == 5, "what both subscriptions bring is one cloud"
+        client.forget(weak)
+        wait_until(lambda: client.values()["cloud_qos"] == "reliable")
+        assert client.ask(GOOD)["level"] == 0 and node.counters.received == 6
+
+
+def test_the_queue_is_as_long_as_the_collection(blob_path, client):
+    with node_in_thread(Collecting(), blob_path, accumulate=30) as node:
+        client.wait_for_state("active")
+        for i in range(31):
+            client.send(GOOD[:250] * (1.0 + 0.01 * i))
+            if i == 0:
+                wait_until(lambda: node.counters.received == 1)
+                node.call_soon(lambda: time.sleep(1.0))
+        wait_until(lambda: node.counters.received == 31, 10.0, "every slice that came while the executor was busy")
+        assert node.counters.lost == 0
+
+
+def test_a_mismatch_that_was_asked_for_ends_with_its_publisher(blob_path, method, monkeypatch):
+    monkeypatch.setattr(subscription, "GRACE_S", 0.5)
+    client = Client(ReliabilityPolicy.BEST_EFFORT)
+    with node_in_thread(method, blob_path, cloud_reliability="reliable"):
+        wait_until(lambda: client.values("input").get("level") == 2)
+        strong = client.node.create_publisher(PointCloud2, "points", 1)
+        client.forget(client.points)
+        wait_until(lambda: client.values("input")["level"] < 2)
+        client.forget(strong)
+    client.close()

@@ -1,0 +1,110 @@
+"""The launch files, run with stand-ins for launch and launch_ros, which are part of a ROS installation."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gapr_ros.parameters import FIELDS, problem
+
+ROOT = Path(__file__).parents[2]
+
+
+class Recorded:
+    """Whatever is made of a class of launch, with what it was made of."""
+
+    def __init__(self, *given, **named):
+        self.given, self.named = given, named
+
+
+@pytest.fixture
+def load(monkeypatch):
+    names = {
+        "launch": ["LaunchContext", "LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction"],
+        "launch.conditions": ["IfCondition"],
+        "launch.substitutions": ["PathJoinSubstitution"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+        "launch_ros.substitutions": ["FindPackageShare"],
+    }
+    for module, classes in names.items():
+        made = types.ModuleType(module)
+        for name in classes:
+            setattr(made, name, type(name, (Recorded,), {}))
+        monkeypatch.setitem(sys.modules, module, made)
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(name.split(".")[0], ROOT / "launch" / name)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+def started(module, **arguments):
+    """The nodes that a launch file starts when it is given these arguments."""
+    *declared, opaque = module.generate_launch_description().given[0]
+    values = {argument.given[0]: argument.named["default_value"] for argument in declared}
+    assert set(arguments) <= set(values), "an argument that is not declared"
+    values = {name: value if isinstance(value, str) else "share/register_node.yaml" for name, value in values.items()}
+    context = types.SimpleNamespace(launch_configurations=values | arguments)
+    return opaque.named["function"](context, *opaque.named.get("args", []))
+
+
+def test_every_parameter_of_the_node_is_an_argument_and_none_is_given_unasked(load):
+    module = load("register.launch.py")
+    declared = {argument.given[0] for argument in module.generate_launch_description().given[0][:-1]}
+    assert set(FIELDS) <= declared
+    register, _ = started(module)
+    assert register.named["parameters"] == ["share/register_node.yaml", {}]
+
+
+def test_arguments_become_parameters_of_the_type_that_the_node_wants(load):
+    arguments = {"min_confidence": "1", "accumulate": "50", "model_path": "007", "guide": "true", "max_tre": "0.002",
+                 "crop_min": "[0, 0, -1]", "use_sim_time": "true"}  # fmt: skip
+    register, rviz = started(load("register.launch.py"), points="/camera/points", namespace="/left", **arguments)
+    given = register.named["parameters"][1]
+    wanted = {"min_confidence": 1.0, "accumulate": 50, "model_path": "007", "guide": True, "use_sim_time": True,
+              "crop_min": [0.0, 0.0, -1.0], "max_tre": 0.002}  # fmt: skip
+    assert given == wanted
+    assert [problem(FIELDS[name], value) for name, value in given.items() if name in FIELDS] == [""] * 6
+    assert ("points", "/camera/points") in register.named["remappings"] and register.named["namespace"] == "/left"
+    assert rviz.named["parameters"] == [{"use_sim_time": True}]
+
+
+def test_a_use_sim_time_that_is_neither_true_nor_false_is_refused(load):
+    with pytest.raises(ValueError, match="must be true or false, got 'maybe'"):
+        started(load("register.launch.py"), use_sim_time="maybe")
+
+
+def test_the_shipped_file_of_two_bones_starts_two_nodes_that_hear_one_topic(load):
+    path = ROOT / "config" / "two_bones.yaml"
+    nodes = started(load("bones.launch.py"), params_file=str(path), points="/camera/points")
+    assert [node.named["namespace"] for node in nodes] == ["/femur", "/tibia"]
+    assert all(node.named["remappings"] == [("points", "/camera/points")] for node in nodes)
+    for entry in yaml.safe_load(path.read_text()).values():
+        given = entry["ros__parameters"]
+        assert [problem(FIELDS[name], value) for name, value in given.items()] == [""] * len(given)
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("/**: {ros__parameters: {}}", "no entry such as /femur/register_node"),
+        (
+            "/a/register_node: {ros__parameters: {}}\n/b/register_node: {ros__parameters: {}}",
+            "a model_frame of its own",
+        ),
+    ],
+)
+def test_a_file_without_bones_and_one_frame_for_two_are_refused(load, tmp_path, text, hint):
+    (tmp_path / "bones.yaml").write_text(text)
+    with pytest.raises(ValueError, match=hint):
+        started(load("bones.launch.py"), params_file=str(tmp_path / "bones.yaml"))

@@ -1,0 +1,131 @@
+"""While a bone is read, the node goes on: diagnostics, services, clouds; and it ends when it is asked to."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import bones
+import numpy as np
+import pytest
+from harness import NodeProcess, StandIn, node_in_thread, wait_until
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from std_srvs.srv import Trigger
+
+LIMIT_S = 2.0  # of CPU time
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+
+
+class Slow(StandIn):
+    """Prepares a bone when its gate is opened."""
+
+    def prepare(self, target, units="mm"):
+        assert self.gate.wait(20.0)
+        if self.error is not None:
+            raise self.error
+        return super().prepare(target, units)
+
+
+@pytest.fixture
+def slow():
+    made = Slow()
+    made.gate.clear()
+    return made
+
+
+def asked(client, transition):
+    service = client.ready(ChangeState, "/register_node/change_state")
+    return service.call_async(ChangeState.Request(transition=Transition(id=transition)))
+
+
+def state_of(client):
+    future = client.ready(GetState, "/register_node/get_state").call_async(GetState.Request())
+    wait_until(future.done, 2.0)
+    return future.result().current_state.label
+
+
+def test_while_it_configures_diagnostics_go_on_and_services_answer(blob_path, client, slow):
+    with node_in_thread(slow, blob_path, autostart=False):
+        wait_until(lambda: client.values().get("state") == "unconfigured")
+        configured = asked(client, Transition.TRANSITION_CONFIGURE)
+        wait_until(lambda: "loading" in client.values()["message"])
+        count = len(client.diagnostics)
+        wait_until(lambda: len(client.diagnostics) > count + 5, 3.0)
+        assert state_of(client) == "unconfigured" and not configured.done()
+        answer = client.call("reload_model")
+        assert not answer.success and "configure it" in answer.message
+        second = asked(client, Transition.TRANSITION_CONFIGURE)
+        wait_until(second.done)
+        assert not second.result().success, "one bone at a time"
+        slow.gate.set()
+        wait_until(configured.done)
+        assert configured.result().success and state_of(client) == "inactive"
+
+
+def test_a_bone_that_cannot_be_prepared_fails_the_transition_with_its_reason(blob_path, client, slow):
+    slow.error = RuntimeError("no such bone")
+    with node_in_thread(slow, blob_path, autostart=False):
+        wait_until(lambda: client.values().get("state") == "unconfigured")
+        configured = asked(client, Transition.TRANSITION_CONFIGURE)
+        slow.gate.set()
+        wait_until(configured.done)
+        assert not configured.result().success
+        wait_until(lambda: client.values()["level"] == 2)
+        assert client.values()["message"].startswith("configure failed: RuntimeError: no such bone")
+        slow.error = None
+        configured = asked(client, Transition.TRANSITION_CONFIGURE)
+        wait_until(configured.done)
+        assert configured.result().success
+
+
+def test_while_it_reloads_clouds_are_registered_to_the_old_bone(blob_path, client, slow):
+    slow.gate.set()
+    with node_in_thread(slow, blob_path):
+        client.wait_for_state("active")
+        slow.gate.clear()
+        slow.register = StandIn().register  # of clouds; only the bone waits
+        reloaded = client.ready(Trigger, "/register_node/reload_model").call_async(Trigger.Request())
+        for _ in range(3):
+            assert client.ask(GOOD)["level"] == 0
+        assert not reloaded.done()
+        answer = client.call("reload_model")
+        assert not answer.success and "one bone at a time" in answer.message
+        slow.gate.set()
+        wait_until(reloaded.done)
+        assert reloaded.result().success and client.ask(GOOD)["level"] == 0
+
+
+def test_a_transition_that_the_state_does_not_allow_is_refused_and_survived(blob_path, client, method):
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE, 77):
+            refused = asked(client, transition)
+            wait_until(refused.done)
+            assert not refused.result().success
+        assert client.ask(GOOD)["level"] == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_within_two_seconds_while_it_loads(client, tmp_path, number):
+    """A fifo that nobody writes to: reading it takes for ever."""
+    os.mkfifo(tmp_path / "bone.stl")
+    node = NodeProcess(tmp_path, model_path=tmp_path / "bone.stl", model_unit="mm")
+    wait_until(lambda: "loading" in client.values().get("message", ""), 90.0)
+    assert node.stop_cpu_s(number) < LIMIT_S
+    assert "Traceback" not in node.log
+
+
+def test_a_signal_ends_the_node_within_two_seconds_while_it_registers(client, tmp_path):
+    """400 000 points are sorted out for seconds."""
+    bone = bones.bone()
+    node = NodeProcess(
+        tmp_path, model_path=bones.save(bone, tmp_path / "bone.npz"), model_unit="mm", max_points=0, track=False
+    )
+    client.wait_for_state("active", 90.0)
+    cloud = bones.partial(bone, np.eye(4), count=400_000)
+    for _ in range(3):
+        client.send(cloud)
+    wait_until(lambda: int(client.values()["frames_received"]) > 0)
+    assert node.stop_cpu_s(signal.SIGTERM) < LIMIT_S
+    assert "Traceback" not in node.log

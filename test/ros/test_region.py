@@ -1,0 +1,137 @@
+"""The region of interest: a box in a frame, the neighbourhood of the tracked bone; and where the camera was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from harness import StandIn, accepted, node_in_thread, pose_mm
+from rclpy.parameter import Parameter
+from scipy.spatial import cKDTree
+
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.node import frames, region
+from gapr_ros.parameters import NodeParameters
+from msg_adapters import matrix_to_transform
+
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+FAR = np.random.default_rng(2).normal(size=(800, 3)) * 0.02 + [3.0, 0.0, 0.0]
+T_BOX_PROBE = pose_mm([0.0, 0.0, np.pi / 2], [0.1, 0.2, 0.3])  # metres
+
+
+class Tf2:
+    """What the node uses of tf2_ros, with one transform that is known."""
+
+    class TransformException(Exception):
+        pass
+
+    def TransformListener(self, buffer, node):
+        return self
+
+    def unregister(self):
+        pass
+
+    def Buffer(self, node):
+        return self
+
+    def can_transform(self, parent, child, stamp):
+        return (parent, child) == ("table", "probe")
+
+    def lookup_transform(self, parent, child, stamp):
+        if not self.can_transform(parent, child, stamp):
+            raise self.TransformException(f"{parent} does not exist")
+        return TransformStamped(transform=matrix_to_transform(T_BOX_PROBE))
+
+
+def test_the_box_keeps_what_is_inside_it_in_its_own_frame():
+    parameters = NodeParameters(crop_min=(0.0, 0.1, 0.2), crop_max=(0.1, 0.3, 0.4))
+    there_m = np.array([[0.05, 0.2, 0.3], [0.11, 0.2, 0.3], [0.05, 0.09, 0.3], [0.05, 0.2, 0.41], [0.01, 0.11, 0.21]])
+    points_mm = se3.apply(se3.inverse(T_BOX_PROBE), there_m) * 1000.0
+    kept = region.box(parameters, T_BOX_PROBE)(points_mm)
+    np.testing.assert_allclose(kept, points_mm[[0, 4]], atol=1e-9)
+
+
+def test_the_neighbourhood_of_the_bone_is_where_its_last_pose_puts_it():
+    model_mm = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    T_cloud_model = pose_mm([0.0, 0.0, np.pi / 2], [0.5, 0.0, 0.0])  # metres: the second point is at (0.5, 0.1, 0)
+    points_mm = np.array([[500.0, 100.0, 9.0], [500.0, 100.0, 11.0], [600.0, 0.0, 0.0], [495.0, 0.0, 0.0]])
+    kept = region.around(cKDTree(model_mm), T_cloud_model, 0.01)(points_mm)
+    np.testing.assert_array_equal(kept, points_mm[[0, 3]])
+
+
+def test_a_cloud_with_points_metres_away_is_registered_when_it_is_cropped(blob_path, client, method):
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        assert client.ask(np.vstack([GOOD, FAR]))["last_refusal"].startswith("unit_mismatch")
+        box = [Parameter("crop_min", value=[-1.0, -1.0, -1.0]), Parameter("crop_max", value=[1.0, 1.0, 1.0])]
+        assert node.set_parameters_atomically(box).successful
+        values = client.ask(np.vstack([GOOD, FAR]))
+        assert values["level"] == 0 and values["points_used"] == "1000"
+        assert "too_few_points: 0 usable points" in client.ask(FAR)["last_refusal"]
+
+
+def test_the_box_is_looked_up_in_its_frame_and_a_missing_frame_is_a_refusal(blob_path, client, method, monkeypatch):
+    monkeypatch.setattr(frames, "_import_tf2", Tf2)
+    middle = se3.apply(T_BOX_PROBE, GOOD.mean(axis=0)[None])[0]
+    options = {"crop_min": (middle - 1.0).tolist(), "crop_max": (middle + 1.0).tolist(), "tf_timeout": 0.0}
+    with node_in_thread(method, blob_path, crop_frame="table", **options):
+        client.wait_for_state("active")
+        values = client.ask(np.vstack([GOOD, FAR]), frame="probe")
+        assert values["level"] == 0 and values["points_used"] == "1000"
+        refused = client.ask(GOOD, frame="elsewhere")
+        assert refused["last_refusal"] == "tf_missing: table <- elsewhere: table does not exist"
+
+
+def test_after_a_good_pose_only_the_neighbourhood_counts_and_after_a_refusal_everything(blob_path, client, method):
+    aside = GOOD + [0.0, 0.4, 0.0]
+    with node_in_thread(method, blob_path, crop_to_track=0.15):
+        client.wait_for_state("active")
+        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "2000"
+        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "1000"
+        method.answer = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE)
+        client.ask(np.vstack([GOOD, aside]))
+        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "2000", "the bone may be elsewhere"
+        method.answer = accepted()
+        client.ask(GOOD)
+        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "1000"
+        client.call("reset")
+        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "2000"
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "expected_mm"),
+    [
+        ("none", None),
+        ("origin", [0.0, 0.0, 0.0]),
+        ("table", se3.inverse(T_BOX_PROBE)[:3, 3] * 1000.0),
+    ],
+)
+def test_the_camera_is_where_the_parameter_says(blob_path, client, method, monkeypatch, viewpoint, expected_mm):
+    monkeypatch.setattr(frames, "_import_tf2", Tf2)
+    with node_in_thread(method, blob_path, viewpoint=viewpoint):
+        client.wait_for_state("active")
+        assert client.ask(GOOD, frame="probe")["level"] == 0
+    given = method.calls[-1]["viewpoint"]
+    if expected_mm is None:
+        assert given is None
+    else:
+        np.testing.assert_allclose(given, expected_mm, atol=1e-9)
+
+
+def test_the_origin_of_the_cloud_is_given_in_the_frame_of_the_answer(blob_path, client, method, monkeypatch):
+    monkeypatch.setattr(frames, "_import_tf2", Tf2)
+    with node_in_thread(method, blob_path, viewpoint="origin", output_frame="table"):
+        client.wait_for_state("active")
+        client.ask(GOOD, frame="probe")
+    np.testing.assert_allclose(method.calls[-1]["viewpoint"], T_BOX_PROBE[:3, 3] * 1000.0, atol=1e-9)
+
+
+def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client):
+    class Plain(StandIn):
+        def register(self, source, target, initial=None):
+            return super().register(source, target, initial)
+
+    with node_in_thread(Plain(), blob_path):
+        client.wait_for_state("active")
+        assert client.ask(GOOD)["level"] == 0

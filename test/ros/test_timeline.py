@@ -1,0 +1,182 @@
+"""Time: clouds from the future, stragglers, and time that starts over."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from harness import accepted, node_in_thread, pose_mm, wait_until
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gapr_ros.node import frames
+from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.timeline import BACK_NS, Timeline
+from gapr_ros.parameters import NodeParameters
+
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+NS = 1_000_000_000
+MOVED = pose_mm([0, 0, 0], [50.0, 0, 0])
+
+
+def judged(timeline, stamp_s, now_s=0.0, **parameters):
+    """True for time that starts over, False for a cloud of now, the reason for a refusal."""
+    try:
+        return timeline.admit(int(stamp_s * NS), int(now_s * NS), NodeParameters(**parameters))
+    except RefusedError as refusal:
+        return refusal.reason
+
+
+def test_a_stamp_ahead_of_the_clock_is_refused_beyond_the_limit_and_not_within_it():
+    timeline = Timeline()
+    assert judged(timeline, 100.4, now_s=100.0) is False
+    assert judged(timeline, 100.6, now_s=100.0) is Reason.FUTURE
+    assert judged(timeline, 100.6, now_s=100.0, max_future=0.0) is False, "0 is off"
+    assert judged(timeline, 9999.0, now_s=0.0) is False, "the clock does not run yet"
+
+
+def test_a_cloud_from_the_future_leaves_no_trace():
+    timeline = Timeline()
+    assert judged(timeline, 100.0, now_s=100.0) is False
+    assert judged(timeline, 500.0, now_s=100.1) is Reason.FUTURE
+    assert judged(timeline, 100.2, now_s=100.2) is False
+
+
+def test_a_cloud_that_is_old_by_age_leaves_no_trace():
+    timeline = Timeline()
+    assert judged(timeline, 100.0, now_s=100.0) is False
+    for behind in range(5):
+        assert judged(timeline, 50.0 + behind, now_s=100.1, max_cloud_age=1.0) is Reason.STALE
+    assert judged(timeline, 100.1, now_s=100.1, max_cloud_age=1.0) is False
+
+
+def test_one_straggler_is_refused_and_the_third_of_a_row_starts_time_over():
+    timeline = Timeline()
+    assert judged(timeline, 100.0) is False
+    assert judged(timeline, 90.0) is Reason.STALE
+    assert judged(timeline, 100.1) is False, "the row is broken by a cloud of now"
+    assert [judged(timeline, s) for s in (90.0, 90.1, 90.2)] == [Reason.STALE, Reason.STALE, True]
+    assert judged(timeline, 90.3) is False
+    assert judged(timeline, 90.0) is False, "within a second"
+
+
+def test_stragglers_whose_stamps_do_not_go_forward_never_start_time_over():
+    timeline = Timeline()
+    judged(timeline, 100.0)
+    assert {judged(timeline, stamp_s) for stamp_s in (90.0, 89.0, 88.0, 87.0)} == {Reason.STALE}
+    assert {judged(timeline, 80.0) for _ in range(9)} == {Reason.STALE}
+
+
+def test_small_steps_back_do_not_add_up():
+    timeline = Timeline()
+    judged(timeline, 100.0)
+    answers = [judged(timeline, 100.0 - 0.6 * i) for i in range(4)]
+    assert answers == [False, False, Reason.STALE, Reason.STALE]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=30))
+def test_stamps_never_go_back_more_than_a_second_unless_time_starts_over(stamps):
+    timeline, newest = Timeline(), 0
+    for stamp in stamps:
+        answer = judged(timeline, stamp)
+        if answer is False:
+            assert stamp * NS >= newest - BACK_NS
+            newest = max(newest, stamp * NS)
+        elif answer is True:
+            newest = stamp * NS
+
+
+class Tf2:
+    """What a tf2 buffer does with what it is sent: strictly newer wins, a look-up of the latest gives the last one.
+
+    From tf2's TimeCache: the latest transform is that with the newest stamp, whenever it was inserted; data older than
+    the newest by more than the length of the cache (10 s) is ignored.
+    """
+
+    CACHE_S = 10.0
+
+    def __init__(self):
+        self.stored = {}
+
+    def TransformBroadcaster(self, node):
+        fake = self
+
+        class Broadcaster:
+            pub_tf = node.create_publisher(TransformStamped, "unused", 1)
+
+            def sendTransform(self, transform):
+                fake.insert(transform)
+
+        return Broadcaster()
+
+    def insert(self, transform):
+        stamp_s = transform.header.stamp.sec + transform.header.stamp.nanosec * 1e-9
+        if stamp_s >= max(self.stored, default=0.0) - self.CACHE_S:
+            self.stored[stamp_s] = transform.transform.translation.x
+
+    def latest(self):
+        return self.stored[max(self.stored)]
+
+
+@pytest.fixture
+def tf2(monkeypatch):
+    made = Tf2()
+    monkeypatch.setattr(frames, "_import_tf2", lambda: made)
+    return made
+
+
+def test_one_cloud_from_the_future_does_not_hold_back_what_tf2_says(blob_path, client, method, tf2):
+    with node_in_thread(method, blob_path, publish_tf=True):
+        client.wait_for_state("active")
+        assert client.ask(GOOD)["level"] == 0
+        method.answer = accepted(MOVED)
+        refused = client.ask(GOOD, stamp_s=time.time() + 30.0)
+        assert refused["last_refusal"].startswith("future: the stamp is") and "synchronise" in refused["last_refusal"]
+        assert client.ask(GOOD)["level"] == 0
+        wait_until(lambda: len(client.poses) == 2)
+        assert tf2.latest() == pytest.approx(client.poses[-1].pose.pose.position.x) == pytest.approx(-0.05)
+
+
+def test_a_straggler_changes_neither_the_jump_guard_nor_the_epoch_nor_tf(blob_path, client, method, tf2):
+    with node_in_thread(method, blob_path, publish_tf=True, max_jump_translation=0.01) as node:
+        client.wait_for_state("active")
+        client.ask(GOOD, stamp_s=1000.0)
+        epoch, calls = node.session._epoch, len(method.calls)
+        assert client.ask(GOOD, stamp_s=980.0)["last_refusal"].startswith("stale: the stamp is 20 s behind")
+        assert (node.session._epoch, len(method.calls), len(tf2.stored)) == (epoch, calls, 1)
+        method.answer = accepted(MOVED)
+        assert client.ask(GOOD, stamp_s=1000.5)["last_refusal"].startswith("jump"), "the guard still stands"
+
+
+def test_a_straggler_does_not_push_a_good_cloud_out_of_the_mailbox(blob_path, client, method):
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        client.send(GOOD, stamp_s=1000.0)
+        wait_until(lambda: node.counters.received == 1)
+        client.ask(GOOD, stamp_s=900.0)
+        answer = client.call("register")
+        assert answer.success and node.counters.dropped == 0
+
+
+def test_a_straggler_does_not_end_the_row_of_good_poses(blob_path, client, method):
+    with node_in_thread(method, blob_path, require_consecutive=2):
+        client.wait_for_state("active")
+        assert "1 of 2" in client.ask(GOOD, stamp_s=1000.0)["last_refusal"]
+        assert "stale" in client.ask(GOOD, stamp_s=900.0)["last_refusal"]
+        assert client.ask(GOOD, stamp_s=1000.1)["level"] == 0
+
+
+def test_a_bag_that_is_looped_without_simulated_time_clears_the_track_and_goes_on(blob_path, client, method, tf2):
+    with node_in_thread(method, blob_path, publish_tf=True, max_jump_translation=0.01) as node:
+        client.wait_for_state("active")
+        for stamp_s in (1000.0, 1001.0):
+            assert client.ask(GOOD, stamp_s=stamp_s)["level"] == 0
+        epoch = node.session._epoch
+        method.answer = accepted(MOVED)
+        answers = [client.ask(GOOD, stamp_s=995.0 + i) for i in range(4)]
+        assert [answer["level"] for answer in answers] == [1, 1, 0, 0]
+        assert node.session._epoch == epoch + 1
+        assert sorted(tf2.stored) == [997.0, 998.0, 1000.0, 1001.0]

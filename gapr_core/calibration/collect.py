@@ -69,7 +69,7 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int) -> list[Record]:
     bones = pairs.bones_of(*where) if left else {}
     spawn = get_context("spawn")
     with ProcessPoolExecutor(jobs, spawn, pairs.keep, (*where, bones)) as pool, path.open("a") as file:
-        for record in tqdm(pool.map(record_of, left), total=len(left), unit="pair"):
+        for record in tqdm(pool.map(record_of, left, chunksize=pairs.IN_A_ROW), total=len(left), unit="pair"):
             file.write(json.dumps(record) + "\n")
             file.flush()
             done[record["name"]] = record

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 
@@ -55,12 +55,21 @@ class NormalEquations:
     Fy: Array
 
     @classmethod
-    def of(cls, fit: Fit, fields: Array) -> NormalEquations:
-        """Those of a fit; points without weight count for nothing."""
+    def of(cls, fit: Fit, fields: Array, more: Array | None = None, sizes: ArrayLike = ()) -> NormalEquations:
+        """Those of a fit; points without weight count for nothing.
+
+        Args:
+            fit: its residuals and motions.
+            fields: (N, m) of the bias.
+            more: (N, k) derivatives of the residuals by further unknowns, after the six of the motion.
+            sizes: (k,) standard deviations of these before the residuals are seen.
+        """
         W = fit.weights[:, None] / fit.sigma_mm**2
-        J, y = fit.jacobian, np.nan_to_num(fit.signed_mm)
+        J, y, prior = fit.jacobian, np.nan_to_num(fit.signed_mm), np.diag(POSE_PRIOR)
+        if more is not None:
+            J, prior = np.column_stack([J, more]), np.append(prior, 1.0 / np.square(sizes))
         WJ, WF = W * J, W * fields
-        return cls(J.T @ WJ + POSE_PRIOR, WJ.T @ fields, fields.T @ WF, WJ.T @ y, WF.T @ y)
+        return cls(J.T @ WJ + np.diag(prior), WJ.T @ fields, fields.T @ WF, WJ.T @ y, WF.T @ y)
 
     def log_likelihood(self, sizes_mm: Array, smallest_share: float) -> Array:
         """(K,) restricted log likelihood of standard deviations (K,) of the bias; 0 without a bias.
@@ -77,10 +86,18 @@ class NormalEquations:
         return np.asarray(0.5 * (variances * score[smooth] ** 2 / gain - np.log(gain)).sum(axis=1))
 
     def step(self, size_mm: float) -> Array:
-        """(6,) x y z (mm) rx ry rz (rad): the motion that fits best with a bias of this size."""
-        A = self.FF + np.eye(len(self.FF)) / size_mm**2
-        taken = np.linalg.solve(A, np.column_stack([self.JF.T, self.Fy]))
+        """(6 + k,) x y z (mm) rx ry rz (rad), then the further unknowns: the best fit with a bias of this size."""
+        taken = self._taken(size_mm)
         return np.asarray(-np.linalg.solve(self.JJ - self.JF @ taken[:, :-1], self.Jy - self.JF @ taken[:, -1]))
+
+    def step_covariance(self, size_mm: float) -> Array:
+        """(6 + k, 6 + k) covariance of `step` under the noise and a bias of this size."""
+        return np.asarray(np.linalg.inv(self.JJ - self.JF @ self._taken(size_mm)[:, :-1]))
+
+    def _taken(self, size_mm: float) -> Array:
+        """(m, 7 + k) what the bias takes up of the motions and of the residuals."""
+        A = self.FF + np.eye(len(self.FF)) / size_mm**2
+        return np.asarray(np.linalg.solve(A, np.column_stack([self.JF.T, self.Fy])))
 
 
 def root_mean_square(sizes_mm: Array, log_posterior: Array) -> float:

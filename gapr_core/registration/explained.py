@@ -157,7 +157,7 @@ def measure(
         "normal_agreement": float(np.median(agreement[inlier])) if inlier.any() else 0.0,
         "log_points": float(np.log(len(part.points))),
         "extent": float(reach_mm / target.half_extent_mm),
-        **of_another_bone(fit, uncertainty, part, target, config),
+        **of_another_bone(fit, part, target, config),
     }
 
 

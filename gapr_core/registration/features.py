@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig
 from gapr_core.registration import mirror
-from gapr_core.registration.bias_field import fields
+from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.source import PreparedSource
@@ -16,7 +16,7 @@ from gapr_core.registration.verification import Candidates
 
 Array = NDArray[np.float64]
 
-OTHER_BONE = ("scale_off", "log_scale_sd", "mirror_margin")
+OTHER_BONE = ("scale_z", "scale_off", "log_scale_sd", "mirror_margin")
 FEATURES = (
     "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "residual", "margin", "support",
     "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
@@ -29,9 +29,12 @@ SCENE_FEATURES = (
 FEATURES_OF = {"network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES}
 SIGNS = {
     "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1, "log_shift_sd": -1,
-    "log_turn_sd": -1, "normal_agreement": 1, "scale_off": -1, "mirror_margin": 1, "free_space_score": 1,
+    "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "mirror_margin": 1, "free_space_score": 1,
     "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
+SURE_SCALE_SD, LARGEST_SCALE_Z = 0.005, 10.0  # a model of a bone is no truer than half a percent
+FEWEST_FOR_SCALE = 8  # points
+STANDOFF_MM, WIDEST_SCALE = 0.5, 0.3  # standard deviations before the residuals are seen
 USUAL_SCALE_SD = 0.05  # prior of how much larger or smaller a source may be than the bone
 
 
@@ -72,39 +75,42 @@ def measure(
         "extent": float(
             np.linalg.norm(source.points - source.points.mean(axis=0), axis=1).max() / target.half_extent_mm
         ),
-        **of_another_bone(fit, uncertainty, source, target, config),
+        **of_another_bone(fit, source, target, config),
     }
 
 
 def of_another_bone(
-    fit: Fit, uncertainty: PoseUncertainty, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
+    fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> dict[str, float]:
     """What tells a bone of another size or of the other side of the body; `OTHER_BONE` are the names."""
-    scale, scale_sd = scale_of(fit, uncertainty.bias_mm, config.covariance)
+    scale, scale_sd = scale_of(fit, config.covariance)
     return {
+        "scale_z": min(abs(scale) / float(np.hypot(scale_sd, SURE_SCALE_SD)), LARGEST_SCALE_Z),
         "scale_off": abs(scale) * USUAL_SCALE_SD**2 / (USUAL_SCALE_SD**2 + scale_sd**2),
         "log_scale_sd": float(np.log(scale_sd)),
         "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),
     }
 
 
-def scale_of(fit: Fit, bias_mm: float, config: CovarianceConfig) -> tuple[float, float]:
+def scale_of(fit: Fit, config: CovarianceConfig) -> tuple[float, float]:
     """How much larger the source would have to be to fit best, and the standard deviation of that.
 
-    One Gauss-Newton step of a similarity: the pose's six columns and, for the scale, the residuals' derivative
-    n . (p - c). The standard deviation is that of the same least squares under noise and smooth bias.
+    Generalised least squares of a similarity beside a smooth bias (see `bias_field`): the pose's six motions, the size,
+    by which a residual grows as n . (q - c) at its foot point q, and a stand-off that all points share, which looks
+    much like another size on a patch seen from one side. How large the bias is follows from what these leave.
 
     Returns:
-        The scale less 1 (0.05: the source is 5 % too small), and its standard deviation, at most 1.
+        The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
     """
-    inlier = np.flatnonzero(fit.weights > 0.0)
-    if len(inlier) < 8:
+    if np.count_nonzero(fit.weights) < FEWEST_FOR_SCALE:
         return 0.0, 1.0
-    offsets = (fit.moved - fit.moved.mean(axis=0))[inlier]
-    grows = np.einsum("ni,ni->n", fit.gradients[inlier], offsets)
-    J, w = np.column_stack([fit.jacobian[inlier], grows]), fit.weights[inlier]
-    H = (J * w[:, None]).T @ J + np.diag([1e-6] * 3 + [1e-3] * 4)
-    gain = np.linalg.inv(H)[6] @ (J * w[:, None]).T
-    of_bias = gain @ fields(fit, config.correlation_mm, config.centres)[inlier]
-    variance = fit.sigma_mm**2 * gain @ gain + bias_mm**2 * of_bias @ of_bias
-    return float(np.clip(-gain @ fit.signed_mm[inlier], -1.0, 1.0)), float(np.clip(np.sqrt(variance), 1e-5, 1.0))
+    outward = np.einsum("ni,ni->n", fit.gradients, fit.moved - fit.moved.mean(axis=0))
+    growth = outward - np.nan_to_num(fit.signed_mm)  # of the foot points: the points' own noise is in the residuals
+    more = np.column_stack([growth, np.ones_like(growth)])
+    spanned = fields(fit, config.correlation_mm, config.centres)
+    equations = NormalEquations.of(fit, spanned, more, (WIDEST_SCALE, STANDOFF_MM))
+    sizes_mm = np.array(config.sizes_mm)
+    size_mm = root_mean_square(sizes_mm, equations.log_likelihood(sizes_mm, config.smallest_share))
+    variance = equations.step_covariance(size_mm)[6, 6]
+    scale = float(equations.step(size_mm)[6])
+    return float(np.clip(scale, -1.0, 1.0)), float(np.clip(np.sqrt(max(variance, 0.0)), 1e-5, 1.0))

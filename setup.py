@@ -82,5 +82,10 @@ setup(
             "bag_replay = gapr_ros.bags.replay:main",
         ],
         "gapr.commands": ["demo = gapr_ros.demo.cli"],
+        "gapr.sources": [  # the ending of a file, or a file that its folder has
+            "mcap = gapr_ros.bags.source",
+            "db3 = gapr_ros.bags.source",
+            "metadata.yaml = gapr_ros.bags.source",
+        ],
     },
 )

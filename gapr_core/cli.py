@@ -33,6 +33,7 @@ COMMANDS = {
 EXTRAS = {  # top-level module -> the extra of setup.py that installs it
     "torch": "network", "safetensors": "network", "open3d": "data", "matplotlib": "reports", "plotly": "reports",
     "rich": "reports", "rclpy": "ros", "rosbags": "bags",
+    "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros",
     "SimpleITK": "medical", "skimage": "medical", "highdicom": "medical",
 }  # fmt: skip
 

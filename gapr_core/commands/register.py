@@ -29,10 +29,13 @@ OK, REFUSED = 0, 2
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr register`; docs/formats.md explains formats, axes and units."""
     parser.add_argument(
-        "--source", required=True, type=Path, help="partial cloud, markups, recording, folder of slices"
+        "--source", required=True, type=Path, help="partial cloud, markups, recording, folder of slices, bag"
     )
     parser.add_argument("--target", required=True, type=Path, help="full bone: mesh, cloud or label map")
-    parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of meshes and clouds (mm)")
+    parser.add_argument("--units", choices=("mm", "m"), help="of meshes and clouds (default: mm; clouds of a bag: m)")
+    parser.add_argument("--topic", default="", help="of the clouds in a bag; may be left out where it has one")
+    parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
+                        help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
     parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
     parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
@@ -54,17 +57,23 @@ def _point(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+def _span(text: str) -> tuple[int | None, int | None]:
+    try:
+        first, last = (int(word) if word else None for word in text.split(":"))
+    except ValueError as error:
+        raise ArgumentTypeError(f"FIRST:LAST, such as 0:10, not {text!r}") from error
+    return first, last
+
+
 def run(args: Namespace) -> int:
     """Print the result; exit code 0 with a pose, 2 when the data refuse one."""
-    from gapr_core import clouds
     from gapr_core.benchmark import methods
-    from gapr_core.formats.options import ReadOptions
 
     _check_outputs(args)
     method = methods.make(args.method, options.registrar_config(args))
     plan = _plan(args)
-    target = clouds.load(args.target, args.units, ReadOptions(axes=args.axes, labels=tuple(args.label)))
-    source = clouds.load(args.source, args.units, ReadOptions(tip_mm=args.tip)).points
+    target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
+    source = _load(args, args.source, tip_mm=args.tip, topic=args.topic, clouds=args.clouds).points
     result = method.register(source, method.prepare(target), **_hints(args, method))  # type: ignore[call-arg]
     errors = _errors(plan, result)
     if args.json:
@@ -73,15 +82,26 @@ def run(args: Namespace) -> int:
 
 
 def _check_outputs(args: Namespace) -> None:
-    """Before the work, what it could not be written to."""
-    from gapr_core.formats import transforms
+    """Before the work, what cannot be written, and what does not go together."""
+    from gapr_core.formats import plugins, transforms
 
     if args.out:
         transforms.check(args.out)
         if args.axes == "lps_to_ras":
             raise ConfigError("--axes lps or ras with --out, which is LPS", "lps_to_ras", "say what the mesh is in")
+    if args.topic and plugins.of(args.source) is None:
+        raise ConfigError("a bag as the source of --topic", args.source.name, "give a bag, or leave --topic out")
     if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
         raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
+
+
+def _load(args: Namespace, path: Path, **how: Any) -> Surface:
+    """A file in the unit that is named, or that files of its kind usually have."""
+    from gapr_core import clouds
+    from gapr_core.formats import reading
+    from gapr_core.formats.options import ReadOptions
+
+    return clouds.load(path, args.units or reading.format_of(path).unit, ReadOptions(**how))
 
 
 def _plan(args: Namespace) -> Any:

@@ -16,10 +16,14 @@ class ReadOptions:
             it did in earlier versions), or "auto": what a `SPACE=` comment in the file says, as_is without one.
         labels: names or numbers of the segments of a label map that make up one rigid target; none where it has one.
         tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.
+        topic: of the clouds in a bag; empty where it has one such topic.
+        clouds: (first, last) of the clouds of that topic, as in a slice; all of them are joined.
         limits: how large the file may be.
     """
 
     axes: str = "auto"
     labels: tuple[str, ...] = ()
     tip_mm: tuple[float, float, float] | None = None
+    topic: str = ""
+    clouds: tuple[int | None, int | None] = (None, None)
     limits: FileLimits = field(default_factory=FileLimits.from_environment)

@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from gapr_core.errors import GaprError, InvalidPointCloudError
-from gapr_core.formats import axes
+from gapr_core.formats import axes, plugins
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
@@ -22,11 +22,13 @@ class Format:
         reader: `module:function` under `gapr_core.formats`; takes (path, limits) or, of patient data, (path, options).
         in_patient: whether the file says its own axes and is in mm: it comes out in LPS mm, and units do not apply.
         with_options: whether the reader of another file takes all options.
+        unit: of its numbers, where the user names none.
     """
 
     reader: str
     in_patient: bool = False
     with_options: bool = False
+    unit: str = "mm"
 
     def read(self, path: Path, options: ReadOptions) -> Surface:
         """The surface, in LPS mm for patient data, otherwise in the file's unit with its axes turned as asked."""
@@ -65,10 +67,11 @@ LONGEST_REASON = 160
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Surface:
-    """The points and faces of a file or a folder of tracked slices.
+    """The points and faces of a file, a folder of tracked slices, or what an installed plug-in reads.
 
     Raises:
         InvalidPointCloudError: an unknown format, a missing, damaged, cut or empty file, or one beyond the limits.
+        MethodUnavailableError: a library that the format needs is not installed.
     """
     options = options or ReadOptions()
     kind = format_of(path)
@@ -86,17 +89,20 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
     return surface
 
 
-def format_of(path: Path) -> Format:
+def format_of(path: Path) -> Format | plugins.Plugin:
     """The kind of a file, by its name.
 
     Raises:
         InvalidPointCloudError: an unknown ending, or nothing there.
     """
+    if plugin := plugins.of(path):
+        return plugin
     if path.is_dir():
         return FOLDER
     ending = _ending(path)
     if ending not in FORMATS:
-        raise InvalidPointCloudError(f"one of {' '.join(FORMATS)}", path.name, "convert the file to one of these")
+        endings = " ".join([*FORMATS, *(f".{ending}" for ending in plugins.endings())])
+        raise InvalidPointCloudError(f"one of {endings}", path.name, "convert the file to one of these")
     if not path.is_file():
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
     return FORMATS[ending]

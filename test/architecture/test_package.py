@@ -35,14 +35,15 @@ def test_the_version_is_the_same_in_setup_py_package_xml_the_library_and_the_cha
 def test_every_entry_point_leads_to_something_that_can_be_called():
     ours = [
         e
-        for group in ("console_scripts", "gapr.commands")
+        for group in ("console_scripts", "gapr.commands", "gapr.sources")
         for e in entry_points(group=group)
         if e.dist.name.replace("-", "_") == "gapr_ros"
     ]
-    assert {"gapr", "register_node", "bag_replay", "demo"} <= {e.name for e in ours}
+    assert {"gapr", "register_node", "bag_replay", "demo", "mcap", "db3"} <= {e.name for e in ours}
     for entry in ours:
         loaded = entry.load()
-        assert callable(loaded) or (callable(loaded.add_arguments) and callable(loaded.run))
+        promised = {"gapr.commands": ("add_arguments", "run"), "gapr.sources": ("read", "UNIT")}.get(entry.group)
+        assert all(hasattr(loaded, name) for name in promised) if promised else callable(loaded)
 
 
 def test_kiss_matcher_is_not_asked_for_on_a_python_that_it_has_no_wheel_for():

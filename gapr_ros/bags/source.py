@@ -1,0 +1,102 @@
+"""Clouds of a bag as a source: `gapr register --source bag --topic /points`. Found through the group `gapr.sources`."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
+
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats.options import ReadOptions
+from gapr_core.surface import Surface
+from gapr_ros.bags.files import Bag, BagError, open_bag
+from gapr_ros.bags.writing import type_name
+from msg_adapters import INPUTS, Input
+
+log = logging.getLogger(__name__)
+
+UNIT = "m"  # REP-103
+READABLE = {type_name(kind.message()): kind for kind in INPUTS.values()}
+NAME_ONE = "name one with --topic, or topic= in Python"
+
+
+def read(path: Path, options: ReadOptions) -> Surface:
+    """The clouds of one topic, joined, in the unit and the frame of the topic.
+
+    Raises:
+        InvalidPointCloudError: a damaged or empty bag, no such topic, one without clouds, or clouds of two frames.
+    """
+    try:
+        bag = open_bag(path)
+    except BagError as error:
+        raise _unreadable(path, error) from error
+    try:
+        topic = _topic(bag, options.topic)
+        clouds = _clouds(bag, topic, options)
+    except BagError as error:
+        raise _unreadable(path, error) from error
+    finally:
+        bag.reader.close()
+    return Surface(np.vstack(clouds))
+
+
+def _unreadable(path: Path, error: BagError) -> InvalidPointCloudError:
+    why = str(error).removeprefix(f"{path}: ")
+    return InvalidPointCloudError("a bag that can be read", f"{path.name} ({why})", "record it again, or repair it")
+
+
+def _topic(bag: Bag, wanted: str) -> str:
+    """The topic that is meant, once it is known to have clouds."""
+    kinds = {connection.topic: connection.msgtype for connection in bag.reader.connections}
+    usable = sorted(topic for topic, kind in kinds.items() if kind in READABLE)
+    if wanted and wanted not in kinds:
+        raise InvalidPointCloudError(f"a topic of the bag ({', '.join(sorted(kinds))})", wanted, NAME_ONE)
+    if wanted and wanted not in usable:
+        there = f"; the bag has {', '.join(usable)}" if usable else "; the bag has none"
+        expected = f"a topic of {' or '.join(READABLE)}{there}"
+        raise InvalidPointCloudError(expected, f"{wanted} of {kinds[wanted]}", NAME_ONE)
+    if not wanted and len(usable) != 1:
+        given = f"{len(usable)} of them" + (f" ({', '.join(usable)})" if usable else f" ({', '.join(sorted(kinds))})")
+        raise InvalidPointCloudError(f"one topic of {' or '.join(READABLE)}", given, NAME_ONE)
+    return wanted or usable[0]
+
+
+def _clouds(bag: Bag, topic: str, options: ReadOptions) -> list[NDArray[np.float64]]:
+    """The points of the clouds that are asked for, all in one frame."""
+    bag.connections = [connection for connection in bag.connections if connection.topic == topic]
+    wanted = range(bag.count)[slice(*options.clouds)]
+    if not wanted:
+        given = f"{bag.count} of {topic}" + (" and a choice without any" if bag.count else "")
+        raise InvalidPointCloudError("clouds", given, "record the topic, or choose others with --clouds")
+    clouds: list[NDArray[np.float64]] = []
+    frames: set[str] = set()
+    for number, (_, connection, data) in enumerate(bag.messages()):
+        if number in wanted:
+            frame, points = _cloud(READABLE[connection.msgtype], data)
+            clouds.append(points)
+            frames.add(frame)
+            options.limits.check_counts(sum(map(len, clouds)))
+        elif number >= wanted.stop:
+            break
+    if len(clouds) != len(wanted):
+        raise BagError(f"damaged: {len(clouds)} clouds where it announces {len(wanted)}")
+    if len(frames) > 1:
+        given = f"clouds in {', '.join(sorted(frames))}"
+        raise InvalidPointCloudError(f"clouds of {topic} in one frame", given, "choose some with --clouds FIRST:LAST")
+    if len(clouds) > 1:
+        log.warning("%d clouds of %s (frame %s) are joined; the bone must not have moved in it; --clouds FIRST:LAST "
+                    "chooses some", len(clouds), topic, *frames)  # fmt: skip
+    return clouds
+
+
+def _cloud(kind: Input, data: bytes) -> tuple[str, NDArray[np.float64]]:
+    """Frame and finite points of one message."""
+    try:
+        message: Any = deserialize_message(data, kind.message)
+        return message.header.frame_id.lstrip("/"), kind.points(message)
+    except Exception as error:  # the middleware raises several kinds
+        raise BagError(f"damaged: a message that is no {kind.message.__name__}: {error}") from error

@@ -42,6 +42,14 @@ class ModelConfig(Settings):
     radius_voxels: float = setting(2.5, "radius of a neighbourhood in voxels of its stage", low=0.1)
     sigma_voxels: float = setting(2.0, "reach of a kernel point in voxels of its stage", low=0.1)
     small_ball: float = setting(0.5, "k_r: radius of the PGF's second ball over the first", low=0.01, high=1)
+    global_small_ball: str = setting(
+        "part", "second ball of global self-attention: the bottleneck's whole ball (paper), or small_ball of it",
+        choices=("part", "whole"),
+    )  # fmt: skip
+    early_features: str = setting(
+        "projected", "what repositioning compares: the self-attention's output as it is (paper: plain), or projected",
+        choices=("projected", "plain"),
+    )  # fmt: skip
     fine_stage: int = setting(0, "stage whose points are matched finely; 0 is the densest", low=0)
     patch_size: int = setting(32, "most points of one patch", low=3)
     train_pairs: int = setting(32, "patch pairs that are matched finely in training", low=1)

@@ -55,7 +55,7 @@ def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Clou
             "check the units of both clouds",
         )
     trees = [cKDTree(p) for p in resolutions]
-    radii = [config.radius_voxels * frame.voxel * config.voxel_growth**s for s in range(config.stages)]
+    radii = stage_radii(frame.voxel, config)
     within = [
         neighborhood(p, tree, config.neighbors[s], radii[s], config.small_ball)
         for s, (p, tree) in enumerate(zip(resolutions, trees, strict=True))
@@ -92,6 +92,11 @@ def choose_voxel(points: Array, config: ModelConfig, steps: int = 12) -> float:
             return middle
         low, high = (middle, high) if count > wanted else (low, middle)
     return float(np.sqrt(low * high))
+
+
+def stage_radii(voxel: float, config: ModelConfig) -> list[float]:
+    """Radius of a neighbourhood of every stage, in the unit of the first voxel."""
+    return [config.radius_voxels * voxel * config.voxel_growth**stage for stage in range(config.stages)]
 
 
 def pyramid(points: Array, voxel: float, config: ModelConfig) -> list[Array]:

@@ -26,10 +26,11 @@ class Nodes:
     valid: Tensor
 
     @classmethod
-    def of(cls, cloud: Cloud) -> Nodes:
-        """The coarsest level of a cloud."""
+    def of(cls, cloud: Cloud, small_ball: str = "part") -> Nodes:
+        """The coarsest level of a cloud; `small_ball` as `global_small_ball` of the configuration."""
         level = cloud.coarse
-        points, normals, c_k = (pad(x, level.lengths) for x in (level.points, level.normals, level.within.c_k))
+        inner = level.within.c_h if small_ball == "whole" else level.within.c_k
+        points, normals, c_k = (pad(x, level.lengths) for x in (level.points, level.normals, inner))
         reach = pad(level.within.radius, level.lengths)[:, 0]
         return cls(points, normals, c_k, reach, padding_mask(level.lengths, points.device))
 
@@ -70,16 +71,16 @@ class GlobalAggregation(nn.Module):
         super().__init__()
         dim, layers = config.global_width, config.global_layers
         self.enter, self.leave = nn.Linear(config.stage_widths[-1], dim), nn.Linear(dim, dim)
-        self.early = nn.Linear(dim, dim)
+        self.early = nn.Linear(dim, dim) if config.early_features == "projected" else nn.Identity()
         crosses = ["vanilla"] * (layers - 1) + [config.final_cross]
         self.self_layers = nn.ModuleList(make_transformer(config.encoding, dim, config) for _ in range(layers))
         self.cross_layers = nn.ModuleList(make_transformer(name, dim, config) for name in crosses)
-        self.centred = config.centred_features
+        self.centred, self.small_ball = config.centred_features, config.global_small_ball
         self.reposition = choose("repositioning", REPOSITIONING, config.repositioning)(config)
 
     def forward(self, source: Cloud, target: Cloud, x_p: Tensor, x_q: Tensor) -> Aggregated:
         """Superpoint features (S, C) of both clouds, clouds one after the other, to padded unit features."""
-        p, q = Nodes.of(source), Nodes.of(target)
+        p, q = Nodes.of(source, self.small_ball), Nodes.of(target, self.small_ball)
         x_p, x_q = self.enter(pad(x_p, source.coarse.lengths)), self.enter(pad(x_q, target.coarse.lengths))
         self_p, self_q, cross_p, cross_q = p.look_at_self(), q.look_at_self(), p.look_at(q), q.look_at(p)
         for self_layer, cross_layer in zip(self.self_layers[:-1], self.cross_layers[:-1], strict=True):

@@ -24,11 +24,12 @@ class Losses:
     coarse: Tensor
     fine: Tensor
     early: Tensor
+    early_weight: float = 0.5
 
     @property
     def total(self) -> Tensor:
-        """Eq. (10), with half of the auxiliary loss."""
-        return self.coarse + self.fine + 0.5 * self.early
+        """Eq. (10), with the auxiliary loss at its weight; the paper has none."""
+        return self.coarse + self.fine + self.early_weight * self.early
 
 
 def circle_loss(f_p: Tensor, f_q: Tensor, overlaps: Tensor, valid_p: Tensor, valid_q: Tensor) -> Tensor:

@@ -47,6 +47,8 @@ def tiny(path: Path, toy) -> ModelConfig:
                 "centred_features",
                 "coarse_temperature",
                 "fine_stage",
+                "global_small_ball",
+                "early_features",
             )
         },
     )

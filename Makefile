@@ -17,7 +17,7 @@ demo: $(READY)  ## a partial cloud from a bag, through the ROS 2 node, to a pose
 	$(BIN)/gapr demo $(ARGS)
 
 test: $(READY)  ## the test suite, under ten minutes on two cores; ARGS="-k node" chooses
-	$(BIN)/python -m pytest -n 2 $(ARGS)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
 
 slow: $(READY)  ## the tests that take longer
 	$(BIN)/python -m pytest -m slow $(ARGS)

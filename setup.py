@@ -7,7 +7,15 @@ from setuptools import find_packages, setup
 
 PACKAGE = "gapr_ros"
 
-CORE = ["numba", "numpy", "plyfile", "pyyaml", "scipy>=1.10", "tqdm"]  # what a registration by the search needs
+CORE = [
+    "numba",
+    "numpy",
+    "plyfile",
+    "pyyaml",
+    "scipy>=1.10",
+    "threadpoolctl>=3.1",
+    "tqdm",
+]  # what a registration by the search needs
 NETWORK = ["safetensors", "torch>=2.4,<2.14"]
 DATA = ["open3d>=0.18"]  # rays and distances of simulated bones
 REPORTS = ["matplotlib", "pillow", "plotly>=5.20", "rich"]

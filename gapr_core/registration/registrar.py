@@ -30,6 +30,7 @@ from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import verify
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
+from gapr_core.runtime.parallel import single_threaded_blas
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -121,8 +122,9 @@ class Registrar:
         """The answer to an assessment: thresholds, guidance where asked for, times."""
         if isinstance(assessment, Refusal):
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
-        guidance = guide(assessment, self.config.guidance) if self.config.guide else None
-        return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
+        with single_threaded_blas():
+            guidance = guide(assessment, self.config.guidance) if self.config.guide else None
+            return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
 
     def assess(
         self,
@@ -134,7 +136,17 @@ class Registrar:
     ) -> Assessment | Refusal:
         """What `register` knows before `min_confidence` and `max_tre_mm` decide: for calibration and research."""
         clock = clock or Clock()
-        target = offset_surface(target, self.config.sensor)
+        with single_threaded_blas():
+            return self._assess(source, offset_surface(target, self.config.sensor), initial, viewpoint, clock)
+
+    def _assess(
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None,
+        viewpoint: ArrayLike | None,
+        clock: Clock,
+    ) -> Assessment | Refusal:
         prepared = sources.prepare(source, self.config.source)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):

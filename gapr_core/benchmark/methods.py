@@ -14,6 +14,7 @@ from gapr_core.baselines import RegistrationMethod
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.results import RegistrationResult
+from gapr_core.runtime import settings
 
 OURS = "gapr"
 
@@ -88,6 +89,16 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
         return _from_module(*name.split(":", 1))
     check([name])
     return baselines.make(name)
+
+
+def config_of(name: str, config: RegistrarConfig) -> RegistrarConfig | None:
+    """The settings for a method: those given for our own, none for the others."""
+    return config if name in OWN else None
+
+
+def settings_of(name: str, config: RegistrarConfig) -> str:
+    """What of them is not the default, as `name=value` with commas."""
+    return ", ".join(settings.changes(config)) if name in OWN else ""
 
 
 def register(

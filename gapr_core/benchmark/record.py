@@ -118,6 +118,7 @@ class Record(PairFacts, Answer, Verdict):
         method: its name on the command line.
         seconds, prepare_seconds: wall time; None after an error.
         commit: of the code that ran.
+        settings: those that were not the defaults, as `name=value` with commas; none of the baselines has any.
     """
 
     file: str
@@ -126,6 +127,7 @@ class Record(PairFacts, Answer, Verdict):
     seconds: float | None = None
     prepare_seconds: float | None = None
     commit: str = ""
+    settings: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; None for what is not finite. `runtime.settings.from_dict` reads it back."""

@@ -74,20 +74,25 @@ def discard_cut_line(path: Path) -> None:
         files.write_text(path, whole)
 
 
-def done(records: Iterable[Record], hashes: dict[str, str]) -> set[tuple[str, str]]:
+def done(records: Iterable[Record], hashes: dict[str, str], settings: dict[str, str]) -> set[tuple[str, str]]:
     """(pair, method) of every record.
 
     Args:
         records: of an earlier, interrupted run.
         hashes: pair name to sha256 of this run's pairs.
+        settings: method to `Record.settings` of this run.
 
     Raises:
-        ConfigError: a record of a pair of the same name with other clouds.
+        ConfigError: a record of a pair of the same name with other clouds, or of a method with other settings.
     """
     found = set()
     for record in records:
         if hashes.get(record.pair, record.sha256) != record.sha256:
             raise ConfigError("records of these pairs", f"other clouds named {record.pair}", "choose another --out")
+        wanted = settings.get(record.method, record.settings)
+        if wanted != record.settings:
+            given = f"records with {record.settings or 'the default settings'}"
+            raise ConfigError(f"{record.method} with {wanted or 'the default settings'}", given, "choose another --out")
         found.add((record.pair, record.method))
     return found
 

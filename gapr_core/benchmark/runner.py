@@ -16,6 +16,7 @@ from gapr_core.baselines import RegistrationMethod
 from gapr_core.benchmark import methods
 from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts
 from gapr_core.benchmark.record import Answer, Record, Verdict
+from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair_files import load_pair, pair_hash
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
@@ -24,14 +25,15 @@ from gapr_core.results import RegistrationResult
 log = logging.getLogger(__name__)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-_methods: dict[str, RegistrationMethod] = {}  # of this worker process, made at their first use
+_methods: dict[tuple[str, RegistrarConfig], RegistrationMethod] = {}  # of this worker process, made at their first use
 
 
 class Task(NamedTuple):
-    """One pair for one method."""
+    """One pair for one method; `config` are the settings of our own methods."""
 
     path: Path
     method: str
+    config: RegistrarConfig = RegistrarConfig()
 
 
 def run(tasks: Sequence[Task], jobs: int = 1, threads: int = 1) -> Iterator[Record]:
@@ -76,10 +78,11 @@ def run_task(task: Task) -> Record:
     pair = load_pair(task.path)
     check_truth(pair)
     try:
-        if task.method not in _methods:
-            _methods[task.method] = methods.make(task.method)
-            _timed(_methods[task.method], pair)
-        result, times = _timed(_methods[task.method], pair)
+        made_of = task.method, task.config
+        if made_of not in _methods:
+            _methods[made_of] = methods.make(task.method, methods.config_of(task.method, task.config))
+            _timed(_methods[made_of], pair)
+        result, times = _timed(_methods[made_of], pair)
     except (ConfigError, MethodUnavailableError, WeightsError):
         raise
     except Exception as error:
@@ -121,7 +124,7 @@ def _record(
     facts = {**vars(pair_facts(pair)), **vars(answer), **vars(verdict), "pair": task.path.stem}
     return Record(
         **facts, file=task.path.name, sha256=pair_hash(pair), method=task.method, seconds=seconds,
-        prepare_seconds=prepare_seconds,
+        prepare_seconds=prepare_seconds, settings=methods.settings_of(task.method, task.config),
     )  # fmt: skip
 
 

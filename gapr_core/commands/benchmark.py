@@ -1,6 +1,6 @@
 """`gapr benchmark`: pairs x methods to one table, plots and a report; resumable, parallel, sharded.
 
-gapr benchmark --pairs DIR --methods gapr,kiss4,icp --out OUT [--shard 1/4] [--jobs 2]
+gapr benchmark --pairs DIR --methods gapr,kiss4,icp --out OUT [--shard 1/4] [--jobs 2] [--set NAME=VALUE]
 gapr benchmark merge OUT_1 OUT_2 ... --out OUT
 """
 
@@ -22,6 +22,8 @@ from gapr_core.benchmark import records, runner, table
 from gapr_core.benchmark.record import ERROR, Record
 from gapr_core.benchmark.records import Plan
 from gapr_core.benchmark.table import Row
+from gapr_core.commands import options
+from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
 from gapr_core.pages import benchmark_report, writers
@@ -41,6 +43,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="worker processes (1)")
     parser.add_argument("--threads", type=at_least_one, default=1, help="cores for each worker (1)")
+    options.add_settings(parser)
     parser.add_argument("--ours", help="the method that the others are compared with (gapr, or the first one)")
 
 
@@ -55,7 +58,8 @@ def run(args: Namespace) -> int:
         if args.pairs is None:
             raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
         methods = [name.strip() for name in args.methods.split(",") if name.strip()]
-        rows = benchmark(args.pairs, methods, args.out, _shard(args.shard), args.jobs, args.threads, args.ours)
+        config, shard = options.registrar_config(args), _shard(args.shard)
+        rows = benchmark(args.pairs, methods, args.out, shard, args.jobs, args.threads, args.ours, config)
     say(f"{len(rows)} rows in {args.out / 'table.md'}; to look at: {args.out / 'report.html'}")
     return 0
 
@@ -68,6 +72,7 @@ def benchmark(
     jobs: int = 1,
     threads: int = 1,
     ours: str | None = None,
+    config: RegistrarConfig | None = None,
 ) -> list[Row]:
     """Run what is not yet in `out`, then write table, plots and report there.
 
@@ -79,25 +84,30 @@ def benchmark(
         jobs: worker processes.
         threads: cores for each of them.
         ours: the method the others are compared with.
+        config: settings of our own methods; the others have none.
 
     Returns:
         The rows of the table.
 
     Raises:
-        ConfigError: no pairs, an unknown method, or results of other pairs in `out`.
+        ConfigError: no pairs, an unknown method, settings without a method of ours, or results of other pairs or
+            settings in `out`.
         MethodUnavailableError: a method whose library is not installed.
     """
     paths = pair_paths(pairs)
     if not methods:
         raise ConfigError("methods", "none", f"name some of {', '.join(known_methods.names())} with --methods")
     known_methods.check(methods)
+    config = config or RegistrarConfig()
+    if config != RegistrarConfig() and not any(name in known_methods.OWN for name in methods):
+        raise ConfigError(f"settings with one of {', '.join(known_methods.OWN)}", ", ".join(methods), "leave them out")
     known = records.read(out / records.FILE)
     all_methods = list(dict.fromkeys([*(record.method for record in records.sort(known, methods)), *methods]))
     plan = _plan(pairs, paths, all_methods, threads, ours)
-    done = records.done(known, plan.pairs)
+    done = records.done(known, plan.pairs, {name: known_methods.settings_of(name, config) for name in methods})
     records.write_plan(out, plan)
     records.discard_cut_line(out / records.FILE)
-    tasks = [runner.Task(path, method) for path in paths[shard[0] - 1 :: shard[1]] for method in methods]
+    tasks = [runner.Task(path, method, config) for path in paths[shard[0] - 1 :: shard[1]] for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
         for record in runner.run(open_tasks, jobs, threads):
@@ -111,7 +121,7 @@ def merge(folders: Sequence[Path], out: Path) -> list[Row]:
     """Join the results of shards of one run.
 
     Raises:
-        ConfigError: a folder that is no output of a benchmark, or shards of different pairs.
+        ConfigError: a folder that is no output of a benchmark, or shards of different pairs or settings.
     """
     plans = [records.read_plan(folder) for folder in folders]
     pairs: dict[str, str] = {}
@@ -122,6 +132,7 @@ def merge(folders: Sequence[Path], out: Path) -> list[Row]:
     named = (*(name for plan in plans for name in plan.methods), *(record.method for record in joined))
     methods = list(dict.fromkeys(named))
     _check_same_pairs(joined, pairs, out)
+    records.done(joined, pairs, {record.method: record.settings for record in reversed(joined)})
     records.write(out / records.FILE, records.sort(joined, methods))
     records.write_plan(out, replace(plans[0], pairs=pairs, methods=methods, command=_command()))
     return write(out, records.read_plan(out))
@@ -171,8 +182,9 @@ def _notes(found: Sequence[Record], plan: Plan) -> list[str]:
     commits = sorted({r.commit for r in found})
     if len(commits) > 1:
         notes.append(f"Results of different commits: {', '.join(commits)}.")
+    changed = sorted({f"Settings of {r.method}: {r.settings}." for r in found if r.settings})
     failed = {f"{r.method} on {r.pair} ({r.reason})" for r in found if r.status == ERROR}
-    return [*notes, *(f"Failed: {line}." for line in sorted(failed))]
+    return [*notes, *changed, *(f"Failed: {line}." for line in sorted(failed))]
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -10,10 +10,15 @@ from gapr_core.runtime import settings
 
 
 def add_method(parser: ArgumentParser) -> None:
-    """`--method`, `--config` and `--set`."""
+    """`--method`, and the settings."""
     parser.add_argument(
         "--method", default="gapr", help="gapr, gapr_search (needs no torch), gapr_network, gapr_tracker or a baseline"
     )
+    add_settings(parser)
+
+
+def add_settings(parser: ArgumentParser) -> None:
+    """`--config` and `--set`."""
     parser.add_argument("--config", type=Path, help="YAML file of settings; gapr settings lists them")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",

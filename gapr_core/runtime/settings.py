@@ -168,6 +168,18 @@ def table(cls: type, prefix: str = "") -> Iterator[Row]:
         yield Row(f"{prefix}{f.name}", default, of_range, f.metadata.get("text", ""))
 
 
+def changes(config: Any, prefix: str = "") -> list[str]:
+    """`name=value` of every setting that is not its default, with dotted names; no entry where all are."""
+    found: list[str] = []
+    for f in fields(config):
+        value = getattr(config, f.name)
+        if is_dataclass(value):
+            found += changes(value, f"{prefix}{f.name}.")
+        elif value != (f.default_factory() if f.default_factory is not MISSING else f.default):
+            found.append(f"{prefix}{f.name}={value}")
+    return found
+
+
 @cache
 def _hints(cls: type) -> dict[str, Any]:
     return get_type_hints(cls)

@@ -1,6 +1,7 @@
 """A run is repeatable, resumable and can be split; failures and false accepts are counted, never dropped."""
 
 import argparse
+import importlib
 import json
 import shutil
 
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 from benchmark_cases import make_pair
 
+from gapr_core.benchmark import methods as known_methods
 from gapr_core.benchmark import records, runner
 from gapr_core.benchmark.table import TIMES
 from gapr_core.commands import benchmark
+from gapr_core.config import RegistrarConfig, SearchConfig
 from gapr_core.data.pair_files import save_pair
 from gapr_core.errors import ConfigError, MethodUnavailableError
 
@@ -163,3 +166,48 @@ def test_a_damaged_line_in_the_middle_is_no_silent_loss(tmp_path):
     (tmp_path / records.FILE).write_text('{"a": 1}\n{"a": \n{"a": 3}\n')
     with pytest.raises(ConfigError, match="damaged"):
         records.read(tmp_path / records.FILE)
+
+
+@pytest.fixture
+def ours(fakes, monkeypatch):
+    """A method of ours, `mine`, that notes the settings it is made with."""
+    seen = []
+
+    def make(config):
+        seen.append(config)
+        return importlib.import_module("fakes").good()
+
+    monkeypatch.setitem(known_methods.OWN, "mine", make)
+    monkeypatch.setattr(runner, "_methods", {})
+    return seen
+
+
+def test_settings_reach_our_methods_alone_and_stand_in_records_and_table(pairs, fakes, ours, tmp_path, in_process):
+    parser = argparse.ArgumentParser()
+    benchmark.add_arguments(parser)
+    (tmp_path / "settings.yaml").write_text("search: {spins: 12}\nseed: 3\n")
+    words = ["--pairs", pairs, "--methods", f"mine,{fakes('good')[0]}", "--out", tmp_path / "out"]
+    chosen = ["--config", tmp_path / "settings.yaml", "--set", "seed=4"]
+    assert benchmark.run(parser.parse_args([str(word) for word in [*words, *chosen]])) == 0
+    assert ours == [RegistrarConfig(search=SearchConfig(spins=12), seed=4)]
+    found = records.read(tmp_path / "out" / records.FILE)
+    assert {r.settings for r in found if r.method == "mine"} == {"search.spins=12, seed=4"}
+    assert {r.settings for r in found if r.method != "mine"} == {""}
+    assert "Settings of mine: search.spins=12, seed=4." in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_records_of_other_settings_do_not_pass_for_new_ones(pairs, fakes, ours, tmp_path, in_process):
+    benchmark.benchmark(pairs, ["mine"], tmp_path / "out")
+    shutil.copytree(tmp_path / "out", tmp_path / "old")
+    other = RegistrarConfig(seed=1)
+    with pytest.raises(ConfigError, match=r"mine with seed=1; got records with the default"):
+        benchmark.benchmark(pairs, ["mine"], tmp_path / "out", config=other)
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")  # its settings are the same: none
+    benchmark.benchmark(pairs, ["mine"], tmp_path / "new", config=other)
+    with pytest.raises(ConfigError, match="settings"):
+        benchmark.merge([tmp_path / "old", tmp_path / "new"], tmp_path / "merged")
+
+
+def test_settings_without_a_method_that_has_some_are_refused(pairs, fakes, tmp_path, in_process):
+    with pytest.raises(ConfigError, match="gapr_search"):
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", config=RegistrarConfig(seed=1))

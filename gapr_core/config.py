@@ -34,6 +34,12 @@ class SourceConfig(Settings):
     most_points: int = setting(6000, "more points are thinned evenly", low=100, high=1_000_000)
     normal_neighbours: int = setting(30, "points that give a normal", low=4, high=200)
     smallest_width_mm: float = setting(2.0, "a narrower cloud is refused: a line", low=0, high=1000, unit="mm")
+    most_raw_points: int = setting(100_000, "more are drawn from at random before the even thinning", low=1000)
+    dense_points: int = setting(400, "points from which a cloud is dense enough to tell an isolated point", low=20)
+    companions: int = setting(6, "points that must be near a point, or it is isolated", low=1, high=1000)
+    isolated_mm: float = setting(12.0, "near is at least this", low=0, high=1000, unit="mm")
+    isolated_gaps: float = setting(5.0, "or this many times what is typical of the cloud", low=0, high=1000)
+    most_compared: int = setting(20_000, "points among which companions are looked for", low=1000)
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,7 @@ class VerificationConfig(Settings):
     final_poses: int = setting(8, "distinct poses that are compared in the end", low=1, high=1000)
     final_limits_mm: tuple[float, float, int] = setting((5.0, 4.0, 8), "Tukey scales of that", low=0.1, unit="mm")
     same_pose_mm: float = setting(4.0, "poses nearer to each other (rms over the source) are one", low=0.1, unit="mm")
+    markers: int = setting(16, "source points by which two poses are compared", low=3, high=1000)
 
 
 @dataclass(frozen=True)
@@ -114,6 +121,21 @@ class SensorConfig(Settings):
     noise_mm: float | None = setting(None, "standard deviation of a point", low=1e-3, high=10, unit="mm")
     bias_mm: float | None = setting(None, "standard deviation of the smooth bias", low=1e-3, high=10, unit="mm")
     scale: float | None = setting(None, "standard deviation of the relative error of size", low=0, high=0.2)
+    sparse_points: int = setting(400, "the stand-off of more points of an unknown sensor falls as 1 / N", low=1)
+    known_standoff_mm: float = setting(
+        0.15, "standard deviation of a stand-off that is stated: contact is never full", low=1e-3, high=10, unit="mm"
+    )
+
+
+@dataclass(frozen=True)
+class ScaleConfig(Settings):
+    """How much larger the source may be than the bone: it tells another bone. The confidence was fitted with these."""
+
+    fewest_points: int = setting(8, "inliers without which nothing is said", low=8, high=1000)
+    widest: float = setting(0.3, "standard deviation of the size before the residuals are seen", low=0.01, high=1)
+    standoff_mm: float = setting(0.5, "that of a stand-off beside it", low=1e-3, high=10, unit="mm")
+    sure: float = setting(0.005, "standard deviation of the size of the bone's model", low=0, high=0.1)
+    usual: float = setting(0.05, "standard deviation of the sizes of people's bones", low=1e-3, high=1)
 
 
 @dataclass(frozen=True)
@@ -141,6 +163,12 @@ class RulesConfig(Settings):
     largest_shift_mm: float = setting(5.0, "standard deviation of a shift that is not observed", low=0, unit="mm")
     equal_share: float = setting(0.015, "a rival whose mean square is larger by less is as good", low=0, high=1)
     equal_mm: float = setting(0.25, "the same as a length, whose square is added", low=0, high=10, unit="mm")
+    push: float = setting(1.5, "how far a pose is pushed, in verification.same_pose_mm", low=1, high=100)
+    pushed_motions: int = setting(3, "along so many motions: on a plane that many are not observed", low=1, high=6)
+    ruled_out: float = setting(0.4, "largest confidence of a pose that a rule refuses", low=0, high=1)
+    independent_points: float = setting(
+        30.0, "independent residuals that a source counts for where hypotheses share the probability", low=0
+    )
 
 
 @dataclass(frozen=True)
@@ -183,6 +211,22 @@ class GuidanceConfig(Settings):
 
 
 @dataclass(frozen=True)
+class FreeSpaceConfig(Settings):
+    """What a camera would have seen of a pose, point by point on its lines of sight."""
+
+    smallest_pixel: float = setting(0.003, "edge of a pixel, as the tangent of an angle", low=1e-4, high=1)
+    most_pixels: int = setting(160_000, "of the image; larger pixels where there would be more", low=100)
+    reach: float = setting(0.006, "tangent up to which a point speaks for a line of sight", low=1e-4, high=1)
+    widest_cos: float = setting(0.25, "cosine to the middle of the view up to which points are seen", low=0.01, high=1)
+    facing_cos: float = setting(0.2, "cosine to the line of sight from which a surface is measured", low=0, high=1)
+    hidden_mm: float = setting(3.0, "so far behind the measured point bone is hidden", low=0, unit="mm")
+    slant_mm: float = setting(9.0, "largest difference in depth to a point in whose plane bone lies", low=0, unit="mm")
+    same_surface_cos: float = setting(0.6, "cosine of normals up to which they are of one surface", low=0, high=1)
+    violation_costs: float = setting(2.0, "of a share of the bone that was seen through", low=0)
+    misfit_costs: float = setting(0.2, "of a share of the bone that was seen otherwise", low=0)
+
+
+@dataclass(frozen=True)
 class ClutterConfig(Settings):
     """Clouds of a camera that saw more than bone: regions propose, lines of sight decide. Limits as above."""
 
@@ -213,6 +257,23 @@ class ClutterConfig(Settings):
     same_pose_mm: float = setting(4.0, "closer poses are the same", low=0, unit="mm")
     kept_poses: int = setting(8, "poses that are kept", low=2)
     part_mm: float = setting(2.5, "a point this near to the bone may be explained by it", low=0.1, unit="mm")
+    region_fewest_points: int = setting(40, "fewer points are no region", low=10)
+    levelled_by: int = setting(12, "neighbours over which the noise of a measured depth is averaged", low=1, high=200)
+    markers: int = setting(16, "points by which two poses are compared", low=3, high=1000)
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+
+
+@dataclass(frozen=True)
+class PartConfig(Settings):
+    """The part of a scene that a pose explains, and when the rest is the reason of a refusal."""
+
+    agreeing_cos: float = setting(0.7, "cosine of normals up to which a point may lie on the bone", low=0, high=1)
+    crowd: int = setting(12, "neighbours that are asked whether they lie on it, too", low=1, high=200)
+    most_alone: float = setting(0.5, "share of them that must exceed this", low=0, high=1)
+    fewest_points: int = setting(30, "of a part; else the whole cloud is refined on", low=6)
+    rounds: int = setting(2, "of choosing the part and refining on it", low=1, high=100)
+    mostly_clutter: float = setting(0.5, "share that counts for the pose, below which clutter is named", low=0, high=1)
+    mostly_off: float = setting(0.4, "the same without a viewpoint, as the share on the bone", low=0, high=1)
 
 
 @dataclass(frozen=True)
@@ -225,8 +286,10 @@ class RegistrarConfig(Settings):
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     clutter: ClutterConfig = field(default_factory=ClutterConfig)
+    part: PartConfig = field(default_factory=PartConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
     smooth_bias: SmoothBiasConfig = field(default_factory=SmoothBiasConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     rules: RulesConfig = field(default_factory=RulesConfig)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import RegistrarConfig
+from gapr_core.config import RegistrarConfig, RulesConfig
 from gapr_core.registration import covariance, kernels, precision, rules
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
@@ -21,9 +21,6 @@ from gapr_core.registration.verification import Candidates
 from gapr_core.results import Hypothesis, Refusal, RegistrationResult, RegistrationStatus, Residuals
 
 Array = NDArray[np.float64]
-
-RULED_OUT = 0.4  # the confidence is at most this where a rule says that the pose may be another one
-INDEPENDENT_POINTS = 30.0  # as many independent witnesses a source counts for when hypotheses are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +41,7 @@ class Assessment:
         members: (N,) mask of that part in `seen`; None with it.
         contributions: log odds that each feature adds to the probability's.
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
+        independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
     """
 
     fit: Fit
@@ -60,6 +58,7 @@ class Assessment:
     members: NDArray[np.bool_] | None = None
     contributions: Mapping[str, float] = field(default_factory=dict)
     factor95: float = 1.0
+    independent_points: float = RulesConfig.independent_points
 
     @property
     def centre_mm(self) -> Array:
@@ -84,7 +83,8 @@ class Assessment:
     def hypotheses(self) -> tuple[Hypothesis, ...]:
         """All distinct poses, best first; the first one is the refined one."""
         poses = (self.fit.T, *self.candidates.poses[1:])
-        return tuple(map(Hypothesis, poses, shared_probability(self.probability, self.candidates.scores)))
+        shares = shared_probability(self.probability, self.candidates.scores, self.independent_points)
+        return tuple(map(Hypothesis, poses, shares))
 
     @property
     def residuals(self) -> Residuals:
@@ -123,10 +123,24 @@ def assess(
     """Covariance, features, probability, and what the safety rules say."""
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor)
     features = measure(fit, candidates, uncertainty, source, target, config)
+    return judge(fit, candidates, uncertainty, features, source, target, calibration, config)
+
+
+def judge(
+    fit: Fit,
+    candidates: Candidates,
+    uncertainty: PoseUncertainty,
+    features: Mapping[str, float],
+    source: PreparedSource,
+    target: PreparedTarget,
+    calibration: Calibration,
+    config: RegistrarConfig,
+) -> Assessment:
+    """The probability of a pose with these features, and what the safety rules say."""
     probability = calibration.probability(features)
     refusal = rules.by_geometry(fit, candidates, uncertainty, probability, source, target, config)
     if refusal is not None:
-        probability = min(probability, RULED_OUT)
+        probability = min(probability, config.rules.ruled_out)
     return Assessment(
         fit,
         candidates,
@@ -137,10 +151,11 @@ def assess(
         source,
         target,
         contributions=calibration.contributions(features),
+        independent_points=config.rules.independent_points,
     )
 
 
-def shared_probability(best: float, scores: Array) -> tuple[float, ...]:
+def shared_probability(best: float, scores: Array, independent_points: float) -> tuple[float, ...]:
     """Probabilities of ranked hypotheses.
 
     A rival's likelihood relative to the best is exp(-n / 2 (s / s_best - 1)): that of n independent residuals whose
@@ -150,8 +165,9 @@ def shared_probability(best: float, scores: Array) -> tuple[float, ...]:
     Args:
         best: probability of the best, 0 to 1.
         scores: (K,) mean squares of the residuals, mm^2, best first.
+        independent_points: n, 0 or more.
     """
-    likelihood = np.exp(-0.5 * INDEPENDENT_POINTS * np.maximum(scores[1:] / scores[0] - 1.0, 0.0))
+    likelihood = np.exp(-0.5 * independent_points * np.maximum(scores[1:] / scores[0] - 1.0, 0.0))
     share = min(best, (1.0 - best) / max(float(likelihood.sum()), 1e-12))
     return (best, *(share * likelihood))
 

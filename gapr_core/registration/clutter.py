@@ -33,9 +33,7 @@ from gapr_core.runtime.parallel import thread_count
 Array = NDArray[np.float64]
 
 NAME = "scene"
-MARKERS = 16  # points by which two poses are compared
 SMALLEST_SCORE = 1e-4  # share of the surface; a score below counts as this
-LEVELLED_BY = 12  # neighbours over which the noise of a measured depth is averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +68,12 @@ class Pool:
     scores: Array
 
 
-def look(source: PreparedSource, viewpoint: Array) -> Scene:
+def look(source: PreparedSource, viewpoint: Array, config: ClutterConfig) -> Scene:
     """The scene that a camera at `viewpoint` (3,), mm, source frame, saw; no regions yet."""
     source = source.facing(viewpoint)
-    around = source.points[source.neighbours[:, :LEVELLED_BY]].mean(axis=1) - source.points
+    around = source.points[source.neighbours[:, : config.levelled_by]].mean(axis=1) - source.points
     levelled = source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]
-    image = free_space.see(levelled, source.normals, viewpoint)
+    image = free_space.see(levelled, source.normals, viewpoint, config.free_space)
     return Scene(source, image, viewpoint, [])
 
 
@@ -86,11 +84,11 @@ def with_regions(scene: Scene, config: ClutterConfig, number: int) -> Scene:
 
 def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
     """Hypotheses of all regions, each refined on its own region; and those that are given (K, 4, 4)."""
-    limits = np.linspace(*config.region_limits_mm)
+    steps = _Steps(target, np.linspace(*config.region_limits_mm), config.free_space.same_surface_cos)
 
     def work(region: Region) -> Array:
         poses = regions.search(region, target, config).poses
-        return _refined(poses, region.source, region.source.order[: config.region_points], target, limits)
+        return steps.refined(poses, region.source, region.source.order[: config.region_points])
 
     found = _in_threads(work, scene.regions, num_threads)
     label = np.repeat(np.arange(-1, len(found)), [len(given), *map(len, found)])
@@ -103,9 +101,10 @@ def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConf
     Their scores are 1 / the share of the surface, so that small is good, as for `verification.verify`.
     """
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
-    best = _best_distinct(crowd, scene, config.same_pose_mm, config.final_poses)
+    best = _best_distinct(crowd, scene, config, config.final_poses)
     best = refine_on_all(best, scene, target, config, num_threads)
-    gaps = np.linalg.norm(_moved_markers(best, scene)[:, None] - _moved_markers(crowd, scene)[None], axis=3)
+    ends, others = (_moved_markers(of, scene, config.markers) for of in (best, crowd))
+    gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
     support = (np.sqrt((gaps**2).mean(axis=2)) < config.same_pose_mm).mean(axis=1)
     return Candidates(best.poses, 1.0 / np.maximum(best.scores, SMALLEST_SCORE), support)
 
@@ -113,14 +112,14 @@ def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConf
 def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Pool:
     """The best distinct ones by what the camera would have seen, at the scale of what a region leaves open."""
     pool = _scored(pool, scene, target, config.coarse_points, config.coarse_on_mm, config.coarse_front_mm, num_threads)
-    return _best_distinct(pool, scene, config.same_pose_mm, config.middle_poses)
+    return _best_distinct(pool, scene, config, config.middle_poses)
 
 
 def refine_around(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
     """Each refined on what lies around its region, and scored again."""
-    limits = np.linspace(*config.middle_limits_mm)
+    steps = _Steps(target, np.linspace(*config.middle_limits_mm), config.free_space.same_surface_cos)
     tree = cKDTree(scene.source.points[scene.source.order])
     poses = pool.poses.copy()
 
@@ -128,7 +127,7 @@ def refine_around(
         of_it = np.flatnonzero(pool.region == label)
         near = _around(tree, scene.regions[label].centre, config) if label >= 0 else np.arange(config.middle_points)
         some = scene.source.order[near[near < len(scene.source.order)]]
-        poses[of_it] = _refined(pool.poses[of_it], scene.source, some, target, limits)
+        poses[of_it] = steps.refined(pool.poses[of_it], scene.source, some)
 
     _in_threads(work, np.unique(pool.region), num_threads)
     pool = replace(pool, poses=poses)
@@ -139,12 +138,12 @@ def refine_on_all(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
     """Each refined on all points whose normals agree, ranked at the scale of the noise."""
-    limits, some = np.linspace(*config.final_limits_mm), scene.source.order[: config.final_points]
+    steps = _Steps(target, np.linspace(*config.final_limits_mm), config.free_space.same_surface_cos)
     pieces = [p for p in np.array_split(pool.poses, 4 * thread_count(num_threads)) if len(p)]
-    work = partial(_refined, source=scene.source, some=some, target=target, limits=limits)
+    work = partial(steps.refined, source=scene.source, some=scene.source.order[: config.final_points])
     pool = replace(pool, poses=np.concatenate(_in_threads(work, pieces, num_threads)))
     pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
-    return _best_distinct(pool, scene, config.same_pose_mm, config.kept_poses)
+    return _best_distinct(pool, scene, config, config.kept_poses)
 
 
 def seen_of(poses: Array, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Visible:
@@ -158,14 +157,19 @@ def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.i
     return near[:: max(1, len(near) // config.middle_points)]
 
 
-def _refined(
-    poses: Array, source: PreparedSource, some: NDArray[np.int64], target: PreparedTarget, limits: Array
-) -> Array:
-    """Poses refined on some of the points."""
-    points, normals = source.points[some], source.normals[some]
-    return refine_agreeing(np.ascontiguousarray(poses), points, normals, source.oriented, *target.kernel_view, limits)[
-        0
-    ]
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Gauss-Newton steps on a target: one per limit (K,), mm, on points whose normals agree up to a cosine."""
+
+    target: PreparedTarget
+    limits_mm: Array
+    same_surface_cos: float
+
+    def refined(self, poses: Array, source: PreparedSource, some: NDArray[np.int64]) -> Array:
+        """Poses (K, 4, 4) refined on some of the points."""
+        points, normals, surface = source.points[some], source.normals[some], self.target.kernel_view
+        how = source.oriented, *surface, self.limits_mm, self.same_surface_cos
+        return refine_agreeing(np.ascontiguousarray(poses), points, normals, *how)[0]
 
 
 def _scored(
@@ -185,14 +189,15 @@ def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
     return target.cache[key]  # type: ignore[no-any-return]
 
 
-def _best_distinct(pool: Pool, scene: Scene, tolerance_mm: float, most: int) -> Pool:
-    kept = distinct(_moved_markers(pool, scene), np.argsort(-pool.scores, kind="stable"), tolerance_mm, most)
+def _best_distinct(pool: Pool, scene: Scene, config: ClutterConfig, most: int) -> Pool:
+    ranked = np.argsort(-pool.scores, kind="stable")
+    kept = distinct(_moved_markers(pool, scene, config.markers), ranked, config.same_pose_mm, most)
     return Pool(pool.poses[kept], pool.region[kept], pool.scores[kept])
 
 
-def _moved_markers(pool: Pool, scene: Scene) -> Array:
-    """(K, MARKERS, 3) the same spread source points under every pose."""
-    markers = scene.source.subset(MARKERS)
+def _moved_markers(pool: Pool, scene: Scene, count: int) -> Array:
+    """(K, count, 3) the same spread source points under every pose."""
+    markers = scene.source.subset(count)
     return np.asarray(np.einsum("kij,nj->kni", pool.poses[:, :3, :3], markers) + pool.poses[:, None, :3, 3])
 
 

@@ -8,14 +8,11 @@ import numpy as np
 
 from gapr_core.registration.kernels import FAST, element_near, moved, residual, step
 
-FACING = 0.2  # cosine of the angle to the line of sight from which a surface is steep enough to be measured
-HIDDEN_MM = 3.0  # behind what was measured on its line of sight a point is hidden
-SLANT_MM = 9.0  # largest difference in depth to the measured point in whose plane a point lies
-SAME_SURFACE = 0.6  # cosine of the angle between two normals up to which they are of one surface
-
 
 @numba.njit(**FAST)
-def compare_with_image(poses, cloud, pixels, left, top, per_pixel, on_mm, front_mm):
+def compare_with_image(
+    poses, cloud, pixels, left, top, per_pixel, on_mm, front_mm, facing_cos, hidden_mm, slant_mm, same_surface_cos
+):
     """Shares of a target (M, 6: points, normals) explained, violating, compared, under poses (K, 3, 4) T_camera_target.
 
     All float32. A point is explained when it faces the camera, lies within `on_mm` of the plane measured on its line
@@ -50,14 +47,14 @@ def compare_with_image(poses, cloud, pixels, left, top, per_pixel, on_mm, front_
             ny = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
             nz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
             towards = nx * right + ny * down + nz * depth
-            if towards > -np.float32(FACING) * depth:
+            if towards > -facing_cos * depth:
                 continue
             off = seen[0] * right + seen[1] * down + seen[2] * depth - seen[3]
-            if depth < seen[4] + np.float32(HIDDEN_MM) and depth > seen[5] - front_mm:
+            if depth < seen[4] + hidden_mm and depth > seen[5] - front_mm:
                 compared += 1
-            if abs(off) < on_mm and abs(depth - seen[4]) < np.float32(SLANT_MM):
+            if abs(off) < on_mm and abs(depth - seen[4]) < slant_mm:
                 same = nx * seen[0] + ny * seen[1] + nz * seen[2]
-                if same > np.float32(SAME_SURFACE):
+                if same > same_surface_cos:
                     off /= on_mm
                     explained += np.float32(1.0) - off * off
         out[k, 0], out[k, 1], out[k, 2] = explained, violating, compared
@@ -65,11 +62,11 @@ def compare_with_image(poses, cloud, pixels, left, top, per_pixel, on_mm, front_
 
 
 @numba.njit(**FAST)
-def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits):
+def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same):
     """Gauss-Newton from every pose (K, 4, 4) on the points (N, 3) whose normals (N, 3) agree with the surface's.
 
-    One iteration per entry of `limits` (Tukey scale). Returns the poses and the mean Tukey weight at the last limit:
-    the share of the points that each explains.
+    One iteration per entry of `limits` (Tukey scale); normals agree from the cosine `same`. Returns the poses and the
+    mean Tukey weight at the last limit: the share of the points that each explains.
     """
     out, shares = poses.copy(), np.empty(len(poses))
     surface = elements, nearest, origin, per_cell, spacing
@@ -78,15 +75,18 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
     for k in range(len(poses)):
         T = out[k]
         for i in range(len(limits)):
-            weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], middle, H, g)
+            weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], same, middle, H, g)
             if weight > 0.0:
                 step(T, middle, H, g, weight)
-        shares[k] = accumulate_agreeing(T, points, normals, signed, *surface, limits[-1], middle, H, g) / len(points)
+        total = accumulate_agreeing(T, points, normals, signed, *surface, limits[-1], same, middle, H, g)
+        shares[k] = total / len(points)
     return out, shares
 
 
 @numba.njit(**FAST)
-def accumulate_agreeing(T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limit, middle, H, g):
+def accumulate_agreeing(
+    T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limit, same, middle, H, g
+):
     """Normal equations H twist = g about the moved `middle` (3,), filled in place; returns the sum of the weights."""
     H[:] = 0.0
     g[:] = 0.0
@@ -102,8 +102,8 @@ def accumulate_agreeing(T, points, normals, signed, elements, nearest, origin, p
         ux = T[0, 0] * n[0] + T[0, 1] * n[1] + T[0, 2] * n[2]
         uy = T[1, 0] * n[0] + T[1, 1] * n[1] + T[1, 2] * n[2]
         uz = T[2, 0] * n[0] + T[2, 1] * n[1] + T[2, 2] * n[2]
-        same = ux * elements[q, 3] + uy * elements[q, 4] + uz * elements[q, 5]
-        if same < SAME_SURFACE and (signed or same > -SAME_SURFACE):
+        cosine = ux * elements[q, 3] + uy * elements[q, 4] + uz * elements[q, 5]
+        if cosine < same and (signed or cosine > -same):
             continue
         r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, 0.0)
         square = (r * r + aside * aside) / (limit * limit)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration import clutter, covariance, kernels, rules
+from gapr_core.registration import clutter, covariance, kernels
 from gapr_core.registration import source as sources
-from gapr_core.registration.assessment import RULED_OUT, Assessment
+from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.clutter import Scene
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
@@ -24,12 +24,6 @@ from gapr_core.results import Refusal, RegistrationStatus
 
 Array = NDArray[np.float64]
 
-AGREEING = 0.7  # cosine of the angle between normals up to which a point may lie on the surface
-CROWD, MOST_ALONE = 12, 0.5  # a point counts when less than this share of so many neighbours is off the surface
-FEWEST_POINTS = 30  # of a part that a pose can be refined on
-ROUNDS = 2  # of choosing the part and refining on it
-MOSTLY_CLUTTER = 0.5  # share of a cloud that counts for the pose below which a refusal names the rest as its reason
-MOSTLY_OFF = 0.4  # the same for the share on the surface; a fifth of outliers and 1.5 mm of noise and bias leave 0.5
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
 
 
@@ -55,9 +49,9 @@ class Explained:
 
 def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> Explained:
     """Refine a pose (4, 4) on what it explains; on the whole cloud where that is next to nothing."""
-    for _ in range(ROUNDS):
-        members = _on_surface(T, scene.source, target, config.clutter.part_mm)
-        if members.sum() < FEWEST_POINTS:
+    for _ in range(config.part.rounds):
+        members = _on_surface(T, scene.source, target, config)
+        if members.sum() < config.part.fewest_points:
             members[:] = True
         part = _described(scene, members, config)
         fit = refine_fully(T, part.points, target, config.refinement, part.neighbours)
@@ -65,13 +59,13 @@ def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConf
     return Explained(part, members, fit)
 
 
-def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, on_mm: float) -> NDArray[np.bool_]:
+def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig) -> NDArray[np.bool_]:
     """(N,) mask of the points that lie on the surface with most of their neighbours, normals agreeing."""
     signed, gradients, aside, _ = kernels.residuals_at(T, source.points, *target.kernel_view, 0.0)
-    near = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < on_mm
+    near = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < config.clutter.part_mm
     same = np.einsum("ni,ni->n", source.normals @ T[:3, :3].T, gradients)
-    near &= (same if source.oriented else np.abs(same)) > AGREEING
-    return near & (near[source.neighbours[:, :CROWD]].mean(axis=1) > MOST_ALONE)
+    near &= (same if source.oriented else np.abs(same)) > config.part.agreeing_cos
+    return near & (near[source.neighbours[:, : config.part.crowd]].mean(axis=1) > config.part.most_alone)
 
 
 def _described(scene: Scene, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
@@ -90,34 +84,19 @@ def assess(
     fit, part = explained.fit, explained.source
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor)
     features = measure(explained, candidates, uncertainty, scene, target, config)
-    probability = calibration.probability(features)
-    refusal = rules.by_geometry(fit, candidates, uncertainty, probability, part, target, config)
-    if refusal is not None:
-        probability = min(probability, RULED_OUT)
-    if probability < config.min_confidence and explained.share < MOSTLY_CLUTTER:
-        refusal = _clutter(explained.share, refusal)
-    return Assessment(
-        fit,
-        candidates,
-        uncertainty,
-        features,
-        probability,
-        refusal,
-        part,
-        target,
-        seen=scene.source,
-        members=explained.members,
-        contributions=calibration.contributions(features),
-    )
+    judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
+    if judged.probability < config.min_confidence and explained.share < config.part.mostly_clutter:
+        judged = replace(judged, refusal=_clutter(explained.share, judged.refusal))
+    return replace(judged, seen=scene.source, members=explained.members)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same; a refusal of a dense cloud of no known viewpoint says so where most of the cloud lies off the bone."""
     source, judged = assessment.source, assessment.seen is not None
-    if judged or assessment.is_sure(config.min_confidence) or len(source.points) < sources.FEWEST_DENSE:
+    if judged or assessment.is_sure(config.min_confidence) or len(source.points) < config.source.dense_points:
         return assessment
-    share = _on_surface(assessment.fit.T, source, assessment.target, config.clutter.part_mm).mean()
-    if share >= MOSTLY_OFF:
+    share = _on_surface(assessment.fit.T, source, assessment.target, config).mean()
+    if share >= config.part.mostly_off:
         return assessment
     return replace(assessment, refusal=_clutter(float(share), assessment.refusal, "say where the camera was, "))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import CovarianceConfig, RegistrarConfig
+from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
 from gapr_core.registration import mirror
 from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
@@ -32,10 +32,7 @@ SIGNS = {
     "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "mirror_margin": 1, "free_space_score": 1,
     "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
-SURE_SCALE_SD, LARGEST_SCALE_Z = 0.005, 10.0  # a model of a bone is no truer than half a percent
-FEWEST_FOR_SCALE = 8  # points
-STANDOFF_MM, WIDEST_SCALE = 0.5, 0.3  # standard deviations before the residuals are seen
-USUAL_SCALE_SD = 0.05  # prior of how much larger or smaller a source may be than the bone
+LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
 
 
 def measure(
@@ -83,16 +80,16 @@ def of_another_bone(
     fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> dict[str, float]:
     """What tells a bone of another size or of the other side of the body; `OTHER_BONE` are the names."""
-    scale, scale_sd = scale_of(fit, config.covariance)
+    (scale, scale_sd), known = scale_of(fit, config.covariance, config.scale), config.scale
     return {
-        "scale_z": min(abs(scale) / float(np.hypot(scale_sd, SURE_SCALE_SD)), LARGEST_SCALE_Z),
-        "scale_off": abs(scale) * USUAL_SCALE_SD**2 / (USUAL_SCALE_SD**2 + scale_sd**2),
+        "scale_z": min(abs(scale) / float(np.hypot(scale_sd, known.sure)), LARGEST_SCALE_Z),
+        "scale_off": abs(scale) * known.usual**2 / (known.usual**2 + scale_sd**2),
         "log_scale_sd": float(np.log(scale_sd)),
         "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),
     }
 
 
-def scale_of(fit: Fit, config: CovarianceConfig) -> tuple[float, float]:
+def scale_of(fit: Fit, config: CovarianceConfig, prior: ScaleConfig) -> tuple[float, float]:
     """How much larger the source would have to be to fit best, and the standard deviation of that.
 
     Generalised least squares of a similarity beside a smooth bias (see `bias_field`): the pose's six motions, the size,
@@ -102,13 +99,13 @@ def scale_of(fit: Fit, config: CovarianceConfig) -> tuple[float, float]:
     Returns:
         The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
     """
-    if np.count_nonzero(fit.weights) < FEWEST_FOR_SCALE:
+    if np.count_nonzero(fit.weights) < prior.fewest_points:
         return 0.0, 1.0
     outward = np.einsum("ni,ni->n", fit.gradients, fit.moved - fit.moved.mean(axis=0))
     growth = outward - np.nan_to_num(fit.signed_mm)  # of the foot points: the points' own noise is in the residuals
     more = np.column_stack([growth, np.ones_like(growth)])
     spanned = fields(fit, config.correlation_mm, config.centres)
-    equations = NormalEquations.of(fit, spanned, more, (WIDEST_SCALE, STANDOFF_MM))
+    equations = NormalEquations.of(fit, spanned, more, (prior.widest, prior.standoff_mm))
     sizes_mm = np.array(config.sizes_mm)
     size_mm = root_mean_square(sizes_mm, equations.log_likelihood(sizes_mm, config.smallest_share))
     variance = equations.step_covariance(size_mm)[6, 6]

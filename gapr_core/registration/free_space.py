@@ -15,17 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
+from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import quadrics, se3
 from gapr_core.registration.clutter_kernels import compare_with_image
 from gapr_core.runtime.parallel import thread_count
 
 Array = NDArray[np.float64]
-
-SMALLEST_PIXEL, MOST_PIXELS = 0.003, 160_000  # tangent of an angle; of the whole image
-REACH = 0.006  # tangent of the angle up to which a measured point speaks for a line of sight; at least 1.5 pixels
-VIOLATION_COSTS, MISFIT_COSTS = 2.0, 0.2  # of a share of the surface that cannot be, or is not, where a pose puts it
-WIDEST_COS = 0.25  # of the angle to the middle of the view up to which points are in the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +35,14 @@ class DepthImage:
             is 0 where nothing was measured.
         origin: (2,) x / z and y / z of the middle of pixel (0, 0).
         pixel: edge of a pixel as a difference of x / z.
+        config: how poses are compared with it.
     """
 
     T_camera_source: Array
     pixels: NDArray[np.float32]
     origin: Array
     pixel: float
+    config: FreeSpaceConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,48 +53,54 @@ class Visible:
         explained: (K,) share that faces the camera and lies on what was measured.
         violating: (K,) share that lies clearly in front of what was measured.
         compared: (K,) share that faces the camera and could have been seen: neither outside the image nor hidden.
+        config: what the score takes off for each.
     """
 
     explained: Array
     violating: Array
     compared: Array
+    config: FreeSpaceConfig
 
     @property
     def score(self) -> Array:
         """(K,) explained share, less what the camera saw otherwise and, dearer, what it saw through."""
         otherwise = np.maximum(self.compared - self.explained, 0.0)
-        return np.asarray(self.explained - MISFIT_COSTS * otherwise - VIOLATION_COSTS * self.violating)
+        return np.asarray(
+            self.explained - self.config.misfit_costs * otherwise - self.config.violation_costs * self.violating
+        )
 
 
-def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
+def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceConfig | None = None) -> DepthImage:
     """The image of a cloud.
 
     Args:
         points: (N, 3), mm, source frame.
         normals: (N, 3), unit; the sign does not matter.
         viewpoint: (3,), mm, source frame.
+        config: of the image, and of what is compared with it.
 
     Raises:
         InvalidPointCloudError: when the viewpoint lies in the middle of the points, so that no camera sees them.
     """
+    config = config or FreeSpaceConfig()
     eye = np.asarray(viewpoint, dtype=np.float64)
     T = _looking_at(eye, points)
     seen = se3.apply(T, points)
-    in_view = seen[:, 2] > WIDEST_COS * np.linalg.norm(seen, axis=1)
+    in_view = seen[:, 2] > config.widest_cos * np.linalg.norm(seen, axis=1)
     if in_view.sum() < quadrics.FEWEST_NEIGHBOURS:
         raise InvalidPointCloudError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
     seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
     turned = quadrics.orient(turned, -seen)
     rays = seen[:, :2] / seen[:, 2:]
     tree = cKDTree(rays)
-    pixel = max(SMALLEST_PIXEL, float(np.median(tree.query(rays, k=2)[0][:, 1])))
-    pixel = max(pixel, float(np.sqrt(np.prod(np.ptp(rays, axis=0)) / MOST_PIXELS)))
+    pixel = max(config.smallest_pixel, float(np.median(tree.query(rays, k=2)[0][:, 1])))
+    pixel = max(pixel, float(np.sqrt(np.prod(np.ptp(rays, axis=0)) / config.most_pixels)))
     origin = rays.min(axis=0)
     columns, rows = (int(n) for n in np.ceil(np.ptp(rays, axis=0) / pixel) + 1)
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     centres = origin + pixel * np.stack([x.ravel(), y.ravel()], axis=1)
-    _, nearest = tree.query(centres, distance_upper_bound=max(REACH, 1.5 * pixel))
-    return DepthImage(T, _pixels(nearest.reshape(rows, columns), seen, turned), origin, pixel)
+    _, nearest = tree.query(centres, distance_upper_bound=max(config.reach, 1.5 * pixel))
+    return DepthImage(T, _pixels(nearest.reshape(rows, columns), seen, turned), origin, pixel, config)
 
 
 def _looking_at(eye: Array, points: Array) -> Array:
@@ -145,11 +149,16 @@ def compare(
     cloud = np.hstack([points, normals]).astype(np.float32)
     view = image.pixels, np.float32(image.origin[0]), np.float32(image.origin[1]), np.float32(1.0 / image.pixel)
 
+    config = image.config
+    limits = on_mm, front_mm, config.facing_cos, config.hidden_mm, config.slant_mm, config.same_surface_cos
+    limits32 = tuple(map(np.float32, limits))
+
     def work(piece: NDArray[np.float32]) -> NDArray[np.float32]:
-        return compare_with_image(piece, cloud, *view, np.float32(on_mm), np.float32(front_mm))  # type: ignore[no-any-return]
+        return compare_with_image(piece, cloud, *view, *limits32)  # type: ignore[no-any-return]
 
     threads = thread_count(num_threads)
     pieces = [p for p in np.array_split(T, 4 * threads) if len(p)]
     with ThreadPoolExecutor(threads) as pool:
         shares = np.concatenate(list(pool.map(work, pieces)))
-    return Visible(*shares.astype(np.float64).T)
+    explained, violating, compared = shares.astype(np.float64).T
+    return Visible(explained, violating, compared, config)

@@ -22,8 +22,6 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 
 DEFAULT = RulesConfig()
-WEAKEST = 3  # motions along which a pose is pushed: on a plane so many are not observed
-PUSH = 1.5  # how far, in distances at which two poses are no longer the same
 
 
 def by_geometry(
@@ -89,7 +87,7 @@ def can_be_pushed(
     the surface elements of a plane seem to say about a slide is the noise of their normals.
     """
     some = source.subset(config.middle_points)
-    pushes = _weakest_motions(fit) * PUSH * config.same_pose_mm
+    pushes = _weakest_motions(fit, rules.pushed_motions) * rules.push * config.same_pose_mm
     centre = fit.moved.mean(axis=0)
     poses = np.array([fit.T, *(se3.exp(sign * push, centre) @ fit.T for push in pushes for sign in (1.0, -1.0))])
     rested, scores = refine_many(poses, some, target, np.linspace(*config.final_limits_mm), num_threads)
@@ -107,12 +105,12 @@ def _as_good(score: float, rules: RulesConfig) -> float:
     return max((1.0 + rules.equal_share) * score, score + rules.equal_mm**2)
 
 
-def _weakest_motions(fit: Fit) -> Array:
-    """(WEAKEST, 6) twists about the moved source's centroid, of 1 mm over it, that the residuals say least about."""
+def _weakest_motions(fit: Fit, count: int) -> Array:
+    """(count, 6) twists about the moved source's centroid, of 1 mm over it, that the residuals say least about."""
     J = fit.jacobian
     arm_mm = max(_rms_mm(fit.moved - fit.moved.mean(axis=0)), 1.0)
     scale = np.array([1.0] * 3 + [1.0 / arm_mm] * 3)
-    motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:WEAKEST] * scale
+    motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:count] * scale
     moves = motion_jacobians(fit.moved, fit.moved.mean(axis=0)) @ motions.T
     return motions / np.array([[max(_rms_mm(move), 1e-6)] for move in moves.transpose(2, 0, 1)])
 

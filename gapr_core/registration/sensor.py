@@ -9,9 +9,6 @@ import numpy as np
 from gapr_core.config import SensorConfig
 from gapr_core.registration.target import PreparedTarget
 
-SPARSE_POINTS = 400  # a source of more is the less likely touched or sliced: its stand-off falls as 1 / N
-KNOWN_STANDOFF_MM = 0.15  # standard deviation of a stand-off that the user states: contact is never full
-
 
 @dataclass(frozen=True)
 class Errors:
@@ -49,12 +46,12 @@ def errors(sensor: SensorConfig, points: int) -> Errors:
     """
     usual = KINDS[sensor.kind]
     if sensor.kind == "unknown":
-        usual = replace(usual, standoff_mm=usual.standoff_mm * min(1.0, SPARSE_POINTS / max(points, 1)))
+        usual = replace(usual, standoff_mm=usual.standoff_mm * min(1.0, sensor.sparse_points / max(points, 1)))
     stated = {name: getattr(sensor, name) for name in ("noise_mm", "bias_mm", "scale")}
     usual = replace(usual, **{name: value for name, value in stated.items() if value is not None})
     if sensor.standoff_mm is None:
         return usual
-    return replace(usual, offset_mm=sensor.standoff_mm, standoff_mm=KNOWN_STANDOFF_MM)
+    return replace(usual, offset_mm=sensor.standoff_mm, standoff_mm=sensor.known_standoff_mm)
 
 
 def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarget:

@@ -15,11 +15,6 @@ from gapr_core.results import Refusal, RegistrationStatus
 
 Array = NDArray[np.float64]
 
-MOST_RAW_POINTS = 100_000  # more are drawn from at random before the even thinning
-FEWEST_DENSE = 400  # points from which a cloud is dense enough to tell an isolated point
-COMPANIONS, ISOLATED_MM, ISOLATED_GAPS = 6, 12.0, 5.0  # see `without_isolated`
-MOST_COMPARED = 20_000  # points among which neighbours are looked for
-
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
@@ -74,9 +69,9 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     """
     config = config or SourceConfig()
     points = clouds.finite_points(source)
-    if len(points) > MOST_RAW_POINTS:
-        points = points[np.random.default_rng(0).choice(len(points), MOST_RAW_POINTS, replace=False)]
-    points = without_isolated(np.unique(points, axis=0))
+    if len(points) > config.most_raw_points:
+        points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
+    points = without_isolated(np.unique(points, axis=0), config)
     if len(points) < config.fewest_points:
         return Refusal(
             RegistrationStatus.TOO_FEW_POINTS,
@@ -91,18 +86,18 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     return describe(points[sampling.thin(points, config.most_points)], config)
 
 
-def without_isolated(points: Array) -> Array:
+def without_isolated(points: Array, config: SourceConfig) -> Array:
     """Points (N, 3), mm, without those far from all others: far echoes, flying pixels.
 
-    A point is isolated when its sixth nearest neighbour is farther than 12 mm and than five times what is typical of
-    the cloud: Open3D's `remove_radius_outlier` with a radius that follows the spacing. Of a sparse cloud, such as a
-    pointer gives, every point counts: it stays as it is.
+    A point is isolated when its sixth nearest neighbour (`companions`) is farther than 12 mm and than five times what
+    is typical of the cloud: Open3D's `remove_radius_outlier` with a radius that follows the spacing. Of a sparse cloud,
+    such as a pointer gives, every point counts: it stays as it is.
     """
-    if len(points) < FEWEST_DENSE:
+    if len(points) < config.dense_points:
         return points
-    some = points[:: -(-len(points) // MOST_COMPARED)]
-    gaps = cKDTree(some).query(points, k=COMPANIONS + 1)[0][:, -1]
-    return points[gaps <= max(ISOLATED_MM, ISOLATED_GAPS * float(np.median(gaps)))]
+    some = points[:: -(-len(points) // config.most_compared)]
+    gaps = cKDTree(some).query(points, k=config.companions + 1)[0][:, -1]
+    return points[gaps <= max(config.isolated_mm, config.isolated_gaps * float(np.median(gaps)))]
 
 
 def describe(points: Array, config: SourceConfig) -> PreparedSource:

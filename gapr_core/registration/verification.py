@@ -15,8 +15,6 @@ from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
-MARKERS = 16  # source points by which two poses are compared
-
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
@@ -47,25 +45,27 @@ def verify(
     """
     few, some = source.subset(config.coarse_points), source.subset(config.middle_points)
     poses, scores = refine_many(poses, few, target, np.linspace(*config.coarse_limits_mm), num_threads)
-    poses = _distinct(poses, scores, source, config.same_pose_mm, config.middle_poses)[0]
+    poses = _distinct(poses, scores, source, config, config.middle_poses)[0]
     poses, scores = refine_many(poses, some, target, np.linspace(*config.middle_limits_mm), num_threads)
     crowd = poses
-    poses = _distinct(poses, scores, source, config.same_pose_mm, config.final_poses)[0]
+    poses = _distinct(poses, scores, source, config, config.final_poses)[0]
     poses, scores = refine_many(poses, source.points, target, np.linspace(*config.final_limits_mm), num_threads)
-    poses, scores = _distinct(poses, scores, source, config.same_pose_mm, config.final_poses)
-    gaps = np.linalg.norm(_markers(poses, source)[:, None] - _markers(crowd, source)[None], axis=3)
+    poses, scores = _distinct(poses, scores, source, config, config.final_poses)
+    ends, others = (_markers(T, source, config.markers) for T in (poses, crowd))
+    gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
     support = (np.sqrt((gaps**2).mean(axis=2)) < config.same_pose_mm).mean(axis=1)
     return Candidates(poses, scores, support)
 
 
 def _distinct(
-    poses: Array, scores: Array, source: PreparedSource, tolerance_mm: float, most: int
+    poses: Array, scores: Array, source: PreparedSource, config: VerificationConfig, most: int
 ) -> tuple[Array, Array]:
-    """The best poses, none within `tolerance_mm` (root mean square over the markers) of a better one."""
-    kept = distinct(_markers(poses, source), np.argsort(scores, kind="stable"), tolerance_mm, most)
+    """The best poses, none within `same_pose_mm` (root mean square over the markers) of a better one."""
+    ranked = np.argsort(scores, kind="stable")
+    kept = distinct(_markers(poses, source, config.markers), ranked, config.same_pose_mm, most)
     return poses[kept], scores[kept]
 
 
-def _markers(poses: Array, source: PreparedSource) -> Array:
-    """(K, MARKERS, 3) the same spread source points under every pose."""
-    return np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(MARKERS)) + poses[:, None, :3, 3]
+def _markers(poses: Array, source: PreparedSource, count: int) -> Array:
+    """(K, count, 3) the same spread source points under every pose."""
+    return np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(count)) + poses[:, None, :3, 3]

@@ -118,10 +118,10 @@ def test_a_push_goes_both_ways_along_the_weakest_motions_by_its_length(plate, mo
     monkeypatch.setattr(rules, "refine_many", note)
     assert not rules.can_be_pushed(fit, source, target, PUSHED, 1)  # all are worse
     ((poses, points, limits),) = seen
-    assert len(poses) == 1 + 2 * rules.WEAKEST and tuple(limits) == (5.0, 4.75, 4.5, 4.25, 4.0)
+    assert len(poses) == 1 + 2 * 3 and tuple(limits) == (5.0, 4.75, 4.5, 4.25, 4.0)
     assert len(points) == PUSHED.middle_points and np.array_equal(poses[0], fit.T)
     moves = np.array([se3.apply(T, source.points) - fit.moved for T in poses[1:]])
-    assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(rules.PUSH * PUSHED.same_pose_mm, rel=0.02)
+    assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(1.5 * PUSHED.same_pose_mm, rel=0.02)
     assert moves[0] == pytest.approx(-moves[1], abs=0.4)
 
 
@@ -142,7 +142,7 @@ def test_only_a_pose_that_rests_elsewhere_and_fits_as_well_is_a_push(plate, monk
 
 def test_the_weakest_motions_of_a_plane_lie_in_it_and_move_the_source_by_1_mm(plate):
     fit = plate[0]
-    motions = rules._weakest_motions(fit)
+    motions = rules._weakest_motions(fit, 3)
     centre = fit.moved.mean(axis=0)
     moves = np.array([m[:3] + np.cross(m[3:], fit.moved - centre) for m in motions])
     assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(1.0)
@@ -155,7 +155,7 @@ def test_points_without_weight_say_nothing_of_the_weakest_motions(egg):
     ignored = replace(fit, weights=np.where(top, 1.0, 0.0))
     turned = np.where(top[:, None], fit.gradients, [0.0, 0.0, 1.0])
     same = replace(ignored, gradients=turned)
-    assert np.abs(rules._weakest_motions(ignored)) == pytest.approx(np.abs(rules._weakest_motions(same)))
+    assert np.abs(rules._weakest_motions(ignored, 3)) == pytest.approx(np.abs(rules._weakest_motions(same, 3)))
 
 
 @pytest.mark.parametrize("probability", [0.499, np.nan])
@@ -174,9 +174,9 @@ def test_an_error_bound_above_the_allowed_one_refuses_alone():
 
 
 def test_rivals_share_what_the_best_leaves_in_the_order_of_their_residuals():
-    shares = shared_probability(0.9, np.array([1.0, 1.1, 1.1, 2.0]))
+    shares = shared_probability(0.9, np.array([1.0, 1.1, 1.1, 2.0]), 30.0)
     assert shares[0] == 0.9 and sum(shares) == pytest.approx(1.0)
     assert shares[1] == shares[2] > shares[3]
     assert shares[1] / shares[3] == pytest.approx(np.exp(15.0 * 0.9))
-    assert shared_probability(0.2, np.array([1.0, 1.0]))[1] == 0.2  # never above the best
-    assert shared_probability(0.7, np.array([1.0])) == (0.7,)
+    assert shared_probability(0.2, np.array([1.0, 1.0]), 30.0)[1] == 0.2  # never above the best
+    assert shared_probability(0.7, np.array([1.0]), 30.0) == (0.7,)

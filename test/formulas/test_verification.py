@@ -34,7 +34,7 @@ def test_the_best_pose_comes_first_and_the_others_are_distinct(source, hypothese
     found = verification.verify(hypotheses, source, target, CONFIG, num_threads=1)
     assert 1 <= len(found.poses) <= CONFIG.final_poses
     assert (np.diff(found.scores) >= 0.0).all()
-    some = source.subset(verification.MARKERS)
+    some = source.subset(16)
     for i in range(len(found.poses)):
         for j in range(i):
             gap = se3.apply(found.poses[i], some) - se3.apply(found.poses[j], some)
@@ -87,12 +87,12 @@ def test_support_is_the_share_of_the_hypotheses_that_ended_at_the_pose(source, m
 
 def test_a_pose_is_compared_by_the_same_spread_points(source):
     T = se3.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-    markers = verification._markers(np.array([np.eye(4), T]), source)
-    some = source.subset(verification.MARKERS)
+    markers = verification._markers(np.array([np.eye(4), T]), source, 16)
+    some = source.subset(16)
     assert markers[0] == pytest.approx(some) and markers[1] == pytest.approx(se3.apply(T, some))
 
 
 def test_the_distinct_best_are_kept_with_their_scores(source):
     poses = np.array([se3.exp([x, 0.0, 0.0, 0.0, 0.0, 0.0]) for x in (0.0, 1.0, 9.0)])
-    kept, scores = verification._distinct(poses, np.array([2.0, 1.0, 3.0]), source, 4.0, 5)
+    kept, scores = verification._distinct(poses, np.array([2.0, 1.0, 3.0]), source, CONFIG, 5)
     assert [float(T[0, 3]) for T in kept] == [1.0, 9.0] and scores.tolist() == [1.0, 3.0]

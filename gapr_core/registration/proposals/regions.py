@@ -21,8 +21,6 @@ from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
-FEWEST_POINTS = 40  # of a region
-
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -44,7 +42,7 @@ def regions(source: PreparedSource, config: ClutterConfig, number: int = 0) -> l
     for radius_mm, count in zip(config.radii_mm, config.seeds, strict=True):
         for seed in _seeds(source, count * (number + 1))[count * number :]:
             members = np.array(tree.query_ball_point(source.points[seed], radius_mm))
-            if len(members) >= FEWEST_POINTS:
+            if len(members) >= config.region_fewest_points:
                 found.append(Region(_part(source, np.sort(members)), source.points[seed]))
     return found
 

@@ -11,7 +11,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.errors import MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.registration import rules
-from gapr_core.registration.assessment import RULED_OUT, answer
+from gapr_core.registration.assessment import answer
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.network import NetworkProposer
 
@@ -67,7 +67,7 @@ def test_a_pose_that_can_be_pushed_refuses_alone(right, monkeypatch):
 def test_a_refusal_by_rule_does_not_depend_on_the_threshold(right, monkeypatch, min_confidence):
     monkeypatch.setattr(rules, "can_be_pushed", lambda *_: True)
     config = replace(ONE_THREAD, min_confidence=min_confidence)
-    refused = replace(right, refusal=judged(right, config), probability=RULED_OUT)
+    refused = replace(right, refusal=judged(right, config), probability=config.rules.ruled_out)
     result = answer(refused, config)
     assert result.status is RegistrationStatus.DEGENERATE and result.T_target_source is None
     assert result.hypotheses and np.array_equal(result.best, right.fit.T)

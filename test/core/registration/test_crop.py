@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gapr_core.config import SourceConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration.crop import crop_box, crop_to_pose
@@ -41,20 +42,20 @@ def test_uniform_far_clutter_is_removed_and_the_bone_stays(femur):
     points = points[points[:, 2] < np.quantile(points[:, 2], 0.4)]
     low, high = points.min(axis=0) - 150.0, points.max(axis=0) + 150.0
     clutter = rng.uniform(low, high, (len(points) // 3, 3))
-    kept = {tuple(p) for p in without_isolated(np.vstack([points, clutter]))}
+    kept = {tuple(p) for p in without_isolated(np.vstack([points, clutter]), SourceConfig())}
     assert all(tuple(p) in kept for p in points) and len(kept) < len(points) + 0.1 * len(clutter)
 
 
 @pytest.mark.parametrize("count", [12, 40, 200])
 def test_a_few_digitised_points_all_count(count):
     points = np.random.default_rng(0).uniform(0.0, 200.0, (count, 3))
-    assert len(without_isolated(points)) == count
+    assert len(without_isolated(points, SourceConfig())) == count
 
 
 def test_slices_of_ultrasound_stay_whole():
     line = np.stack([np.arange(0.0, 40.0, 0.5), np.zeros(80), np.zeros(80)], axis=1)
     slices = np.vstack([line + [0.0, 30.0 * i, 0.0] for i in range(8)])
-    assert len(without_isolated(slices)) == len(slices)
+    assert len(without_isolated(slices, SourceConfig())) == len(slices)
 
 
 def test_a_source_is_prepared_without_its_isolated_points(femur):

@@ -37,27 +37,27 @@ def fit_of(points, bone):
 @pytest.mark.parametrize("factor", [0.97, 1.0, 1.03])
 def test_the_scale_says_how_much_larger_the_source_would_have_to_be(bone, end, factor):
     centre = end.mean(axis=0)
-    scale, sd = scale_of(fit_of(centre + factor * (end - centre), bone), CONFIG.covariance)
+    scale, sd = scale_of(fit_of(centre + factor * (end - centre), bone), CONFIG.covariance, CONFIG.scale)
     assert scale == pytest.approx(1.0 / factor - 1.0, abs=0.008)
     assert 1e-4 < sd < 0.02
 
 
 def test_the_scale_of_a_small_patch_is_hardly_known(bone, end):
     patch = end[np.argsort(np.linalg.norm(end - end[0], axis=1))[:250]]
-    small, large = (scale_of(fit_of(points, bone), CONFIG.covariance)[1] for points in (patch, end))
+    small, large = (scale_of(fit_of(points, bone), CONFIG.covariance, CONFIG.scale)[1] for points in (patch, end))
     assert small > 3.0 * large
 
 
 def test_a_bias_makes_the_scale_less_certain(bone, end):
     rng = np.random.default_rng(3)
     wave = 0.8 * np.sin(end @ rng.normal(size=3) * 0.08)[:, None] * (end - end.mean(axis=0)) / 60.0
-    clean, biased = (scale_of(fit_of(points, bone), CONFIG.covariance)[1] for points in (end, end + wave))
+    clean, biased = (scale_of(fit_of(points, bone), CONFIG.covariance, CONFIG.scale)[1] for points in (end, end + wave))
     assert biased > 1.5 * clean
 
 
 def test_without_inliers_nothing_is_known_of_the_scale():
     nothing = SimpleNamespace(weights=np.zeros(9))
-    assert scale_of(nothing, CONFIG.covariance) == (0.0, 1.0)
+    assert scale_of(nothing, CONFIG.covariance, CONFIG.scale) == (0.0, 1.0)
 
 
 def test_the_mirrored_source_of_a_whole_end_fits_badly(bone, end):

@@ -1,10 +1,13 @@
 """What a camera saw says where the bone is and where it cannot be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.registration.free_space import MISFIT_COSTS, VIOLATION_COSTS, compare, see
+from gapr_core.registration.free_space import compare, see
 
 EYE = np.array([0.0, 0.0, 400.0])
 
@@ -66,8 +69,11 @@ def test_the_nearer_to_the_measured_surface_the_better_it_is_explained(image):
 
 
 def test_a_score_takes_off_what_was_seen_otherwise_and_what_was_seen_through(image):
-    found = compare(np.stack([moved(z_mm=-2.0), moved(z_mm=-10.0)]), *wall(), image, on_mm=1.0, front_mm=4.0)
-    assert found.score == pytest.approx([-MISFIT_COSTS, -VIOLATION_COSTS], abs=1e-3)
+    dearer = replace(image, config=FreeSpaceConfig(misfit_costs=0.3, violation_costs=5.0))
+    poses = np.stack([moved(z_mm=-2.0), moved(z_mm=-10.0)])
+    for seen_by, costs in ((image, [-0.2, -2.0]), (dearer, [-0.3, -5.0])):
+        found = compare(poses, *wall(), seen_by, on_mm=1.0, front_mm=4.0)
+        assert found.score == pytest.approx(costs, abs=1e-3)
 
 
 def test_a_step_in_depth_forbids_nothing_at_its_edge():

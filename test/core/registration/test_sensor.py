@@ -59,7 +59,9 @@ def test_what_is_stated_replaces_what_is_usual(kind):
     usual = sensor.errors(SensorConfig(kind), 100)
     stated = sensor.errors(SensorConfig(kind, standoff_mm=0.3, noise_mm=0.9, bias_mm=0.8, scale=0.05), 100)
     assert (stated.offset_mm, stated.noise_mm, stated.bias_mm, stated.scale) == (0.3, 0.9, 0.8, 0.05)
-    assert stated.standoff_mm == sensor.KNOWN_STANDOFF_MM
+    assert stated.standoff_mm == 0.15
+    known = SensorConfig(kind, standoff_mm=0.3, known_standoff_mm=0.4)
+    assert sensor.errors(known, 100).standoff_mm == 0.4
     assert usual.standoff_mm > 0.0
 
 

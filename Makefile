@@ -28,8 +28,9 @@ mutants: $(DEV)  ## change one operator of a formula at a time: does a test noti
 faults: $(READY)  ## a table of faults on real processes of the node
 	$(BIN)/python test/ros/faults.py $(ARGS)
 
-fuzz: $(READY)  ## 100 000 mutated PointCloud2 through the node's reader; ARGS="--seed 2" for others
+fuzz: $(READY)  ## 100 000 mutated PointCloud2 through the node's reader, 20 000 files of all formats; ARGS="--seed 2" for others
 	$(BIN)/python test/ros/fuzz.py $(ARGS)
+	$(BIN)/python test/fuzz/files.py $(ARGS)
 
 soak: $(READY)  ## a long bag at 10 Hz: every cloud is answered or counted; ARGS="--frames 36000" is an hour
 	$(BIN)/python test/ros/soak.py $(ARGS)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import axes
 from gapr_core.formats.options import ReadOptions
+from gapr_core.formats.text import check_end
 from gapr_core.runtime.files import write_json
 from gapr_core.surface import Surface
 
@@ -49,8 +50,8 @@ def load(path: Path, options: ReadOptions | None = None) -> Markups:
     Raises:
         InvalidPointCloudError: damaged, empty, or without its coordinate system.
     """
-    text = (options or ReadOptions()).limits.read(path).decode("utf-8-sig")
-    markups = _of_fcsv(text) if path.suffix.lower() == ".fcsv" else _of_json(json.loads(text))
+    data = (options or ReadOptions()).limits.read(path)
+    markups = _of_fcsv(data) if path.suffix.lower() == ".fcsv" else _of_json(json.loads(data.decode("utf-8-sig")))
     if not np.isfinite(markups.points).all():
         raise InvalidPointCloudError("finite coordinates", f"{path.name} with others", "place the points again")
     return markups
@@ -79,7 +80,9 @@ def _of_json(content: Any) -> Markups:
     return Markups(np.vstack(points), tuple(labels))
 
 
-def _of_fcsv(text: str) -> Markups:
+def _of_fcsv(data: bytes) -> Markups:
+    check_end(data)
+    text = data.decode("utf-8-sig")
     found = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
     space = _space(found[1] if found else None)
     columns = re.search(r"^#\s*columns\s*=\s*(.+)$", text, re.MULTILINE)

@@ -35,11 +35,13 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Arra
     """(N, 4, 4) poses of the valid frames by the transform's name, such as `ProbeToTracker` (PLUS sequence format).
 
     Raises:
-        ValueError: no transform in any valid frame.
+        ValueError: no transform in any valid frame, or a header that is cut.
     """
     data = (options or ReadOptions()).limits.read(path)
     end = data.find(b"ElementDataFile")
-    head = data[: min(end if end >= 0 else len(data), HEADER_BYTES)].decode("ascii", "replace")
+    if not 0 <= end < HEADER_BYTES:
+        raise ValueError("no ElementDataFile at the end of its header: the file is cut, or no sequence")
+    head = data[:end].decode("ascii", "replace")
     values: dict[tuple[str, int], Array] = {}
     invalid = set()
     for number, name, kind, value in FRAME.findall(head):

@@ -16,11 +16,16 @@ def lines(data: bytes) -> Iterator[str]:
     """The lines of a text file, one at a time.
 
     Raises:
-        ValueError: the last line does not end: whether its last number is whole cannot be known.
+        ValueError: the last line does not end.
     """
+    check_end(data)
+    return iter(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace"))
+
+
+def check_end(data: bytes) -> None:
+    """Raise `ValueError` where the last line does not end: whether its last number is whole cannot be known."""
     if not data.rstrip(b" \t").endswith((b"\n", b"\r")):
         raise ValueError("the last line does not end: the file is cut, or lacks its final line break")
-    return iter(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace"))
 
 
 def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None = None) -> Array:

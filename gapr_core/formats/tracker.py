@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.text import check_end
 
 Array = NDArray[np.float64]
 
@@ -49,9 +50,11 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> A
 
     Raises:
         InvalidPointCloudError: no such columns, or no row in which the tool was seen.
+        ValueError: a file that is cut.
     """
-    text = (limits or FileLimits.from_environment()).read(path).decode("utf-8-sig", "replace")
-    rows = list(csv.reader(io.StringIO(text)))
+    data = (limits or FileLimits.from_environment()).read(path)
+    check_end(data)
+    rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"))))
     names = [name.strip().lower() for name in rows[0]] if rows else []
     starts = [i for i, name in enumerate(names) if name == "q0"]
     if tool >= len(starts) or [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
@@ -59,14 +62,16 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> A
         raise InvalidPointCloudError(f"columns {' '.join(POSE)} of tool {tool}", given, "export it from NDI Track")
     start = starts[tool]
     state = max((i for i, name in enumerate(names[:start]) if name.startswith("state")), default=None)
-    seen = [row for row in rows[1:] if len(row) >= start + 7 and (state is None or _is_seen(row[state]))]
-    values = np.array([[float(value) for value in row[start : start + 7]] for row in seen]).reshape(-1, 7)
+    seen = [row[start : start + 7] for row in rows[1:] if row and (state is None or _is_seen(*row[state : state + 1]))]
+    if any(len(row) < len(POSE) for row in seen):
+        raise ValueError("a row that ends before its pose")
+    values = np.array([[float(value) for value in row] for row in seen]).reshape(-1, 7)
     if len(values) == 0:
         raise InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
     return poses_of(values[:, :4], values[:, 4:])
 
 
-def _is_seen(state: str) -> bool:
+def _is_seen(state: str = "") -> bool:
     return state.strip().lower() in SEEN
 
 

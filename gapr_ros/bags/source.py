@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 UNIT = "m"  # REP-103
 READABLE = {type_name(kind.message()): kind for kind in INPUTS.values()}
+LONGEST_REASON = 160
 NAME_ONE = "name one with --topic, or topic= in Python"
 
 
@@ -45,7 +46,9 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def _unreadable(path: Path, error: BagError) -> InvalidPointCloudError:
-    why = str(error).removeprefix(f"{path}: ")
+    why = " ".join(str(error).removeprefix(f"{path}: ").split())
+    if len(why) > LONGEST_REASON:
+        why = f"{why[:LONGEST_REASON]}..."
     return InvalidPointCloudError("a bag that can be read", f"{path.name} ({why})", "record it again, or repair it")
 
 

@@ -201,13 +201,13 @@ def test_a_dicom_segmentation_is_read_by_the_name_of_its_segment(tmp_path):
     assert np.sqrt((error_mm(surface.points, CENTRE + [0, 0, 20], [12, 12, 12]) ** 2).mean()) < 0.3
 
 
-def dicom_seg(tmp_path):
-    """Two balls of radius 12, written by highdicom against a CT of slices."""
+def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia")):
+    """Balls of radius 12, written by highdicom against a CT of slices."""
     highdicom = pytest.importorskip("highdicom")
     import pydicom
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
-    affine, size = affine_of((1.5, 1.5, 2.0))
+    affine, size = affine_of(spacing)
     study, series, frame = generate_uid(), generate_uid(), generate_uid()
     slices = []
     for k in range(size[2]):
@@ -220,19 +220,20 @@ def dicom_seg(tmp_path):
         s.StudyID, s.StudyDate, s.StudyTime = "1", "20200101", "000000"
         s.AccessionNumber, s.ReferringPhysicianName = "", ""
         s.Modality, s.SeriesNumber, s.InstanceNumber = "CT", 1, k + 1
-        s.Rows, s.Columns, s.PixelSpacing, s.SliceThickness = int(size[1]), int(size[0]), [1.5, 1.5], 2.0
+        s.Rows, s.Columns, s.PixelSpacing, s.SliceThickness = int(size[1]), int(size[0]), [*spacing[:2]], spacing[2]
         s.ImageOrientationPatient, s.ImagePositionPatient = (
             [1, 0, 0, 0, 1, 0],
-            (affine[:3, 3] + [0, 0, 2.0 * k]).tolist(),
+            (affine[:3, 3] + [0, 0, spacing[2] * k]).tolist(),
         )
         s.BitsAllocated, s.BitsStored, s.HighBit, s.PixelRepresentation, s.SamplesPerPixel = 16, 16, 15, 0, 1
         s.PhotometricInterpretation = "MONOCHROME2"
         slices.append(s)
     balls = np.stack([voxels_of(affine, size, CENTRE + [0, 0, z], [12, 12, 12]) for z in (20, -20)], axis=-1)
+    balls = balls[..., : len(names)]
     from pydicom.sr.codedict import codes
 
     kind = (codes.SCT.Bone, codes.SCT.Bone, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL)
-    segments = [highdicom.seg.SegmentDescription(n, name, *kind) for n, name in ((1, "femur"), (2, "tibia"))]
+    segments = [highdicom.seg.SegmentDescription(n, name, *kind) for n, name in enumerate(names, start=1)]
     seg = highdicom.seg.Segmentation(
         slices, balls.astype(np.uint8), highdicom.seg.SegmentationTypeValues.BINARY, segments, generate_uid(), 2,
         generate_uid(), 1, "GAPR", "test", "1", "1",

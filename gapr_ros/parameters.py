@@ -39,12 +39,13 @@ class NodeParameters(Settings):
     `live=False`: read when configuring.
     """
 
-    model_path: str = setting("", "file of the pre-operative bone: PLY PCD STL OBJ VTK VTP NPY NPZ")
+    model_path: str = setting("", "file of the pre-operative bone: a mesh, a cloud or a label map (docs/formats.md)")
+    model_label: str = setting("", "name or number of the bone in a label map; several, with commas, are one bone")
     model_unit: str = setting("auto", "unit of that file; auto guesses from the extent and warns",
                               choices=("auto", "mm", "m"))  # fmt: skip
     model_scale: float = setting(1.0, "the bone is multiplied by this", low=1e-6)
-    model_axes: str = setting("as_is", "axes of that file; lps_to_ras turns DICOM's axes into those of 3D Slicer",
-                              choices=("as_is", "lps_to_ras"))  # fmt: skip
+    model_axes: str = setting("as_is", "axes of a mesh file: auto is what it says of itself; ras is turned to LPS, "
+                              "lps_to_ras to RAS", choices=("as_is", "auto", "lps", "ras", "lps_to_ras"))  # fmt: skip
     model_frame: str = setting("bone_preop", "frame of the pre-operative bone, child of every pose", live=False)
     output_frame: str = setting("", "frame of the poses; empty: the frame of the cloud", live=False)
     tf_timeout: float = setting(0.1, "longest wait for a transform into output_frame", unit="s", low=0.0, high=60.0)

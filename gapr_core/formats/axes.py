@@ -1,6 +1,7 @@
 """Patient axes: LPS (left, posterior, superior) inside, and RAS (right, anterior, superior) as some files have it.
 
 The change is a turn by 180 deg about the long axis of the body: a rigid motion, so that no residual shows a wrong one.
+Files are turned here alone, for the library, the command line and the node.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ COMMENT_BYTES = 8192
 
 
 def turned(surface: Surface, path: Path, axes: str) -> Surface:
-    """The surface of a file in LPS, as far as the axes are known.
+    """The surface of a mesh or cloud file, turned once at most.
+
+    What the caller says wins over the file, and a contradiction is logged; "lps_to_ras" says LPS as well, and what it
+    makes of a file that says RAS would be neither, so that is refused.
 
     Args:
         surface: as it is in the file.
@@ -35,16 +39,37 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
         axes: see `ReadOptions`.
 
     Raises:
-        ConfigError: unknown axes.
+        ConfigError: unknown axes, or "lps_to_ras" of a file that says RAS.
     """
-    if axes not in CHOICES:
-        raise ConfigError(f"axes {' '.join(CHOICES)}", repr(axes), "name one of them")
+    check(axes)
     said = stated(path)
-    if axes in ("lps", "ras") and said not in (None, axes):
-        log.warning("%s says SPACE=%s and is read as %s", path.name, said.upper(), axes.upper())
+    if axes == "lps_to_ras" and said == "ras":
+        raise ConfigError("a file in LPS for lps_to_ras", f"{path.name}, which says SPACE=RAS", "use as_is: it is RAS")
     if axes == "auto" and said == "ras":
         log.warning("%s says SPACE=RAS: x and y are negated, to LPS", path.name)
+    elif said == "ras" and axes != "ras":
+        log.warning("%s says SPACE=RAS and is read as %s, as you say", path.name, axes.upper())
+    elif said == "lps" and axes == "ras":
+        log.warning("%s says SPACE=LPS and is read as RAS, as you say", path.name)
     return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])
+
+
+def of_patient(surface: Surface, path: Path, axes: str) -> Surface:
+    """The surface of a file that is in LPS already, by its own header: "lps_to_ras" alone turns it.
+
+    Raises:
+        ConfigError: unknown axes, or "ras": such a file says its axes.
+    """
+    check(axes)
+    if axes == "ras":
+        raise ConfigError("axes of a mesh or a cloud", f"ras for {path.name}, which says its own", "leave them out")
+    return scaled(surface, FACTORS["lps_to_ras"]) if axes == "lps_to_ras" else surface
+
+
+def check(axes: str) -> None:
+    """Raise `ConfigError` for a name that means no axes."""
+    if axes not in CHOICES:
+        raise ConfigError(f"axes {' '.join(CHOICES)}", repr(axes), "name one of them")
 
 
 def scaled(surface: Surface, factors: Array) -> Surface:

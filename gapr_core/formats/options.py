@@ -12,8 +12,8 @@ class ReadOptions:
     """How to read a file; each format takes what concerns it.
 
     Attributes:
-        axes: axes of a mesh or cloud file: "lps", "ras" (turned to LPS), "as_is", "lps_to_ras" (x and y negated, what
-            it did in earlier versions), or "auto": what a `SPACE=` comment in the file says, as_is without one.
+        axes: axes of a mesh or cloud file: "lps", "ras" (turned to LPS), "as_is", "lps_to_ras" (a file in LPS, turned
+            to RAS), or "auto": what a `SPACE=` comment in the file says, as_is without one.
         labels: names or numbers of the segments of a label map that make up one rigid target; none where it has one.
         tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.
         topic: of the clouds in a bag; empty where it has one such topic.

@@ -36,7 +36,7 @@ class Format:
         reader: Callable[[Path, FileLimits | ReadOptions], Surface]
         reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
         if self.in_patient:
-            return reader(path, options)
+            return axes.of_patient(reader(path, options), path, options.axes)
         return axes.turned(reader(path, options if self.with_options else options.limits), path, options.axes)
 
 

@@ -18,7 +18,6 @@ from gapr_core.surface import Surface
 from gapr_ros.parameters import NodeParameters
 
 Array = NDArray[np.float64]
-AXES = {"as_is": np.array([1.0, 1.0, 1.0]), "lps_to_ras": np.array([-1.0, -1.0, 1.0])}  # both are rotations
 DISPLAY_POINTS = 20_000
 
 
@@ -62,14 +61,17 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     """
     if not parameters.model_path:
         raise ConfigError("model_path", "nothing", "give -p model_path:=/path/to/bone.stl")
-    options = ReadOptions(axes="as_is")  # model_axes says what to turn, whatever the file says of itself
+    options = ReadOptions(axes=parameters.model_axes, labels=labels_of(parameters.model_label))
     surface = clouds.load(parameters.model_path, units=parameters.model_unit, options=options)
-    factors = AXES[parameters.model_axes] * parameters.model_scale
-    normals = None if surface.normals is None else surface.normals * AXES[parameters.model_axes]
-    surface = Surface(surface.points * factors, surface.faces, normals)
+    surface = Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
     target = method.prepare(surface, units="mm")
     points_mm = _for_display(surface.points)
     return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm))
+
+
+def labels_of(text: str) -> tuple[str, ...]:
+    """The names or numbers of a parameter, which may hold several with commas between them."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
 @dataclass(frozen=True)

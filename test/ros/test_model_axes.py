@@ -1,11 +1,11 @@
-"""The node turns a model as `model_axes` says, and only so."""
-
-from types import SimpleNamespace
+"""The node turns a model once at most, as `model_axes` says, and takes the bone that `model_label` names."""
 
 import numpy as np
 import pytest
 
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_ros.node.model import load_model
+from gapr_ros.parameters import NodeParameters
 
 POINTS = np.array([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 120.0]])
 FACES = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
@@ -18,14 +18,41 @@ class Keep:
         return surface
 
 
-@pytest.mark.parametrize(("axes", "sign"), [("as_is", 1.0), ("lps_to_ras", -1.0)])
-def test_a_file_that_says_its_axes_is_turned_once_at_most(tmp_path, axes, sign):
-    path = tmp_path / "bone.ply"
-    head = ["ply", "format ascii 1.0", "comment SPACE=RAS", f"element vertex {len(POINTS)}"]
+def bone(path, said):
+    head = ["ply", "format ascii 1.0", f"comment {said}", f"element vertex {len(POINTS)}"]
     head += [f"property float {axis}" for axis in "xyz"]
     head += [f"element face {len(FACES)}", "property list uchar int vertex_indices", "end_header"]
     rows = [" ".join(map(str, p)) for p in POINTS] + [" ".join(map(str, [3, *f])) for f in FACES]
     path.write_text("\n".join([*head, *rows]) + "\n")
-    parameters = SimpleNamespace(model_path=str(path), model_unit="mm", model_axes=axes, model_scale=1.0)
-    model = load_model(Keep(), parameters)
-    assert np.allclose(model.target.points, POINTS * [sign, sign, 1.0])
+    return str(path)
+
+
+def loaded(path, **how):
+    return load_model(Keep(), NodeParameters(model_path=str(path), model_unit="mm", **how)).target.points
+
+
+@pytest.mark.parametrize(("said", "axes", "sign"), [
+    ("SPACE=RAS", "as_is", 1.0), ("SPACE=RAS", "auto", -1.0), ("SPACE=RAS", "ras", -1.0), ("SPACE=RAS", "lps", 1.0),
+    ("SPACE=LPS", "auto", 1.0), ("SPACE=LPS", "lps_to_ras", -1.0), ("bone", "auto", 1.0), ("bone", "ras", -1.0),
+    ("bone", "lps_to_ras", -1.0),
+])  # fmt: skip
+def test_a_model_is_turned_once_at_most_whatever_its_file_says(tmp_path, said, axes, sign):
+    points = loaded(bone(tmp_path / "bone.ply", said), model_axes=axes, model_scale=2.0)
+    assert np.allclose(points, 2.0 * POINTS * [sign, sign, 1.0])
+
+
+def test_a_model_that_is_ras_already_is_not_turned_by_lps_to_ras(tmp_path):
+    with pytest.raises(ConfigError, match="which says SPACE=RAS; use as_is"):
+        loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"), model_axes="lps_to_ras")
+
+
+def test_the_bone_of_a_label_map_is_named_by_its_label(tmp_path):
+    sitk = pytest.importorskip("SimpleITK")
+    voxels = np.zeros((40, 30, 30), dtype=np.uint8)
+    voxels[5:15, 8:20, 8:20], voxels[25:35, 8:20, 8:20] = 75, 76
+    sitk.WriteImage(sitk.GetImageFromArray(voxels), str(tmp_path / "seg.nrrd"))
+    for label, middle in (("75", 9.5), ("76", 29.5), ("75, 76", 19.5)):
+        z = loaded(tmp_path / "seg.nrrd", model_label=label)[:, 2]
+        assert (z.min() + z.max()) / 2.0 == pytest.approx(middle, abs=0.1)
+    with pytest.raises(InvalidPointCloudError, match="2 of them .75, 76.; name one"):
+        loaded(tmp_path / "seg.nrrd")

@@ -83,7 +83,8 @@ def _only(named: list[Segment], present: Present) -> Segment:
     if len(segments) == 1:
         return segments[0]
     given = f"{len(segments)} of them ({_listed([s.name or str(s.value) for s in segments])})" if segments else "none"
-    raise InvalidPointCloudError("one label", given, "name one with --label, or labels= in Python")
+    how = "name one with --label, labels= in Python, or model_label of the node"
+    raise InvalidPointCloudError("one label", given, how)
 
 
 def _by_number(value: int, named: list[Segment], present: Present) -> Segment:

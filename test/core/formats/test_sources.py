@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gapr_core import clouds
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import markups, reading, tracker
 from gapr_core.formats.options import ReadOptions
 
@@ -176,7 +176,8 @@ MESH = (
 @pytest.mark.parametrize(("title", "axes", "factors"), [
     ("bone", "auto", [1, 1, 1]), ("SPACE=LPS", "auto", [1, 1, 1]), ("SPACE=RAS", "auto", LPS_RAS),
     ("bone", "ras", LPS_RAS), ("bone", "lps_to_ras", LPS_RAS), ("bone", "lps", [1, 1, 1]),
-    ("SPACE=RAS", "as_is", [1, 1, 1]), ("SPACE=RAS", "lps", [1, 1, 1]),
+    ("SPACE=RAS", "as_is", [1, 1, 1]), ("SPACE=RAS", "lps", [1, 1, 1]), ("SPACE=RAS", "ras", LPS_RAS),
+    ("SPACE=LPS", "ras", LPS_RAS), ("SPACE=LPS", "lps_to_ras", LPS_RAS), ("SPACE=LPS", "as_is", [1, 1, 1]),
 ])  # fmt: skip
 def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title, axes, factors):
     (tmp_path / "a.vtk").write_text(MESH.format(title))
@@ -187,3 +188,16 @@ def test_a_contradiction_of_axes_is_said(tmp_path, caplog):
     (tmp_path / "a.vtk").write_text(MESH.format("SPACE=RAS"))
     reading.read(tmp_path / "a.vtk", ReadOptions(axes="lps"))
     assert "says SPACE=RAS and is read as LPS" in caplog.text
+    with pytest.raises(ConfigError, match="a file in LPS for lps_to_ras; got a.vtk, which says SPACE=RAS; use as_is"):
+        reading.read(tmp_path / "a.vtk", ReadOptions(axes="lps_to_ras"))
+
+
+def test_files_that_say_their_own_axes_are_not_turned_by_those_of_a_mesh(tmp_path):
+    path = fcsv(tmp_path / "a.fcsv", "# CoordinateSystem = RAS\n")
+    for axes in ("auto", "lps", "as_is"):
+        np.testing.assert_allclose(reading.read(path, ReadOptions(axes=axes)).points, POINTS * LPS_RAS)
+    np.testing.assert_allclose(reading.read(path, ReadOptions(axes="lps_to_ras")).points, POINTS)
+    with pytest.raises(ConfigError, match="ras for a.fcsv, which says its own"):
+        reading.read(path, ReadOptions(axes="ras"))
+    with pytest.raises(ConfigError, match="axes auto lps"):
+        reading.read(path, ReadOptions(axes="up"))

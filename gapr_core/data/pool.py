@@ -23,6 +23,14 @@ def parametric_people(split: str, count: int) -> list[int]:
     return [5 * (i // len(residues)) + residues[i % len(residues)] for i in range(count)]
 
 
+def parametric_split(person: str) -> str | None:
+    """The split of a parametric subject by name, "parametric_7"; None for anybody else."""
+    prefix, _, number = person.rpartition("_")
+    if prefix != "parametric" or not number.isdecimal():
+        return None
+    return next(split for split, residues in PARAMETRIC_SPLIT.items() if int(number) % 5 in residues)
+
+
 def parametric_specimen(bone: str, number: int) -> Specimen:
     """The bone of parametric subject `number`; all bones of one number are of one subject."""
     return Specimen(make_bone(bone, number), bone, f"parametric_{number}", "parametric")

@@ -86,15 +86,23 @@ class FineMatching(nn.Module):
         log_z = log_optimal_transport(scores, self.dustbin.float(), valid_p, valid_q, self.iterations)
         return FineAssignment(log_z, index_p, index_q, valid_p, valid_q)
 
-    def correspondences(self, source: Cloud, target: Cloud, fine: FineAssignment, chosen: PatchPairs) -> Matches:
-        """Eq. (9): the union of the mutual top-k matches of all patch pairs."""
+    def correspondences(
+        self, source: Cloud, target: Cloud, fine: FineAssignment, chosen: PatchPairs, bone: Tensor | None = None
+    ) -> Matches:
+        """Eq. (9): the union of the mutual top-k matches of all patch pairs.
+
+        `bone` (N,) is the probability of the source's fine points to be bone; it multiplies the scores.
+        """
         z = fine.log_z[:, :-1, :-1].clamp(min=_LOWEST).exp()
         z = z * (fine.source_valid[:, :, None] & fine.target_valid[:, None])
         kept = mutual_top_k(z, self.mutual_k) & (z > self.confidence)
         patch, a, b = kept.nonzero(as_tuple=True)
         p = source.fine.points[fine.source_index[patch, a]]
         q = target.fine.points[fine.target_index[patch, b]]
-        return Matches(p, q, z[patch, a, b] * chosen.score[patch].sqrt(), patch, chosen.pair[patch])
+        score = z[patch, a, b] * chosen.score[patch].sqrt()
+        if bone is not None:
+            score = score * bone[fine.source_index[patch, a]]
+        return Matches(p, q, score, patch, chosen.pair[patch])
 
 
 def log_optimal_transport(scores: Tensor, dustbin: Tensor, valid_p: Tensor, valid_q: Tensor, rounds: int) -> Tensor:

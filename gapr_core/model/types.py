@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -156,12 +157,17 @@ class PatchPairs:
 
 def on_device(value: T, device: torch.device | str) -> T:
     """Moves every tensor inside nested dataclasses and tuples."""
+    return mapped(value, lambda tensor: tensor.to(device, non_blocking=True))
+
+
+def mapped(value: T, change: Callable[[Tensor], Tensor]) -> T:
+    """The same with every tensor inside nested dataclasses and tuples changed."""
     if isinstance(value, Tensor):
-        return value.to(device, non_blocking=True)  # type: ignore[return-value]
+        return change(value)  # type: ignore[return-value]
     if isinstance(value, tuple):
-        return tuple(on_device(v, device) for v in value)  # type: ignore[return-value]
+        return tuple(mapped(v, change) for v in value)  # type: ignore[return-value]
     if is_dataclass(value) and not isinstance(value, type):
-        moved: dict[str, Any] = {f.name: on_device(getattr(value, f.name), device) for f in fields(value)}
+        moved: dict[str, Any] = {f.name: mapped(getattr(value, f.name), change) for f in fields(value)}
         return replace(value, **moved)
     return value
 

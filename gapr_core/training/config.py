@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sysconfig
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,18 @@ class TrainConfig(Settings):
 
     model: str = setting("", "path of a yaml in config/model; empty: the defaults (best)")
     initial: str = setting("", "weights (safetensors) of the same network to begin with; empty: random ones")
+    model_settings: dict[str, Any] = setting({}, "settings of the network over those of its yaml")
     bones: tuple[str, ...] = setting(("femur", "tibia", "pelvis", "thoracic"), "bone types")
     mix: dict[str, float] = setting(MIX, "protocols and how often each is drawn", low=0)
+    target_frame: str = setting(
+        "random", "how targets lie: as scanned (paper: scan), or turned at random", choices=("random", "scan")
+    )
+    source_points: str = setting(
+        "new", "of protocols that crop: the target's own points (paper: target), or sampled again (new)",
+        choices=("new", "target"),
+    )  # fmt: skip
+    early_loss: float = setting(0.5, "weight of the coarse loss before repositioning; the paper has none: 0", low=0)
+    bone_loss: float = setting(0.5, "weight of the loss of the bone head, where the network has one", low=0)
     pairs: int = setting(24_000, "length of the schedule, in pairs", low=1)
     batch: int = setting(8, "pairs per optimiser step, over all processes", low=1)
     micro_batch: int = setting(4, "pairs per forward pass; gradients add up to a batch", low=1)
@@ -44,12 +54,22 @@ class TrainConfig(Settings):
     device: str = setting("auto", "auto, cpu or cuda")
     checkpoint_minutes: float = setting(3.0, "between two checkpoints", low=0, unit="min")
     validate_minutes: float = setting(10.0, "between two validations", low=0, unit="min")
+    log_steps: int = setting(1, "steps between two lines of log.csv; on a GPU every line waits for it", low=1)
     validation_pairs: int = setting(8, "per protocol of the mix", low=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.batch % self.micro_batch:
             raise ConfigError("a batch of whole micro-batches", f"{self.batch} and {self.micro_batch}", "make them fit")
+
+    def network(self) -> ModelConfig:
+        """What is trained: `model` with `model_settings` over it."""
+        return network_of(self.model, self.model_settings)
+
+
+def network_of(model: str | Path, settings: Mapping[str, Any]) -> ModelConfig:
+    """The network of a yaml (the default one without) with settings over it."""
+    return ModelConfig.from_dict((read_yaml(model) if model else {}) | dict(settings))
 
 
 @dataclass(frozen=True)
@@ -83,7 +103,10 @@ def _variant(table: str, row: Any, models: Path, path: Path) -> Variant:
     return Variant(table, row["label"], models / f"{row['model']}.yaml", row.get("paper"))
 
 
-def trained_as(plan: Sequence[Variant]) -> dict[Path, Path]:
-    """For every yaml the first one with the same network: what is equal but for its name is trained once."""
-    networks = {v.model: replace(ModelConfig.from_yaml(v.model), name="") for v in plan}
+def trained_as(plan: Sequence[Variant], settings: Mapping[str, Any]) -> dict[Path, Path]:
+    """For every yaml the first one with the same network: what is equal but for its name is trained once.
+
+    `settings` are those that the run has over every yaml.
+    """
+    networks = {v.model: replace(network_of(v.model, settings), name="") for v in plan}
     return {path: next(p for p, other in networks.items() if other == network) for path, network in networks.items()}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,19 +14,22 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from gapr_core.data import anatomy, parametric
+from gapr_core.data.pair import TARGET_POINTS
 from gapr_core.data.pool import parametric_people, parametric_specimen
-from gapr_core.data.protocols import Pair, make_pair
+from gapr_core.data.protocols import PROTOCOLS, STRANGERS, Pair, make_pair
 from gapr_core.data.specimen import Specimen
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
-from gapr_core.model.pyramid import FEWEST_POINTS, Frame, build_cloud, target_frame
-from gapr_core.model.types import Cloud
+from gapr_core.model.pyramid import FEWEST_POINTS, build_cloud, target_frame
+from gapr_core.training import bone_cache
+from gapr_core.training.bone_cache import PooledBone
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.shapes import ShapeModel, vary
 from gapr_core.training.targets import TrainingPair, join, training_pair
 
 Array = NDArray[np.float64]
+CROPPED = ("paper", "overlap", "incomplete")  # protocols (beginnings) that crop a cloud
 OWN_TARGET = ("incomplete",)  # protocols whose target is not the whole bone
 
 
@@ -35,39 +40,56 @@ class People:
         self.bone, self.split = bone, split
         self.real = anatomy.surfaces(folder, bone, split) if folder else []
         known = anatomy.corresponded(folder, bone) if folder else []
-        sets = [c.of({s.person for s in self.real}) for c in known]
-        self.models = [ShapeModel.of(c) for c in sets if len(c.points) > 2]
+        sets = [own for c in known if len((own := c.of({s.person for s in self.real})).points) > 2]
+        self.models = [ShapeModel.of(c) for c in sets]
+        self.model_subjects = [c.person for c in sets]
         if not self.real and bone not in parametric.BONES:
             raise ConfigError(f"meshes or a parametric model of {bone}", "neither", "leave it out of `bones`")
 
     def draw(self, number: int, synthetic: float, seed: int) -> Specimen:
         """Subject `number`: always the same one."""
+        return self.draw_of(number, synthetic, seed)[0]
+
+    def draw_of(self, number: int, synthetic: float, seed: int) -> tuple[Specimen, tuple[str, ...]]:
+        """Subject `number`, and whose bones it was made of."""
         rng = np.random.default_rng([seed, number])
         if not self.real:
             people = parametric_people(self.split, 2000)
-            return parametric_specimen(self.bone, people[int(rng.integers(len(people)))])
+            specimen = parametric_specimen(self.bone, people[int(rng.integers(len(people)))])
+            return specimen, (specimen.person,)
         if self.models and rng.random() < synthetic:
-            surface = self.models[int(rng.integers(len(self.models)))].draw(rng)
+            index = int(rng.integers(len(self.models)))
+            surface, subjects = self.models[index].draw(rng), self.model_subjects[index]
         else:
-            surface = self.real[int(rng.integers(len(self.real)))].surface
-        return Specimen(vary(surface, rng), self.bone, f"drawn_{number}", "drawn")
+            real = self.real[int(rng.integers(len(self.real)))]
+            surface, subjects = real.surface, (real.person,)
+        return Specimen(vary(surface, rng), self.bone, f"drawn_{number}", "drawn"), subjects
 
 
-@dataclass
-class PooledBone:
-    """A bone in use: its target's pyramid in a frame of its own, which `turn` (4, 4) takes it to from the scan's."""
+@dataclass(frozen=True, eq=False)
+class SampledOnce(Specimen):
+    """A bone of which every sample is one and the same: what a protocol crops are the target's own points."""
 
-    specimen: Specimen
-    frame: Frame
-    target: Cloud
-    turn: Array
+    cloud: Array | None = None
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Any, Any]:
+        """The cloud; normals are not known."""
+        return self.cloud, None
 
 
 class TrainingPairs(Dataset[TrainingPair]):
     """Micro-batches by number. Bones come and go as the numbers rise; a worker keeps those in use."""
 
-    def __init__(self, train: TrainConfig, model: ModelConfig, folder: Path | None, split: str = "train") -> None:
-        self.train, self.model = train, model
+    def __init__(
+        self,
+        train: TrainConfig,
+        model: ModelConfig,
+        folder: Path | None,
+        split: str = "train",
+        cache: Path | None = None,
+    ) -> None:
+        check_mix(train.mix)
+        self.train, self.model, self.cache = train, model, cache
         self.people = [People(bone, folder, split) for bone in available(train.bones, folder)]
         self.protocols = list(train.mix)
         self.weights = np.array([train.mix[p] for p in self.protocols]) / sum(train.mix.values())
@@ -86,16 +108,28 @@ class TrainingPairs(Dataset[TrainingPair]):
         rng = np.random.default_rng([self.train.seed, 1, number])
         for _ in range(20):
             bone = self._bone(self._bone_number(number))
-            made = make_pair(str(rng.choice(self.protocols, p=self.weights)), bone.specimen, int(rng.integers(2**31)))
-            found = self._prepare(made, bone) if len(made.source) >= FEWEST_POINTS else None
+            protocol = str(rng.choice(self.protocols, p=self.weights))
+            seed = int(rng.integers(2**31))
+            try:
+                made = make_pair(protocol, self._seen_by(protocol, bone), seed)
+                found = self._prepare(made, bone) if len(made.source) >= FEWEST_POINTS else None
+            except (ConfigError, InvalidPointCloudError):  # no wound shows enough bone; a scene larger than its bone
+                continue
             if found is not None and bool((found.overlaps > 0.1).any()):
-                return found
+                return replace(found, subjects=bone.subjects)
         raise RuntimeError(f"no usable pair under number {number}")
 
     def _bone_number(self, number: int) -> int:
         """Neighbouring pairs share a bone, and so its features."""
         rng = np.random.default_rng([self.train.seed, 3, number // self.train.share])
         return number // self.train.reuse + int(rng.integers(self.train.pool))
+
+    def _seen_by(self, protocol: str, bone: PooledBone) -> Specimen:
+        """What a protocol makes its pair of: the bone, or the target's own points where they are to be cropped."""
+        whose = bone.specimen
+        if self.train.source_points == "new" or not protocol.startswith(CROPPED):
+            return whose
+        return SampledOnce(whose.surface, whose.bone, whose.person, whose.cohort, bone.points)
 
     def _prepare(self, made: Pair, bone: PooledBone) -> TrainingPair:
         frame, target, T = bone.frame, bone.target, made.T_target_source.copy()
@@ -108,17 +142,47 @@ class TrainingPairs(Dataset[TrainingPair]):
 
     def _bone(self, number: int) -> PooledBone:
         if number not in self._pool:
-            people = self.people[number % len(self.people)]
-            specimen = people.draw(number, self.train.synthetic, self.train.seed)
-            rng = np.random.default_rng([self.train.seed, 2, number])
-            points, _ = specimen.sample(8192, rng)
-            frame = target_frame(points, self.model)
-            turn = se3.from_rotation_translation(se3.random_rotation(rng), np.zeros(3))
-            self._pool[number] = PooledBone(specimen, frame, build_cloud(points, frame, self.model).turned(turn), turn)
+            self._pool[number] = self._shared_bone(number)
         self._pool.move_to_end(number)
         while len(self._pool) > 2 * self.train.pool:
             self._pool.popitem(last=False)
         return self._pool[number]
+
+    def _shared_bone(self, number: int) -> PooledBone:
+        """Bone `number`, drawn by whichever worker needs it first."""
+        if self.cache is None:
+            return self._new_bone(number)
+        path = self.cache / f"{number}.npz"
+        if path.exists():
+            return bone_cache.load(path)
+        bone = self._new_bone(number)
+        bone_cache.save(path, bone)
+        return bone
+
+    def _new_bone(self, number: int) -> PooledBone:
+        people = self.people[number % len(self.people)]
+        specimen, subjects = people.draw_of(number, self.train.synthetic, self.train.seed)
+        rng = np.random.default_rng([self.train.seed, 2, number])
+        points, _ = specimen.sample(TARGET_POINTS, rng)
+        frame, turn = target_frame(points, self.model), np.eye(4)
+        if self.train.target_frame == "random":
+            turn = se3.from_rotation_translation(se3.random_rotation(rng), np.zeros(3))
+        target = build_cloud(points, frame, self.model).turned(turn)
+        return PooledBone(specimen, points, frame, target, turn, subjects)
+
+
+def check_mix(mix: Mapping[str, float]) -> None:
+    """Raise `ConfigError` for a protocol that does not exist or has no true pose to learn from."""
+    known = [name for name in PROTOCOLS if name not in STRANGERS]
+    unknown = [name for name in mix if name not in known]
+    if unknown or not sum(mix.values()) > 0:
+        given = ", ".join(unknown) or "shares that add up to 0"
+        raise ConfigError(f"a mix of the protocols {', '.join(known)}", given, "correct `mix`")
+
+
+def prune(folder: Path, train: TrainConfig, pairs: int) -> None:
+    """Delete what the cache holds for pairs before number `pairs`."""
+    bone_cache.prune(folder, pairs // train.reuse)
 
 
 def available(bones: tuple[str, ...], folder: Path | None) -> list[str]:

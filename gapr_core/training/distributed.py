@@ -1,45 +1,72 @@
-"""One process or many under `torchrun`: the few lines that differ."""
+"""One process or many under `torchrun`: DistributedDataParallel where there are several, nothing where there is one."""
 
 from __future__ import annotations
 
 import os
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 
 import torch
 import torch.distributed as dist
 from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from gapr_core.errors import ConfigError
 
 
-def start(device: str) -> tuple[int, int, torch.device]:
-    """Rank, number of processes and this process's device."""
+@dataclass(frozen=True)
+class Group:
+    """This process among those that train together: its `rank` of `world`, and its device."""
+
+    rank: int
+    world: int
+    device: torch.device
+
+    def wrap(self, module: nn.Module) -> nn.Module:
+        """The module whose backward pass leaves the mean gradient of all processes; the module itself for one."""
+        if self.world == 1:
+            return module
+        devices = [self.device] if self.device.type == "cuda" else None
+        return DistributedDataParallel(module, devices, broadcast_buffers=False, gradient_as_bucket_view=True)
+
+    def agree(self, last: bool) -> bool:
+        """True in every process as soon as it is true in the first."""
+        if self.world == 1:
+            return last
+        flag = torch.tensor([int(last)], device=self.device)
+        dist.broadcast(flag, 0)
+        return bool(flag.item())
+
+    def share(self, batch: int, micro_batch: int) -> int:
+        """Micro-batches of every process in one step.
+
+        Raises:
+            ConfigError: the batch cannot be shared equally.
+        """
+        if batch % (micro_batch * self.world):
+            wanted = f"a batch that is a multiple of micro_batch x processes, {micro_batch} x {self.world}"
+            raise ConfigError(wanted, str(batch), "change batch or micro_batch, or the number of processes")
+        return batch // micro_batch // self.world
+
+
+def start(device: str) -> Group:
+    """Join the group that `torchrun` has made; alone without it."""
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     cuda = torch.cuda.is_available() if device == "auto" else device == "cuda"
+    own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
+    if cuda:
+        torch.cuda.set_device(own)
     if world > 1:
         dist.init_process_group("nccl" if cuda else "gloo")
-    return rank, world, torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
+    return Group(rank, world, own)
 
 
-def sum_gradients(network: nn.Module, world: int) -> None:
-    """Adds the gradients of all processes, in one message."""
-    if world == 1:
-        return
-    parameters = list(network.parameters())
-    gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
-    flat = torch.cat([g.flatten() for g in gradients])
-    dist.all_reduce(flat)
-    for p, part in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
-        p.grad = part.view_as(p)
+def without_sync(module: nn.Module, wanted: bool) -> AbstractContextManager[None]:
+    """Gradients stay with this process: for all but the last micro-batch of a step."""
+    return module.no_sync() if wanted and isinstance(module, DistributedDataParallel) else nullcontext()
 
 
-def agree(last: bool, world: int) -> bool:
-    """True in every process as soon as it is true in the first."""
-    if world == 1:
-        return last
-    flag = torch.tensor([int(last)], device="cuda" if dist.get_backend() == "nccl" else "cpu")
-    dist.broadcast(flag, 0)
-    return bool(flag.item())
-
-
-def stop(world: int) -> None:
-    """Ends the group."""
-    if world > 1:
+def stop(group: Group) -> None:
+    """Leave the group."""
+    if group.world > 1:
         dist.destroy_process_group()

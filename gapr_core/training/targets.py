@@ -14,7 +14,7 @@ from torch.nn.functional import pad as pad_tensor
 from gapr_core.geometry import se3
 from gapr_core.model.pyramid import Frame
 from gapr_core.model.repositioning import move
-from gapr_core.model.types import Cloud, PatchPairs, collate, on_device
+from gapr_core.model.types import Cloud, PatchPairs, collate, mapped, on_device
 
 Array = NDArray[np.float64]
 MOST_RADIUS_MM = 5.0  # but never less than the first voxel: two samplings of a surface lie that far apart
@@ -32,6 +32,8 @@ class TrainingPair:
         radius: (B,) matching radius in units.
         distinct: the different targets, each once; None for a single pair.
         which: row of `distinct` for each pair.
+        is_bone: (N,) bool, fine points of the source that lie on the target under the truth.
+        subjects: whose bones the pairs were made of, a name for each contribution.
     """
 
     source: Cloud
@@ -41,10 +43,16 @@ class TrainingPair:
     radius: Tensor
     distinct: Cloud | None = None
     which: tuple[int, ...] = ()
+    is_bone: Tensor | None = None
+    subjects: tuple[str, ...] = ()
 
     def to(self, device: torch.device | str) -> TrainingPair:
         """The same on another device."""
         return on_device(self, device)
+
+    def pin_memory(self) -> TrainingPair:
+        """The same in memory that a GPU copies from without waiting; a `DataLoader` asks for it."""
+        return mapped(self, Tensor.pin_memory)
 
 
 def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: Frame) -> TrainingPair:
@@ -52,9 +60,11 @@ def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: F
     T = to_units(T_target_source, source, target)
     radius = matching_radius(frame)
     overlaps = patch_overlaps(source, target, T, radius)
+    near = cKDTree(target.fine.points.numpy()).query(se3.apply(T, source.fine.points.numpy()))[0] < radius
     return TrainingPair(
-        source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius])
-    )
+        source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius]),
+        is_bone=torch.from_numpy(near),
+    )  # fmt: skip
 
 
 def matching_radius(frame: Frame) -> float:
@@ -116,21 +126,28 @@ def join(pairs: list[TrainingPair]) -> TrainingPair:
         torch.cat([p.radius for p in pairs]),
         collate(distinct),
         which,
+        torch.cat([p.is_bone for p in pairs if p.is_bone is not None]),
+        tuple(name for p in pairs for name in p.subjects),
     )
 
 
 def true_patch_pairs(pair: TrainingPair, count: int, generator: torch.Generator) -> PatchPairs:
     """Up to `count` patch pairs per pair of clouds, drawn from those that overlap by 10 % or more: the set C*."""
-    parts = []
-    start_p = start_q = 0
-    for b, (n, m) in enumerate(zip(pair.source.coarse.lengths, pair.target.coarse.lengths, strict=True)):
-        rows, columns = (pair.overlaps[b, :n, :m] > POSITIVE_OVERLAP).nonzero(as_tuple=True)
-        drawn = torch.randperm(len(rows), generator=generator)[:count].to(rows.device)
-        rows, columns = rows[drawn], columns[drawn]
-        score = pair.overlaps[b, rows, columns]
-        parts.append((torch.full_like(rows, b), rows + start_p, columns + start_q, score))
-        start_p, start_q = start_p + n, start_q + m
-    return PatchPairs(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    which, rows, columns = (pair.overlaps > POSITIVE_OVERLAP).nonzero(as_tuple=True)  # padding overlaps nothing
+    order = torch.rand(len(which), generator=generator).to(which.device).argsort()
+    order = order[which[order].argsort(stable=True)]  # the pairs of clouds in turn, each in a random order
+    each = torch.bincount(which, minlength=len(pair.overlaps))
+    place = torch.arange(len(which), device=which.device) - (each.cumsum(0) - each).repeat_interleave(each)
+    drawn = order[place < count]
+    which, rows, columns = which[drawn], rows[drawn], columns[drawn]
+    score = pair.overlaps[which, rows, columns]
+    return PatchPairs(which, rows + _starts(pair.source, which), columns + _starts(pair.target, which), score)
+
+
+def _starts(clouds: Cloud, which: Tensor) -> Tensor:
+    """For each entry of `which` the row of its cloud's first superpoint."""
+    counts = torch.tensor(clouds.coarse.lengths)
+    return (counts.cumsum(0) - counts).to(which.device)[which]
 
 
 def fine_labels(

@@ -9,13 +9,17 @@ import csv
 import json
 import logging
 import math
+import shutil
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
@@ -27,8 +31,9 @@ from gapr_core.runtime import files
 from gapr_core.training import distributed, provenance
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.config import TrainConfig
-from gapr_core.training.dataset import TrainingPairs, one_thread
+from gapr_core.training.dataset import TrainingPairs, one_thread, prune
 from gapr_core.training.losses import Losses, compute_losses
+from gapr_core.training.subjects import Drawn
 from gapr_core.training.targets import TrainingPair
 from gapr_core.training.validation import validate, validation_set
 
@@ -54,8 +59,10 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     Raises:
         FloatingPointError: step after step had gradients that are not finite.
     """
-    rank, world, device = distributed.start(config.device)
-    model = ModelConfig.from_yaml(config.model) if config.model else ModelConfig()
+    group = distributed.start(config.device)
+    rank, world, device = group.rank, group.world, group.device
+    model = config.network()
+    per_step = group.share(config.batch, config.micro_batch)
     claim_folder(folder, config, model, rank)
     torch.manual_seed(config.seed)
     checkpoint = folder / "checkpoint.safetensors"
@@ -68,10 +75,13 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     state: dict[str, Any] = {"step": 0, "seconds": 0.0}
     if checkpoint.exists():
         state = load_checkpoint(checkpoint, network, ema, optimizer)
+    learner = group.wrap(Learner(network, config))
+    drawn = Drawn.of(anatomy, folder / f"subjects_{rank}.json")
     steps = config.pairs // config.batch
     origin = provenance.append(folder, config, anatomy, state["step"], world) if rank == 0 else []
-    per_step = config.batch // config.micro_batch // world
-    batches = micro_batches(config, model, anatomy, state["step"] * config.batch // config.micro_batch, rank, world)
+    bones = bones_folder(folder, config) if max(1, config.workers) * world > 1 else None
+    first = state["step"] * config.batch // config.micro_batch
+    batches = micro_batches(config, model, anatomy, first, rank, world, bones, device.type == "cuda")
     held_out = validation_set(config, model, anatomy) if rank == 0 else []
     begun, saved, validated = time.monotonic(), time.monotonic(), time.monotonic()
     earlier, lost = state["seconds"], 0
@@ -80,15 +90,18 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     progress = tqdm(ahead, initial=state["step"], total=steps, disable=rank > 0 or None, unit="step")
     for step in progress:
         rate = learning_rate(config, step / steps)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
+        for parameters in optimizer.param_groups:
+            parameters["lr"] = rate
         parts = []
         for part in range(per_step):
-            generator = torch.Generator().manual_seed(config.seed + 7919 * (step * per_step + part) + rank)
-            losses = forward(network, next(batches).to(device), generator, config.precision)
-            (losses.total / (per_step * world)).backward()
+            number = (step * per_step + part) * world + rank  # of the micro-batch, however many processes there are
+            generator = torch.Generator().manual_seed(config.seed + 7919 * number)
+            pairs = next(batches)
+            drawn.add(pairs.subjects)
+            with distributed.without_sync(learner, part + 1 < per_step):
+                losses = learner(pairs.to(device), generator)
+                (losses.total / per_step).backward()
             parts.append(losses)
-        distributed.sum_gradients(network, world)
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip)
         lost = 0 if torch.isfinite(norm) else lost + 1
         if lost == MOST_LOST:
@@ -99,23 +112,32 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
         average(ema, network, min(config.ema, (1 + step) / (10 + step)))
 
         state = {"step": step + 1, "seconds": earlier + time.monotonic() - begun}
-        row = log_row(state, config, rate, float(norm), parts)
-        progress.set_postfix(loss=row["loss"], coarse=row["coarse"], fine=row["fine"])
         last = step + 1 == steps or time.monotonic() - begun > 60.0 * minutes
-        if rank == 0:
+        is_logged = last or (step + 1) % config.log_steps == 0
+        if rank == 0 and is_logged:
+            row = log_row(state, config, rate, float(norm), parts)
+            progress.set_postfix(loss=row["loss"], coarse=row["coarse"], fine=row["fine"])
             append(folder / "log.csv", row)
             if last or time.monotonic() - validated > 60.0 * config.validate_minutes:
                 validated = time.monotonic()
                 report(folder, ema, held_out, state, config, device)
                 draw_curves(folder)
-            if last or time.monotonic() - saved > 60.0 * config.checkpoint_minutes:
-                saved = time.monotonic()
-                save_checkpoint(checkpoint, network, ema, optimizer, state)
-                header = {**(card or {}), "run": config.to_dict(), **state, "provenance": origin}
-                weights.save(ema, folder / "weights.safetensors", header)
-        if distributed.agree(last, world):
+        is_due = last or time.monotonic() - saved > 60.0 * config.checkpoint_minutes
+        if is_due:
+            saved = time.monotonic()
+            drawn.write()
+        if rank == 0 and is_due:
+            save_checkpoint(checkpoint, network, ema, optimizer, state)
+            header = {**(card or {}), "run": config.to_dict(), **state, "provenance": origin}
+            weights.save(ema, folder / "weights.safetensors", header | {"subjects": drawn.count()})
+            if bones:
+                prune(bones, config, (step + 1) * config.batch)
+        if group.agree(last):
+            drawn.write()
             break
-    distributed.stop(world)
+    distributed.stop(group)
+    if bones and rank == 0 and state["step"] == steps:
+        shutil.rmtree(bones, ignore_errors=True)
     return folder / "weights.safetensors"
 
 
@@ -141,18 +163,43 @@ def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
     return network.train()
 
 
-def forward(network: GAPRNet, pair: TrainingPair, generator: torch.Generator, precision: str) -> Losses:
-    """The losses of one micro-batch, in bfloat16 where asked for."""
-    device = pair.T.device.type
-    with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
-        return compute_losses(network, pair, generator)[0]
+def bones_folder(folder: Path, config: TrainConfig) -> Path:
+    """Where the bones in use of a run are kept: a scratch folder of this machine, the same at every call."""
+    name = sha256(f"{folder.resolve()} {json.dumps(config.to_dict())}".encode()).hexdigest()[:16]
+    scratch = Path(tempfile.gettempdir()) / f"gapr-bones-{name}"
+    scratch.mkdir(exist_ok=True)
+    return scratch
+
+
+class Learner(nn.Module):
+    """The network with its losses: what a training pass calls, in bfloat16 where asked for."""
+
+    def __init__(self, network: GAPRNet, config: TrainConfig) -> None:
+        super().__init__()
+        self.network, self.config = network, config
+
+    def forward(self, pair: TrainingPair, generator: torch.Generator) -> Losses:
+        """The losses of one micro-batch."""
+        with torch.autocast(pair.T.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+            weights = self.config.early_loss, self.config.bone_loss
+            return compute_losses(self.network, pair, generator, *weights)[0]
 
 
 def micro_batches(
-    config: TrainConfig, model: ModelConfig, anatomy: Path | None, first: int, rank: int, world: int
+    config: TrainConfig,
+    model: ModelConfig,
+    anatomy: Path | None,
+    first: int,
+    rank: int,
+    world: int,
+    cache: Path | None = None,
+    pinned: bool = False,
 ) -> Iterator[TrainingPair]:
-    """This process's share of the micro-batches, in order, from number `first` on."""
-    dataset = TrainingPairs(config, model, anatomy)
+    """This process's share of the micro-batches, in order, from number `first` on.
+
+    With `cache`, a folder, the workers of all processes draw every bone once; `pinned` is for copies to a GPU.
+    """
+    dataset = TrainingPairs(config, model, anatomy, cache=cache)
     numbers = range(first + rank, config.pairs // config.micro_batch, world)
     loader = DataLoader(
         dataset,
@@ -162,6 +209,7 @@ def micro_batches(
         worker_init_fn=one_thread,
         prefetch_factor=4 if config.workers else None,
         multiprocessing_context="fork" if config.workers else None,
+        pin_memory=pinned,
     )
     return iter(loader)
 
@@ -203,9 +251,12 @@ def log_row(
     state: dict[str, Any], config: TrainConfig, rate: float, norm: float, parts: list[Losses]
 ) -> dict[str, Any]:
     """One line of log.csv."""
-    means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in ("coarse", "fine", "early")}
+    names = (
+        ("coarse", "fine", "early", "bone") if isinstance(parts[0].bone, torch.Tensor) else ("coarse", "fine", "early")
+    )
+    means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in names}
     row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
-    total = means["coarse"] + means["fine"] + 0.5 * means["early"]
+    total = sum(float(p.total.detach()) for p in parts) / len(parts)
     values = {"rate": rate, "norm": norm, "loss": total, **means}
     return row | {name: float(f"{value:.5g}") for name, value in values.items()}
 
@@ -214,6 +265,8 @@ def report(
     folder: Path, ema: GAPRNet, held_out: Any, state: dict[str, Any], config: TrainConfig, device: torch.device
 ) -> None:
     """Validate the averaged weights: lines of validation.csv, and one on the terminal."""
+    if not held_out:
+        return
     scores = validate(ema, held_out, device)
     for protocol, score in scores.items():
         values = {name: round(value, 4) for name, value in asdict(score).items()}

@@ -66,9 +66,7 @@ class NetworkProposer:
             return Proposals(np.empty((0, 4, 4)), np.empty(0))
         found = self.match(moving, cloud, features)
         radius_mm = 1.5 * max(5.0, frame.voxel * frame.scale_mm)
-        if self.method == "ransac":
-            return Proposals(*ransac(found, radius_mm, rng, count=self.count))
-        return Proposals(*local_to_global(found, radius_mm, count=self.count))
+        return Proposals(*consensus(self.method, found, radius_mm, rng, self.count))
 
     def prepare(self, target: PreparedTarget) -> tuple[Frame, Cloud, Features]:
         """The target's share: its pyramid and its features, computed once and kept with it."""
@@ -94,6 +92,15 @@ class NetworkProposer:
     @property
     def _device(self) -> Any:
         return next(self.network.parameters()).device
+
+
+def consensus(
+    method: str, found: Correspondences, radius_mm: float, rng: np.random.Generator | None = None, count: int = 32
+) -> tuple[Array, Array]:
+    """Poses (K, 4, 4), best first, and their scores (K,) from correspondences, by a method of `METHODS`."""
+    if method == "ransac":
+        return ransac(found, radius_mm, rng or np.random.default_rng(0), count=count)
+    return local_to_global(found, radius_mm, count=count)
 
 
 def _available(device: str) -> str:

@@ -34,12 +34,10 @@ from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model import weights
-from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.registration import target
-from gapr_core.registration.proposals.consensus import local_to_global
-from gapr_core.registration.proposals.network import correspondences_mm
+from gapr_core.registration.proposals.network import METHODS, consensus, correspondences_mm
 from gapr_core.registration.refinement import refine_fully
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import at_least_one
@@ -63,6 +61,7 @@ class Task:
     anatomy: Path | None
     pairs: Path
     deadline: float  # of the clock, seconds
+    pose: str = "local_to_global"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -72,6 +71,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
     parser.add_argument("--plan", type=Path, help="which networks, in which tables (config/ablation.yaml)")
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
+    parser.add_argument("--pose", default=METHODS[0], choices=METHODS, help=f"from matches, in the exam ({METHODS[0]})")
     parser.add_argument("--seeds", type=at_least_one, default=1, help="trainings of every network, seeds 0, 1, ... (1)")
     parser.add_argument("--protocols", default="paper,L1,L2", help="of the examination, with commas (paper,L1,L2)")
     parser.add_argument("--count", type=at_least_one, default=10, help="pairs of the exam, per protocol and bone (10)")
@@ -87,7 +87,7 @@ def run(args: Namespace) -> int:
     bones = tuple(available(config.bones, args.anatomy))
     origin = "anatomy" if args.anatomy else "parametric"
     recipe = Recipe(tuple(args.protocols.split(",")), bones, args.count, 0, args.split, args.count, origin)
-    missing = ablate(plan, config, args.out, args.anatomy, recipe, args.seeds, args.jobs, args.minutes)
+    missing = ablate(plan, config, args.out, args.anatomy, recipe, args.seeds, args.jobs, args.minutes, args.pose)
     say(f"table in {args.out / 'table.md'}" + (f"; {missing} networks are left, call again" if missing else ""))
     return 0
 
@@ -101,6 +101,7 @@ def ablate(
     seeds: int = 1,
     jobs: int = 1,
     minutes: float = math.inf,
+    pose: str = METHODS[0],
 ) -> int:
     """Bring the comparison in `out` to its end, or as far as `minutes` suffice.
 
@@ -113,6 +114,7 @@ def ablate(
         seeds: trainings of every network.
         jobs: processes.
         minutes: budget of this call.
+        pose: how the examination makes one from matches: local_to_global, or ransac as in the paper.
 
     Returns:
         How many networks are not finished yet.
@@ -123,13 +125,13 @@ def ablate(
     deadline = time.time() + 60.0 * minutes
     todo = {
         folder_of(out, model, seed): replace(config, model=str(model), seed=seed)
-        for seed in range(seeds) for model in dict.fromkeys(trained_as(plan).values())
+        for seed in range(seeds) for model in dict.fromkeys(trained_as(plan, config.model_settings).values())
     }  # fmt: skip
     for folder, settings in todo.items():
         if (folder / "config.json").exists():
-            claim_folder(folder, settings, ModelConfig.from_yaml(settings.model), 1)
+            claim_folder(folder, settings, settings.network(), 1)
     examination(recipe, out / "pairs", anatomy)
-    tasks = [Task(folder, settings, anatomy, out / "pairs", deadline) for folder, settings in todo.items()]
+    tasks = [Task(folder, settings, anatomy, out / "pairs", deadline, pose) for folder, settings in todo.items()]
     missing = [task for task in tasks if not (task.folder / "exam.json").exists()]
     left, written = len(missing), False
     with tqdm(total=len(tasks), initial=len(tasks) - left, unit="network", desc="ablation", disable=None) as bar:
@@ -181,7 +183,10 @@ def finish(task: Task) -> bool:
         return False
     network = weights.load(task.folder / "weights.safetensors")[0]
     pairs = sorted(task.pairs.glob("*.npz"))
-    records = [examine(network, load_pair(f)) for f in tqdm(pairs, task.folder.name, False, unit="pair", disable=None)]
+    records = [
+        examine(network, load_pair(f), task.pose)
+        for f in tqdm(pairs, task.folder.name, False, unit="pair", disable=None)
+    ]
     files.write_json(task.folder / "exam.json", {"pairs": read_manifest(task.pairs)["hash"], "records": records})
     return True
 
@@ -193,7 +198,7 @@ def trained(task: Task) -> bool:
 
 
 @torch.inference_mode()
-def examine(network: GAPRNet, pair: Pair) -> Record:
+def examine(network: GAPRNet, pair: Pair, pose: str = METHODS[0]) -> Record:
     """Inlier ratios and the best raw pose of one pair, as it is and refined; a pair without a pose is a failure."""
     record: Record = {"pair": pair.name, "protocol": pair.protocol, "bone": pair.bone, "person": pair.person}
     frame = target_frame(pair.target, network.config)
@@ -205,7 +210,7 @@ def examine(network: GAPRNet, pair: Pair) -> Record:
     output = network(source, full)
     record["coarse"], record["fine"] = inlier_ratios(output, source, truth)
     radius_mm = float(truth.radius[0]) * float(source.scale_mm[0])
-    poses, _ = local_to_global(correspondences_mm(output.matches, source, full), 1.5 * radius_mm)
+    poses, _ = consensus(pose, correspondences_mm(output.matches, source, full), 1.5 * radius_mm)
     if not len(poses):
         return record | dict.fromkeys([name for name in FIGURES if "rr_" in name], 0.0)
     refined = refine_fully(poses[0], pair.source, target.prepare(pair.target), RefinementConfig()).T

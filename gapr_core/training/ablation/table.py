@@ -34,7 +34,8 @@ def folder_of(out: Path, model: Path, seed: int) -> Path:
 
 def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recipe, seeds: int) -> None:
     """table.md, table.json, table.csv and the curves of each table, from whatever is finished."""
-    folders = {v: [folder_of(out, trained_as(plan)[v.model], seed) for seed in range(seeds)] for v in plan}
+    trained = trained_as(plan, config.model_settings)
+    folders = {v: [folder_of(out, trained[v.model], seed) for seed in range(seeds)] for v in plan}
     rows = [row(v, protocol, folders[v], recipe) for v in plan for protocol in _protocols(recipe)]
     made = provenance.summary([folder for found in folders.values() for folder in found])
     settings = {"train": config.to_dict(), "exam": asdict(recipe), "seeds": seeds, "made": made}
@@ -94,7 +95,7 @@ def _preamble(settings: Record) -> str:
         f"{run['pairs']} training pairs a network, {settings['seeds']} seed(s), the same pairs in the same order for "
         f"all; examined on subjects of split {exam['split']}, {exam['count']} pairs a protocol and bone "
         f"({', '.join(exam['bones'])}).\n\nIn %, with 95 % intervals from a bootstrap over subjects. Recall is of the "
-        "best raw pose (local-to-global consensus, no search): RMSE < 0.02 x the target's half extent, or 4 mm and 5° "
+        "best raw pose (consensus of the matches, no search): RMSE < 0.02 x the target's half extent, or 4 mm and 5° "
         "at the source's centroid; refined: after the point-to-surface refinement. The paper's numbers are on its own "
         "data at its own budget: compare the order of the rows, not the values. A dash: not finished, or no value."
     )

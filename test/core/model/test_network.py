@@ -49,6 +49,7 @@ def tiny(path: Path, toy) -> ModelConfig:
                 "fine_stage",
                 "global_small_ball",
                 "early_features",
+                "bone_head",
             )
         },
     )

@@ -2,6 +2,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import subprocess
+import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +16,11 @@ import yaml
 
 from gapr_core.errors import ConfigError
 from gapr_core.model import weights
+from gapr_core.model.export import leaves
 from gapr_core.surface import Surface
-from gapr_core.training import trainer
+from gapr_core.training import distributed, trainer
 from gapr_core.training.config import TrainConfig
-from gapr_core.training.dataset import TrainingPairs
+from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
 
 
@@ -96,8 +101,8 @@ def test_a_run_can_begin_with_the_weights_of_another_one(settings, anatomy, tmp_
 def test_a_run_whose_gradients_are_never_finite_ends_with_an_error(settings, anatomy, tmp_path, monkeypatch):
     compute = trainer.compute_losses
 
-    def spoilt(network, pair, generator):
-        losses, *rest = compute(network, pair, generator)
+    def spoilt(*arguments):
+        losses, *rest = compute(*arguments)
         return replace(losses, coarse=losses.coarse * float("nan")), *rest
 
     monkeypatch.setattr(trainer, "compute_losses", spoilt)
@@ -124,10 +129,51 @@ def test_workers_make_the_same_pairs_in_the_same_order(settings, anatomy):
     assert all(torch.equal(a.overlaps, b.overlaps) for a, b in zip(alone, helped, strict=True))
 
 
-def test_processes_share_the_micro_batches_without_repeating_any(settings, anatomy):
-    dataset = settings.pairs // settings.micro_batch
-    shares = [set(range(0 + rank, dataset, 2)) for rank in range(2)]
-    assert shares[0] | shares[1] == set(range(dataset)) and not shares[0] & shares[1]
+@pytest.mark.timeout(400)
+def test_two_processes_under_torchrun_learn_what_one_learns(settings, anatomy, tmp_path):
+    """DistributedDataParallel on gloo: the same pairs and patches, so the same weights but for the order of sums."""
+    one = trainer.train(settings, tmp_path / "one", anatomy)
+    (tmp_path / "run.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(settings.to_dict()))))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
+               "-m", "gapr_core.cli", "train", "--config", str(tmp_path / "run.yaml"), "--anatomy", str(anatomy),
+               "--out", str(tmp_path / "two")]  # fmt: skip
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "TMPDIR": str(tmp_path)}
+    subprocess.run(command, check=True, env=environment, capture_output=True, timeout=300)
+    first, second = weights.load(one)[0], weights.load(tmp_path / "two" / "weights.safetensors")[0]
+    for a, b in zip(first.parameters(), second.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-4)
+    of_one = json.loads((tmp_path / "one" / "subjects_0.json").read_text())
+    of_two = [json.loads((tmp_path / "two" / f"subjects_{rank}.json").read_text()) for rank in range(2)]
+    assert Counter(of_one) == Counter(of_two[0]) + Counter(of_two[1]) and all(of_two)
+
+
+def test_a_batch_that_the_processes_cannot_share_is_refused():
+    group = distributed.Group(0, 3, torch.device("cpu"))
+    assert distributed.Group(0, 2, torch.device("cpu")).share(8, 2) == 2
+    with pytest.raises(ConfigError, match="2 x 3"):
+        group.share(8, 2)
+
+
+def test_a_bone_from_the_shared_folder_gives_the_same_pairs_bit_by_bit(settings, anatomy, tmp_path):
+    model = settings.network()
+    drawn, shared, other = (TrainingPairs(settings, model, anatomy, cache=c) for c in (None, tmp_path, tmp_path))
+    first = [drawn.pair(number) for number in range(3)]
+    second = [shared.pair(number) for number in range(3)]
+    written = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
+    third = [other.pair(number) for number in range(3)]
+    assert written and {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")} == written
+    for pairs in (second, third):
+        for a, b in zip(first, pairs, strict=True):
+            assert all(torch.equal(p, q) for p, q in zip(leaves(a), leaves(b), strict=True))
+            assert a.source.coarse.lengths == b.source.coarse.lengths and a.subjects == b.subjects
+    prune(tmp_path, settings, 10**6)
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_a_mix_of_what_does_not_exist_or_has_no_pose_is_refused(settings, anatomy):
+    for mix in ({"L9": 1.0}, {"wrong": 1.0}, {"L1": 0.0}):
+        with pytest.raises(ConfigError, match="mix of the protocols"):
+            TrainingPairs(replace(settings, mix=mix), settings.network(), anatomy)
 
 
 def test_the_learning_rate_rises_then_falls_to_its_final_share():

@@ -1,0 +1,59 @@
+"""Whose bones a run really drew: counted while it trains, and an error as soon as one is held out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gapr_core.data import anatomy
+from gapr_core.data.pool import parametric_split
+from gapr_core.errors import ConfigError
+from gapr_core.runtime import files
+
+
+@dataclass
+class Drawn:
+    """Pairs for every subject who contributed to them; a shape model counts for everybody that it is made of.
+
+    Attributes:
+        path: of the record, JSON; one a process.
+        held_out: subjects of val and test.
+        pairs: subject to how many pairs.
+    """
+
+    path: Path
+    held_out: frozenset[str] = frozenset()
+    pairs: Counter[str] = field(default_factory=Counter)
+
+    @classmethod
+    def of(cls, folder: Path | None, path: Path) -> Drawn:
+        """The record that an earlier call left in `path`, or a new one; `folder` has the bones and splits.json."""
+        people = anatomy.splits(folder) if folder else {"val": [], "test": []}
+        known = files.read_json(path, "subjects of a training run") if path.exists() else {}
+        return cls(path, frozenset([*people["val"], *people["test"]]), Counter(known))
+
+    def add(self, subjects: Iterable[str]) -> None:
+        """Count one batch.
+
+        Raises:
+            ConfigError: a subject of val or test is among them: the training would leak.
+        """
+        subjects = list(subjects)
+        leaked = sorted({name for name in subjects if name in self.held_out or parametric_split(name) in HELD_OUT})
+        if leaked:
+            wanted = "subjects of the train split only"
+            raise ConfigError(wanted, ", ".join(leaked), "the training pairs draw from held-out subjects: fix that")
+        self.pairs.update(subjects)
+
+    def write(self) -> None:
+        """Write the record."""
+        files.write_json(self.path, dict(sorted(self.pairs.items())))
+
+    def count(self) -> int:
+        """How many subjects contributed so far."""
+        return len(self.pairs)
+
+
+HELD_OUT = ("val", "test")

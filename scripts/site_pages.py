@@ -18,10 +18,19 @@ from mkdocs.structure.files import File, Files
 
 from gapr_core.cli import modules
 from gapr_core.config import RegistrarConfig
-from gapr_core.runtime.settings import Row
+from gapr_core.pages import markdown
 from gapr_core.runtime.settings import table as table_of
 
 ROOT = Path(__file__).resolve().parents[1]
+SETTINGS = """# Parameters of the library
+
+| where | how |
+|---|---|
+| Python | `RegistrarConfig(min_confidence=0.8, refinement=RefinementConfig(iterations=5))` (`gapr_core.config`) |
+| file | `gapr register --config FILE.yaml`, with `refinement: {iterations: 5}` in it; the node: `settings_file` |
+| command line | `gapr register --set refinement.iterations=5` |
+
+A value out of range is an error. `gapr settings` prints these tables as one."""
 ELSEWHERE = {"contributing.md": "CONTRIBUTING.md", "weights.md": "gapr_core/weights/README.md"}  # page: where it lives
 LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
 TABLE = re.compile(r"^\[[^\]]*\]\((\S*tables/\w+\.md)\)$", re.MULTILINE)
@@ -60,15 +69,16 @@ def link(found: re.Match[str], here: str, folder: str, files: Files) -> str:
 
 
 def settings_of_the_library() -> str:
-    """Every setting with its default, unit, range and help."""
-    intro = "Each can be set in Python (`RegistrarConfig(min_confidence=0.8)`), in a file or on the command line."
-    lines = [
-        f"# Parameters of the library\n\n{intro}\n",
-        f"| {' | '.join(Row._fields)} |",
-        "|---" * len(Row._fields) + "|",
-    ]
-    lines += [f"| `{row[0]}` | {' | '.join(map(str, row[1:]))} |" for row in table_of(RegistrarConfig)]
-    return "\n".join(lines)
+    """Every setting with its default, unit, range and help: a table for each group."""
+    header = ("setting", "default", "range", "meaning")
+    groups: dict[str, list[tuple[object, ...]]] = {"": []}
+    for name, *rest in table_of(RegistrarConfig):
+        groups.setdefault(name.rpartition(".")[0], []).append((f"`{name}`", *rest))
+    parts = [SETTINGS, markdown.table(header, groups.pop(""))]
+    for group, rows in groups.items():
+        about = (type(getattr(RegistrarConfig(), group)).__doc__ or "").splitlines()[0]
+        parts += [f"## {group}", about, markdown.table(header, rows)]
+    return "\n\n".join(parts)
 
 
 def help_of_commands() -> str:
@@ -79,4 +89,5 @@ def help_of_commands() -> str:
         run = [sys.executable, "-m", "gapr_core.cli", *command.split(), "--help"]
         text = subprocess.run(run, capture_output=True, text=True, check=True, env=env).stdout
         parts.append(f"## {f'gapr {command}'.strip()}\n\n```text\n{text}```")
+    parts.append("The programs of the ROS package, `register_node` and `bag_replay`: [the ROS 2 node](../ros.md).")
     return "\n\n".join(parts)

@@ -14,11 +14,23 @@ if TYPE_CHECKING:
     from gapr_ros.node.lifecycle import RegisterNode
 
 
+USAGE = """usage: register_node [--ros-args [-p NAME:=VALUE ...] [--params-file FILE] [-r points:=TOPIC] ...]
+
+Registers the partial clouds of a topic to a pre-operative bone, and publishes poses or the reasons why there are none.
+
+  register_node --ros-args -p model_path:=/data/femur_ct.stl -p model_unit:=mm -r points:=/probe/points
+
+`python -m gapr_ros.parameters` prints every parameter with its default, range and meaning; docs/ros.md explains topics,
+services and reasons.
+"""
 PATIENCE_S = 0.3  # for the registration that is on its way when the program is asked to stop
 
 
 def main(args: list[str] | None = None) -> int:
-    """`ros2 run gapr_ros register_node`; 1 when a parameter or the sourced ROS cannot be used."""
+    """`ros2 run gapr_ros register_node`; `--help` says how; 1 when a parameter or the sourced ROS cannot be used."""
+    if {"-h", "--help"} & set(sys.argv[1:] if args is None else args):
+        sys.stdout.write(USAGE)
+        return 0
     why = distribution.problem(os.environ)
     if why:
         return _fail(why)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from harness import NodeProcess
 
+from gapr_ros import register_node
+
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_process_with_0_even_while_it_registers(client, tmp_path, number):
@@ -21,3 +23,9 @@ def test_a_signal_ends_the_process_with_0_even_while_it_registers(client, tmp_pa
     time.sleep(0.3)
     assert node.stop(number, 30.0) == 0, node.log
     assert "Traceback" not in node.log
+
+
+def test_help_shows_a_command_line_and_starts_no_node(capsys, monkeypatch):
+    monkeypatch.setattr(register_node.distribution, "problem", pytest.fail)
+    assert register_node.main(["--help"]) == 0
+    assert "-p model_path:=" in capsys.readouterr().out

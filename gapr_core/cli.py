@@ -32,14 +32,18 @@ COMMANDS = {
 }
 EXTRAS = {  # top-level module -> the extra of setup.py that installs it
     "torch": "network", "safetensors": "network", "open3d": "data", "matplotlib": "reports", "plotly": "reports",
-    "rich": "reports", "rclpy": "ros", "rosbags": "bags",
+    "PIL": "reports", "rich": "reports", "rclpy": "ros", "rosbags": "bags",
     "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros",
     "SimpleITK": "medical", "skimage": "medical", "highdicom": "medical",
 }  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; 0 for success, 2 for a refusal by the data, 1 for bad input (one line, no traceback)."""
+    """Run one command.
+
+    Returns:
+        0 for success, 2 for a refusal by the data, 1 for bad input (one line, no traceback), 130 when interrupted.
+    """
     logging.basicConfig(format="gapr: %(message)s", level=logging.WARNING)
     try:
         args = _parser(sys.argv[1:] if arguments is None else arguments)

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 from gapr_core.runtime.settings import Settings, setting
 
+TUKEY = "Tukey scale of the first and the last iteration, and the number of iterations"
+
 
 @dataclass(frozen=True)
 class TargetConfig(Settings):
@@ -49,36 +51,38 @@ class SearchConfig(Settings):
     references: int = setting(14, "points of the source that are laid on anchors", low=1, high=1000)
     spins: int = setting(36, "turns about the normal", low=1, high=360)
     probes: int = setting(32, "points of the source that score a pose", low=3, high=1000)
-    first_probes: int = setting(8, "probes after which a bad pose is given up", low=1, high=1000)
-    first_limit_mm: float = setting(7.0, "mean distance of these probes that is bad", low=0, high=100, unit="mm")
+    first_probes: int = setting(8, "probes after which a bad pose is discarded", low=1, high=1000)
+    first_limit_mm: float = setting(
+        7.0, "mean distance of these probes above which a pose is bad", low=0, high=100, unit="mm"
+    )
     keep: int = setting(1500, "poses that go to verification", low=1, high=100_000)
 
 
 @dataclass(frozen=True)
 class VerificationConfig(Settings):
-    """Which proposals are refined further, and when two poses are the same. Limits are (from, to, iterations)."""
+    """Which proposals are refined further, and when two poses are the same."""
 
     coarse_points: int = setting(192, "points of the coarse step", low=10)
-    coarse_limits_mm: tuple[float, float, int] = setting((10.0, 5.0, 6), "Tukey scales of it", low=0.1, unit="mm")
+    coarse_limits_mm: tuple[float, float, int] = setting((10.0, 5.0, 6), TUKEY, low=0.1, unit="mm")
     middle_points: int = setting(300, "points of the middle step", low=10)
-    middle_poses: int = setting(200, "poses that reach it", low=1)
-    middle_limits_mm: tuple[float, float, int] = setting((6.0, 4.0, 10), "Tukey scales of it", low=0.1, unit="mm")
+    middle_poses: int = setting(200, "poses that reach the middle step", low=1)
+    middle_limits_mm: tuple[float, float, int] = setting((6.0, 4.0, 10), TUKEY, low=0.1, unit="mm")
     final_poses: int = setting(8, "distinct poses that are compared in the end", low=1, high=1000)
-    final_limits_mm: tuple[float, float, int] = setting((5.0, 4.0, 8), "Tukey scales of that", low=0.1, unit="mm")
+    final_limits_mm: tuple[float, float, int] = setting((5.0, 4.0, 8), TUKEY, low=0.1, unit="mm")
     same_pose_mm: float = setting(4.0, "poses nearer to each other (rms over the source) are one", low=0.1, unit="mm")
     markers: int = setting(16, "source points by which two poses are compared", low=3, high=1000)
 
 
 @dataclass(frozen=True)
 class RefinementConfig(Settings):
-    """The last, robust point-to-surface refinement: Gauss-Newton until the points rest."""
+    """The last, robust point-to-surface refinement: Gauss-Newton until it converges."""
 
     rounds: int = setting(12, "most rounds; each has its own scale", low=1, high=1000)
     iterations: int = setting(3, "Gauss-Newton steps of a round", low=1, high=1000)
     tukey_scale: float = setting(3.0, "end of Tukey's weight, in standard deviations", low=1, high=100)
-    clean_tukey_scale: float = setting(5.0, "the same where almost nothing lies beyond 3 of them", low=1, high=100)
+    clean_tukey_scale: float = setting(5.0, "the end where almost nothing lies beyond 3 of them", low=1, high=100)
     clean_share: float = setting(0.015, "share beyond 3 standard deviations that is almost nothing", low=0, high=1)
-    rest_mm: float = setting(1e-3, "points that move less are at rest", low=1e-9, high=1.0, unit="mm")
+    rest_mm: float = setting(1e-3, "converged when the points move less than this", low=1e-9, high=1.0, unit="mm")
     free_rounds: int = setting(2, "first rounds in which no patch is distrusted", low=0, high=1000)
     patch_scale: float = setting(6.0, "end of Tukey's weight for a patch's mean residual, in its deviations", low=1)
     smallest_sigma_mm: float = setting(0.15, "least standard deviation of the residuals", low=1e-9, high=10, unit="mm")
@@ -97,7 +101,7 @@ class CovarianceConfig(Settings):
         (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0),
         "standard deviations of the bias to choose from", low=1e-3, high=100, unit="mm",
     )  # fmt: skip
-    smallest_share: float = setting(0.03, "information of a field over the largest, to have a say", low=0, high=1)
+    smallest_share: float = setting(0.03, "least information of a usable field, over the largest", low=0, high=1)
     bias_gain: float = setting(2.5, "bias over what the residuals of a robust fit show of it", low=0, high=100)
     no_bias_mm: float = setting(0.035, "bias that residuals without any show on average", low=0, high=10, unit="mm")
     bias_spread: float = setting(1.5, "log standard deviation of the bias before the residuals", low=0.01, high=10)
@@ -116,7 +120,7 @@ class SensorConfig(Settings):
 
     kind: str = setting("unknown", "what measured the source", choices=SENSOR_KINDS)
     standoff_mm: float | None = setting(
-        None, "distance of the points outside of the bone, subtracted", low=-10, high=10, unit="mm"
+        None, "mean distance of the points outside of the bone, which is subtracted", low=-10, high=10, unit="mm"
     )
     noise_mm: float | None = setting(None, "standard deviation of a point", low=1e-3, high=10, unit="mm")
     bias_mm: float | None = setting(None, "standard deviation of the smooth bias", low=1e-3, high=10, unit="mm")
@@ -175,17 +179,19 @@ class RulesConfig(Settings):
 class CorticesConfig(Settings):
     """Sources that follow the inner and the outer cortex of a hollow bone."""
 
-    share: float = setting(0.82, "of its residuals that both cortices leave to such a source", low=0, high=1)
-    largest_confidence: float = setting(0.85, "the confidence was not fitted on such sources", low=0, high=1)
+    share: float = setting(
+        0.82, "residual scale to both cortices over that to the outer, below which both are followed", low=0, high=1
+    )
+    largest_confidence: float = setting(0.85, "of such a source: the models were not fitted on any", low=0, high=1)
 
 
 @dataclass(frozen=True)
 class AccumulationConfig(Settings):
     """Which sources an `Accumulator` keeps."""
 
-    off: float = setting(2.5, "a source so many times farther from the bone than all together lies off it", low=1)
+    off: float = setting(2.5, "a source so many times farther off the bone than all together is discarded", low=1)
     most_off: int = setting(3, "after so many of them in a row the bone has moved", low=1, high=1000)
-    fewest_points: int = setting(20, "of a source that can be said to lie off", low=3)
+    fewest_points: int = setting(20, "points of a source that is checked by itself", low=3)
     most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
 
 
@@ -228,31 +234,37 @@ class FreeSpaceConfig(Settings):
 
 @dataclass(frozen=True)
 class ClutterConfig(Settings):
-    """Clouds of a camera that saw more than bone: regions propose, lines of sight decide. Limits as above."""
+    """Clouds of a camera that saw more than bone: regions propose, lines of sight decide."""
 
     radii_mm: tuple[float, ...] = setting((30.0, 45.0), "radii of the regions that propose", low=5, unit="mm")
     seeds: tuple[int, ...] = setting((24, 12), "regions of each radius in a round", low=1, high=1000)
     rounds: int = setting(2, "rounds of other regions, until an answer is sure", low=1, high=100)
     references: int = setting(4, "points of a region that are laid on anchors", low=1, high=1000)
     probes: int = setting(32, "points of a region that score a pose", low=3, high=1000)
-    first_limit_mm: float = setting(5.0, "mean distance of the first probes that is bad", low=0, high=100, unit="mm")
+    first_limit_mm: float = setting(
+        5.0, "mean distance of the first probes above which a pose is bad", low=0, high=100, unit="mm"
+    )
     keep: int = setting(300, "poses that a region proposes", low=1, high=100_000)
     region_points: int = setting(64, "points of a region that refine its poses", low=10)
-    region_limits_mm: tuple[float, float, int] = setting((8.0, 4.0, 4), "Tukey scales of it", low=0.1, unit="mm")
+    region_limits_mm: tuple[float, float, int] = setting((8.0, 4.0, 4), TUKEY, low=0.1, unit="mm")
     coarse_points: int = setting(500, "target points of the coarse step", low=10)
-    coarse_on_mm: float = setting(5.0, "in it: off the measured surface, yet explained", low=0.01, unit="mm")
-    coarse_front_mm: float = setting(6.0, "in it: in front of what was measured, so impossible", low=0.01, unit="mm")
+    coarse_on_mm: float = setting(
+        5.0, "coarse step: target points this near to the measured surface agree", low=0.01, unit="mm"
+    )
+    coarse_front_mm: float = setting(
+        6.0, "coarse step: target points farther in front of it are impossible", low=0.01, unit="mm"
+    )
     middle_poses: int = setting(1000, "poses that reach the middle step", low=1)
     middle_reach_mm: float = setting(60.0, "around its region a pose is refined", low=5, unit="mm")
     middle_points: int = setting(300, "points of the middle step", low=10)
-    middle_limits_mm: tuple[float, float, int] = setting((8.0, 2.5, 8), "Tukey scales of it", low=0.1, unit="mm")
-    middle_target_points: int = setting(1500, "target points of it", low=10)
-    middle_on_mm: float = setting(2.5, "as coarse_on_mm", low=0.01, unit="mm")
+    middle_limits_mm: tuple[float, float, int] = setting((8.0, 2.5, 8), TUKEY, low=0.1, unit="mm")
+    middle_target_points: int = setting(1500, "target points of the middle step", low=10)
+    middle_on_mm: float = setting(2.5, "as coarse_on_mm, in the middle step", low=0.01, unit="mm")
     final_poses: int = setting(200, "poses that reach the final step", low=1)
     final_points: int = setting(1200, "points of the final step", low=10)
-    final_limits_mm: tuple[float, float, int] = setting((5.0, 2.0, 8), "Tukey scales of it", low=0.1, unit="mm")
-    final_target_points: int = setting(4000, "target points of it", low=10)
-    on_mm: float = setting(0.6, "as coarse_on_mm", low=0.01, unit="mm")
+    final_limits_mm: tuple[float, float, int] = setting((5.0, 2.0, 8), TUKEY, low=0.1, unit="mm")
+    final_target_points: int = setting(4000, "target points of the final step", low=10)
+    on_mm: float = setting(0.6, "as coarse_on_mm, in the final step", low=0.01, unit="mm")
     front_mm: float = setting(3.0, "as coarse_front_mm, in the middle and the final step", low=0.01, unit="mm")
     same_pose_mm: float = setting(4.0, "closer poses are the same", low=0, unit="mm")
     kept_poses: int = setting(8, "poses that are kept", low=2)
@@ -296,9 +308,9 @@ class RegistrarConfig(Settings):
     cortices: CorticesConfig = field(default_factory=CorticesConfig)
     accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
-    guide: bool = setting(False, "say in every answer where to look next")
-    min_confidence: float = setting(0.5, "answers below are refused", low=0, high=1)
-    max_tre_mm: float = setting(0.0, "answers whose tre95_mm exceeds it are refused; 0: off", low=0, unit="mm")
-    sure: float = setting(0.95, "an answer at or above it is final; above 1 every proposer is asked", low=0, high=2)
-    num_threads: int = setting(0, "of search, verification and refinement; 0: all cores", low=0, high=1024)
-    seed: int = setting(0, "of whatever is drawn at random", low=0, high=2**31 - 1)
+    guide: bool = setting(False, "say with every answer where another look would help most")
+    min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
+    max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
+    sure: float = setting(0.95, "a confidence from which no further proposer is asked; above 1 all are", low=0, high=2)
+    num_threads: int = setting(0, "threads of search, verification and refinement; 0: all cores", low=0, high=1024)
+    seed: int = setting(0, "seed of every random choice", low=0, high=2**31 - 1)

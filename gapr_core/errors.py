@@ -13,11 +13,11 @@ class GaprError(ValueError):
 
 
 class InvalidPointCloudError(GaprError):
-    """A cloud or mesh that cannot be registered: unreadable, wrong shape, non-finite, wrong unit."""
+    """A cloud or mesh that cannot be used: unreadable, wrong shape, nothing finite, wrong unit."""
 
 
 class ConfigError(GaprError):
-    """A setting that does not exist or is out of range."""
+    """A setting, option or file of settings that cannot be used: unknown, out of range, missing or contradictory."""
 
 
 class WeightsError(GaprError):

@@ -78,9 +78,9 @@ class Patch:
     Attributes:
         centre: (3,) mm, target frame.
         normal: (3,) unit, outward, target frame.
-        tre95_mm: 95 % bound of the error over the bone to expect after the look, if the best hypothesis is right.
-        rivals_excluded: share, 0 to 1, of the rivals' probability that the look would take.
-        gain_mm: by how much the look lowers the bound, rivals included.
+        tre95_mm: 95 % bound of the error over the bone to expect after the look, mm, if the best hypothesis is right.
+        rivals_excluded: share, 0 to 1, of the rivals' probability that the look would exclude.
+        gain_mm: by how much the look lowers the bound, rivals included, mm.
     """
 
     centre: Array
@@ -96,8 +96,8 @@ class Guidance:
 
     Attributes:
         points: (M, 3) mm, the target's points, target frame.
-        gain_mm: (M,) what a look there would gain; 0 where the source has been.
-        now_mm: the bound of the error over the bone today, rivals included.
+        gain_mm: (M,) by how much a look there lowers the bound, mm; 0 where the source has been.
+        now_mm: 95 % bound of the error over the bone without another look, rivals included, mm.
         patches: ranked, the best first.
     """
 
@@ -124,9 +124,10 @@ class RegistrationResult:
         T_target_source: (4, 4) float64 rigid transform, source to target frame, mm; None unless `OK`.
         covariance: (6, 6) float64 of the pose error as x y z (mm) rx ry rz (rad), fixed axes of the target frame,
             rotation about `centre_mm`; None unless `OK`.
-        confidence: calibrated probability, 0 to 1, that the pose is within 4 mm and 5 deg of the truth.
+        confidence: calibrated probability, 0 to 1, that the best pose is within 4 mm and 5 deg of the truth; also of a
+            refused pose.
         tre_mm: expected target registration error, root mean square over the target's points; None unless `OK`.
-        tre95_mm: its 95 % bound; None unless `OK`.
+        tre95_mm: its 95 % bound, mm; None unless `OK`.
         inlier_ratio: share of the source points that the best hypothesis explains, 0 to 1.
         hypotheses: distinct refined poses, best first; on refusals too, to look at, not to use.
         guidance: where on the target another look would help most; None unless `RegistrarConfig.guide` asks for it.

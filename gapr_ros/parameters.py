@@ -87,7 +87,7 @@ class NodeParameters(Settings):
     publish_tf: bool = setting(True, "send accepted poses to /tf", live=False)
     publish_hypotheses: bool = setting(False, "send poses that are not believed to ~/hypotheses, to look at")
     guide: bool = setting(False, "work out where to look next, for ~/guidance and ~/next_view; takes time", live=False)
-    settings_file: str = setting("", "YAML file of the library's settings, as `gapr --config` takes; these here win",
+    settings_file: str = setting("", "YAML file for `gapr register --config`; the node's parameters win",
                                  live=False)  # fmt: skip
     device: str = setting("auto", "where a network runs", choices=("auto", "cpu", "cuda"), live=False)
     num_threads: int = setting(0, "threads of a registration; 0: all cores", low=0, high=1024, live=False)

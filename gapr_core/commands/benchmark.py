@@ -38,7 +38,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr benchmark`."""
     parser.add_argument("merge", nargs="*", help="`merge DIR...`: join the outputs of several shards into --out")
     parser.add_argument("--pairs", type=Path, help="folder of NAME.npz, as gapr make-pairs writes it")
-    parser.add_argument("--methods", default=DEFAULT_METHODS, help=f"names with commas; {DEFAULT_METHODS}")
+    parser.add_argument(
+        "--methods", default=DEFAULT_METHODS, help=f"with commas (default: {DEFAULT_METHODS}); see docs/benchmark.md"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for the table, the plots and the report")
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="worker processes (1)")

@@ -27,8 +27,10 @@ INVALID_INPUT = "INVALID_INPUT"  # status of a pair that cannot be read
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr evaluate`."""
     parser.add_argument("--pairs", required=True, type=Path, help="folder of NAME.npz with source and target, mm")
-    parser.add_argument("--out", required=True, type=Path, help="poses.json")
-    parser.add_argument("--limit", type=at_least_one, help="only the first so many")
+    parser.add_argument(
+        "--out", required=True, type=Path, help="file for the answers, poses.json; keys: docs/reference/json.md"
+    )
+    parser.add_argument("--limit", type=at_least_one, help="register only the first LIMIT pairs")
     options.add_method(parser)
 
 

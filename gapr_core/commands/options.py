@@ -12,7 +12,9 @@ from gapr_core.runtime import settings
 def add_method(parser: ArgumentParser) -> None:
     """`--method`, and the settings."""
     parser.add_argument(
-        "--method", default="gapr", help="gapr, gapr_search (needs no torch), gapr_network, gapr_tracker or a baseline"
+        "--method",
+        default="gapr",
+        help="gapr (default), gapr_search (needs no torch), gapr_network, gapr_tracker, a baseline or module:factory",
     )
     add_settings(parser)
 

@@ -1,4 +1,4 @@
-"""`gapr register`: lay one partial cloud on one full bone."""
+"""`gapr register`: register one partial cloud to one full bone."""
 
 from __future__ import annotations
 
@@ -40,12 +40,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
     parser.add_argument("--viewpoint", type=_point, help="X,Y,Z of the camera in the source's frame, mm")
-    parser.add_argument("--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups, a start")
+    parser.add_argument(
+        "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
+    )
     parser.add_argument("--targets", type=Path, help="markups of a plan, target frame: the error to expect there")
     parser.add_argument("--out", type=Path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
-    parser.add_argument("--residuals", type=Path, help="of every point, as .json or coloured .ply")
+    parser.add_argument("--residuals", type=Path, help="signed distance of every point, as .json or coloured .ply")
     parser.add_argument("--slicer", type=Path, metavar="FOLDER", help="a scene for 3D Slicer")
-    parser.add_argument("--json", type=Path, help="write the result here as well")
+    parser.add_argument("--json", type=Path, help="write the result here as well; keys: docs/reference/json.md")
     options.add_method(parser)
 
 

@@ -78,6 +78,7 @@ def draw_chart(axes: Any, name: str, values: Sequence[float], limit: float | Non
     if limit is not None:
         axes.axhline(limit, color="0.5", linestyle="--", linewidth=1.0)
     axes.set(title=name, xlabel=x_title, xlim=(0.5, len(values) + 0.5))
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)

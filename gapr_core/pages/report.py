@@ -31,7 +31,7 @@ class Image:
         png: its bytes; None where there is none, which is said in its place.
         name: what it shows, for those who cannot see it.
         caption: a line below.
-        is_bad: the caption tells of a mistake.
+        is_bad: the caption reports a mistake.
     """
 
     png: bytes | None

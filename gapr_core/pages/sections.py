@@ -28,7 +28,7 @@ class Section(NamedTuple):
 
 
 def number(key: str, digits: int) -> Callable[[Row], str]:
-    """Prints a figure; a dash where there is none."""
+    """Prints a number; a dash where there is none."""
     return lambda row: "–" if row.get(key) is None else f"{row[key]:.{digits}f}"
 
 
@@ -125,7 +125,7 @@ def sections(rows: Sequence[Row]) -> list[Section]:
 
 
 def where_beaten(rows: Sequence[Row], ours: str) -> list[str]:
-    """One line for each protocol and figure in which another method is better than ours, over all its bones."""
+    """One line for each protocol and column in which another method is better than ours, over all its bones."""
     lines = []
     for protocol in dict.fromkeys(row["protocol"] for row in rows):
         of_protocol = [row for row in rows if row["protocol"] == protocol]
@@ -139,7 +139,7 @@ def where_beaten(rows: Sequence[Row], ours: str) -> list[str]:
 
 
 def _beaten(own: Row, others: Sequence[Row], column: Column) -> tuple[str, str]:
-    """The methods that are better in one figure (empty if none), and what ours has."""
+    """The methods that are better in one column (empty if none), and what ours has."""
     if own[column.key] is None:
         return "", ""
     there = [row for row in others if row[column.key] is not None]

@@ -20,7 +20,7 @@ def write_json(path: Path, rows: Sequence[Row], plan: Plan) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """One line per row, empty where there is no figure."""
+    """One line per row; a cell is empty where there is no value."""
     with files.replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()

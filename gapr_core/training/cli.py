@@ -27,7 +27,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
     parser.add_argument("--workers", type=int, default=None, help="processes that make pairs")
     parser.add_argument(
-        "--plot", type=Path, nargs="+", metavar="RUN", help="train nothing, draw the curves of these runs over another"
+        "--plot", type=Path, nargs="+", metavar="RUN", help="train nothing, draw the curves of these runs together"
     )
 
 

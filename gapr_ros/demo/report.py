@@ -234,7 +234,7 @@ def _charts(rows: Sequence[Row]) -> dict[str, list[float]]:
     nan = float("nan")
     charts = {"confidence": [row.answer.confidence if row.answer else nan for row in rows]}
     if any(row.taken for row in rows):
-        charts["bone of taken, %"] = [100.0 * row.taken.right_share if row.taken else nan for row in rows]
+        charts["taken points that are bone, %"] = [100.0 * row.taken.right_share if row.taken else nan for row in rows]
     return charts | {
         "error at the centroid, mm": [row.error_mm for row in rows],
         "error, deg": [row.error_deg for row in rows],

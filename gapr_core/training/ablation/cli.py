@@ -1,9 +1,9 @@
-"""gapr ablate: train the paper's ablations at one budget, examine them on subjects they never saw, and compare.
+"""gapr ablate: train the paper's ablations at one budget, test them on held-out subjects, and compare.
 
 gapr ablate --out runs/ablation --pairs 8000 --anatomy DIR --jobs 2
 
 Stop it at any time and call it again: finished networks stay, the one under way goes on from its checkpoint. OUT gets
-table.md, table.json, table.csv and curves_*.png again after every network, pairs/ with the examination's pairs, and one
+table.md, table.json, table.csv and curves_*.png again after every network, pairs/ with the test pairs, and one
 folder a network and seed, as `gapr train` writes it, with exam.json.
 """
 
@@ -73,8 +73,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--pose", default=METHODS[0], choices=METHODS, help=f"from matches, in the exam ({METHODS[0]})")
     parser.add_argument("--seeds", type=at_least_one, default=1, help="trainings of every network, seeds 0, 1, ... (1)")
-    parser.add_argument("--protocols", default="paper,L1,L2", help="of the examination, with commas (paper,L1,L2)")
-    parser.add_argument("--count", type=at_least_one, default=10, help="pairs of the exam, per protocol and bone (10)")
+    parser.add_argument("--protocols", default="paper,L1,L2", help="of the test pairs, with commas (paper,L1,L2)")
+    parser.add_argument("--count", type=at_least_one, default=10, help="test pairs per protocol and bone (10)")
     parser.add_argument("--split", default="test", choices=[s for s in SPLITS if s != "train"], help="whose bones")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="networks at a time, which share the cores (1)")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")

@@ -37,10 +37,10 @@ class SourceConfig(Settings):
     normal_neighbours: int = setting(30, "points that give a normal", low=4, high=200)
     smallest_width_mm: float = setting(2.0, "a narrower cloud is refused: a line", low=0, high=1000, unit="mm")
     most_raw_points: int = setting(100_000, "more are drawn from at random before the even thinning", low=1000)
-    dense_points: int = setting(400, "points from which a cloud is dense enough to tell an isolated point", low=20)
+    dense_points: int = setting(400, "points from which isolated points are looked for", low=20)
     companions: int = setting(6, "points that must be near a point, or it is isolated", low=1, high=1000)
-    isolated_mm: float = setting(12.0, "near is at least this", low=0, high=1000, unit="mm")
-    isolated_gaps: float = setting(5.0, "or this many times what is typical of the cloud", low=0, high=1000)
+    isolated_mm: float = setting(12.0, "points at this distance or less are near", low=0, high=1000, unit="mm")
+    isolated_gaps: float = setting(5.0, "or at so many times the typical distance of the cloud", low=0, high=1000)
     most_compared: int = setting(20_000, "points among which companions are looked for", low=1000)
 
 
@@ -125,7 +125,7 @@ class SensorConfig(Settings):
     noise_mm: float | None = setting(None, "standard deviation of a point", low=1e-3, high=10, unit="mm")
     bias_mm: float | None = setting(None, "standard deviation of the smooth bias", low=1e-3, high=10, unit="mm")
     scale: float | None = setting(None, "standard deviation of the relative error of size", low=0, high=0.2)
-    sparse_points: int = setting(400, "the stand-off of more points of an unknown sensor falls as 1 / N", low=1)
+    sparse_points: int = setting(400, "with more points the stand-off of an unknown sensor falls as 1 / N", low=1)
     known_standoff_mm: float = setting(
         0.15, "standard deviation of a stand-off that is stated: contact is never full", low=1e-3, high=10, unit="mm"
     )
@@ -133,13 +133,13 @@ class SensorConfig(Settings):
 
 @dataclass(frozen=True)
 class ScaleConfig(Settings):
-    """How much larger the source may be than the bone: it tells another bone. The confidence was fitted with these."""
+    """How far the size of a source may be off, or it is of another bone. The confidence was fitted with these."""
 
-    fewest_points: int = setting(8, "inliers without which nothing is said", low=8, high=1000)
-    widest: float = setting(0.3, "standard deviation of the size before the residuals are seen", low=0.01, high=1)
-    standoff_mm: float = setting(0.5, "that of a stand-off beside it", low=1e-3, high=10, unit="mm")
-    sure: float = setting(0.005, "standard deviation of the size of the bone's model", low=0, high=0.1)
-    usual: float = setting(0.05, "standard deviation of the sizes of people's bones", low=1e-3, high=1)
+    fewest_points: int = setting(8, "fewer inliers say nothing about the size", low=8, high=1000)
+    widest: float = setting(0.3, "prior standard deviation of the relative size", low=0.01, high=1)
+    standoff_mm: float = setting(0.5, "prior standard deviation of a stand-off", low=1e-3, high=10, unit="mm")
+    sure: float = setting(0.005, "standard deviation of the relative size of the bone's model", low=0, high=0.1)
+    usual: float = setting(0.05, "standard deviation of the relative sizes of other subjects' bones", low=1e-3, high=1)
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,10 @@ class RulesConfig(Settings):
     largest_shift_mm: float = setting(5.0, "standard deviation of a shift that is not observed", low=0, unit="mm")
     equal_share: float = setting(0.015, "a rival whose mean square is larger by less is as good", low=0, high=1)
     equal_mm: float = setting(0.25, "the same as a length, whose square is added", low=0, high=10, unit="mm")
-    push: float = setting(1.5, "how far a pose is pushed, in verification.same_pose_mm", low=1, high=100)
-    pushed_motions: int = setting(3, "along so many motions: on a plane that many are not observed", low=1, high=6)
+    push: float = setting(1.5, "how far a pose is pushed, in units of verification.same_pose_mm", low=1, high=100)
+    pushed_motions: int = setting(
+        3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6
+    )
     ruled_out: float = setting(0.4, "largest confidence of a pose that a rule refuses", low=0, high=1)
     independent_points: float = setting(
         30.0, "independent residuals that a source counts for where hypotheses share the probability", low=0
@@ -220,16 +222,16 @@ class GuidanceConfig(Settings):
 class FreeSpaceConfig(Settings):
     """What a camera would have seen of a pose, point by point on its lines of sight."""
 
-    smallest_pixel: float = setting(0.003, "edge of a pixel, as the tangent of an angle", low=1e-4, high=1)
-    most_pixels: int = setting(160_000, "of the image; larger pixels where there would be more", low=100)
+    smallest_pixel: float = setting(0.003, "least width of a pixel, as the tangent of an angle", low=1e-4, high=1)
+    most_pixels: int = setting(160_000, "most pixels of the image; they grow where there would be more", low=100)
     reach: float = setting(0.006, "tangent up to which a point speaks for a line of sight", low=1e-4, high=1)
     widest_cos: float = setting(0.25, "cosine to the middle of the view up to which points are seen", low=0.01, high=1)
     facing_cos: float = setting(0.2, "cosine to the line of sight from which a surface is measured", low=0, high=1)
-    hidden_mm: float = setting(3.0, "so far behind the measured point bone is hidden", low=0, unit="mm")
+    hidden_mm: float = setting(3.0, "bone farther behind the measured point is hidden", low=0, unit="mm")
     slant_mm: float = setting(9.0, "largest difference in depth to a point in whose plane bone lies", low=0, unit="mm")
     same_surface_cos: float = setting(0.6, "cosine of normals up to which they are of one surface", low=0, high=1)
-    violation_costs: float = setting(2.0, "of a share of the bone that was seen through", low=0)
-    misfit_costs: float = setting(0.2, "of a share of the bone that was seen otherwise", low=0)
+    violation_costs: float = setting(2.0, "cost of a share of the bone that the camera looked through", low=0)
+    misfit_costs: float = setting(0.2, "cost of a share of the bone that lies off the measured surface", low=0)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def of_another_bone(
 def scale_of(fit: Fit, config: CovarianceConfig, prior: ScaleConfig) -> tuple[float, float]:
     """How much larger the source would have to be to fit best, and the standard deviation of that.
 
-    Generalised least squares of a similarity beside a smooth bias (see `bias_field`): the pose's six motions, the size,
+    Generalised least squares of a similarity and a smooth bias (see `bias_field`): the pose's six motions, the size,
     by which a residual grows as n . (q - c) at its foot point q, and a stand-off that all points share, which looks
     much like another size on a patch seen from one side. How large the bias is follows from what these leave.
 

@@ -81,9 +81,7 @@ def save_scene_poster(
     all_axes = np.ravel(below.subplots(1, len(charts)))
     for axes, (name, (values, limit)) in zip(all_axes, charts.items(), strict=True):
         draw_chart(axes, name, values, limit, "frame")
-    out = BytesIO()
-    figure.savefig(out, format="png")
-    Path(path).write_bytes(_smaller(out))
+    figure.savefig(path)  # in all colours: few of them would leave steps in the bar
 
 
 def _figure(width: float, height: float) -> Any:

@@ -23,7 +23,7 @@ PANELS = (
     *(("tibia", f"scene-{name}") for name in ("C1", "slit", "hand", "image", "ultrasound")),
     *(("pelvis", f"scene-{name}") for name in ("C1", "C2", "C3", "packed", "drape")),
 )
-COLUMNS, COLOURS = 5, 48
+COLUMNS, COLOURS = 5, 64
 BONE, OTHER = np.array([0.98, 0.88, 0.66]), np.array([0.80, 0.24, 0.20])
 PERSON, SEED = 3, 1
 FAR_MM = 1e4  # from where a cloud without a viewpoint is looked at
@@ -53,7 +53,7 @@ def draw(out: Path) -> None:
 def _panel(ax: Any, pair: Pair) -> None:
     is_bone = np.asarray(pair.metadata["is_bone"])
     paint(ax, pair.source, pair.viewpoint, np.where(is_bone[:, None], BONE, OTHER))
-    ax.set_title(f"{pair.protocol}\n{pair.bone}, {is_bone.mean():.0%} bone", fontsize=8)
+    ax.set_title(f"{pair.protocol}\n{pair.bone}, {is_bone.mean():.0%} bone", fontsize=12)
 
 
 def paint(axes: Any, points: Array, viewpoint: Array | None, colours: Array) -> None:

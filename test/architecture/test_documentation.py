@@ -1,5 +1,6 @@
 """What the documentation shows is true: its code runs, its links lead somewhere, its words exist."""
 
+import json
 import os
 import re
 import shlex
@@ -98,6 +99,38 @@ def shell(command):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def check_readme(names):
+    assert names["result"].ok, names["result"]
+    assert np.linalg.norm(names["aligned"] - np.load("seen.npy"), axis=1).max() < 2.0
+
+
+def check_slicer(names):
+    assert np.percentile(names["off_mm"], 95) < 1.5, names["off_mm"]
+    assert json.loads(Path("result.json").read_text())["targets"][0]["label"] == "entry"
+    assert Path("result/scene.mrml").is_file()
+
+
+def check_own_bag(names):
+    assert json.loads(Path("first.json").read_text())["status"] == "OK"
+    assert 0 < len(names["poses"]) == names["reasons"].count("") <= 12
+    origin = [getattr(names["poses"][-1].pose.pose.position, axis) * 1000.0 for axis in "xyz"]
+    assert np.linalg.norm(origin - names["T_camera_bone"][:3, 3]) < 5.0
+
+
+def check_own_data(names):
+    table = Path("bench/table.md").read_text()
+    assert all(method in table for method in ("gapr", "gapr_search", "icp"))
+    assert json.loads(Path("poses.json").read_text())["specimen_1"]["status"] == "OK"
+
+
+CHECKS = {
+    "README.md": check_readme,
+    "docs/tutorials/slicer.md": check_slicer,
+    "docs/tutorials/own_bag.md": check_own_bag,
+    "docs/tutorials/own_data.md": check_own_data,
+}  # what must have come out of a page
+
+
 @pytest.mark.timeout(400)  # whole commands, on a machine that may be busy
 @pytest.mark.parametrize("page", [p for p in PAGES if any(not b.reason for b in blocks(p))], ids=name_of)
 def test_the_code_of_a_page_runs_from_top_to_bottom(page, here):
@@ -105,9 +138,7 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(page, here):
     for block in blocks(page):
         if not block.reason:
             run(block, names)
-    if page is README:
-        assert names["result"].ok, names["result"]
-        assert np.linalg.norm(names["aligned"] - np.load("seen.npy"), axis=1).max() < 2.0
+    CHECKS.get(name_of(page), lambda names: None)(names)
 
 
 def test_the_recipes_of_contributing_work(here, monkeypatch):

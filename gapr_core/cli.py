@@ -29,6 +29,7 @@ COMMANDS = {
     "make-pairs": "gapr_core.data.make_pairs",
     "train": "gapr_core.training.cli",
     "ablate": "gapr_core.training.ablation.cli",
+    "paper": "gapr_core.commands.paper",
 }
 EXTRAS = {  # top-level module -> the extra of setup.py that installs it
     "torch": "network", "safetensors": "network", "open3d": "data", "matplotlib": "reports", "plotly": "reports",

@@ -39,4 +39,4 @@ def make(name: str) -> RegistrationMethod:
     return REGISTRY[name]()
 
 
-__all__ = ["REGISTRY", "Baseline", "BaselineTarget", "RegistrationMethod", "Refined", "make"]
+__all__ = ["REGISTRY", "Baseline", "BaselineTarget", "PointToPlane", "RegistrationMethod", "Refined", "make"]

@@ -54,15 +54,41 @@ OWN: dict[str, Maker] = {
 }
 
 
+def _paper_pipeline(weights: str | None) -> RegistrationMethod:
+    from gapr_core.benchmark.paper_pipeline import PaperPipeline
+
+    return PaperPipeline(weights) if weights else PaperPipeline()
+
+
+def _paper_pipeline_refined(weights: str | None) -> RegistrationMethod:
+    coarse = _paper_pipeline(weights)
+    return baselines.Refined(coarse, baselines.PointToPlane(), f"{coarse.name}{REFINED}")
+
+
+REFINED = "+point_to_plane"
+TRAINED: dict[str, Callable[[str | None], RegistrationMethod]] = {  # NAME, or NAME@WEIGHTS
+    "gapr_paper": _paper_pipeline,
+    f"gapr_paper{REFINED}": _paper_pipeline_refined,
+}
+
+
+def _with_weights(name: str) -> tuple[str, str | None]:
+    """The method and the weights of a name: "gapr_paper@runs/mine/weights.safetensors+point_to_plane" has both."""
+    method, has_weights, rest = name.partition("@")
+    ending = REFINED if has_weights and rest.endswith(REFINED) else ""
+    return method + ending, rest.removesuffix(REFINED) or None
+
+
 def names() -> tuple[str, ...]:
     """Every method that has a name: ours, then the baselines."""
-    return (*OWN, *sorted(baselines.REGISTRY))
+    return (*OWN, *TRAINED, *sorted(baselines.REGISTRY))
 
 
 def check(wanted: Sequence[str]) -> None:
     """Raise `ConfigError` where a name is none of `names()` and no module:factory; nothing is loaded."""
     for name in wanted:
-        if name not in names() and ":" not in name:
+        is_known = name in names() or (_with_weights(name)[0] in TRAINED and "@" in name) or ":" in name
+        if not is_known:
             raise ConfigError(f"one of {', '.join(names())}, or module:factory", repr(name), "name one of them")
 
 
@@ -71,7 +97,8 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
 
     Args:
         name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
-            proposers alone), "gapr_tracker", a baseline of `gapr_core.baselines.REGISTRY`, or "package.module:factory"
+            proposers alone), "gapr_tracker", "gapr_paper" (the paper's pipeline; "gapr_paper@WEIGHTS" with those of a
+            run), a baseline of `gapr_core.baselines.REGISTRY`, or "package.module:factory"
             for a callable without arguments that returns a `RegistrationMethod`.
         config: settings of our own methods.
 
@@ -85,6 +112,9 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
         raise ConfigError(
             f"settings for one of {', '.join(OWN)}", f"settings for {name}", "leave --config and --set out"
         )
+    if _with_weights(name)[0] in TRAINED:
+        method, weights = _with_weights(name)
+        return TRAINED[method](weights)
     if ":" in name:
         return _from_module(*name.split(":", 1))
     check([name])

@@ -56,7 +56,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     where.add_argument("--anatomy", type=Path, help="folder of corresponded meshes with splits.json")
     where.add_argument("--meshes", type=Path, help="folder of your own meshes, one per subject, or a folder per bone")
     parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of --meshes")
-    parser.add_argument("--split", default="all", choices=(*anatomy.SPLITS, "all"), help="whose bones")
+    parser.add_argument(
+        "--split", required=True, choices=(*anatomy.SPLITS, "all"),
+        help="whose bones: test to judge what was trained here, all where nobody has trained on these subjects",
+    )  # fmt: skip
     parser.add_argument("--people", type=at_least_one, default=20, help="parametric subjects for each bone (20)")
 
 

@@ -21,6 +21,7 @@ from gapr_core.model.types import Cloud, Level, Neighborhood
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 FEWEST_POINTS = 16
+MOST_RADIUS_MM = 5.0  # but never less than the first voxel: two samplings of a surface lie that far apart
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ def target_frame(target_mm: ArrayLike, config: ModelConfig) -> Frame:
     centred = points - points.mean(axis=0)
     scale_mm = extent.half_extent_mm(points)
     return Frame(scale_mm, choose_voxel(centred / scale_mm, config))
+
+
+def matching_radius(frame: Frame) -> float:
+    """Two first voxels, at most 5 mm, at least one voxel; in units."""
+    return min(2.0 * frame.voxel, max(MOST_RADIUS_MM / frame.scale_mm, frame.voxel))
 
 
 def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Cloud:

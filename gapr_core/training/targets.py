@@ -12,12 +12,11 @@ from torch import Tensor
 from torch.nn.functional import pad as pad_tensor
 
 from gapr_core.geometry import se3
-from gapr_core.model.pyramid import Frame
+from gapr_core.model.pyramid import Frame, matching_radius
 from gapr_core.model.repositioning import move
 from gapr_core.model.types import Cloud, PatchPairs, collate, mapped, on_device
 
 Array = NDArray[np.float64]
-MOST_RADIUS_MM = 5.0  # but never less than the first voxel: two samplings of a surface lie that far apart
 POSITIVE_OVERLAP = 0.1
 
 
@@ -65,11 +64,6 @@ def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: F
         source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius]),
         is_bone=torch.from_numpy(near),
     )  # fmt: skip
-
-
-def matching_radius(frame: Frame) -> float:
-    """Two first voxels, at most 5 mm, at least one voxel; in units."""
-    return min(2.0 * frame.voxel, max(MOST_RADIUS_MM / frame.scale_mm, frame.voxel))
 
 
 def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:

@@ -86,13 +86,13 @@ benchmark merge none --out o
 benchmark merge run --out o
 benchmark merge torn --out o
 benchmark join run --out o
-make-pairs --protocol L9 --out o
-make-pairs --protocol L1 --count 0 --out o
-make-pairs --protocol L1 --bones skull --out o
-make-pairs --protocol L1 --meshes none --out o
-make-pairs --protocol L1 --anatomy none --out o
-make-pairs --protocol L1 --out cloud.npy
-make-pairs --protocol L1 --out torn_pairs
+make-pairs --split all --protocol L9 --out o
+make-pairs --split all --protocol L1 --count 0 --out o
+make-pairs --split all --protocol L1 --bones skull --out o
+make-pairs --split all --protocol L1 --meshes none --out o
+make-pairs --split all --protocol L1 --anatomy none --out o
+make-pairs --split all --protocol L1 --out cloud.npy
+make-pairs --split all --protocol L1 --out torn_pairs
 train
 train --out o --config none.yaml
 train --out o --config broken.yaml

@@ -103,7 +103,7 @@ def test_a_recipe_that_makes_no_sense_is_refused(bad):
 
 def test_a_folder_of_five_stl_files_becomes_pairs_with_one_command(tmp_path, capsys):
     write_meshes(tmp_path / "humerus", 5)
-    words = ["--protocol", "L2,wrong", "--meshes", str(tmp_path / "humerus"), "--count", "5", "--out"]
+    words = ["--split", "all", "--protocol", "L2,wrong", "--meshes", str(tmp_path / "humerus"), "--count", "5", "--out"]
     assert make_pairs.run(parse(*words, str(tmp_path / "pairs"))) == 0
     manifest = read_manifest(tmp_path / "pairs")
     assert {p["person"] for p in manifest["pairs"]} == {f"person{i}" for i in range(5)}

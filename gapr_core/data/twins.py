@@ -1,0 +1,48 @@
+"""Near-duplicates among subjects: bones that are more alike than two subjects of their cohort ever are by chance."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.data.anatomy import Corresponded
+
+Array = NDArray[np.float64]
+SUSPICIOUS = 0.5  # of the median distance to the most similar other subject of the cohort
+COMPARED = 500  # vertices of each mesh that are compared
+
+
+class Twins(NamedTuple):
+    """Two subjects whose bones differ by `rms_mm` only; `typical_mm` is usual between most similar subjects."""
+
+    first: str
+    second: str
+    rms_mm: float
+    typical_mm: float
+
+
+def near_duplicates(subjects: Corresponded, suspicious: float = SUSPICIOUS) -> list[Twins]:
+    """Pairs of subjects who may be one and the same, scanned twice or mirrored, the most similar first."""
+    if len(subjects.points) < 3:
+        return []
+    points = subjects.points[:, :: max(1, subjects.points.shape[1] // COMPARED)]
+    points = points - points.mean(axis=1, keepdims=True)
+    apart = np.full((len(points),) * 2, np.inf)
+    for i, j in combinations(range(len(points)), 2):
+        apart[i, j] = apart[j, i] = min(_rms(points[i], points[j] * side) for side in ([1, 1, 1], [-1, 1, 1]))
+    typical = float(np.median(apart.min(axis=1)))
+    found = [
+        Twins(subjects.person[i], subjects.person[j], float(apart[i, j]), typical)
+        for i, j in combinations(range(len(points)), 2) if apart[i, j] < suspicious * typical
+    ]  # fmt: skip
+    return sorted(found, key=lambda twins: twins.rms_mm)
+
+
+def _rms(p: Array, q: Array) -> float:
+    """Root mean square distance of corresponding points (N, 3), centred, after the best rotation of one of them."""
+    u, s, vt = np.linalg.svd(p.T @ q)
+    turned = s[0] + s[1] + np.sign(np.linalg.det(u @ vt)) * s[2]
+    return float(np.sqrt(max((p * p).sum() + (q * q).sum() - 2.0 * turned, 0.0) / len(p)))

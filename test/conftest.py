@@ -1,16 +1,18 @@
 """What every test needs: few threads, and ROS graphs that do not see each other or anything outside."""
 
 import os
+import sys
+from pathlib import Path
 
 import pytest
 
-WORKER = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
+sys.path.insert(0, str(Path(__file__).parent / "ros"))
+import domain  # noqa: E402
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = str(1 + (os.getppid() * 7 + int(WORKER)) % 100)  # 1..101; two runs at once rarely collide
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a message field of the wrong type is an error, not garbage
+domain.claim()
 
 
 @pytest.fixture(autouse=True, scope="session")

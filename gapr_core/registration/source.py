@@ -71,7 +71,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     points = clouds.finite_points(source)
     if len(points) > config.most_raw_points:
         points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
-    points = without_isolated(np.unique(points, axis=0), config)
+    points = without_isolated(sampling.distinct(points), config)
     if len(points) < config.fewest_points:
         return Refusal(
             RegistrationStatus.TOO_FEW_POINTS,

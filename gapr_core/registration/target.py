@@ -127,7 +127,7 @@ def _surface_elements(surface: Surface, config: TargetConfig) -> tuple[Array, Ar
         points, normals = surface.sample(4 * config.most_points, np.random.default_rng(0))
         keep = sampling.thin(points, config.most_points)
         return points[keep], normals[keep]
-    unique = np.unique(surface.points, axis=0)
+    unique = sampling.distinct(surface.points)
     unique = unique[sampling.voxel_indices(unique, DOUBLES_MM)]
     points = unique[sampling.thin(unique, config.most_points)]
     neighbours = cKDTree(points).query(points, k=min(config.normal_neighbours, len(points)))[1]

@@ -1,3 +1,6 @@
+import threading
+import time
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -17,6 +20,35 @@ def test_thinning_keeps_at_most_the_number_asked_for_and_spreads_them():
     gaps = cKDTree(kept).query(kept, k=2)[0][:, 1]
     random = points[np.random.default_rng(1).choice(20_000, 1000, replace=False)]
     assert np.quantile(gaps, 0.05) > 1.5 * np.quantile(cKDTree(random).query(random, k=2)[0][:, 1], 0.05)
+
+
+def test_distinct_points_are_those_of_numpy_whatever_repeats():
+    rng = np.random.default_rng(0)
+    points = rng.integers(-2, 3, (400, 3)) * 0.5
+    np.testing.assert_array_equal(sampling.distinct(points), np.unique(points, axis=0))
+    for count in (0, 1):
+        np.testing.assert_array_equal(sampling.distinct(points[:count]), points[:count])
+
+
+def test_sorting_out_doubles_does_not_stop_other_threads():
+    """A node must be able to answer, and to end, while it sorts millions of points."""
+    points, gaps, done = np.random.default_rng(0).normal(size=(400_000, 3)), [], threading.Event()
+
+    def tick():
+        last = time.perf_counter()
+        while not done.wait(0.001):
+            now = time.perf_counter()
+            gaps.append(now - last)
+            last = now
+
+    thread = threading.Thread(target=tick)
+    thread.start()
+    start = time.perf_counter()
+    sampling.distinct(points)
+    lasted = time.perf_counter() - start
+    done.set()
+    thread.join()
+    assert max(gaps) < 0.7 * lasted
 
 
 def test_a_small_cloud_is_not_thinned():

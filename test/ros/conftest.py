@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,8 +11,7 @@ import pytest
 
 ROS_IS_MISSING = find_spec("rclpy") is None
 collect_ignore_glob = ["test_*.py"] if ROS_IS_MISSING else []
-os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
-sys.path.insert(0, str(Path(__file__).parent))  # for `import harness`
+FAILED_TO_START = pytest.StashKey[bool]()
 
 
 def pytest_report_header() -> str:
@@ -43,3 +41,33 @@ def method():
     from harness import StandIn
 
     return StandIn()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """A failed test shows what its nodes wrote."""
+    report = yield
+    if report.failed:
+        for node in _running_nodes():
+            code = node.process.poll()
+            state = "running" if code is None else f"ended with {code}"
+            report.sections.append((f"{node.log_path.name}, {state}", node.log[-5000:]))
+    if report.when == "setup":
+        item.stash[FAILED_TO_START] = report.failed
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Whatever becomes of a test, the processes that it started end with it, or with the fixture that keeps them."""
+    before = _running_nodes()
+    result = yield
+    for node in _running_nodes():
+        if node not in before and (item.stash.get(FAILED_TO_START, False) or not node.keeps):
+            node.kill()
+    return result
+
+
+def _running_nodes() -> list:
+    harness = sys.modules.get("harness")
+    return list(harness.NodeProcess.running) if harness else []

@@ -74,7 +74,7 @@ class Bench:
         self.end()
         self.client.diagnostics.clear()
         options = {"model_path": self.model, "model_unit": "mm", "timeout": ANSWER_S, "diagnostics_period": 0.2}
-        self.node = NodeProcess(self.folder, **(options | parameters))
+        self.node = NodeProcess(self.folder, keeps=True, **(options | parameters))
         self.client.wait_for_state("active", ANSWER_S)
 
     def end(self) -> None:

@@ -1,12 +1,14 @@
 """What the ROS tests share: a client that talks to a node over DDS, nodes as processes or in threads, synthetic bones.
 
-Every test process has a domain of its own and stays on this machine, so that runs side by side do not meet.
+Every test process has a domain of its own and stays on this machine, so that runs side by side do not meet. No node
+outlives the test that started it, nor the process that the tests run in.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,8 +17,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import domain
 import numpy as np
 import psutil
 from diagnostic_msgs.msg import DiagnosticArray
@@ -38,7 +41,7 @@ from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node.lifecycle import RegisterNode
 from msg_adapters import xyz_to_cloud
 
-DOMAIN = 1 + os.getpid() % 101
+DOMAIN = domain.claim()
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NODE = "/register_node"
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -62,7 +65,6 @@ def context() -> Context:
     of them still holds half is never ready: rmw_fastrtps wants as many ends for requests as for responses.
     """
     gc.collect()
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     made = Context()
     made.init(args=[], domain_id=DOMAIN)
     return made
@@ -206,7 +208,17 @@ def node_in_thread(method: Any, model_path: Path, namespace: str = "", **paramet
 
 
 class NodeProcess:
-    """`python -m gapr_ros.register_node` as a process of its own."""
+    """`python -m gapr_ros.register_node` as a process of its own.
+
+    Args:
+        folder: for its log.
+        arguments: of the program.
+        module, script: another program.
+        keeps: it may outlive the test that starts it; who made it ends it.
+        parameters: of the node.
+    """
+
+    running: ClassVar[list[NodeProcess]] = []  # those that were started and have not been waited for
 
     def __init__(
         self,
@@ -214,17 +226,20 @@ class NodeProcess:
         *arguments: str,
         module: str = "gapr_ros.register_node",
         script: Path | None = None,
+        keeps: bool = False,
         **parameters: Any,
     ) -> None:
+        self.keeps = keeps
         self.log_path = folder / f"{script.stem if script else module}-{time.monotonic_ns()}.log"
         self._log = self.log_path.open("wb")
         given = [part for name, value in parameters.items() for part in ("-p", f"{name}:={yaml_value(value)}")]
         ros = ["--ros-args", *given] if given else []
         program = [str(script)] if script else ["-m", module]
-        command = [sys.executable, *program, *arguments, *ros]
+        command = [*ends_with_its_parent(), sys.executable, *program, *arguments, *ros]
         self.process = subprocess.Popen(
             command, stdout=self._log, stderr=subprocess.STDOUT, env=environment(folder), cwd=REPOSITORY
         )
+        NodeProcess.running.append(self)
 
     @property
     def log(self) -> str:
@@ -259,8 +274,21 @@ class NodeProcess:
         try:
             return self.process.wait(timeout_s)
         finally:
-            self.process.kill()
-            self._log.close()
+            self.kill()
+
+    def kill(self) -> None:
+        """End it, whatever it does; once more does nothing."""
+        self.process.kill()
+        self.process.wait()
+        self._log.close()
+        if self in NodeProcess.running:
+            NodeProcess.running.remove(self)
+
+
+def ends_with_its_parent() -> list[str]:
+    """Begins a command whose process the kernel kills when this one ends, however it ends; empty without util-linux."""
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "KILL", "--"] if setpriv else []
 
 
 def environment(folder: Path) -> dict[str, str]:

@@ -38,8 +38,8 @@ def live(bone, tmp_path_factory):
     folder = tmp_path_factory.mktemp("node")
     model = bones.save(bone, folder / "bone.npz")
     client = Client()
-    node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, seed=3)
-    client.wait_for_state("active", 60.0)
+    node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, seed=3, keeps=True)
+    client.wait_for_state("active", 90.0)
     yield node, client
     client.close()
     assert node.stop() == 0, node.log

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from gapr_core.config import RegistrarConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
     from gapr_core.registration.accumulation import Accumulator
+    from gapr_core.registration.crop import crop_box, crop_to_pose
     from gapr_core.registration.registrar import Registrar
     from gapr_core.registration.target import PreparedTarget
     from gapr_core.registration.tracking import Tracker
@@ -31,6 +32,8 @@ _HOMES = {
     "RegistrationStatus": "results",
     "Surface": "surface",
     "load": "clouds",
+    "crop_box": "registration.crop",
+    "crop_to_pose": "registration.crop",
     "GaprError": "errors",
     "InvalidPointCloudError": "errors",
     "ConfigError": "errors",

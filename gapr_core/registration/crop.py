@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
+
+
+class Findable(Protocol):
+    """A bone whose nearest points can be looked for, as those of a `PreparedTarget`."""
+
+    @property
+    def tree(self) -> cKDTree:
+        """Of its points, mm."""
+        ...
 
 
 def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, highest: ArrayLike) -> Array:
@@ -34,7 +45,7 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
     return np.asarray(points[((placed >= low) & (placed <= high)).all(axis=1)])
 
 
-def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: PreparedTarget, margin_mm: float) -> Array:
+def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: Findable, margin_mm: float) -> Array:
     """The points within `margin_mm` of the bone as it lay last.
 
     Args:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from gapr_core.geometry import se3
+from gapr_core import crop_box, crop_to_pose
 from gapr_ros.node import wire
+from gapr_ros.node.model import Model
 from gapr_ros.parameters import NodeParameters
 
 Array = NDArray[np.float64]
@@ -37,28 +38,17 @@ def box(parameters: NodeParameters, T_crop_cloud: Array) -> Crop:
         parameters: the corners, m, in `crop_frame`.
         T_crop_cloud: (4, 4), metres.
     """
-    low, high = (np.asarray(corner) * wire.MM_PER_M for corner in (parameters.crop_min, parameters.crop_max))
-
-    def crop(points_mm: Array) -> Array:
-        there = wire.moved_mm(T_crop_cloud, points_mm)
-        return points_mm[((there >= low) & (there <= high)).all(axis=1)]
-
-    return crop
+    low, high = (wire.to_mm(np.asarray(corner), "m") for corner in (parameters.crop_min, parameters.crop_max))
+    return partial(crop_box, T_box_points=wire.in_mm(T_crop_cloud), lowest=low, highest=high)
 
 
-def around(model_tree: cKDTree, T_cloud_model: Array, reach_m: float) -> Crop:
+def around(model: Model, T_cloud_model: Array, reach_m: float) -> Crop:
     """Keeps the points near the bone where it was last.
 
     Args:
-        model_tree: of the bone's points, mm, in its own frame.
+        model: the bone in its own frame, mm.
         T_cloud_model: (4, 4), metres.
         reach_m: farther points go.
     """
-    T_model_cloud = se3.inverse(T_cloud_model)
-
-    def crop(points_mm: Array) -> Array:
-        there = wire.moved_mm(T_model_cloud, points_mm)
-        distance_mm, _ = model_tree.query(there, distance_upper_bound=reach_m * wire.MM_PER_M)
-        return points_mm[np.isfinite(distance_mm)]
-
-    return crop
+    T_target_source = wire.core_pose(T_cloud_model)
+    return partial(crop_to_pose, T_target_source=T_target_source, target=model, margin_mm=reach_m * wire.MM_PER_M)

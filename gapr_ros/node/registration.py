@@ -116,7 +116,7 @@ class Registration:
             crops.append(region.box(now.parameters, self._lookup(now.parameters.crop_frame, outcome, now)))
         if now.parameters.crop_to_track > 0.0 and place is not None and place.frame == outcome.header.frame_id:
             T_cloud_model = se3.inverse(T_frame_cloud) @ place.T_frame_model
-            crops.append(region.around(now.model.tree, T_cloud_model, now.parameters.crop_to_track))
+            crops.append(region.around(now.model, T_cloud_model, now.parameters.crop_to_track))
         return crops
 
     def _watch_frame(self, frame: str, now: Situation) -> None:

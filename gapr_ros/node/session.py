@@ -201,7 +201,7 @@ class Session:
     # --- state ---
 
     def reset(self) -> None:
-        """Forget track, seed, all clouds so far, their stamps and the pose that late listeners get."""
+        """Forget track, seed, all clouds so far, their stamps on /tf too, and the pose that late listeners get."""
         self._timeline.forget()
         self._clear()
 
@@ -209,6 +209,7 @@ class Session:
         self._begin_anew()
         self.worker.outdate(self._epoch)
         self._publishers.withdraw_pose()
+        self._frames.forget()
         self._cloud_frames = []
 
     def clock_jumped(self) -> None:
@@ -219,7 +220,6 @@ class Session:
     def _restart(self, why: str) -> None:
         self._host.ros.get_logger().warning(f"{why}: time starts over and the track is cleared")
         self._clear()
-        self._frames.forget()
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""

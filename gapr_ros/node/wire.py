@@ -32,7 +32,14 @@ def metres_from_mm(length_mm: float) -> float:
 
 def moved_mm(T: Array, points_mm: Array) -> Array:
     """Points in mm moved by a ROS transform (4, 4), metres."""
-    return points_mm @ T[:3, :3].T + T[:3, 3] * MM_PER_M
+    return se3.apply(in_mm(T), points_mm)
+
+
+def in_mm(T: Array) -> Array:
+    """A ROS transform (4, 4), metres, as one of points in mm."""
+    scaled = T.copy()
+    scaled[:3, 3] *= MM_PER_M
+    return scaled
 
 
 def wire_pose(T_target_source: Array) -> Array:
@@ -44,9 +51,7 @@ def wire_pose(T_target_source: Array) -> Array:
 
 def core_pose(T_cloud_model: Array) -> Array:
     """A pose from ROS (4, 4), metres, as T_target_source in mm."""
-    T = se3.inverse(T_cloud_model)
-    T[:3, 3] *= MM_PER_M
-    return T
+    return in_mm(se3.inverse(T_cloud_model))
 
 
 def wire_covariance(covariance: Array, T_target_source: Array, centre_mm: Array, floors: tuple[float, float]) -> Array:

@@ -14,6 +14,13 @@ collect_ignore_glob = ["test_*.py"] if ROS_IS_MISSING else []
 FAILED_TO_START = pytest.StashKey[bool]()
 
 
+def pytest_collection_modifyitems(items) -> None:
+    """Nodes start in seconds, on a busy machine in minutes."""
+    for item in items:
+        if Path(__file__).parent in item.path.parents and item.get_closest_marker("timeout") is None:
+            item.add_marker(pytest.mark.timeout(500))
+
+
 def pytest_report_header() -> str:
     return "rclpy: " + ("missing, test/ros is left out" if ROS_IS_MISSING else "found")
 

@@ -44,10 +44,11 @@ from msg_adapters import xyz_to_cloud
 DOMAIN = domain.claim()
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NODE = "/register_node"
+PATIENCE_S = 240.0  # for what comes in a moment on a machine of one's own, and in minutes on a busy one
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "") -> Any:
+def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
     """The first true value of the condition; fails when there is none in time."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
@@ -148,11 +149,11 @@ class Client:
                     return {pair.key: pair.value for pair in entry.values} | own
         return {}
 
-    def wait_for_state(self, state: str, timeout_s: float = 20.0) -> None:
+    def wait_for_state(self, state: str, timeout_s: float = PATIENCE_S) -> None:
         wait_until(lambda: self.values().get("state") == state, timeout_s, f"state {state}")
         if state == "active":
-            wait_until(lambda: self.points.get_subscription_count(), 10.0, "the subscription")
-            wait_until(lambda: self.node.count_publishers(f"{NODE}/confidence"), 10.0, "the publishers")
+            wait_until(lambda: self.points.get_subscription_count(), 60.0, "the subscription")
+            wait_until(lambda: self.node.count_publishers(f"{NODE}/confidence"), 60.0, "the publishers")
 
     def send(self, cloud: PointCloud2 | np.ndarray | bytes, frame: str = "probe", stamp_s: float | None = None) -> None:
         """Publish a cloud, (N, 3) points in metres, or the bytes of a message."""
@@ -162,7 +163,7 @@ class Client:
             cloud = xyz_to_cloud(np.asarray(cloud, dtype=np.float32), Header(frame_id=frame, stamp=stamp))
         self.points.publish(cloud)
 
-    def ask(self, cloud: PointCloud2 | np.ndarray, timeout_s: float = 20.0, **kwargs: Any) -> dict[str, str]:
+    def ask(self, cloud: PointCloud2 | np.ndarray, timeout_s: float = PATIENCE_S, **kwargs: Any) -> dict[str, str]:
         """Publish one cloud and wait for its answer: the diagnostics after it was counted."""
         before = _answered(self.values())
         self.send(cloud, **kwargs)
@@ -173,10 +174,10 @@ class Client:
         """A client whose service has been found."""
         if name not in self._services:
             self._services[name] = self.do(lambda: self.node.create_client(kind, name))
-        wait_until(self._services[name].service_is_ready, 20.0, f"service {name}")
+        wait_until(self._services[name].service_is_ready, 60.0, f"service {name}")
         return self._services[name]
 
-    def call(self, name: str, request: Any = None, timeout_s: float = 20.0) -> Any:
+    def call(self, name: str, request: Any = None, timeout_s: float = PATIENCE_S) -> Any:
         """The response of one of the node's services."""
         request = request or Trigger.Request()
         kind = SetBool if isinstance(request, SetBool.Request) else Trigger
@@ -194,7 +195,13 @@ def _answered(values: dict[str, str]) -> int:
 def node_in_thread(method: Any, model_path: Path, namespace: str = "", **parameters: Any) -> Iterator[RegisterNode]:
     """A register_node in this process with a registration method of the test's own."""
     spinner = Spinner(context())
-    values = {"model_path": str(model_path), "model_unit": "mm", "publish_tf": False, "diagnostics_period": 0.1}
+    values = {
+        "model_path": str(model_path),
+        "model_unit": "mm",
+        "publish_tf": False,
+        "diagnostics_period": 0.1,
+        "timeout": 60.0,
+    }
     overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
     options = {"context": spinner.context, "parameter_overrides": overrides, "namespace": namespace}
     node = RegisterNode(lambda _: method, **options)
@@ -248,13 +255,13 @@ class NodeProcess:
     def rss_mb(self) -> float:
         return psutil.Process(self.process.pid).memory_info().rss / 2**20
 
-    def stop(self, number: int = signal.SIGINT, timeout_s: float = 20.0) -> int:
+    def stop(self, number: int = signal.SIGINT, timeout_s: float = 60.0) -> int:
         """Send a signal and return the exit code."""
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.wait(timeout_s)
 
-    def stop_cpu_s(self, number: int, timeout_s: float = 30.0) -> float:
+    def stop_cpu_s(self, number: int, timeout_s: float = 60.0) -> float:
         """CPU time from a signal to an end with 0: the wall clock says nothing on a busy machine."""
         process = psutil.Process(self.process.pid)
         before_s = last_s = sum(process.cpu_times()[:2])
@@ -270,7 +277,7 @@ class NodeProcess:
         assert code in (0, -number) and (code == 0 or number == signal.SIGKILL), (code, self.log)
         return last_s - before_s
 
-    def wait(self, timeout_s: float = 20.0) -> int:
+    def wait(self, timeout_s: float = 60.0) -> int:
         try:
             return self.process.wait(timeout_s)
         finally:
@@ -330,7 +337,7 @@ class StandIn:
         self, source: np.ndarray, target: Any, initial: np.ndarray | None = None, viewpoint: np.ndarray | None = None
     ) -> RegistrationResult:
         self.calls.append({"source": source, "initial": initial, "target": target, "viewpoint": viewpoint})
-        assert self.gate.wait(20.0)
+        assert self.gate.wait(PATIENCE_S)
         if self.error is not None:
             raise self.error
         return self.answer

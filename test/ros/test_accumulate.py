@@ -6,7 +6,7 @@ import time
 
 import bones
 import numpy as np
-from harness import NodeProcess, pose_mm, wait_until
+from harness import PATIENCE_S, NodeProcess, pose_mm, wait_until
 
 from gapr_core.geometry import se3
 from gapr_ros.node import wire
@@ -26,13 +26,13 @@ def test_slices_of_a_probe_that_are_too_small_alone_give_the_pose_together(clien
         tmp_path, model_path=bones.save(bone, tmp_path / "bone.npz"), model_unit="mm", timeout=60.0, accumulate=50
     )
     try:
-        client.wait_for_state("active", 60.0)
-        before = client.ask(slices[0], timeout_s=60.0)
+        client.wait_for_state("active")
+        before = client.ask(slices[0])
         assert before["last_refusal"].startswith("too_few_points: 60 usable points")
         for points in slices[1:]:
             client.send(points)
             time.sleep(0.02)
-        wait_until(lambda: sum(int(client.values()[f"frames_{kind}"]) for kind in KINDS) == 50, 60.0)
+        wait_until(lambda: sum(int(client.values()[f"frames_{kind}"]) for kind in KINDS) == 50, PATIENCE_S)
         wait_until(lambda: client.poses)
         estimate = wire.core_pose(pose_to_matrix(client.poses[-1]))
         translation_mm, rotation_deg = se3.pose_error(estimate, T, cloud * 1000.0)

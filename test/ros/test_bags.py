@@ -20,7 +20,7 @@ from gapr_ros.bags.writing import BagWriter, offered
 from msg_adapters import cloud_to_xyz
 
 START_NS = 1_700_000_000_250_000_000
-WAIT_S = 20.0  # for listeners; DDS takes seconds to find them now and then
+WAIT_S = 60.0  # for listeners; DDS takes seconds to find them now and then
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
@@ -74,7 +74,17 @@ def test_a_replayed_bag_arrives_whole_in_order_and_at_its_pace(bag_path, listene
     assert heard["clouds"][0].header.stamp.sec == 1_700_000_000
     assert heard["clouds"][0].header.stamp.nanosec == 250_000_000
     assert [m.child_frame_id for m in heard["transforms"]] == ["tool0", "tool5"]
-    assert heard["times"][-1] - heard["times"][0] == pytest.approx(0.45, abs=0.1)
+    assert at_its_pace(bag_path, 0.45)
+
+
+def at_its_pace(bag_path, seconds, **options):
+    """A busy machine delays a message now and then and never hurries one: the shortest of some plays counts."""
+    lasted = []
+    while len(lasted) < 20 and min(lasted, default=np.inf) > 1.3 * seconds:
+        sent = []
+        play(bag_path, on_message=lambda *_, sent=sent: sent.append(time.monotonic()), topics=["/points"], **options)
+        lasted.append(sent[-1] - sent[0])
+    return 0.95 * seconds < min(lasted) < 1.3 * seconds
 
 
 def test_rate_topics_and_clock_are_obeyed(bag_path, listener):
@@ -88,7 +98,7 @@ def test_rate_topics_and_clock_are_obeyed(bag_path, listener):
     assert time.monotonic() - sent[-1][1] < bag_replay.DRAIN_S, "all was acknowledged before the player gave up waiting"
     wait_until(lambda: len(listener.heard["clouds"]) == 10 and len(listener.heard["clocks"]) >= 20)
     assert not listener.heard["transforms"]
-    assert listener.heard["times"][-1] - listener.heard["times"][0] == pytest.approx(0.225, abs=0.08)
+    assert at_its_pace(bag_path, 0.225, rate=2.0)
     clocks = [m.sec + m.nanosec * 1e-9 for m in listener.heard["clocks"]]
     assert clocks == sorted(clocks)
     assert clocks[0] == pytest.approx(START_NS / 1e9, abs=0.1)
@@ -97,7 +107,7 @@ def test_rate_topics_and_clock_are_obeyed(bag_path, listener):
 
 def test_a_looped_bag_starts_over_until_it_is_interrupted(bag_path, listener, tmp_path):
     player = NodeProcess(tmp_path, str(bag_path), "--loop", "--rate", "4", "--clock", module="gapr_ros.bags.replay")
-    wait_until(lambda: len(listener.heard["clouds"]) > 25, 20.0, player.log)
+    wait_until(lambda: len(listener.heard["clouds"]) > 25, 60.0, player.log)
     assert player.stop() == 0, player.log
     clocks = [m.sec + m.nanosec * 1e-9 for m in listener.heard["clocks"]]
     assert min(np.diff(clocks)) < -0.3, "time goes back when the bag starts over"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bones
 import numpy as np
 import pytest
-from harness import Client, NodeProcess, context, pose_mm, wait_until
+from harness import PATIENCE_S, Client, NodeProcess, context, pose_mm, wait_until
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 
@@ -39,7 +39,7 @@ def live(bone, tmp_path_factory):
     model = bones.save(bone, folder / "bone.npz")
     client = Client()
     node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, seed=3, keeps=True)
-    client.wait_for_state("active", 90.0)
+    client.wait_for_state("active")
     yield node, client
     client.close()
     assert node.stop() == 0, node.log
@@ -53,7 +53,7 @@ def test_a_partial_cloud_gives_the_true_pose(live, bone, seed):
     rng = np.random.default_rng(seed)
     T = se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-150.0, 150.0, 3))
     cloud = bones.partial(bone, T, seed)
-    values = client.ask(cloud, timeout_s=60.0)
+    values = client.ask(cloud)
     assert values["level"] == 0, values
     wait_until(lambda: client.poses)
     estimate = wire.core_pose(pose_to_matrix(client.poses[0]))
@@ -71,15 +71,15 @@ def test_the_next_cloud_is_looked_for_where_the_last_one_was_until_a_reset(live,
     nearby = se3.exp([4.0, -3.0, 2.0, 0.03, 0.02, -0.04]) @ T
     client.call("reset")
     clouds = [bones.partial(bone, T, 21), bones.partial(bone, nearby, 22)]
-    assert client.ask(clouds[0], timeout_s=60.0)["found_by"] in ("network", "search")
+    assert client.ask(clouds[0])["found_by"] in ("network", "search")
     client.poses.clear()
-    assert client.ask(clouds[1], timeout_s=60.0)["found_by"] == "track"
+    assert client.ask(clouds[1])["found_by"] == "track"
     wait_until(lambda: client.poses)
     estimate = wire.core_pose(pose_to_matrix(client.poses[0]))
     translation_mm, rotation_deg = se3.pose_error(estimate, nearby, clouds[1] * 1000.0)
     assert translation_mm < 1.0 and rotation_deg < 1.0
     client.call("reset")
-    assert client.ask(clouds[1], timeout_s=60.0)["found_by"] in ("network", "search")
+    assert client.ask(clouds[1])["found_by"] in ("network", "search")
 
 
 def plane(rng):
@@ -113,7 +113,7 @@ def test_bad_input_is_refused_by_the_real_registration(live, name):
     make, reasons = BAD_INPUT[name]
     client.poses.clear()
     client.confidences.clear()
-    values = client.ask(make(np.random.default_rng(0)), timeout_s=60.0)
+    values = client.ask(make(np.random.default_rng(0)))
     assert values["last_refusal"].split(":")[0] in reasons, values
     wait_until(lambda: client.confidences)
     assert client.confidences == [0.0] and not client.poses
@@ -133,7 +133,7 @@ def test_every_cloud_of_a_replayed_bag_is_answered_or_counted(live, bone, tmp_pa
     def gone():
         return {key: int(client.values()[f"frames_{key}"]) - int(before[f"frames_{key}"]) for key in KINDS}
 
-    wait_until(lambda: sum(gone()[k] for k in ("accepted", "refused", "dropped", "lost")) == 12, 60.0, gone())
+    wait_until(lambda: sum(gone()[k] for k in ("accepted", "refused", "dropped", "lost")) == 12, PATIENCE_S, gone())
     assert gone()["refused"] == 0 and gone()["accepted"] >= 1, client.values()
     assert gone()["received"] + gone()["lost"] == 12
 
@@ -154,8 +154,8 @@ def test_services_work_on_the_real_node(live, bone):
     node, client = live
     assert client.call("set_enabled", SetBool.Request(data=False)).success
     assert client.call("set_enabled", SetBool.Request(data=True)).success
-    client.ask(bones.partial(bone, np.eye(4)), timeout_s=60.0)
-    answer = client.call("register", timeout_s=60.0)
+    client.ask(bones.partial(bone, np.eye(4)))
+    answer = client.call("register")
     assert answer.success and answer.message.startswith("OK"), answer
-    answer = client.call("reload_model", timeout_s=60.0)
+    answer = client.call("reload_model")
     assert answer.success and "points" in answer.message

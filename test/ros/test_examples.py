@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Pose, PoseArray, TransformStamped
-from harness import NodeProcess, Spinner, accepted, context, node_in_thread, pose_mm, wait_until
+from harness import PATIENCE_S, NodeProcess, Spinner, accepted, context, node_in_thread, pose_mm, wait_until
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
@@ -87,11 +87,9 @@ def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):
     arguments = ("--ros-args", "-p", "min_confidence:=0.5", "-p", "max_tre:=0.01")
     program = NodeProcess(tmp_path, *arguments, script=EXAMPLES / "trusted_pose.py")
     try:
-        client.wait_for_state("active", 60.0)
-        wait_until(lambda: client.node.count_subscribers("/register_node/status"), 30.0)
-        wait_until(
-            lambda: client.ask(bones.partial(bone, np.eye(4)), timeout_s=60.0) and "bone at" in program.log, 60.0
-        )
+        client.wait_for_state("active")
+        wait_until(lambda: client.node.count_subscribers("/register_node/status"))
+        wait_until(lambda: client.ask(bones.partial(bone, np.eye(4))) and "bone at" in program.log, PATIENCE_S)
     finally:
         assert program.stop(signal.SIGINT) == 0, program.log
         node.stop()

@@ -83,7 +83,7 @@ def test_a_parameter_file_with_an_unknown_name_is_warned_about(tmp_path):
 
 def test_the_shipped_file_starts_the_node_without_a_warning(tmp_path):
     node = NodeProcess(tmp_path, "--ros-args", "--params-file", str(FILE), "-p", "autostart:=false")
-    wait_until(lambda: list(tmp_path.glob("python*_*.log")), 30.0, "rclpy's log file")  # silent, but it runs
+    wait_until(lambda: list(tmp_path.glob("python*_*.log")), 60.0, "rclpy's log file")  # silent, but it runs
     time.sleep(2.0)
     assert node.stop() == 0, node.log
     assert "WARN" not in node.log and "unknown" not in node.log

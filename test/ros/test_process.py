@@ -18,10 +18,10 @@ def test_a_signal_ends_the_process_with_0_even_while_it_registers(client, tmp_pa
     bone = bones.bone()
     model = bones.save(bone, tmp_path / "bone.npz")
     node = NodeProcess(tmp_path, model_path=model, model_unit="mm")
-    client.wait_for_state("active", 60.0)
+    client.wait_for_state("active")
     client.send(bones.partial(bone, np.eye(4)))
     time.sleep(0.3)
-    assert node.stop(number, 30.0) == 0, node.log
+    assert node.stop(number) == 0, node.log
     assert "Traceback" not in node.log
 
 

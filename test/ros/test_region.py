@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
@@ -56,7 +58,7 @@ def test_the_neighbourhood_of_the_bone_is_where_its_last_pose_puts_it():
     model_mm = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
     T_cloud_model = pose_mm([0.0, 0.0, np.pi / 2], [0.5, 0.0, 0.0])  # metres: the second point is at (0.5, 0.1, 0)
     points_mm = np.array([[500.0, 100.0, 9.0], [500.0, 100.0, 11.0], [600.0, 0.0, 0.0], [495.0, 0.0, 0.0]])
-    kept = region.around(cKDTree(model_mm), T_cloud_model, 0.01)(points_mm)
+    kept = region.around(SimpleNamespace(tree=cKDTree(model_mm)), T_cloud_model, 0.01)(points_mm)
     np.testing.assert_array_equal(kept, points_mm[[0, 3]])
 
 

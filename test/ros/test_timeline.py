@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from geometry_msgs.msg import TransformStamped
 from harness import accepted, node_in_thread, pose_mm, wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rclpy.time import Time as RosTime
+from rosgraph_msgs.msg import Clock
 
 from gapr_ros.node import frames
 from gapr_ros.node.refusal import Reason, RefusedError
@@ -89,8 +92,8 @@ def test_stamps_never_go_back_more_than_a_second_unless_time_starts_over(stamps)
             newest = stamp * NS
 
 
-class Tf2:
-    """What a tf2 buffer does with what it is sent: strictly newer wins, a look-up of the latest gives the last one.
+class Model:
+    """What a tf2 buffer does with what it is sent.
 
     From tf2's TimeCache: the latest transform is that with the newest stamp, whenever it was inserted; data older than
     the newest by more than the length of the cache (10 s) is ignored.
@@ -101,17 +104,6 @@ class Tf2:
     def __init__(self):
         self.stored = {}
 
-    def TransformBroadcaster(self, node):
-        fake = self
-
-        class Broadcaster:
-            pub_tf = node.create_publisher(TransformStamped, "unused", 1)
-
-            def sendTransform(self, transform):
-                fake.insert(transform)
-
-        return Broadcaster()
-
     def insert(self, transform):
         stamp_s = transform.header.stamp.sec + transform.header.stamp.nanosec * 1e-9
         if stamp_s >= max(self.stored, default=0.0) - self.CACHE_S:
@@ -120,12 +112,49 @@ class Tf2:
     def latest(self):
         return self.stored[max(self.stored)]
 
+    def at(self, stamp_s):
+        return self.stored[stamp_s]
 
-@pytest.fixture
-def tf2(monkeypatch):
-    made = Tf2()
-    monkeypatch.setattr(frames, "_import_tf2", lambda: made)
-    return made
+    def clear(self):
+        self.stored.clear()
+
+
+class Real:
+    """The buffer of tf2 itself."""
+
+    def __init__(self):
+        self._buffer = pytest.importorskip("tf2_py", reason="part of a ROS installation").BufferCore()
+
+    def insert(self, transform):
+        self._buffer.set_transform(transform, "register_node")
+
+    def latest(self):
+        return self.at(0.0)
+
+    def at(self, stamp_s):
+        found = self._buffer.lookup_transform_core("probe", "bone_preop", RosTime(nanoseconds=round(stamp_s * 1e9)))
+        return found.transform.translation.x
+
+    def clear(self):
+        self._buffer.clear()
+
+
+@pytest.fixture(params=[Model, Real])
+def tf2(monkeypatch, request):
+    """A buffer that gets what the node sends to /tf; `sent` are the stamps, s."""
+    buffer, sent = request.param(), []
+
+    class Broadcaster:
+        def __init__(self, node):
+            self.pub_tf = node.create_publisher(TransformStamped, "unused", 1)
+
+        def sendTransform(self, transform):
+            sent.append(transform.header.stamp.sec + transform.header.stamp.nanosec * 1e-9)
+            buffer.insert(transform)
+
+    buffer.sent = sent
+    monkeypatch.setattr(frames, "_import_tf2", lambda: SimpleNamespace(TransformBroadcaster=Broadcaster))
+    return buffer
 
 
 def test_one_cloud_from_the_future_does_not_hold_back_what_tf2_says(blob_path, client, method, tf2):
@@ -146,7 +175,7 @@ def test_a_straggler_changes_neither_the_jump_guard_nor_the_epoch_nor_tf(blob_pa
         client.ask(GOOD, stamp_s=1000.0)
         epoch, calls = node.session._epoch, len(method.calls)
         assert client.ask(GOOD, stamp_s=980.0)["last_refusal"].startswith("stale: the stamp is 20 s behind")
-        assert (node.session._epoch, len(method.calls), len(tf2.stored)) == (epoch, calls, 1)
+        assert (node.session._epoch, len(method.calls), len(tf2.sent)) == (epoch, calls, 1)
         method.answer = accepted(MOVED)
         assert client.ask(GOOD, stamp_s=1000.5)["last_refusal"].startswith("jump"), "the guard still stands"
 
@@ -179,4 +208,37 @@ def test_a_bag_that_is_looped_without_simulated_time_clears_the_track_and_goes_o
         answers = [client.ask(GOOD, stamp_s=995.0 + i) for i in range(4)]
         assert [answer["level"] for answer in answers] == [1, 1, 0, 0]
         assert node.session._epoch == epoch + 1
-        assert sorted(tf2.stored) == [997.0, 998.0, 1000.0, 1001.0]
+        assert tf2.sent == [1000.0, 1001.0, 997.0, 998.0]
+        assert tf2.at(1000.0) == pytest.approx(0.0) and tf2.at(997.0) == tf2.at(998.0) == pytest.approx(-0.05)
+
+
+def test_stamps_of_before_go_to_tf_after_a_reset(blob_path, client, method, tf2):
+    """Somebody plays a bag once more and calls ~/reset: /tf must not wait until the stamps are those of before."""
+    with node_in_thread(method, blob_path, publish_tf=True):
+        client.wait_for_state("active")
+        assert client.ask(GOOD, stamp_s=1005.0)["level"] == 0
+        assert client.call("reset").success
+        method.answer = accepted(MOVED)
+        assert client.ask(GOOD, stamp_s=1000.0)["level"] == 0
+        wait_until(lambda: tf2.sent == [1005.0, 1000.0], what=tf2.sent)
+        assert tf2.at(1000.0) == pytest.approx(-0.05)
+
+
+def test_a_bag_that_is_looped_with_simulated_time_never_blinds_a_buffer(blob_path, client, method, tf2):
+    """Far more than a buffer's 10 s back: buffers clear themselves with the clock, and the node starts over with it."""
+    with node_in_thread(method, blob_path, publish_tf=True, use_sim_time=True) as node:
+        client.wait_for_state("active")
+
+        def at(seconds):
+            client.clock.publish(Clock(clock=RosTime(nanoseconds=int(seconds * NS)).to_msg()))
+            wait_until(lambda: node.now_ns() == int(seconds * NS), what="the clock")
+
+        for second in (1000.0, 1030.0, 1060.0):
+            at(second)
+            assert client.ask(GOOD, stamp_s=second)["level"] == 0
+        method.answer = accepted(MOVED)
+        at(1000.5)
+        tf2.clear()  # as tf2_ros does when its clock goes back
+        assert client.ask(GOOD, stamp_s=1000.5)["level"] == 0, "the first cloud of the new round"
+        wait_until(lambda: tf2.sent[-1] == 1000.5)
+        assert tf2.latest() == tf2.at(1000.5) == pytest.approx(-0.05)

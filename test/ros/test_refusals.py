@@ -143,7 +143,8 @@ def test_a_cloud_cut_off_on_the_wire_is_refused(live):
 def test_five_million_points_are_thinned_and_answered(live):
     cloud = np.random.default_rng(0).normal(size=(5_000_000, 3)).astype(np.float32) * 0.02
     node, client, method = live
-    values = client.ask(cloud, timeout_s=60.0)
+    node.set_parameters_atomically([Parameter("timeout", value=60.0)])
+    values = client.ask(cloud)
     assert values["level"] == 0, values
     assert (values["points_in"], values["points_used"]) == ("5000000", "200000")
 

@@ -1,7 +1,8 @@
 """`gapr demo`: a bone, simulated clouds of it in a bag, the node as its own process, poses, a table and a report.
 
 Three acts: a probe that sweeps along the bone; with --scene a camera that circles a wound; with --guided a probe that
-goes where the node says that a look would help most.
+goes where the node says that a look would help most. With --real DIR public real clouds are registered instead, without
+the node; docs/real_data.md says where they are.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                      help="a camera circles a wound: most of what it sees is no bone")  # fmt: skip
     act.add_argument("--guided", dest="act", action="store_const", const="guided",
                      help="small looks, each where the node says that it would help most")  # fmt: skip
+    act.add_argument("--real", type=Path, metavar="DIR", help="register the public real data in this folder")
     parser.add_argument("--bone", default="femur", help="femur, pelvis, ...: a parametric bone (default: femur)")
     parser.add_argument("--seed", type=int, default=1, help="which subject, which way, where the patient lies")
     parser.add_argument("--frames", type=int, help="clouds in the bag, or most looks (default: 24; --scene and "
@@ -45,6 +47,10 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else 110)
+    if args.real is not None:
+        from gapr_ros.demo import real
+
+        return real.run(args.real, console)
     args.frames = FRAMES[args.act] if args.frames is None else args.frames
     try:
         args.out.mkdir(parents=True, exist_ok=True)

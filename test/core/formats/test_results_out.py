@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core import clouds
 from gapr_core.cli import main
+from gapr_core.data.masks import mask_of
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import markups, planning, scene, transforms
 from gapr_core.geometry import se3
@@ -37,23 +38,13 @@ def test_a_matrix_as_text_is_the_pose_itself(tmp_path):
 
 
 def voxelised(surface, spacing, turn, flip):
-    """The mask [k, j, i] of a closed mesh on an oblique grid, and the image with its place."""
-    import open3d as o3d
-
-    axes = Rotation.from_rotvec(turn).as_matrix() @ np.diag(flip)
-    inside = surface.points @ axes / spacing
-    low, high = np.floor(inside.min(axis=0)) - 5.4, np.ceil(inside.max(axis=0)) + 5
-    size = (high - low).astype(int)
-    index = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1)
-    points = np.ascontiguousarray((((index + low) * spacing) @ axes.T).astype(np.float32))
-    rays = o3d.t.geometry.RaycastingScene()
-    rays.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(surface.to_open3d()))
-    image = sitk.GetImageFromArray(
-        rays.compute_occupancy(o3d.core.Tensor(points)).numpy().astype(np.uint8).transpose(2, 1, 0)
-    )
-    image.SetSpacing([float(s) for s in spacing])
-    image.SetDirection(axes.ravel().tolist())
-    image.SetOrigin((axes @ (low * spacing)).tolist())
+    """The image of a closed mesh on an oblique grid."""
+    mask, affine = mask_of(surface, spacing, Rotation.from_rotvec(turn).as_matrix() @ np.diag(flip))
+    size = np.linalg.norm(affine[:3, :3], axis=0)
+    image = sitk.GetImageFromArray(mask)
+    image.SetSpacing(size.tolist())
+    image.SetDirection((affine[:3, :3] / size).ravel().tolist())
+    image.SetOrigin(affine[:3, 3].tolist())
     return image
 
 
@@ -61,15 +52,18 @@ GRIDS = [
     ((2.0, 2.0, 2.0), (0.0, 0.0, 0.0), (-1, -1, 1), "nii.gz", False),
     ((1.0, 1.4, 3.0), (0.2, -0.3, 0.5), (1, 1, -1), "nrrd", True),
 ]
-FINE = [
-    ((0.5, 0.5, 0.5), (0.0, 0.0, 0.0), (1, 1, 1), "nii.gz", False),
-    ((1.0, 1.0, 1.0), (0.1, 0.6, 0.0), (-1, 1, 1), "nii.gz", True),
-    ((3.0, 3.0, 3.0), (0.1, 0.6, 0.0), (-1, 1, 1), "mha", False),
+SPACINGS = [(0.5, 0.5, 0.5), (1.0, 1.0, 1.0), (2.0, 2.0, 2.0), (3.0, 3.0, 3.0), (1.0, 1.4, 3.0)]
+PLACES = [((0.0, 0.0, 0.0), (1, 1, 1)), ((0.2, -0.3, 0.5), (1, 1, 1)), ((0.1, 0.6, 0.0), (-1, 1, 1))]
+ENDINGS = ["nii.gz", "nrrd", "mha"]
+LONG = [  # every spacing in every place; every format on every spacing and on every place; both sides
+    (spacing, turn, flip, ENDINGS[(i + j) % 3], (i + j) % 2 == 1)
+    for i, spacing in enumerate(SPACINGS)
+    for j, (turn, flip) in enumerate(PLACES)
 ]
 
 
 @pytest.mark.parametrize(
-    ("spacing", "turn", "flip", "ending", "mirrored"), GRIDS + [pytest.param(*g, marks=pytest.mark.slow) for g in FINE]
+    ("spacing", "turn", "flip", "ending", "mirrored"), GRIDS + [pytest.param(*g, marks=pytest.mark.slow) for g in LONG]
 )
 def test_a_mask_becomes_a_transform_that_itk_maps_the_right_way_round(
     tmp_path, femur, spacing, turn, flip, ending, mirrored

@@ -1,0 +1,140 @@
+"""The smooth bias against dense linear algebra: marginal likelihood, generalised least squares, correlation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from gapr_core.registration import bias_field
+from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square, smooth_correlation
+from gapr_core.registration.refinement import Fit
+
+COUNT, FIELDS, SIGMA_MM = 24, 4, 0.5
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """Unit normals and residuals drawn at random; two points without weight, one of them without a residual."""
+    rng = np.random.default_rng(2)
+    normals = rng.normal(size=(COUNT, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    weights = rng.uniform(0.4, 1.0, COUNT)
+    signed = rng.normal(0.0, 0.8, COUNT)
+    weights[[3, 9]], signed[3] = 0.0, np.nan
+    moved = rng.uniform(-20.0, 20.0, (COUNT, 3)) + [50.0, -10.0, 5.0]
+    return Fit(np.eye(4), SIGMA_MM, signed, weights, normals, np.zeros(COUNT, dtype=np.int64), moved)
+
+
+@pytest.fixture(scope="module")
+def spanned():
+    return np.random.default_rng(3).normal(size=(COUNT, FIELDS))
+
+
+def dense(fit, spanned, size_mm, more=None, sizes=()):
+    """J, y, covariance V of the residuals and information P of the unknowns; points without weight left out."""
+    inlier = fit.weights > 0.0
+    J = np.hstack([fit.gradients, np.cross(fit.moved - fit.moved.mean(axis=0), fit.gradients)])
+    P = np.diag([1e-6] * 3 + [1e-3] * 3)
+    if more is not None:
+        J, P = np.hstack([J, more]), np.diag([*np.diag(P), *(1.0 / np.array(sizes) ** 2)])
+    V = np.diag(SIGMA_MM**2 / fit.weights[inlier]) + size_mm**2 * spanned[inlier] @ spanned[inlier].T
+    return J[inlier], fit.signed_mm[inlier], V, P
+
+
+def test_points_are_alike_as_the_exponential_of_half_their_squared_distance():
+    a, b = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]), np.array([[0.0, 0.0, 5.0]])
+    assert smooth_correlation(a, b, 5.0) == pytest.approx(np.exp([[-0.5], [-1.0]]))
+    assert smooth_correlation(a, b, 10.0) == pytest.approx(np.exp([[-0.125], [-0.25]]))
+
+
+def test_fields_of_all_points_have_the_correlation_of_the_bias(fit):
+    F = fields(fit, 12.0, COUNT)
+    inlier = fit.weights > 0.0
+    assert F.shape == (COUNT, inlier.sum())
+    wanted = smooth_correlation(fit.moved, fit.moved, 12.0)
+    assert (F @ F.T)[np.ix_(inlier, inlier)] == pytest.approx(wanted[np.ix_(inlier, inlier)], abs=2e-5)
+
+
+def test_fields_are_spanned_by_as_many_inliers_as_asked_for(fit):
+    few = fields(fit, 12.0, 5)
+    assert few.shape == (COUNT, 5)
+    assert ((few**2).sum(axis=1) <= 1.0 + 1e-9).all()  # never more alike to itself than 1
+    centres = np.flatnonzero((few**2).sum(axis=1) > 1.0 - 1e-5)
+    assert len(centres) == 5 and (fit.weights[centres] > 0.0).all()
+
+
+def test_without_inliers_there_is_one_field_of_zeros(fit):
+    assert np.array_equal(fields(replace(fit, weights=np.zeros(COUNT)), 12.0, 5), np.zeros((COUNT, 1)))
+
+
+def test_two_centres_at_one_place_do_not_break_the_factor(fit):
+    twice = replace(fit, moved=np.repeat(fit.moved[:12], 2, axis=0))
+    assert np.isfinite(fields(twice, 12.0, COUNT)).all()
+
+
+@pytest.mark.parametrize("size_mm", [0.05, 0.4, 2.0])
+def test_the_log_likelihood_is_that_of_the_residuals_with_all_motions_integrated_out(fit, spanned, size_mm):
+    """log N(y; 0, V + J P^-1 J^T) less the same without a bias."""
+    J, y, V, P = dense(fit, spanned, size_mm)
+    motions = J @ np.linalg.inv(P) @ J.T
+    without = dense(fit, spanned, 0.0)[2]
+    wanted = multivariate_normal(np.zeros(len(y)), V + motions).logpdf(y)
+    wanted -= multivariate_normal(np.zeros(len(y)), without + motions).logpdf(y)
+    found = NormalEquations.of(fit, spanned).log_likelihood(np.array([size_mm, 1e-9]), 0.0)
+    assert found[0] == pytest.approx(wanted, abs=1e-4)
+    assert found[1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("size_mm", [0.05, 0.4, 2.0])
+@pytest.mark.parametrize("unknowns", [0, 2])
+def test_a_step_is_that_of_dense_generalised_least_squares(fit, spanned, size_mm, unknowns):
+    rng, sizes = np.random.default_rng(4), (0.3, 0.05)[:unknowns]
+    more = rng.normal(size=(COUNT, unknowns)) if unknowns else None
+    J, y, V, P = dense(fit, spanned, size_mm, more, sizes)
+    information = J.T @ np.linalg.solve(V, J) + P
+    equations = NormalEquations.of(fit, spanned, more, sizes)
+    assert equations.step(size_mm) == pytest.approx(-np.linalg.solve(information, J.T @ np.linalg.solve(V, y)))
+    assert equations.step_covariance(size_mm) == pytest.approx(np.linalg.inv(information))
+
+
+def test_a_motion_that_nothing_observes_stays_finite(fit, spanned):
+    blind = replace(fit, weights=np.zeros(COUNT))
+    equations = NormalEquations.of(blind, spanned)
+    assert equations.step(0.4) == pytest.approx(np.zeros(6))
+    assert np.diag(equations.step_covariance(0.4)) == pytest.approx([1e6] * 3 + [1e3] * 3)
+
+
+def hand_made(information, score):
+    """Fields that no motion shares: information and score of each stand on the diagonal."""
+    n = len(information)
+    return NormalEquations(np.eye(6), np.zeros((6, n)), np.diag(information), np.zeros(6), np.array(score))
+
+
+@pytest.mark.parametrize(("share", "counted"), [(0.0, 3), (0.24, 2), (0.26, 1), (0.9, 1)])
+def test_fields_with_a_smaller_share_of_the_best_ones_information_do_not_count(share, counted):
+    information, score, size = np.array([0.1, 1.0, 4.0]), np.array([3.0, -2.0, 5.0]), 0.7
+    each = 0.5 * (size**2 * score**2 / (1.0 + size**2 * information) - np.log1p(size**2 * information))
+    found = hand_made(information, score).log_likelihood(np.array([size]), share)
+    assert found == pytest.approx([each[3 - counted :].sum()])
+
+
+def test_a_field_of_exactly_the_share_does_not_count():
+    found = hand_made([1.0, 4.0], [9.0, 0.0]).log_likelihood(np.array([1.0]), 0.25)
+    assert found == pytest.approx([-0.5 * np.log(5.0)])
+
+
+def test_without_information_nothing_speaks_for_a_bias():
+    assert hand_made([0.0, 0.0], [0.0, 0.0]).log_likelihood(np.array([0.5, 1.0]), 0.1) == pytest.approx([0.0, 0.0])
+
+
+def test_the_size_is_the_posterior_root_mean_square():
+    sizes = np.array([0.1, 0.5, 2.0])
+    chance = np.array([0.2, 0.5, 0.3])
+    wanted = np.sqrt(0.2 * 0.01 + 0.5 * 0.25 + 0.3 * 4.0)
+    for offset in (0.0, -2000.0, 2000.0):  # a factor of the posterior does not count, however large
+        assert root_mean_square(sizes, np.log(chance) + offset) == pytest.approx(wanted)
+
+
+def test_the_prior_of_a_motion_is_weak():
+    assert np.array_equal(np.diag(bias_field.POSE_PRIOR), [1e-6] * 3 + [1e-3] * 3)

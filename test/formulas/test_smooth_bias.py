@@ -1,0 +1,125 @@
+"""The steps of the bias correction, with the linear algebra replaced: `test_bias_field` holds that."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig
+from gapr_core.geometry import se3
+from gapr_core.registration import smooth_bias
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.refinement import Fit
+
+COUNT = 12
+CONFIG = SmoothBiasConfig(fewest_points=10, iterations=3, sizes_mm=(0.5, 1.0), largest_move=22.5)
+STEP = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.015])
+POINTS = np.random.default_rng(0).uniform(-20.0, 20.0, (COUNT, 3)) + [30.0, 0.0, 10.0]
+SOURCE = SimpleNamespace(points=POINTS, neighbours=np.arange(COUNT)[:, None])
+EXACT = np.diag([1.0] * 3 + [1e-2] * 3)
+
+
+def fit_of(T, weights=None):
+    moved = se3.apply(T, POINTS)
+    weights = np.ones(COUNT) if weights is None else weights
+    nothing = np.zeros(COUNT)
+    return Fit(T, 0.5, nothing, weights, np.ones((COUNT, 3)), nothing.astype(int), moved)
+
+
+class Equations:
+    """Evidence for a bias in the first rounds, the same step in each."""
+
+    def __init__(self, believed):
+        self.believed, self.seen = list(believed), []
+
+    def of(self, fit, spanned):
+        self.seen.append(fit.T)
+        return self
+
+    def log_likelihood(self, sizes_mm, share):
+        assert share == CONFIG.smallest_share and tuple(sizes_mm) == CONFIG.sizes_mm
+        return np.array([self.believed.pop(0), -50.0])  # all on the first size
+
+    def step(self, size_mm):
+        assert size_mm == pytest.approx(0.5)
+        return STEP
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """Replaces fields, equations and refinement; says what evidence each round has."""
+
+    def use(*believed):
+        equations = Equations(believed)
+        monkeypatch.setattr(smooth_bias, "fields", lambda fit, length_mm, centres: (length_mm, centres))
+        monkeypatch.setattr(smooth_bias, "NormalEquations", equations)
+        monkeypatch.setattr(smooth_bias, "evaluate_with_patches", lambda T, points, *_: fit_of(T))
+        return equations
+
+    return use
+
+
+def corrected(fit, config=CONFIG, covariance=EXACT):
+    return smooth_bias.corrected_fit(fit, covariance, SOURCE, None, config, RefinementConfig())
+
+
+def moved_by(count, T):
+    for _ in range(count):
+        T = se3.exp(STEP, se3.apply(T, POINTS).mean(axis=0)) @ T
+    return T
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 3])
+def test_each_round_steps_about_the_centroid_of_where_the_source_lies(steps, rounds):
+    equations = steps(9.0, 9.0, 9.0)
+    found = corrected(fit_of(np.eye(4)), replace(CONFIG, iterations=rounds))
+    assert found.T == pytest.approx(moved_by(rounds, np.eye(4)), abs=1e-12) and len(equations.seen) == rounds
+    assert found.bias_mm == pytest.approx(0.5)
+
+
+def test_a_round_without_evidence_is_the_last(steps):
+    steps(9.0, 1.99, 9.0)
+    assert corrected(fit_of(np.eye(4))).T == pytest.approx(moved_by(1, np.eye(4)), abs=1e-12)
+
+
+def test_without_evidence_the_same_fit_comes_back(steps):
+    steps(1.99)
+    fit = fit_of(np.eye(4))
+    assert corrected(fit) is fit
+
+
+def test_evidence_of_exactly_the_limit_is_believed(steps):
+    steps(2.0, 0.0)
+    assert corrected(fit_of(np.eye(4))).bias_mm > 0.0
+
+
+@pytest.mark.parametrize(("inliers", "is_moved"), [(9, False), (10, True)])
+def test_too_few_inliers_show_no_bias(steps, inliers, is_moved):
+    steps(9.0, 0.0)
+    fit = fit_of(np.eye(4), np.arange(COUNT) < inliers)
+    assert (corrected(fit) is not fit) is is_moved
+
+
+@pytest.mark.parametrize(("factor", "is_moved"), [(1.01, True), (0.99, False)])
+def test_a_move_beyond_the_limit_in_its_covariance_is_not_made(steps, factor, is_moved):
+    """The limit is a squared Mahalanobis distance of the move; the covariance is scaled to lie on either side."""
+    steps(9.0, 0.0)
+    fit = fit_of(np.eye(4))
+    move = np.array([*(se3.apply(moved_by(1, np.eye(4)), POINTS) - POINTS).mean(axis=0), *STEP[3:]])
+    distance = move @ np.linalg.solve(EXACT, move)
+    found = corrected(fit, covariance=EXACT * distance / CONFIG.largest_move * factor)
+    assert (found is not fit) is is_moved
+
+
+def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps, monkeypatch):
+    monkeypatch.setattr(smooth_bias, "estimate", lambda fit, *_: ("estimated", fit.bias_mm))
+    config = RegistrarConfig(smooth_bias=CONFIG)
+    known = SimpleNamespace(covariance=EXACT)
+    assessment = Assessment(fit_of(np.eye(4)), None, known, {}, 0.9, None, SOURCE, None)
+    steps(0.0)
+    assert smooth_bias.bias_corrected(assessment, config) is assessment
+    steps(9.0, 0.0)
+    found = smooth_bias.bias_corrected(assessment, config)
+    assert found.fit.T == pytest.approx(moved_by(1, np.eye(4)), abs=1e-12)
+    assert found.uncertainty == ("estimated", pytest.approx(0.5)) and found.probability == 0.9

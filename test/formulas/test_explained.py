@@ -1,0 +1,182 @@
+"""Which part of a scene a pose explains, and what a refusal says of the rest; on a plane, by hand."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tiny
+
+from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceConfig
+from gapr_core.geometry import se3
+from gapr_core.registration import explained
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.explained import Explained
+from gapr_core.registration.free_space import Visible
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.verification import Candidates
+from gapr_core.results import Refusal, RegistrationStatus
+
+CONFIG = RegistrarConfig(
+    num_threads=1, clutter=ClutterConfig(part_mm=2.0), part=PartConfig(crowd=4, most_alone=0.5),
+    source=SourceConfig(normal_neighbours=8, dense_points=20),
+)  # fmt: skip
+REFUSED = Refusal(RegistrationStatus.AMBIGUOUS, "another pose fits")
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return tiny.plane(size_mm=40.0)
+
+
+def source_of(points, normals=None, oriented=True, neighbours=None):
+    points = np.asarray(points, dtype=float)
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1)) if normals is None else np.asarray(normals, dtype=float)
+    neighbours = np.arange(len(points))[:, None] if neighbours is None else np.asarray(neighbours)
+    return SimpleNamespace(points=points, normals=normals, oriented=oriented, neighbours=neighbours)
+
+
+def on_surface(source, plane, T=None, config=CONFIG):
+    return explained._on_surface(np.eye(4) if T is None else T, source, plane, config).tolist()
+
+
+def test_points_are_on_the_surface_up_to_a_distance_above_below_and_aside(plane):
+    heights = [0.0, 1.9, -1.9, 2.1, -2.1, 300.0]
+    assert on_surface(source_of([[0.0, 0.0, z] for z in heights]), plane) == [True] * 3 + [False] * 3
+    reach = 20.0 + 2.0 * plane.spacing_mm  # the end of the last element
+    assert on_surface(source_of([[reach + x, 0.0, 1.2] for x in (1.5, 1.7)]), plane) == [True, False]
+
+
+@pytest.mark.parametrize(("oriented", "expected"), [(True, [True, False, False]), (False, [True, False, True])])
+def test_normals_must_agree_and_count_with_their_sign_where_it_is_known(plane, oriented, expected):
+    normals = [[np.sqrt(1.0 - c * c), 0.0, c] for c in (0.71, 0.69, -0.71)]
+    assert on_surface(source_of(np.zeros((3, 3)), normals, oriented), plane) == expected
+
+
+def test_points_and_normals_are_moved_by_the_pose(plane):
+    T = se3.exp([1.0, 2.0, 3.0, 0.5, -0.8, 0.3])
+    points, normals = np.array([[0.0, 1.0, 0.5], [2.0, 1.0, 4.0]]), np.tile([0.0, 0.0, 1.0], (2, 1))
+    back = se3.inverse(T)
+    assert on_surface(source_of(se3.apply(back, points), normals @ back[:3, :3].T), plane, T) == [True, False]
+
+
+@pytest.mark.parametrize(("others_on", "expected"), [(0, False), (1, False), (2, True), (3, True)])
+def test_a_point_counts_when_most_of_its_first_neighbours_lie_on_the_surface(plane, others_on, expected):
+    """Itself and three others are asked (crowd 4); more than half must lie on it. The fifth is not asked."""
+    heights = [0.0, *([0.0] * others_on + [9.0] * (3 - others_on)), 0.0]
+    neighbours = np.tile(np.arange(5), (5, 1))
+    assert on_surface(source_of([[0.0, 0.0, z] for z in heights], neighbours=neighbours), plane)[0] is expected
+
+
+@pytest.fixture
+def described(monkeypatch):
+    """Replaces description and refinement; notes which points were described and where each refinement began."""
+    seen = []
+
+    def refine_fully(T, points, target, config, neighbours):
+        T = se3.exp([0.0, 0.0, -1.5, 0.0, 0.0, 0.0]) @ T
+        seen.append((len(points), T[2, 3]))
+        zeros = np.zeros(len(points))
+        return Fit(T, 0.5, zeros, (points[:, 2] < 2.6).astype(float), None, zeros, se3.apply(T, points))
+
+    def described(scene, members, config):
+        return SimpleNamespace(points=scene.source.points[members], neighbours=None)
+
+    monkeypatch.setattr(explained, "refine_fully", refine_fully)
+    monkeypatch.setattr(explained, "_described", described)
+    return seen
+
+
+def test_the_part_is_chosen_again_after_each_refinement(plane, described):
+    """40 points at 0, 35 at 3 mm: at first only the first lie within 2 mm; moved down by 1.5 mm, all do."""
+    points = [[0.1 * k, 0.0, 0.0] for k in range(40)] + [[0.1 * k, 1.0, 3.0] for k in range(35)]
+    scene = SimpleNamespace(source=source_of(points))
+    found = explained.refine(np.eye(4), scene, plane, CONFIG)
+    assert described == [(40, -1.5), (75, -3.0)]
+    assert found.members.sum() == 75 and found.share == pytest.approx(40 / 75)
+    once = explained.refine(np.eye(4), scene, plane, replace(CONFIG, part=replace(CONFIG.part, rounds=1)))
+    assert once.members.tolist() == [True] * 40 + [False] * 35 and once.share == pytest.approx(40 / 75)
+
+
+@pytest.mark.parametrize(("count", "all_of_it"), [(29, True), (30, False)])
+def test_the_whole_cloud_is_refined_on_where_the_part_is_next_to_nothing(plane, described, count, all_of_it):
+    points = [[0.1 * k, 0.0, 0.0] for k in range(count)] + [[0.1 * k, 1.0, 50.0] for k in range(20)]
+    explained.refine(np.eye(4), SimpleNamespace(source=source_of(points)), plane, CONFIG)
+    assert described[0][0] == (count + 20 if all_of_it else count)
+
+
+def part_of(share, count=10):
+    zeros = np.zeros(count)
+    weights = (np.arange(count) < round(share * count)).astype(float)
+    fit = Fit(np.eye(4), 0.5, zeros, weights, None, zeros, np.zeros((count, 3)))
+    return Explained(SimpleNamespace(points=np.zeros((count, 3))), np.ones(count, dtype=bool), fit)
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """Replaces covariance, features and the judge; `probability` and `refusal` are what the judge says."""
+    verdict = SimpleNamespace(probability=0.9, refusal=None)
+
+    def judge(fit, candidates, uncertainty, features, source, target, calibration, config):
+        return Assessment(fit, candidates, uncertainty, features, verdict.probability, verdict.refusal, source, target)
+
+    monkeypatch.setattr(explained, "judge", judge)
+    monkeypatch.setattr(explained, "measure", lambda *_: {})
+    monkeypatch.setattr(explained.covariance, "estimate", lambda *_: None)
+    return verdict
+
+
+@pytest.mark.parametrize(("probability", "share", "refusal", "status"), [
+    (0.5, 0.4, None, None), (0.49, 0.5, None, None), (0.49, 0.4, None, "CLUTTER"), (0.3, 0.4, REFUSED, "CLUTTER"),
+    (0.9, 0.4, REFUSED, "AMBIGUOUS"), (0.3, 0.6, REFUSED, "AMBIGUOUS"),
+])  # fmt: skip
+def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed(
+    judged, probability, share, refusal, status
+):
+    judged.probability, judged.refusal = probability, refusal
+    scene, part = SimpleNamespace(source=object()), part_of(share)
+    found = explained.assess(part, None, scene, None, None, CONFIG)
+    assert (found.refusal and found.refusal.status.value) == status
+    assert found.seen is scene.source and found.members is part.members and found.probability == probability
+    if status == "CLUTTER":
+        assert "at most 40 % of the cloud" in found.refusal.reason
+        assert (refusal.reason if refusal else "no pose of it is certain") in found.refusal.reason
+
+
+def assessed(plane, probability=0.2, count=20, off=13, **more):
+    points = np.column_stack([0.1 * np.arange(count), np.zeros(count), np.where(np.arange(count) < off, 9.0, 0.0)])
+    fit = SimpleNamespace(T=np.eye(4))
+    return Assessment(fit, None, None, {}, probability, None, source_of(points), plane, **more)
+
+
+@pytest.mark.parametrize(("change", "is_named"), [
+    ({}, True), ({"off": 12}, False), ({"probability": 0.5}, False), ({"count": 19, "off": 13}, False),
+    ({"seen": object()}, False),
+])  # fmt: skip
+def test_a_dense_cloud_that_lies_mostly_off_the_bone_is_named_clutter(plane, change, is_named):
+    """20 points are dense here; 7 of 20 on the bone are less than .4 of them, 8 are not."""
+    a = assessed(plane, **change)
+    found = explained.named_clutter(a, CONFIG)
+    if not is_named:
+        assert found is a
+        return
+    assert found.refusal.status is RegistrationStatus.CLUTTER
+    assert "at most 35 % of the cloud" in found.refusal.reason and "say where the camera was" in found.refusal.reason
+
+
+def test_lines_of_sight_give_shares_areas_and_the_margin_to_the_rival(plane):
+    seen = Visible(*(np.array([x]) for x in (0.2, 0.05, 0.4)), CONFIG.clutter.free_space)
+    found = explained._visible_features(seen, Candidates(None, np.array([2.0, 3.0, 9.0]), None), plane)
+    assert found["free_space_score"] == pytest.approx(0.2 - 0.2 * 0.2 - 2.0 * 0.05)
+    assert found["log_explained_mm2"] == pytest.approx(np.log(1.0 + 0.2 * len(plane.points) * plane.spacing_mm**2))
+    assert found["explained_of_compared"] == pytest.approx(0.5)
+    assert found["violating_of_compared"] == pytest.approx(0.125)
+    assert found["rival_margin"] == pytest.approx(np.log(1.5))
+
+
+@pytest.mark.parametrize(("scores", "margin"), [([2.0], 3.0), ([1.0, 100.0], 3.0), ([1.0, 1e-9], -3.0)])
+def test_the_margin_has_ends(plane, scores, margin):
+    seen = Visible(*(np.array([x]) for x in (0.2, 3.0, 0.0)), CONFIG.clutter.free_space)
+    found = explained._visible_features(seen, Candidates(None, np.array(scores), None), plane)
+    assert found["rival_margin"] == margin and found["violating_of_compared"] == 1.0
+    assert found["explained_of_compared"] == pytest.approx(0.2e6)  # nothing was compared: no division by 0

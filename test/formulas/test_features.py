@@ -1,0 +1,143 @@
+"""The features of the confidence, each from a fit made by hand; the size against dense least squares."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
+from gapr_core.geometry import se3
+from gapr_core.registration import features
+from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.verification import Candidates
+
+COUNT = 40
+AXIS = np.array([0.0, 0.0, 1.0])
+T = se3.exp([1.0, 2.0, 3.0, 0.3, -0.2, 0.1])
+
+
+@pytest.fixture(scope="module")
+def points():
+    return np.random.default_rng(0).uniform(-15.0, 15.0, (COUNT, 3)) + [40.0, 0.0, -5.0]
+
+
+def fit_of(points, signed=None, weights=None, sigma_mm=0.5):
+    moved = se3.apply(T, points)
+    gradients = moved - moved.mean(axis=0) + np.random.default_rng(1).normal(0.0, 4.0, points.shape)
+    gradients /= np.linalg.norm(gradients, axis=1, keepdims=True)
+    weights = np.linspace(0.4, 1.0, len(points)) if weights is None else weights
+    signed = np.zeros(len(points)) if signed is None else signed
+    return Fit(T, sigma_mm, signed, weights, gradients, np.zeros(len(points), dtype=int), moved)
+
+
+@pytest.fixture
+def other_bone(monkeypatch):
+    """Replaces size and mirror image."""
+    monkeypatch.setattr(features.mirror, "margin", lambda *_: 1.25)
+    known = SimpleNamespace(scale=(-0.03, 0.04))
+    monkeypatch.setattr(features, "scale_of", lambda *_: known.scale)
+    return known
+
+
+def measured(fit, scores=(0.25, 0.5), normals=None, noise_mm=0.3, **more):
+    count = len(fit.moved)
+    normals = np.tile(AXIS, (count, 1)) if normals is None else normals
+    source = SimpleNamespace(points=se3.apply(se3.inverse(T), fit.moved), normals=normals, noise_mm=noise_mm)
+    covariance = np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6])
+    known = PoseUncertainty(covariance, 0.1, 0.2, 0.3, AXIS, AXIS)
+    candidates = Candidates(None, np.array(scores), np.array([0.7, 0.1]))
+    target = SimpleNamespace(half_extent_mm=50.0)
+    return features.measure(fit, candidates, known, source, target, RegistrarConfig())
+
+
+def test_every_feature_says_what_its_name_says(points, other_bone):
+    weights = np.where(np.arange(COUNT) < 10, 0.0, 0.5)
+    found = measured(fit_of(points, weights=weights))
+    assert set(found) == set(features.FEATURES) and all(isinstance(value, float) for value in found.values())
+    assert found["log_sigma"] == pytest.approx(np.log(0.5)) and found["log_excess"] == pytest.approx(np.log(0.5 / 0.3))
+    assert (found["smooth_misfit"], found["short_misfit"], found["support"]) == (0.2, 0.3, 0.7)
+    assert found["inlier_ratio"] == 0.75 and found["residual"] == 0.5
+    assert found["margin"] == pytest.approx(np.log(1.0 + 1e-3))  # the rival's mean square is twice the best one's
+    assert found["log_shift_sd"] == pytest.approx(np.log(2.0))
+    assert found["log_turn_sd"] == pytest.approx(np.log(np.degrees(0.02)))
+    assert found["log_points"] == pytest.approx(np.log(COUNT))
+    reach = max(np.linalg.norm(p - points.mean(axis=0)) for p in points)
+    assert found["extent"] == pytest.approx(reach / 50.0) and found["mirror_margin"] == 1.25
+
+
+@pytest.mark.parametrize(("scores", "ratio"), [((0.25,), 2.0), ((0.25, 0.2), 1.0), ((0.25, 1.0), 4.0)])
+def test_the_margin_is_that_to_the_next_pose_and_of_a_single_pose_that_to_twice_its_residual(
+    points, other_bone, scores, ratio
+):
+    assert measured(fit_of(points), scores)["margin"] == pytest.approx(np.log(ratio - 1.0 + 1e-3))
+
+
+def test_a_source_without_roughness_counts_as_a_tenth_of_a_millimetre_rough(points, other_bone):
+    assert measured(fit_of(points), noise_mm=0.01)["log_excess"] == pytest.approx(np.log(5.0))
+
+
+def test_normals_agree_as_their_median_cosine_of_either_sign_among_inliers(points, other_bone):
+    weights = np.where(np.arange(COUNT) % 2 == 0, 0.8, 0.0)
+    fit = fit_of(points, weights=weights)
+    cosines = np.linspace(0.5, 0.9, COUNT)
+    aside = np.cross(fit.gradients, np.roll(fit.gradients, 1, axis=1))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    sign = np.where(np.arange(COUNT) % 4 == 0, 1.0, -1.0)[:, None]
+    normals = sign * (cosines[:, None] * fit.gradients + np.sqrt(1.0 - cosines**2)[:, None] * aside)
+    found = measured(fit, normals=normals @ T[:3, :3])
+    assert found["normal_agreement"] == pytest.approx(np.median(cosines[weights > 0.0]))
+    nothing = measured(fit_of(points, weights=np.zeros(COUNT)))
+    assert nothing["normal_agreement"] == 0.0 and nothing["inlier_ratio"] == 0.0
+
+
+@pytest.mark.parametrize(("scale", "sd", "z", "off"), [
+    (-0.03, 0.0, 0.03 / 0.005, 0.03), (0.03, 0.012, 0.03 / 0.013, 0.03 * 25.0 / (25.0 + 1.44)), (0.9, 1e-5, 10.0, 0.9),
+    (-0.05, 0.05, 0.05 / np.hypot(0.05, 0.005), 0.025),
+])  # fmt: skip
+def test_another_size_shows_in_deviations_and_shrunk_towards_none(points, other_bone, scale, sd, z, off):
+    other_bone.scale = scale, max(sd, 1e-9)
+    found = measured(fit_of(points))
+    assert found["scale_z"] == pytest.approx(z) and found["scale_off"] == pytest.approx(off, rel=1e-3)
+    assert found["log_scale_sd"] == pytest.approx(np.log(max(sd, 1e-9)))
+
+
+SURE_OF_NO_BIAS = CovarianceConfig(sizes_mm=(1e-3, 1.1e-3), centres=4)
+
+
+def dense_scale(fit, prior):
+    """Size and its standard deviation by weighted least squares of eight unknowns, each with its prior."""
+    from_centre = fit.moved - fit.moved.mean(axis=0)
+    growth = (fit.gradients * from_centre).sum(axis=1) - fit.signed_mm
+    J = np.column_stack([fit.gradients, np.cross(from_centre, fit.gradients), growth, np.ones(len(growth))])
+    information = (J * (fit.weights / fit.sigma_mm**2)[:, None]).T @ J
+    information += np.diag([1e-6] * 3 + [1e-3] * 3 + [1.0 / prior.widest**2, 1.0 / prior.standoff_mm**2])
+    step = -np.linalg.solve(information, (J * (fit.weights / fit.sigma_mm**2)[:, None]).T @ fit.signed_mm)
+    return step[6], np.sqrt(np.linalg.inv(information)[6, 6])
+
+
+@pytest.mark.parametrize("prior", [ScaleConfig(), ScaleConfig(widest=0.05, standoff_mm=0.1)])
+def test_the_size_is_that_of_least_squares_with_a_standoff_beside_it(points, prior):
+    rng = np.random.default_rng(5)
+    fit = fit_of(points)
+    growth = (fit.gradients * (fit.moved - fit.moved.mean(axis=0))).sum(axis=1)
+    fit = replace(fit, signed_mm=-0.04 * growth + 0.2 + rng.normal(0.0, 0.3, COUNT))
+    scale, sd = features.scale_of(fit, SURE_OF_NO_BIAS, prior)
+    assert (scale, sd) == pytest.approx(dense_scale(fit, prior), rel=1e-3) and abs(scale) > 0.01
+
+
+@pytest.mark.parametrize(("inliers", "is_known"), [(7, False), (8, True)])
+def test_of_few_points_nothing_is_said_of_the_size(points, inliers, is_known):
+    fit = fit_of(points, weights=(np.arange(COUNT) < inliers).astype(float))
+    assert (features.scale_of(fit, SURE_OF_NO_BIAS, ScaleConfig()) != (0.0, 1.0)) is is_known
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_size_and_deviation_have_ends(points, sign):
+    fit = fit_of(points, weights=np.ones(COUNT))
+    growth = (fit.gradients * (fit.moved - fit.moved.mean(axis=0))).sum(axis=1)
+    wide = ScaleConfig(widest=1.0, standoff_mm=1e-3)
+    huge = replace(fit, signed_mm=-sign * 40.0 * np.abs(growth), sigma_mm=1e-6)
+    scale, sd = features.scale_of(huge, SURE_OF_NO_BIAS, wide)
+    assert abs(scale) <= 1.0 and sd == 1e-5

@@ -2,8 +2,10 @@
 
     make mutants                                          # every file of TESTS
     python scripts/mutants.py --files covariance,rules    # some of them
-    python scripts/mutants.py --jobs 2 --out mutants.json
+    python scripts/mutants.py --jobs 2 --out mutants.jsonl
     python scripts/mutants.py --every 5                   # a sample: every fifth mutant
+
+A run that was stopped goes on where it was: what is in `--out` of the same code and the same tests is not run again.
 
 cosmic-ray finds and makes the mutations. Each runs in a forked process that has NumPy, SciPy and pytest loaded already
 and imports the mutated text instead of the file; no file changes. Kernels run without Numba's compiler, so that theirs
@@ -25,6 +27,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 
@@ -76,7 +79,7 @@ TESTS = {
 
 @dataclass
 class Mutant:
-    """One mutation and what became of it: killed, survived, setting or equivalent."""
+    """One mutation and what became of it: killed, survived, setting or equivalent; `digest` is of code and tests."""
 
     file: str
     line: int
@@ -84,6 +87,7 @@ class Mutant:
     occurrence: int
     text: str
     fate: str = ""
+    digest: str = ""
 
     @property
     def key(self) -> str:
@@ -98,6 +102,7 @@ def mutants_of(file: str) -> Iterator[tuple[Mutant, str]]:
     from cosmic_ray.mutating import MutationVisitor
 
     source = (ROOT / file).read_text(encoding="utf-8")
+    digest = _digest(file)
     lines, settings, unchanged = source.splitlines(), _lines_of_settings(source), ast.dump(ast.parse(source))
     tree = get_ast(source)
     fresh = pickle.dumps(tree, -1)  # read back for every mutation: 20 times as fast as parsing
@@ -113,7 +118,13 @@ def mutants_of(file: str) -> Iterator[tuple[Mutant, str]]:
                 continue
             changed = next((b for a, b in zip(lines, mutated.splitlines(), strict=False) if a != b), "").strip()
             fate = "setting" if line in settings and name.startswith(REPLACED) else ""
-            yield Mutant(file, line, name.removeprefix("core/"), occurrence, changed, fate), mutated
+            yield Mutant(file, line, name.removeprefix("core/"), occurrence, changed, fate, digest), mutated
+
+
+def _digest(file: str) -> str:
+    """Of a file and its tests."""
+    texts = [(ROOT / name).read_bytes() for name in (file, *TESTS.get(file, ()))]
+    return sha256(b"".join(texts)).hexdigest()[:16]
 
 
 def _lines_of_settings(source: str) -> set[int]:
@@ -193,7 +204,7 @@ def main() -> int:
     parser.add_argument("--files", help="parts of names, with commas; all when not given")
     parser.add_argument("--every", type=int, default=1, help="only every n-th mutant of a file: a sample (1: all)")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=ROOT / "mutants.json", help="every mutant and its fate")
+    parser.add_argument("--out", type=Path, default=ROOT / "mutants.jsonl", help="every mutant and its fate")
     parser.add_argument("--least", type=float, default=0.85, help="share that must be killed")
     args = parser.parse_args()
     import numba  # noqa: F401  loaded once, before the forks
@@ -207,6 +218,7 @@ def main() -> int:
         if run(file, (ROOT / file).read_text(encoding="utf-8"), TESTS[file]):
             sys.stderr.write(f"mutants: the tests of {file} fail without any mutation: {' '.join(TESTS[file])}\n")
             return 1
+    known = _decided(args.out)
     equivalent = set((ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines())
     everything = [pair for file in wanted for pair in islice(mutants_of(file), 0, None, args.every)]
 
@@ -214,14 +226,30 @@ def main() -> int:
         mutant, text = pair
         if not mutant.fate and mutant.key in equivalent:
             mutant.fate = "equivalent"
+        mutant.fate = mutant.fate or known.get(_identity(mutant), "")
         if not mutant.fate:
             mutant.fate = "killed" if run(mutant.file, text, TESTS[mutant.file]) else "survived"
         return mutant
 
-    with ThreadPoolExecutor(args.jobs) as pool:
-        done = list(tqdm(pool.map(decide, everything), total=len(everything), unit="mutant"))
-    args.out.write_text(json.dumps([asdict(mutant) for mutant in done], indent=1), encoding="utf-8")
+    done: list[Mutant] = []
+    with ThreadPoolExecutor(args.jobs) as pool, args.out.open("a", encoding="utf-8") as file:
+        for mutant in tqdm(pool.map(decide, everything), total=len(everything), unit="mutant"):
+            done.append(mutant)
+            if _identity(mutant) not in known:
+                file.write(json.dumps(asdict(mutant)) + "\n")
+                file.flush()
     return report(done, args.least)
+
+
+def _decided(path: Path) -> dict[tuple[str, str, int, str], str]:
+    """Killed or survived, of every mutant that earlier runs wrote."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    mutants = (Mutant(**json.loads(line)) for line in lines)
+    return {_identity(mutant): mutant.fate for mutant in mutants if mutant.fate in ("killed", "survived")}
+
+
+def _identity(mutant: Mutant) -> tuple[str, str, int, str]:
+    return mutant.file, mutant.operator, mutant.occurrence, mutant.digest
 
 
 def report(done: list[Mutant], least: float) -> int:

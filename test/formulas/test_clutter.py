@@ -9,7 +9,7 @@ import tiny
 from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, SourceConfig
-from gapr_core.geometry import se3
+from gapr_core.geometry import sampling, se3
 from gapr_core.registration import clutter
 from gapr_core.registration import source as sources
 from gapr_core.registration.clutter import Pool, Scene
@@ -77,6 +77,11 @@ def refined(monkeypatch):
     return asked
 
 
+def spread_to(target, count):
+    """How many points `count` evenly spread ones of the target really are."""
+    return len(sampling.thin(target.points, count))
+
+
 def test_the_best_of_each_group_are_kept_in_order(scene):
     pool = pool_of(0.0, 1.9, 2.1, 30.0, scores=[0.2, 0.5, 0.1, 0.3], region=[4, 5, 6, 7])
     found = clutter._best_distinct(pool, scene, CONFIG, 9)
@@ -96,7 +101,7 @@ def test_poses_are_compared_by_as_many_spread_points(scene):
 def test_the_first_ranking_is_rough(scene, target, scored):
     found = clutter.rank_roughly(pool_of(0.0, 30.0, 9.0, 16.0), scene, target, CONFIG, 1)
     assert places(found.poses) == [9.0, 16.0, 0.0] and found.scores == pytest.approx([0.49, 0.44, 0.4])
-    assert scored == [(30, CONFIG.coarse_on_mm, CONFIG.coarse_front_mm)]
+    assert scored == [(spread_to(target, 30), CONFIG.coarse_on_mm, CONFIG.coarse_front_mm)]
 
 
 def test_each_region_refines_its_own_hypotheses_on_what_lies_around_it(scene, target, scored, refined):
@@ -104,7 +109,9 @@ def test_each_region_refines_its_own_hypotheses_on_what_lies_around_it(scene, ta
     found = clutter.refine_around(pool, scene, target, CONFIG, 1)
     assert found.poses[:, 1, 3] == pytest.approx([1.0, 1.0, 1.0]) and places(found.poses) == [0.0, 20.0, 30.0]
     assert found.region.tolist() == [0, 1, -1] and found.scores == pytest.approx([0.4, 0.4, 0.3])
-    assert scored == [(40, CONFIG.middle_on_mm, CONFIG.front_mm)] and pool.poses[:, 1, 3] == pytest.approx([0.0] * 3)
+    assert scored == [(spread_to(target, 40), CONFIG.middle_on_mm, CONFIG.front_mm)] and pool.poses[
+        :, 1, 3
+    ] == pytest.approx([0.0] * 3)
     around = [(np.linalg.norm(scene.source.points - r.centre, axis=1) <= 15.0).sum() for r in scene.regions]
     some = [len(range(0, n, max(1, n // 10))) for n in around]
     assert [(poses, points) for poses, points, *_ in refined] == [(1, 10), (1, some[0]), (1, some[1])]
@@ -129,7 +136,7 @@ def test_the_last_step_refines_on_many_points_and_ranks_at_the_scale_of_the_nois
     assert places(found.poses) == [9.0, 16.0] and found.poses[:, 1, 3] == pytest.approx([1.0, 1.0])
     assert {points for _, points, *_ in refined} == {20} and sum(poses for poses, *_ in refined) == 4
     assert refined[0][2] == pytest.approx(np.linspace(*CONFIG.final_limits_mm))
-    assert scored == [(50, CONFIG.on_mm, CONFIG.front_mm)]
+    assert scored == [(spread_to(target, 50), CONFIG.on_mm, CONFIG.front_mm)]
 
 
 def test_verification_gives_scores_that_are_small_for_good_and_the_support_of_the_crowd(scene, target, scored, refined):
@@ -158,10 +165,10 @@ def test_given_poses_come_first_and_each_hypothesis_names_its_region(scene, targ
 
 def test_the_points_of_a_target_are_spread_once_for_each_count(target):
     points, normals = clutter.spread(target, 37)
-    assert len(points) == len(normals) == 37
+    assert 33 <= len(points) == len(normals) <= 37
     index = [int(np.flatnonzero((target.points == p).all(axis=1))[0]) for p in points]
     assert normals == pytest.approx(target.normals[index])
-    assert clutter.spread(target, 37)[0] is points and len(clutter.spread(target, 20)[0]) == 20
+    assert clutter.spread(target, 37)[0] is points and 15 <= len(clutter.spread(target, 20)[0]) <= 20
 
 
 def test_a_camera_sees_the_cloud_levelled_over_its_neighbours_along_the_normals(source, monkeypatch):

@@ -20,8 +20,7 @@ from gapr_core.pages.report import Image, Report, Step, alignment_figure, timeli
 from gapr_ros.demo.act import Act
 from gapr_ros.demo.observer import Answer
 
-LIMIT_MM, LIMIT_DEG = 4.0, 5.0  # farther off at the source's centroid, or turned farther, is wrong
-LIMITS = {"confidence": 0.5, "error at the centroid, mm": LIMIT_MM, "error, deg": LIMIT_DEG}
+LIMITS = {"confidence": 0.5, "error at the centroid, mm": se3.RIGHT_MM, "error, deg": se3.RIGHT_DEG}
 BONE_COLUMNS = ("bone %", "taken", "right %")
 LEFT_OUT = ("points", "TRE mm")  # of a scene's table in the terminal, which is not wide enough
 STYLES = {"ok": "green", "hold": "yellow", "bad": "bold red", "": "dim"}
@@ -65,7 +64,7 @@ class Row:
             return ""
         if self.answer.T_target_source is None:
             return "hold"
-        return "ok" if self.error_mm <= LIMIT_MM and self.error_deg <= LIMIT_DEG else "bad"
+        return "ok" if se3.PoseError(self.error_mm, self.error_deg).is_right else "bad"
 
     def cells(self) -> tuple[str, ...]:
         """The row as text, one string a column."""
@@ -186,7 +185,7 @@ def add_frames(report: Report, rows: Sequence[Row]) -> None:
     report.paragraph(
         "Errors are against the truth of the simulation, which the node never sees: at the centroid of the cloud and "
         "as an angle; TRE is what the node expects of its own pose, over the whole bone, with its 95 % bound. More "
-        f"than {LIMIT_MM:g} mm or {LIMIT_DEG:g} degrees is a wrong pose. Dashed: the limits."
+        f"than {se3.RIGHT_MM:g} mm or {se3.RIGHT_DEG:g} degrees is a wrong pose. Dashed: the limits."
     )
     report.figure(timeline_figure([row.frame for row in rows], _charts(rows), "frame", LIMITS))
     report.table(columns(rows), [row.cells() for row in rows], [row.mark for row in rows], text=("answer",))

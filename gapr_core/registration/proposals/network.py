@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,7 @@ class NetworkProposer:
         self.network, self.method, self.count = network.eval(), method, count
         self.name = "network"
         self._key = "network", weights_name or network  # the network itself: an id may come again
+        _survive_forks()
 
     @classmethod
     def from_weights(cls, path: str | Path = SHIPPED, device: str = "cpu", **options: Any) -> NetworkProposer:
@@ -101,6 +104,18 @@ def consensus(
     if method == "ransac":
         return ransac(found, radius_mm, rng or np.random.default_rng(0), count=count)
     return local_to_global(found, radius_mm, count=count)
+
+
+@cache
+def _survive_forks() -> None:
+    """From now on, forked processes run torch in one thread.
+
+    OpenMP's threads do not come along with a fork, and a child that waits for them hangs. torch's own data loader does
+    the same in its workers.
+    """
+    import torch
+
+    os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 def _available(device: str) -> str:

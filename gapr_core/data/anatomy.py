@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,6 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 SPLITS = ("train", "val", "test")
-ENVIRONMENT_VARIABLE = "GAPR_ANATOMY"
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,6 @@ class Corresponded:
             Specimen(Surface(points, self.faces), self.bone, person, self.cohort)
             for points, person in zip(self.points, self.person, strict=True)
         ]
-
-
-def default_folder() -> Path:
-    """The folder named by GAPR_ANATOMY, else `../shared/anatomy` next to the repository; it may not exist."""
-    named = os.environ.get(ENVIRONMENT_VARIABLE)
-    return Path(named) if named else Path(__file__).resolve().parents[2].parent / "shared" / "anatomy"
 
 
 def splits(folder: str | Path) -> dict[str, list[str]]:
@@ -99,7 +91,7 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ConfigError("a folder with anatomy", f"{folder}, which is none", f"name it or set {ENVIRONMENT_VARIABLE}")
+        raise ConfigError("a folder with anatomy", f"{folder}, which is none", "name it with --anatomy")
     sets = corresponded(folder, bone)
     specimens = [s for c in sets for s in c.specimens() if cohort in (None, c.cohort)]
     if cohort is not None and not specimens:

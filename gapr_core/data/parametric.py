@@ -36,26 +36,6 @@ def make_bone(name: str, seed: int) -> Surface:
     return BONES[name](np.random.default_rng([seed, crc32(name.encode())]))
 
 
-def femur(seed: int) -> Surface:
-    """A whole femur of subject `seed`, left or right."""
-    return make_bone("femur", seed)
-
-
-def tibia(seed: int) -> Surface:
-    """A whole tibia of subject `seed`, left or right."""
-    return make_bone("tibia", seed)
-
-
-def pelvis(seed: int) -> Surface:
-    """Both hip bones and the sacrum of subject `seed`, joints fused."""
-    return make_bone("pelvis", seed)
-
-
-def thoracic(seed: int) -> Surface:
-    """Sternum and costal cartilages 1-10 of subject `seed`."""
-    return make_bone("thoracic", seed)
-
-
 def _femur(rng: np.random.Generator) -> Surface:
     return _either_side(_finish(femur_surface(draw(FemurParameters, rng)), rng), rng)
 

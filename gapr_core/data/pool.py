@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from gapr_core.data import anatomy
@@ -59,8 +58,3 @@ def specimens(
 def bones_in(meshes_folder: str | Path) -> list[str]:
     """The bone names that a folder of meshes holds."""
     return sorted({s.bone for s in anatomy.meshes(meshes_folder)})
-
-
-def persons(bones: Iterable[Specimen]) -> set[str]:
-    """Who the bones are of."""
-    return {bone.person for bone in bones}

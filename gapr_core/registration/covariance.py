@@ -24,8 +24,6 @@ from gapr_core.registration.sensor import Errors
 
 Array = NDArray[np.float64]
 
-AXES = ("x", "y", "z")
-
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:

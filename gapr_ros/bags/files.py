@@ -24,7 +24,6 @@ class Bag:
     Attributes:
         connections: playable ones.
         skipped: topic and reason of the others.
-        duration_s: from the first to the last message.
         count: messages on the playable connections.
     """
 
@@ -32,11 +31,6 @@ class Bag:
     connections: list[Connection]
     types: dict[str, Any]
     skipped: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def duration_s(self) -> float:
-        """From the first to the last message."""
-        return max(0, self.reader.end_time - self.reader.start_time) * 1e-9
 
     @property
     def count(self) -> int:

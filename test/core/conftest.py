@@ -1,12 +1,12 @@
 """One bone of the project's own for the tests of the core."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.data import anatomy
 from gapr_core.data.parametric import make_bone
 
 
@@ -32,7 +32,8 @@ def target(registrar, femur_cloud):
 
 @pytest.fixture(scope="session")
 def anatomy_folder() -> Path:
-    folder = anatomy.default_folder()
+    named = os.environ.get("GAPR_ANATOMY")
+    folder = Path(named) if named else Path(__file__).resolve().parents[3] / "shared" / "anatomy"
     if not folder.is_dir():
-        pytest.skip(f"the real bones do not ship and {folder} is absent: set {anatomy.ENVIRONMENT_VARIABLE}")
+        pytest.skip(f"the real bones do not ship and {folder} is absent: set GAPR_ANATOMY")
     return folder

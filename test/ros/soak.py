@@ -28,7 +28,7 @@ from harness import NODE, Client, NodeProcess, wait_until
 
 from gapr_core.data import stream
 from gapr_core.data.pair import TARGET_POINTS, Pair
-from gapr_core.data.parametric import femur
+from gapr_core.data.parametric import make_bone
 from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
@@ -123,7 +123,7 @@ class Soak:
 
 def soak(folder: Path, kind: str, seconds: float, hz: float = 10.0, distinct: int = DISTINCT) -> Soak:
     """Start a node, send it clouds for a while, count."""
-    bone = Specimen(femur(SUBJECT), "femur", "soak")
+    bone = Specimen(make_bone("femur", SUBJECT), "femur", "soak")
     make, parameters = KINDS[kind]
     pairs = make(bone, distinct)
     clouds = [(wire.to_metres(pair.source).astype(np.float32), _truth(pair, bone)) for pair in pairs]

@@ -47,15 +47,10 @@ def test_an_unknown_split_is_refused(tmp_path, split):
 
 
 def test_a_missing_folder_and_a_missing_splits_file_say_what_to_do(tmp_path):
-    with pytest.raises(ConfigError, match="GAPR_ANATOMY"):
+    with pytest.raises(ConfigError, match="--anatomy"):
         anatomy.surfaces(tmp_path / "nowhere", "femur")
     with pytest.raises(ConfigError, match="splits.json"):
         anatomy.splits(tmp_path)
-
-
-def test_the_folder_can_be_named_by_the_environment(tmp_path, monkeypatch):
-    monkeypatch.setenv(anatomy.ENVIRONMENT_VARIABLE, str(tmp_path))
-    assert anatomy.default_folder() == tmp_path
 
 
 def test_the_mirrored_bone_is_the_other_side_with_normals_outward():

@@ -15,7 +15,7 @@ import os, sys
 import numpy as np
 import torch
 torch.set_num_threads(2)
-from gapr_core.data.parametric import femur
+from gapr_core.data.parametric import make_bone
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.proposals.search import NormalAlignedSearch
@@ -25,7 +25,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.registration.verification import verify
 
 rng, config = np.random.default_rng(0), RegistrarConfig(num_threads=2)
-points = femur(3).sample(6000, rng)[0]
+points = make_bone("femur", 3).sample(6000, rng)[0]
 target, source = targets.prepare(points), sources.prepare(points[points[:, 2] > np.quantile(points[:, 2], 0.6)])
 proposer = {"network": network, "search": lambda: NormalAlignedSearch(config.search, 2)}[sys.argv[1]]()
 

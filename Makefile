@@ -32,7 +32,7 @@ fuzz: $(READY)  ## 100 000 mutated PointCloud2 through the node's reader, 20 000
 	$(BIN)/python test/ros/fuzz.py $(ARGS)
 	$(BIN)/python test/fuzz/files.py $(ARGS)
 
-soak: $(READY)  ## a long bag at 10 Hz: every cloud is answered or counted; ARGS="--frames 36000" is an hour
+soak: $(READY)  ## sweeps and scenes at 10 Hz: every cloud is answered or counted; ARGS="--minutes 60 --out soak" is an hour
 	$(BIN)/python test/ros/soak.py $(ARGS)
 
 lint: $(DEV)  ## ruff, mypy and the import contracts, on every file

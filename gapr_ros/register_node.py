@@ -34,7 +34,10 @@ def main(args: list[str] | None = None) -> int:
     why = distribution.problem(os.environ)
     if why:
         return _fail(why)
-    import rclpy
+    try:
+        import rclpy
+    except ModuleNotFoundError as error:
+        return _fail(f"{error}: source a ROS 2, or install the wheels with pip install '.[ros]'")
     from rclpy.executors import SingleThreadedExecutor
 
     from gapr_ros.node.guard import describe

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 FIRST_STAMP_S = 1_700_000_000.0
+OWN_BAG = ".written_by_gapr_demo"  # in the folder of a bag that a later demo may replace
 CROP_TO_TRACK_M = 0.04  # what the bone moves in the camera's frame between two frames, and more
 
 
@@ -125,11 +126,19 @@ def write_stl(surface: Surface, path: Path) -> None:
 
 
 def write_bag(act: Act, path: Path, storage: str) -> None:
-    """The clouds as a rosbag2 bag: one PointCloud2 a frame, metres, in the frame of the sensor."""
+    """The clouds as a rosbag2 bag: one PointCloud2 a frame, metres, in the frame of the sensor.
+
+    Raises:
+        DemoError: something is there that no demo has written.
+    """
     from gapr_ros.bags.writing import BagWriter
     from gapr_ros.node import wire
 
-    shutil.rmtree(path, ignore_errors=True)
+    if path.exists():
+        if not (path / OWN_BAG).is_file():
+            raise DemoError(f"expected a free place for the bag; got {path}, which no demo wrote; choose another --out")
+        shutil.rmtree(path)
     with BagWriter(path, storage) as bag:
+        (path / OWN_BAG).touch()
         for frame, cloud in enumerate(act.clouds):
             bag.write_cloud("/points", wire.to_metres(cloud), act.frame_id, act.stamp_ms(frame) * 1_000_000)

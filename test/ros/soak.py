@@ -38,6 +38,7 @@ from msg_adapters import pose_to_matrix
 SEED, SUBJECT = 3, 900_001  # a subject that no training draws
 DISTINCT = 200  # clouds; they come again and again, to and fro
 MOST_GROWTH = 0.02
+START_S = 900.0
 NOT_NOW = ("accepted", "refused", "dropped", "lost")
 
 
@@ -131,7 +132,11 @@ def soak(folder: Path, kind: str, seconds: float, hz: float = 10.0, distinct: in
     client, result = Client(), Soak(kind)
     node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, **parameters)
     try:
-        client.wait_for_state("active", 240.0)
+        wait_until(
+            lambda: node.process.poll() is not None or client.values().get("state") == "active", START_S, "a node"
+        )
+        assert node.process.poll() is None, node.log
+        client.wait_for_state("active")
         sent, truths = _listen(client, result), {}
         begin, steps = time.monotonic(), [*range(distinct), *range(distinct - 2, 0, -1)]
         while time.monotonic() - begin < seconds:

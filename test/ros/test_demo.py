@@ -24,7 +24,7 @@ from gapr_core.geometry import se3
 from gapr_ros.demo import cli as demo
 from gapr_ros.demo import guided
 from gapr_ros.demo import report as demo_report
-from gapr_ros.demo.act import Act, act_of_pairs
+from gapr_ros.demo.act import Act, DemoError, act_of_pairs, write_bag
 from gapr_ros.demo.children import child
 from gapr_ros.demo.observer import Advice, Answer, Observer, Used
 from gapr_ros.demo.report import Row
@@ -96,6 +96,19 @@ def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkey
     monkeypatch.setattr("rich.console.Console.print", lambda self, *text, **_: lines.extend(map(str, text)))
     assert demo.run(parser.parse_args(["--out", str(tmp_path), "--frames", "2"])) == 1
     assert "femur.stl" in " ".join(lines)
+
+
+def test_the_demo_replaces_a_bag_of_its_own_and_no_other(tmp_path):
+    act = Act("femur", None, tmp_path, (CLOUD,), (TRUTH,), 0.1, "", "")
+    for _ in range(2):
+        write_bag(act, tmp_path / "bag", "mcap")
+    assert (tmp_path / "bag" / "metadata.yaml").is_file()
+    mine = tmp_path / "mine" / "recording.mcap"
+    mine.parent.mkdir()
+    mine.write_bytes(b"of an afternoon in the laboratory")
+    with pytest.raises(DemoError, match="which no demo wrote; choose another --out"):
+        write_bag(act, mine.parent, "mcap")
+    assert mine.read_bytes() == b"of an afternoon in the laboratory"
 
 
 def test_an_unknown_bone_is_one_clear_line(tmp_path):

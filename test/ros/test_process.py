@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 
 import bones
@@ -29,3 +30,10 @@ def test_help_shows_a_command_line_and_starts_no_node(capsys, monkeypatch):
     monkeypatch.setattr(register_node.distribution, "problem", pytest.fail)
     assert register_node.main(["--help"]) == 0
     assert "-p model_path:=" in capsys.readouterr().out
+
+
+def test_without_rclpy_one_line_says_what_to_install(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    assert register_node.main([]) == 1
+    error = capsys.readouterr().err
+    assert "pip install '.[ros]'" in error and error.count("\n") == 1

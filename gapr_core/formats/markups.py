@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import GaprError, InvalidPointCloudError
 from gapr_core.formats import axes
+from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
+from gapr_core.formats.reading import unreadable
 from gapr_core.formats.text import check_end
 from gapr_core.runtime.files import write_json
 from gapr_core.surface import Surface
@@ -41,16 +43,30 @@ class Markups:
 
 def read(path: Path, options: ReadOptions) -> Surface:
     """The points alone, LPS mm."""
-    return Surface(load(path, options).points)
+    return Surface(_load(path, options.limits).points)
 
 
-def load(path: Path, options: ReadOptions | None = None) -> Markups:
+def load(path: Path) -> Markups:
     """Points and names of a .mrk.json or .fcsv file.
 
     Raises:
-        InvalidPointCloudError: damaged, empty, or without its coordinate system.
+        InvalidPointCloudError: not there, damaged, empty, or without its coordinate system.
     """
-    data = (options or ReadOptions()).limits.read(path)
+    if not path.is_file() or not path.name.lower().endswith((".mrk.json", ".fcsv")):
+        raise InvalidPointCloudError("markups: a .mrk.json or .fcsv file", str(path), "save the points from 3D Slicer")
+    try:
+        found = _load(path, FileLimits.from_environment())
+    except GaprError:
+        raise
+    except Exception as error:  # whatever a damaged file leads to: the sentence is the same
+        raise unreadable(path, str(error) or type(error).__name__) from error
+    if len(found.points) == 0:
+        raise unreadable(path, "no points in it")
+    return found
+
+
+def _load(path: Path, limits: FileLimits) -> Markups:
+    data = limits.read(path)
     markups = _of_fcsv(data) if path.suffix.lower() == ".fcsv" else _of_json(json.loads(data.decode("utf-8-sig")))
     if not np.isfinite(markups.points).all():
         raise InvalidPointCloudError("finite coordinates", f"{path.name} with others", "place the points again")

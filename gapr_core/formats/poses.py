@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.errors import GaprError
+from gapr_core.errors import GaprError, InvalidPointCloudError
 from gapr_core.formats import sweeps, tracker
 from gapr_core.formats.reading import format_of, unreadable
 
@@ -22,7 +22,10 @@ def poses_in(path: Path, tool: int = 0) -> NDArray[np.float64]:
     try:
         if not path.name.lower().endswith(".igs.mha"):
             return tracker.read_poses(path, tool=tool)
-        return list(sweeps.transforms(path).values())[tool]
+        poses = sweeps.transforms(path)
+        if not 0 <= tool < len(poses):
+            raise InvalidPointCloudError(f"tool {tool}", f"{path.name} with {', '.join(poses)}", "count them from 0")
+        return list(poses.values())[tool]
     except GaprError:
         raise
     except Exception as error:

@@ -57,7 +57,7 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> A
     rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"))))
     names = [name.strip().lower() for name in rows[0]] if rows else []
     starts = [i for i, name in enumerate(names) if name == "q0"]
-    if tool >= len(starts) or [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
+    if not 0 <= tool < len(starts) or [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
         given = f"{path.name} with {len(starts)} tools"
         raise InvalidPointCloudError(f"columns {' '.join(POSE)} of tool {tool}", given, "export it from NDI Track")
     start = starts[tool]

@@ -24,6 +24,7 @@ from gapr_core.benchmark.records import Plan
 from gapr_core.benchmark.table import Row
 from gapr_core.commands import options
 from gapr_core.config import RegistrarConfig
+from gapr_core.data.make_pairs import MANIFEST, read_manifest
 from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
 from gapr_core.pages import benchmark_report, writers
@@ -113,6 +114,7 @@ def benchmark(
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
         for record in runner.run(open_tasks, jobs, threads):
+            check_content(record, plan)
             records.append(out / records.FILE, replace(record, commit=plan.commit))
             bar.set_postfix_str(f"{record.method} {record.pair}", refresh=False)
             bar.update()
@@ -154,7 +156,10 @@ def write(out: Path, plan: Plan) -> list[Row]:
 
 
 def _plan(pairs: Path, paths: Sequence[Path], methods: Sequence[str], threads: int, ours: str | None) -> Plan:
-    hashes = {path.stem: pair_hash(load_pair(path)) for path in tqdm(paths, desc="reading pairs", disable=None)}
+    listed = listed_hashes(pairs)
+    missing = [path for path in paths if path.stem not in listed]
+    read = {path.stem: pair_hash(load_pair(path)) for path in tqdm(missing, desc="reading pairs", disable=None)}
+    hashes = {path.stem: listed.get(path.stem) or read[path.stem] for path in paths}
     return Plan(
         command=_command(),
         commit=_commit(),
@@ -166,6 +171,20 @@ def _plan(pairs: Path, paths: Sequence[Path], methods: Sequence[str], threads: i
         folder=str(pairs.resolve()),
         pairs=hashes,
     )
+
+
+def listed_hashes(pairs: Path) -> dict[str, str]:
+    """Name to sha256 of what the folder's manifest lists, so that no shard has to read all pairs; empty without one."""
+    if not (pairs / MANIFEST).is_file():
+        return {}
+    return {entry["name"]: entry["sha256"] for entry in read_manifest(pairs)["pairs"]}
+
+
+def check_content(record: Record, plan: Plan) -> None:
+    """Raise `ConfigError` where the pair that was registered is not the one that the manifest lists."""
+    if record.sha256 != plan.pairs[record.pair]:
+        wanted, given = f"the clouds that {MANIFEST} lists", f"others in {record.pair}.npz"
+        raise ConfigError(wanted, given, "make the pairs again in another folder")
 
 
 def _check_same_pairs(joined: Sequence[Record], pairs: dict[str, str], out: Path) -> None:

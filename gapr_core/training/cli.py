@@ -14,6 +14,7 @@ from pathlib import Path
 from gapr_core.errors import ConfigError
 from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import say
+from gapr_core.runtime.settings import load
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -25,6 +26,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, help="folder of the run, an interrupted one goes on; with --plot a PNG")
     parser.add_argument("--pairs", type=at_least_one, default=None, help="length of the schedule, in pairs")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting over those of --config; repeatable"
+    )
     parser.add_argument("--workers", type=int, default=None, help="processes that make pairs")
     parser.add_argument(
         "--plot", type=Path, nargs="+", metavar="RUN", help="train nothing, draw the curves of these runs together"
@@ -40,7 +44,7 @@ def run(args: Namespace) -> int:
     from gapr_core.training.config import TrainConfig  # torch takes seconds to load
     from gapr_core.training.trainer import train
 
-    config = TrainConfig.from_yaml(args.config) if args.config else TrainConfig()
+    config = load(TrainConfig, args.config, args.set)
     options = {name: getattr(args, name) for name in ("model", "initial", "pairs", "workers")}
     given = {name: value for name, value in options.items() if value is not None}
     written = train(replace(config, **given), args.out, args.anatomy, args.minutes)

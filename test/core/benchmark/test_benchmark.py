@@ -14,7 +14,7 @@ from gapr_core.benchmark import records, runner
 from gapr_core.benchmark.table import TIMES
 from gapr_core.commands import benchmark
 from gapr_core.config import RegistrarConfig, SearchConfig
-from gapr_core.data.pair_files import save_pair
+from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
 from gapr_core.errors import ConfigError, MethodUnavailableError
 
 
@@ -211,3 +211,24 @@ def test_records_of_other_settings_do_not_pass_for_new_ones(pairs, fakes, ours, 
 def test_settings_without_a_method_that_has_some_are_refused(pairs, fakes, tmp_path, in_process):
     with pytest.raises(ConfigError, match="gapr_search"):
         benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", config=RegistrarConfig(seed=1))
+
+
+def listed(pairs, monkeypatch):
+    """Write a manifest for the folder; afterwards no pair may be hashed for the plan."""
+    entries = [{"name": p.stem, "sha256": pair_hash(load_pair(p))} for p in sorted(pairs.glob("*.npz"))]
+    (pairs / "manifest.json").write_text(json.dumps({"recipe": {}, "hash": "h", "pairs": entries}))
+    monkeypatch.setattr(benchmark, "load_pair", None)
+
+
+def test_a_folder_with_a_manifest_is_planned_without_reading_its_pairs(pairs, fakes, tmp_path, in_process, monkeypatch):
+    read = benchmark.benchmark(pairs, fakes("good"), tmp_path / "read")
+    listed(pairs, monkeypatch)
+    assert timeless(benchmark.benchmark(pairs, fakes("good"), tmp_path / "listed")) == timeless(read)
+
+
+def test_a_pair_that_is_not_what_the_manifest_lists_stops_the_run(pairs, fakes, tmp_path, in_process, monkeypatch):
+    listed(pairs, monkeypatch)
+    first, second = sorted(pairs.glob("*.npz"))[:2]
+    first.write_bytes(second.read_bytes())
+    with pytest.raises(ConfigError, match="manifest.json lists"):
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")

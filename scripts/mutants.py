@@ -2,13 +2,13 @@
 
     make mutants                                          # every file of TESTS
     python scripts/mutants.py --files covariance,rules    # some of them
-    python scripts/mutants.py --jobs 2 --out mutants.jsonl
+    python scripts/mutants.py --out mutants.jsonl
     python scripts/mutants.py --every 5                   # a sample: every fifth mutant
 
 A run that was stopped goes on where it was: what is in `--out` of the same code and the same tests is not run again.
 
-cosmic-ray finds and makes the mutations. Each runs in a forked process that has NumPy, SciPy and pytest loaded already
-and imports the mutated text instead of the file; no file changes. Kernels run without Numba's compiler, so that theirs
+cosmic-ray finds and makes the mutations. Each runs in a forked process that has loaded the tests already
+(`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs
 count, too. Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the
 mutants of `mutants_equivalent.txt`, which change nothing.
 """
@@ -25,7 +25,6 @@ import pickle
 import resource
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from itertools import islice
@@ -39,11 +38,11 @@ os.environ |= {
     "MPLBACKEND": "Agg",
     "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
 }
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+from mutants_session import LIMIT_S, OPTIONS, Session, in_function  # noqa: E402
 
 sys.setrecursionlimit(10_000)  # a tree of syntax is deep
 
-LIMIT_S = 30  # of processor time: a mutant that takes longer hangs, and the tests noticed
 SKIPPED = ("BitOr", "BitAnd", "BitXor", "RShift", "LShift", "FloorDiv", "_Mod", "Mod_")  # no formula has them
 REPLACED = ("core/Number", "core/ReplaceTrue", "core/ReplaceFalse", "core/RemoveDecorator")
 FORMULAS = "test/formulas"
@@ -182,20 +181,38 @@ def _run_tests(file: str, text: str, tests: list[str]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(1, 2)
         sys.meta_path.insert(0, _Mutated(file, text))
-        options = [
-            "-x",
-            "-q",
-            "-p",
-            "no:cacheprovider",
-            "-p",
-            "no:timeout",
-            "-o",
-            "addopts=",
-            "--import-mode=importlib",
-        ]
-        code = int(pytest.main([*options, "-m", "not slow", *(str(ROOT / test) for test in tests)]))
+        code = int(pytest.main([*OPTIONS, "-m", "not slow", *(str(ROOT / test) for test in tests)]))
     finally:
         os._exit(1 if code else 0)
+
+
+class Runner:
+    """Runs tests on mutations of files, in a process that has collected them where that can be.
+
+    What lies outside of functions needs a process of its own.
+    """
+
+    def __init__(self) -> None:
+        self._file, self._source, self._session = "", "", None
+
+    def fails(self, mutant: Mutant, text: str) -> bool:
+        """True when the tests of the mutant's file fail with this text."""
+        if mutant.file != self._file:
+            self.close()
+            self._file, self._source = mutant.file, (ROOT / mutant.file).read_text(encoding="utf-8")
+            tests = [str(ROOT / test) for test in TESTS[mutant.file]]
+            self._session = Session(mutant.file.removesuffix(".py").replace("/", "."), tests)
+            if self._session.fails(self._source):
+                raise SystemExit(f"mutants: the tests of {mutant.file} fail without any mutation: {' '.join(tests)}")
+        if self._session is not None and in_function(self._source, mutant.line):
+            return self._session.fails(text)
+        return run(mutant.file, text, TESTS[mutant.file])
+
+    def close(self) -> None:
+        """End the process."""
+        if self._session is not None:
+            self._session.close()
+        self._session = None
 
 
 def main() -> int:
@@ -203,7 +220,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--files", help="parts of names, with commas; all when not given")
     parser.add_argument("--every", type=int, default=1, help="only every n-th mutant of a file: a sample (1: all)")
-    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=ROOT / "mutants.jsonl", help="every mutant and its fate")
     parser.add_argument("--least", type=float, default=0.85, help="share that must be killed")
     args = parser.parse_args()
@@ -214,30 +230,22 @@ def main() -> int:
     from tqdm import tqdm
 
     wanted = [file for file in TESTS if not args.files or any(part in file for part in args.files.split(","))]
-    for file in wanted:
-        if run(file, (ROOT / file).read_text(encoding="utf-8"), TESTS[file]):
-            sys.stderr.write(f"mutants: the tests of {file} fail without any mutation: {' '.join(TESTS[file])}\n")
-            return 1
     known = _decided(args.out)
     equivalent = set((ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines())
     everything = [pair for file in wanted for pair in islice(mutants_of(file), 0, None, args.every)]
 
-    def decide(pair: tuple[Mutant, str]) -> Mutant:
-        mutant, text = pair
-        if not mutant.fate and mutant.key in equivalent:
-            mutant.fate = "equivalent"
-        mutant.fate = mutant.fate or known.get(_identity(mutant), "")
-        if not mutant.fate:
-            mutant.fate = "killed" if run(mutant.file, text, TESTS[mutant.file]) else "survived"
-        return mutant
-
-    done: list[Mutant] = []
-    with ThreadPoolExecutor(args.jobs) as pool, args.out.open("a", encoding="utf-8") as file:
-        for mutant in tqdm(pool.map(decide, everything), total=len(everything), unit="mutant"):
-            done.append(mutant)
-            if _identity(mutant) not in known:
+    done, runner = [], Runner()
+    with args.out.open("a", encoding="utf-8") as file:
+        for mutant, text in tqdm(everything, unit="mutant"):
+            if not mutant.fate and mutant.key in equivalent:
+                mutant.fate = "equivalent"
+            mutant.fate = mutant.fate or known.get(_identity(mutant), "")
+            if not mutant.fate:
+                mutant.fate = "killed" if runner.fails(mutant, text) else "survived"
                 file.write(json.dumps(asdict(mutant)) + "\n")
                 file.flush()
+            done.append(mutant)
+    runner.close()
     return report(done, args.least)
 
 

@@ -8,8 +8,7 @@
 A run that was stopped goes on where it was: what is in `--out` of the same code and the same tests is not run again.
 
 cosmic-ray finds and makes the mutations. Each runs in a forked process that has loaded the tests already
-(`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs
-count, too. Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the
+(`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs count, too. Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the
 mutants of `mutants_equivalent.txt`, which change nothing.
 """
 
@@ -232,11 +231,11 @@ def main() -> int:
     wanted = [file for file in TESTS if not args.files or any(part in file for part in args.files.split(","))]
     known = _decided(args.out)
     equivalent = set((ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines())
-    everything = [pair for file in wanted for pair in islice(mutants_of(file), 0, None, args.every)]
 
     done, runner = [], Runner()
     with args.out.open("a", encoding="utf-8") as file:
-        for mutant, text in tqdm(everything, unit="mutant"):
+        found = (pair for name in wanted for pair in islice(mutants_of(name), 0, None, args.every))
+        for mutant, text in tqdm(found, unit="mutant"):
             if not mutant.fate and mutant.key in equivalent:
                 mutant.fate = "equivalent"
             mutant.fate = mutant.fate or known.get(_identity(mutant), "")

@@ -105,7 +105,7 @@ class Accumulator:
         initial: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
-        """The pose of all that is collected, this source (N, 3), mm, included; see `Registrar.register`.
+        """As `Registrar.register`, of all that is collected, this source included.
 
         Another target than before starts a new collection. A source that cannot be registered is not kept, and one
         without a finite point is refused: what was collected before says nothing about it.

@@ -124,16 +124,9 @@ class Tracker:
         initial: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
-        """The pose of the next source, or a refusal; another target than before starts a new track.
+        """As `Registrar.register`, for the next source in the same frame.
 
-        Args:
-            source: (N, 3), mm, in the same frame as the sources before.
-            target: from `prepare`.
-            initial: (4, 4) T_target_source to try as well; starts a new track.
-            viewpoint: (3,) mm, source frame: where the camera was, if there was one.
-
-        Raises:
-            InvalidPointCloudError: as `Registrar.register`.
+        Another target than before starts a new track, and so does `initial`.
         """
         if target is not self._bone:
             self.reset()

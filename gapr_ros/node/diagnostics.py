@@ -45,7 +45,7 @@ class Counters:
         self.merged += merged
         self.dropped += not merged
 
-    def settle(self, outcome: Outcome) -> None:
+    def answered(self, outcome: Outcome) -> None:
         """A cloud was answered."""
         if outcome.ok:
             self.accepted += 1

@@ -135,7 +135,7 @@ class Session:
     # --- the worker's thread ---
 
     def _work(self, job: Job) -> None:
-        self._host.call_soon(partial(self._settle, self._registration.process(job)))
+        self._host.call_soon(partial(self._conclude, self._registration.process(job)))
 
     def _collect(self, job: Job) -> None:
         """A cloud that a newer one pushed out of the mailbox is registered with it."""
@@ -164,7 +164,7 @@ class Session:
 
     # --- out: the executor's thread again ---
 
-    def _settle(self, outcome: Outcome) -> None:
+    def _conclude(self, outcome: Outcome) -> None:
         """Decide on an outcome of the worker and answer."""
         self._decide(outcome)
         self._answer(outcome)
@@ -172,7 +172,7 @@ class Session:
     def _answer(self, outcome: Outcome) -> None:
         """Count an outcome, send it, and tell who waits for it."""
         self.last_outcome = outcome
-        self._host.counters.settle(outcome)
+        self._host.counters.answered(outcome)
         if not outcome.ok:
             self._log_refusal(outcome)
         try:

@@ -8,8 +8,9 @@
 A run that was stopped goes on where it was: what is in `--out` of the same code and the same tests is not run again.
 
 cosmic-ray finds and makes the mutations. Each runs in a forked process that has loaded the tests already
-(`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs count, too. Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the
-mutants of `mutants_equivalent.txt`, which change nothing.
+(`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs count, too.
+Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the mutants of
+`mutants_equivalent.txt`, which change nothing.
 """
 
 from __future__ import annotations
@@ -230,7 +231,8 @@ def main() -> int:
 
     wanted = [file for file in TESTS if not args.files or any(part in file for part in args.files.split(","))]
     known = _decided(args.out)
-    equivalent = set((ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines())
+    listed = (ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines()
+    equivalent = {line for line in listed if not line.startswith("#")}  # a reason stands above each
 
     done, runner = [], Runner()
     with args.out.open("a", encoding="utf-8") as file:

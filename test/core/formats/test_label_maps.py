@@ -14,7 +14,7 @@ from gapr_core.formats.volumes import names, nifti
 from gapr_core.formats.volumes.contour import surface_of
 from gapr_core.formats.volumes.names import Segment
 
-sitk = pytest.importorskip("SimpleITK")
+sitk = pytest.importorskip("SimpleITK", reason="reference: pip install SimpleITK")
 
 RADII = np.array([22.0, 15.0, 30.0])
 CENTRE = np.array([12.0, -40.0, 7.0])
@@ -203,7 +203,9 @@ def test_a_dicom_segmentation_is_read_by_the_name_of_its_segment(tmp_path):
 
 def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia")):
     """Balls of radius 12, written by highdicom against a CT of slices."""
-    highdicom = pytest.importorskip("highdicom")
+    highdicom = pytest.importorskip(
+        "highdicom", reason="it writes the DICOM segmentation to read: pip install highdicom"
+    )
     import pydicom
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 

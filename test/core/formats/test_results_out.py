@@ -15,7 +15,7 @@ from gapr_core.formats import markups, planning, scene, transforms
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
 
-sitk = pytest.importorskip("SimpleITK")
+sitk = pytest.importorskip("SimpleITK", reason="reference: pip install SimpleITK")
 
 T = se3.from_rotation_translation(Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix(), [10.0, -70.0, 200.0])
 POINTS = np.random.default_rng(0).uniform(-100.0, 100.0, (20, 3))

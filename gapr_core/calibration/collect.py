@@ -22,7 +22,7 @@ from tqdm import tqdm
 from gapr_core import metrics
 from gapr_core.calibration import pairs
 from gapr_core.calibration.pairs import Drawn, Task
-from gapr_core.config import RegistrarConfig, SensorConfig
+from gapr_core.config import ClutterConfig, RegistrarConfig, SensorConfig
 from gapr_core.data import degradation, protocols
 from gapr_core.geometry import se3
 from gapr_core.registration import clutter
@@ -46,6 +46,7 @@ Record = dict[str, Any]
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FOLLOWED = 0.5  # share of the pairs that become a stream
 LOOKED_AT = 3  # of the clean clouds with a viewpoint every third is registered as a scene as well: that takes seconds
+ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 ACCEPTED = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
@@ -90,12 +91,14 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
     rng = np.random.default_rng([task.seed, task.number, 17])
     registrars, viewpoint = _registrars(drawn.sensor), drawn.pair.viewpoint
     if viewpoint is not None and (drawn.family == "scene" or task.number % LOOKED_AT == 0):
-        in_scene = registrars["search"].assess(drawn.pair.source, target, viewpoint=viewpoint)
+        registrar = registrars["first round" if task.number % 2 else "search"]
+        in_scene = registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
         if isinstance(in_scene, Assessment):
             yield clutter.NAME, judged(in_scene, drawn.pair)
     if drawn.family == "scene":
         return
-    found = {name: registrar.assess(drawn.pair.source, target) for name, registrar in registrars.items()}
+    of_round = {"network": "network", "search": "search alone" if task.number % ALONE == 0 else "search"}
+    found = {name: registrars[used].assess(drawn.pair.source, target) for name, used in of_round.items()}
     for name, assessment in found.items():
         if isinstance(assessment, Assessment):
             yield name, judged(assessment, drawn.pair)
@@ -170,10 +173,11 @@ class AskedOnce:
         return self._last[1]
 
 
-def accepting(proposers: Sequence[Proposer], sensor: str) -> Registrar:
+def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig | None = None) -> Registrar:
     """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     calibrations = [Calibration(proposer.name, ACCEPTED, {}) for proposer in proposers]
-    config = RegistrarConfig(num_threads=1, sensor=SensorConfig(kind=sensor))
+    sensor_config = SensorConfig(kind=sensor)
+    config = RegistrarConfig(num_threads=1, sensor=sensor_config, clutter=clutter_config or ClutterConfig())
     of_scenes = Calibration(clutter.NAME, ACCEPTED, {})
     return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
 
@@ -186,9 +190,17 @@ def _proposers() -> tuple[Proposer, Proposer]:
 
 @cache
 def _registrars(sensor: str) -> dict[str, Registrar]:
-    """The two rounds, as they are when the answer of the first one is not sure."""
+    """The two rounds, as they are when the answer of the first one is not sure, and what users may ask for instead.
+
+    "first round" is that of a scene, of which "search" answers after the last one.
+    """
     network, search = _proposers()
-    return {"network": accepting([network], sensor), "search": accepting([network, search], sensor)}
+    return {
+        "network": accepting([network], sensor),
+        "search": accepting([network, search], sensor),
+        "search alone": accepting([search], sensor),
+        "first round": accepting([search], sensor, ClutterConfig(rounds=1)),
+    }
 
 
 _LAST: dict[int, tuple[Array, PreparedTarget]] = {}

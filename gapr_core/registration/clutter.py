@@ -169,7 +169,7 @@ class _Steps:
         """Poses (K, 4, 4) refined on some of the points."""
         points, normals, surface = source.points[some], source.normals[some], self.target.kernel_view
         how = source.oriented, *surface, self.limits_mm, self.same_surface_cos
-        return refine_agreeing(np.ascontiguousarray(poses), points, normals, *how)[0]
+        return np.asarray(refine_agreeing(np.ascontiguousarray(poses), points, normals, *how))
 
 
 def _scored(

@@ -65,10 +65,9 @@ def compare_with_image(
 def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same):
     """Gauss-Newton from every pose (K, 4, 4) on the points (N, 3) whose normals (N, 3) agree with the surface's.
 
-    One iteration per entry of `limits` (Tukey scale); normals agree from the cosine `same`. Returns the poses and the
-    mean Tukey weight at the last limit: the share of the points that each explains.
+    One iteration per entry of `limits` (Tukey scale); normals agree from the cosine `same`.
     """
-    out, shares = poses.copy(), np.empty(len(poses))
+    out = poses.copy()
     surface = elements, nearest, origin, per_cell, spacing
     H, g = np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
@@ -78,9 +77,7 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
             weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], same, middle, H, g)
             if weight > 0.0:
                 step(T, middle, H, g, weight)
-        total = accumulate_agreeing(T, points, normals, signed, *surface, limits[-1], same, middle, H, g)
-        shares[k] = total / len(points)
-    return out, shares
+    return out
 
 
 @numba.njit(**FAST)

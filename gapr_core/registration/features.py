@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
-from gapr_core.registration import mirror
+from gapr_core.registration import mirror, sensor
 from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
@@ -81,8 +81,9 @@ def of_another_bone(
 ) -> dict[str, float]:
     """What tells a bone of another size or of the other side of the body; `OTHER_BONE` are the names."""
     (scale, scale_sd), known = scale_of(fit, config.covariance, config.scale), config.scale
+    usual = max(known.sure, sensor.errors(config.sensor, len(source.points)).scale)
     return {
-        "scale_z": min(abs(scale) / float(np.hypot(scale_sd, known.sure)), LARGEST_SCALE_Z),
+        "scale_z": min(abs(scale) / float(np.hypot(scale_sd, usual)), LARGEST_SCALE_Z),
         "scale_off": abs(scale) * known.usual**2 / (known.usual**2 + scale_sd**2),
         "log_scale_sd": float(np.log(scale_sd)),
         "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),

@@ -181,6 +181,7 @@ def distinct(moved_points, order, tolerance, most):
     """
     kept = np.empty(most, dtype=np.int64)
     count, points = 0, moved_points.shape[1]
+    same = tolerance * tolerance * points
     for i in order:
         fresh = True
         for j in kept[:count]:
@@ -188,7 +189,9 @@ def distinct(moved_points, order, tolerance, most):
             for p in range(points):
                 for axis in range(3):
                     total += (moved_points[i, p, axis] - moved_points[j, p, axis]) ** 2
-            if total < tolerance * tolerance * points:
+                if total >= same:
+                    break
+            if total < same:
                 fresh = False
                 break
         if fresh:

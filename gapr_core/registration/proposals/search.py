@@ -128,19 +128,17 @@ def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):
     """For every anchor the lowest mean probe distance (in field steps) over the spins, and that spin."""
     spins, probes = local.shape[0], local.shape[1]
     nx, ny, nz = distance.shape
-    score = np.full(len(anchors), np.float32(255.0), dtype=np.float32)
+    score = np.empty(len(anchors), dtype=np.float32)
     best = np.zeros(len(anchors), dtype=np.int32)
     for a in range(len(anchors)):
         ax = (anchors[a, 0] - origin[0]) * per_cell + np.float32(0.5)
         ay = (anchors[a, 1] - origin[1]) * per_cell + np.float32(0.5)
         az = (anchors[a, 2] - origin[2]) * per_cell + np.float32(0.5)
         m = axes[a] * per_cell
+        lowest = 255 * probes
         for s in range(spins):
             total = 0
             for k in range(probes):
-                if k == first and total > limit * first:
-                    total = 255 * probes
-                    break
                 x, y, z = local[s, k, 0], local[s, k, 1], local[s, k, 2]
                 i = int(np.floor(ax + m[0, 0] * x + m[1, 0] * y + m[2, 0] * z))
                 j = int(np.floor(ay + m[0, 1] * x + m[1, 1] * y + m[2, 1] * z))
@@ -149,8 +147,11 @@ def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):
                     total += 255
                 else:
                     total += distance[i, j, h]
-            mean = np.float32(total) / np.float32(probes)
-            if mean < score[a]:
-                score[a] = mean
+                if total >= lowest or (k < first < probes and total > limit * first):
+                    total = lowest
+                    break
+            if total < lowest:
+                lowest = total
                 best[a] = s
+        score[a] = np.float32(lowest) / np.float32(probes)
     return score, best

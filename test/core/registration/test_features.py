@@ -1,16 +1,17 @@
 """Features that unmask other bones: a scale that is off, and a mirrored source that fits as well."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from gapr_core.config import RegistrarConfig
+from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import mirror
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
-from gapr_core.registration.features import FEATURES_OF, SIGNS, scale_of
+from gapr_core.registration.features import FEATURES_OF, SIGNS, of_another_bone, scale_of
 from gapr_core.registration.refinement import refine_fully
 
 CONFIG = RegistrarConfig(num_threads=1)
@@ -53,6 +54,17 @@ def test_a_bias_makes_the_scale_less_certain(bone, end):
     wave = 0.8 * np.sin(end @ rng.normal(size=3) * 0.08)[:, None] * (end - end.mean(axis=0)) / 60.0
     clean, biased = (scale_of(fit_of(points, bone), CONFIG.covariance, CONFIG.scale)[1] for points in (end, end + wave))
     assert biased > 1.5 * clean
+
+
+def test_a_size_within_the_sensors_own_error_speaks_less_against_the_bone(bone, end):
+    centre = end.mean(axis=0)
+    larger = centre + 1.03 * (end - centre)
+    fit, source = fit_of(larger, bone), sources.prepare(larger)
+    kinds = ("unknown", "ultrasound")  # sound is up to 3 % faster or slower than assumed
+    plain, sound = (
+        of_another_bone(fit, source, bone, replace(CONFIG, sensor=SensorConfig(kind=kind)))["scale_z"] for kind in kinds
+    )
+    assert plain > 2.5 > 2.0 > sound
 
 
 def test_without_inliers_nothing_is_known_of_the_scale():

@@ -184,6 +184,9 @@ class CorticesConfig(Settings):
     share: float = setting(
         0.82, "residual scale to both cortices over that to the outer, below which both are followed", low=0, high=1
     )
+    noise: float = setting(
+        1.5, "residual scale to both cortices over the noise of the source, below which both are followed", low=0
+    )
     largest_confidence: float = setting(0.85, "of such a source: the models were not fitted on any", low=0, high=1)
 
 
@@ -201,7 +204,7 @@ class AccumulationConfig(Settings):
 class EvidenceConfig(Settings):
     """How the frames of a stream are combined (`gapr_core.registration.evidence`)."""
 
-    correlation: float = setting(0.5, "of two frames: 0 independent, 1 the same again", low=0, high=1)
+    correlation: float = setting(0.8, "of two frames: 0 independent, 1 the same again", low=0, high=1)
     memory: float = setting(10.0, "frames after which a frame's weight has fallen to 1/e", low=0.1)
     agree_mm: float = setting(15.0, "largest motion between frames (rms) that continues a track", low=0, unit="mm")
 

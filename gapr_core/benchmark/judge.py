@@ -95,7 +95,8 @@ def best_right(pair: Pair, result: RegistrationResult | None) -> bool | None:
 
 def uncertainty(pair: Pair, T: Array, result: RegistrationResult) -> dict[str, Any]:
     """The error as a twist, its NEES, and its ratio to the Cramer-Rao bound, each where it can be had."""
-    twist = metrics.error_twist(T, pair.T_target_source, pair.source)
+    turns_about = pair.source if result.centre_mm is None else se3.apply(se3.inverse(T), result.centre_mm[None])
+    twist = metrics.error_twist(T, pair.T_target_source, turns_about)
     facts: dict[str, Any] = {"twist": twist.tolist(), "axes": extent.principal(pair.target).axes.tolist()}
     if result.covariance is not None:
         facts |= {"nees": metrics.nees(twist, result.covariance), "covariance": result.covariance.tolist()}

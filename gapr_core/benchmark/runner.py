@@ -62,8 +62,8 @@ def _run_pool(waiting: list[Task], jobs: int, threads: int, lost: list[Task]) ->
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < jobs:
-                    task = waiting.pop(0)
-                    under_way[pool.submit(run_task, task)] = task
+                    under_way[pool.submit(run_task, waiting[0])] = waiting[0]
+                    waiting.pop(0)  # only now: a pool that is broken takes no task
                 for future in wait(under_way, return_when=FIRST_COMPLETED).done:
                     yield future.result()
                     del under_way[future]

@@ -17,16 +17,20 @@ from typing import Any
 import numpy as np
 
 from gapr_core.calibration import conformal
-from gapr_core.calibration.answers import Answers, answers_of
+from gapr_core.calibration.answers import Answers, answers_of, together
 from gapr_core.calibration.card import as_markdown
 from gapr_core.calibration.collect import collect
 from gapr_core.calibration.fit import ACCEPTED, by_group, fit, of_unseen_families, of_unseen_people
 from gapr_core.calibration.pairs import HELD_OUT, Task
+from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
+from gapr_core.registration.precision_model import PRECISION_FEATURES
 from gapr_core.runtime import origin
 from gapr_core.runtime.console import say
 from gapr_core.runtime.files import write_json, write_text
+
+SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features that every round has
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tasks = [Task(str(args.anatomy), args.split, args.seed, number) for number in range(args.count)]
     records = collect(tasks, args.out / "records.jsonl", args.jobs)
     given = sys.argv[1:] if arguments is None else arguments
-    made = {"commit": origin.commit(), "command": " ".join(["python -m gapr_core.calibration", *given]),
+    commits = sorted({str(record.get("commit")) for record in records})
+    made = {"commit": origin.commit(), "commits_of_pairs": commits,
+            "command": " ".join(["python -m gapr_core.calibration", *given]),
             "seed": args.seed, "split": args.split, "held_out_family": HELD_OUT}  # fmt: skip
     cards = write_models(records, args.out, made)
     write_text(args.out / "confidence.md", as_markdown(cards, made))
@@ -62,7 +68,7 @@ def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str
         cards[name] = made | confidence_card(answers)
         rounds[name] = answers
         _write(folder / path.name, "confidence", fit(known), {"proposer": name}, cards[name])
-    model, factor, cards["precision"] = fit_precision(accepted(rounds["search"]))
+    model, factor, cards["precision"] = fit_precision(list(rounds.values()))
     _write(folder / "precision.json", "precision", model, {"factor95": round(factor, 4)}, made | cards["precision"])
     return cards
 
@@ -84,13 +90,21 @@ def accepted(answers: Answers) -> Answers:
     return answers.of((of_unseen_people(answers) >= ACCEPTED) & ~answers.refused & np.isfinite(answers.true_mm))
 
 
-def fit_precision(answers: Answers) -> tuple[Additive, float, dict[str, Any]]:
-    """Model, factor and card."""
+def fit_precision(rounds: Sequence[Answers]) -> tuple[Additive, float, dict[str, Any]]:
+    """Model, factor and card, of what is accepted in any round.
+
+    Raises:
+        ConfigError: nothing is accepted.
+    """
+    found = [each for each in (accepted(answers).with_features(SHARED) for answers in rounds) if len(each)]
+    if not found:
+        raise ConfigError("accepted answers with a truth", "none", "collect more pairs (--count)")
+    answers = together(found)
     scale = conformal.of_unseen(answers)
     known = answers.family != HELD_OUT
     scores = answers.true_mm / (scale * answers.tre95_mm)
-    factor = conformal.conformal_factor(scores[known], answers.family[known])
-    model = conformal.fit_scale(answers.of(answers.right & known))
+    factor = conformal.conformal_factor(scores[known], answers.family[known], answers.rounds[known])
+    model = conformal.fit_scale(answers.of(known))
     return model, factor, {"accepted": len(answers), "coverage": conformal.coverage(answers, scale, factor)}
 
 

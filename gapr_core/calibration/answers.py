@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.calibration.pairs import first_of_twins
 from gapr_core.registration.features import FEATURES_OF
 
 Array = NDArray[np.float64]
@@ -29,9 +30,10 @@ class Answers:
     """What one round answered, N pairs.
 
     Attributes:
-        round_name: a key of `FEATURES_OF`.
+        feature_names: F names.
         names: (N,) of the pairs.
-        features: (N, F) in the order of `feature_names`.
+        rounds: (N,) which round answered: keys of `FEATURES_OF`.
+        features: (N, F).
         right: (N,) within 4 mm and 5 deg.
         refused: (N,) a rule speaks against the pose, whatever the probability.
         family, seen_as, what, bone: (N,) how and what was seen.
@@ -41,8 +43,9 @@ class Answers:
         nees: (N,) normalised error squared of the pose.
     """
 
-    round_name: str
+    feature_names: tuple[str, ...]
     names: NDArray[np.str_]
+    rounds: NDArray[np.str_]
     features: Array
     right: Mask
     refused: Mask
@@ -56,11 +59,6 @@ class Answers:
     tre95_mm: Array
     nees: Array
 
-    @property
-    def feature_names(self) -> tuple[str, ...]:
-        """(F,) names of the features."""
-        return FEATURES_OF[self.round_name]
-
     def __len__(self) -> int:
         return len(self.names)
 
@@ -71,14 +69,20 @@ class Answers:
         }
         return replace(self, **columns, people=tuple(p for p, is_in in zip(self.people, chosen, strict=True) if is_in))
 
+    def with_features(self, names: tuple[str, ...]) -> Answers:
+        """Only these features."""
+        chosen = [self.feature_names.index(name) for name in names]
+        return replace(self, feature_names=names, features=self.features[:, chosen])
+
     def people_folds(self, folds: int = FOLDS) -> Iterator[tuple[Mask, Mask]]:
         """(fitted on, judged) masks (N,): nobody of a judged target is in any pair that the model is fitted on."""
-        everybody = sorted({person for group in self.people for person in group})
+        people = [tuple(map(first_of_twins, group)) for group in self.people]
+        everybody = sorted({person for group in people for person in group})
         drawn = np.random.default_rng(0).permutation(len(everybody)) % folds
         fold_of = dict(zip(everybody, drawn, strict=True))
-        own = np.array([fold_of[group[0]] for group in self.people])
+        own = np.array([fold_of[group[0]] for group in people])
         for number in range(folds):
-            is_in = np.array([any(fold_of[person] == number for person in group) for group in self.people])
+            is_in = np.array([any(fold_of[person] == number for person in group) for group in people])
             yield ~is_in, own == number
 
 
@@ -95,10 +99,22 @@ def answers_of(records: Sequence[dict[str, Any]], round_name: str) -> Answers:
     names = FEATURES_OF[round_name]
     features = [[answer["features"][name] for name in names] for _, answer in found]
     return Answers(
-        round_name,
+        names,
+        rounds=np.full(len(found), round_name),
         features=np.array(features, dtype=float).reshape(len(found), len(names)),
         right=np.array([answer["right"] for _, answer in found], dtype=bool),
         refused=np.array([answer["refusal"] is not None for _, answer in found], dtype=bool),
         people=tuple(tuple(record["people"]) or (record["name"],) for record, _ in found),
         **columns,
     )
+
+
+def together(groups: Sequence[Answers]) -> Answers:
+    """The answers of several rounds, which have the same features."""
+    first = groups[0]
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(group, name) for group in groups])
+        for name, value in vars(first).items()
+        if isinstance(value, np.ndarray)
+    }
+    return replace(first, **columns, people=tuple(people for group in groups for people in group.people))

@@ -24,6 +24,7 @@ from gapr_core.calibration import pairs
 from gapr_core.calibration.pairs import Drawn, Task
 from gapr_core.config import ClutterConfig, RegistrarConfig, SensorConfig
 from gapr_core.data import degradation, protocols
+from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration import clutter
 from gapr_core.registration.additive import Additive
@@ -39,6 +40,7 @@ from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Memory
 from gapr_core.results import Hypothesis
+from gapr_core.runtime import origin
 from gapr_core.runtime.files import write_text
 
 Array = NDArray[np.float64]
@@ -82,7 +84,8 @@ def record_of(task: Task) -> Record:
     drawn = pairs.draw(task)
     target = _prepared(drawn.pair.target)
     facts = {"name": _name(task), "family": drawn.family, "seen_as": drawn.seen_as, "what": drawn.what,
-             "sensor": drawn.sensor, "bone": drawn.pair.bone, "people": list(drawn.people)}  # fmt: skip
+             "sensor": drawn.sensor, "bone": drawn.pair.bone, "people": list(drawn.people),
+             "commit": origin.commit()}  # fmt: skip
     return facts | {"answers": dict(_answers(drawn, target, task))}
 
 
@@ -224,8 +227,14 @@ def _read(path: Path) -> list[Record]:
     *whole, cut_off = path.read_text().split("\n")
     if cut_off:
         write_text(path, "".join(f"{line}\n" for line in whole))
-    return [json.loads(line) for line in whole]
+    try:
+        return [json.loads(line) for line in whole]
+    except ValueError as error:
+        raise ConfigError(
+            "one record a line", f"{path}: {error}", "move the file away, or give another --out"
+        ) from error
 
 
 def _is_current(record: Record) -> bool:
-    return all(set(FEATURES_OF[name]) == answer["features"].keys() for name, answer in record["answers"].items())
+    answers = record.get("answers", {}).items()
+    return all(set(FEATURES_OF.get(name, ())) == answer["features"].keys() for name, answer in answers)

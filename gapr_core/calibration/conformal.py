@@ -49,22 +49,23 @@ def of_unseen(answers: Answers) -> Array:
         of_it: Mask = answers.family == family
         for fitted, judged in answers.people_folds():
             if (judged & of_it).any():
-                model = fit_scale(answers.of(fitted & ~of_it & answers.right))
+                model = fit_scale(answers.of(fitted & ~of_it))
                 found[judged & of_it] = scales(model, answers.of(judged & of_it))
     return found
 
 
-def conformal_factor(scores: Array, family: NDArray[np.str_]) -> float:
-    """The smallest factor with which bounds cover their share of all scores, and of those of each family.
+def conformal_factor(scores: Array, *groupings: NDArray[np.str_]) -> float:
+    """The smallest factor with which bounds cover their share of all scores, and of those of each group.
 
     Args:
         scores: (N,) true errors over their bounds.
-        family: (N,) of the pairs.
+        groupings: (N,) each: sensor families, rounds.
     """
     levels = [conformal_quantile(scores, OVERALL)]
-    for name in np.unique(family):
-        if (family == name).sum() >= FEWEST:
-            levels.append(conformal_quantile(scores[family == name], IN_EACH))
+    for grouping in groupings:
+        for name in np.unique(grouping):
+            if (grouping == name).sum() >= FEWEST:
+                levels.append(conformal_quantile(scores[grouping == name], IN_EACH))
     return max(levels)
 
 
@@ -78,14 +79,19 @@ def conformal_quantile(scores: Array, share: float) -> float:
 
 
 def coverage(answers: Answers, scale: Array, factor: float) -> dict[str, dict[str, Any]]:
-    """How often the bound holds, how wide it is, and what the NEES is; of all and of each family."""
+    """How often the bound holds, how wide it is, and what the NEES is: all, by family, by round, by size."""
     rows = {}
-    for name in ("all", *np.unique(answers.family)):
-        of_it = np.full(len(answers), True) if name == "all" else answers.family == name
+    edges_mm = np.quantile(factor * scale * answers.tre95_mm, [0.0, 0.25, 0.5, 0.75, 1.0])
+    quarter = np.clip(np.searchsorted(edges_mm, factor * scale * answers.tre95_mm, side="right"), 1, 4)
+    groups = {"all": np.full(len(answers), True)}
+    groups |= {str(name): answers.family == name for name in np.unique(answers.family)}
+    groups |= {f"round: {name}": answers.rounds == name for name in np.unique(answers.rounds)}
+    groups |= {f"tre95 {edges_mm[k - 1]:.1f} to {edges_mm[k]:.1f} mm": quarter == k for k in range(1, 5)}
+    for name, of_it in groups.items():
         if not of_it.any():
             continue
         true, bound = answers.true_mm[of_it], factor * scale[of_it] * answers.tre95_mm[of_it]
-        rows[str(name)] = {
+        rows[name] = {
             "accepted": int(of_it.sum()),
             "covered": round(float((true <= bound).mean()), 4),
             "bound_over_true": round(float(np.median(bound / true)), 3),

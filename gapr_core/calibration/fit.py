@@ -10,6 +10,7 @@ from scipy.special import expit
 
 from gapr_core.calibration.additive import fit_log_odds
 from gapr_core.calibration.answers import Answers, Mask
+from gapr_core.calibration.pairs import HELD_OUT
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS
@@ -30,10 +31,10 @@ def probability(model: Additive, answers: Answers) -> Array:
 
 
 def of_unseen_people(answers: Answers) -> Array:
-    """(N,) probabilities, each by a model that was fitted without anybody of the pair's subject."""
-    found = np.full(len(answers), np.nan)
+    """(N,) probabilities, each by a model fitted without the pair's subject and the held-out family."""
+    found, known = np.full(len(answers), np.nan), answers.family != HELD_OUT
     for fitted, judged in answers.people_folds():
-        found[judged] = probability(fit(answers.of(fitted)), answers.of(judged))
+        found[judged] = probability(fit(answers.of(fitted & known)), answers.of(judged))
     return found
 
 

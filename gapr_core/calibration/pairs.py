@@ -152,8 +152,13 @@ def _stranger(setting: Setting, what: str, bones: Bones, rng: np.random.Generato
 
 def without_twins(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:
     """The others without those who are so nearly the same subject that their bone is no wrong answer."""
-    alike = {person for group in TWINS if specimen.person in group for person in group} - {specimen.person}
-    return [other for other in others if other.person not in alike]
+    own, person = first_of_twins(specimen.person), specimen.person
+    return [other for other in others if other.person == person or first_of_twins(other.person) != own]
+
+
+def first_of_twins(person: str) -> str:
+    """One name for subjects that are alike: who is judged must not have been learned from as somebody else."""
+    return next((min(group) for group in TWINS if person in group), person)
 
 
 def view(seen_as: str, specimen: Specimen, seed: int) -> protocols.Pair:

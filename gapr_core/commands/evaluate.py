@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from argparse import ArgumentParser, Namespace
 from hashlib import sha256
@@ -12,14 +13,16 @@ from tqdm import tqdm
 
 from gapr_core.baselines import RegistrationMethod
 from gapr_core.benchmark import methods
+from gapr_core.benchmark.record import ERROR
 from gapr_core.commands import options
 from gapr_core.commands.register import as_json
 from gapr_core.data.pair_files import load_clouds, pair_paths
-from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime import files, origin
 from gapr_core.runtime.arguments import at_least_one
 
+log = logging.getLogger(__name__)
 Answer = dict[str, Any]
 INVALID_INPUT = "INVALID_INPUT"  # status of a pair that cannot be read
 
@@ -71,7 +74,7 @@ def _answers_so_far(path: Path) -> dict[str, Answer]:
 
 
 def _answer(path: Path, method: RegistrationMethod) -> Answer:
-    """The answer to one pair; a pair that cannot be read is refused, the others go on."""
+    """The answer to one pair; one that cannot be read, or on which the method fails, is refused; the others go on."""
     try:
         source, target, viewpoint = load_clouds(path)
         start = time.perf_counter()
@@ -83,4 +86,10 @@ def _answer(path: Path, method: RegistrationMethod) -> Answer:
     except InvalidPointCloudError as error:
         refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=str(error))
         return as_json(refusal) | {"status": INVALID_INPUT}
+    except (ConfigError, MethodUnavailableError, WeightsError):
+        raise
+    except Exception as error:
+        log.warning("%s failed", path.name, exc_info=True)
+        refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=f"{type(error).__name__}: {error}")
+        return as_json(refusal) | {"status": ERROR}
     return as_json(result) | {"seconds": seconds, "prepare_seconds": prepare_seconds}

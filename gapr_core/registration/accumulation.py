@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
-from gapr_core.registration.refinement import evaluate
+from gapr_core.registration.kernels import residuals_at
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
@@ -109,7 +109,14 @@ class Accumulator:
 
         Another target than before starts a new collection. A source that cannot be registered is not kept, and one
         without a finite point is refused: what was collected before says nothing about it.
+
+        Raises:
+            ConfigError: a viewpoint is given; the collected sources were seen from many.
+            InvalidPointCloudError: as `collect` and `Registrar.register`.
         """
+        if viewpoint is not None:
+            how = "register the clouds of a camera one by one, or leave the viewpoint out"
+            raise ConfigError("collected sources without a viewpoint", "one viewpoint for all of them", how)
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target
@@ -118,7 +125,7 @@ class Accumulator:
         before = self._new
         self.collect(source)
         try:
-            result = self.method.register(_together(self._last()), target, initial, viewpoint)
+            result = self.method.register(_together(self._last()), target, initial)
         except Exception:
             self._new = [points for points in self._new if _is_among(points, before)]
             raise
@@ -158,9 +165,14 @@ class Accumulator:
         if len(source) < limits.fewest_points:
             return False
         some = points[:: 1 + len(points) // limits.most_points]
-        distances = (evaluate(T, each, target, refinement).signed_mm for each in (source, some))
-        own, of_all = (float(np.median(np.nan_to_num(np.abs(d), nan=np.inf))) for d in distances)
+        own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
         return own > limits.off * max(of_all, refinement.smallest_sigma_mm)
+
+
+def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:
+    """Median distance of (N, 3) points to the surface; what lies beside the end of it is off it."""
+    signed, _, aside, _ = residuals_at(T, points, *target.kernel_view, 0.0)
+    return float(np.median(np.hypot(np.nan_to_num(signed, nan=np.inf), aside)))
 
 
 def _together(sources: list[Array]) -> Array:

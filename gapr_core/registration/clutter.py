@@ -181,11 +181,12 @@ def _scored(
 
 
 def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
-    """At most `count` evenly spread points of the target and their normals; kept with it."""
-    key = "spread", count
+    """At most `count` evenly spread points of the target, where its sensor sees them, and normals; kept with it."""
+    key = "spread", count, target.offset_mm
     if key not in target.cache:
         some = sampling.thin(target.points, count)
-        target.cache[key] = target.points[some], target.normals[some]
+        normals = target.normals[some]
+        target.cache[key] = target.points[some] + target.offset_mm * normals, normals
     return target.cache[key]  # type: ignore[no-any-return]
 
 

@@ -14,9 +14,15 @@ from gapr_core.registration.refinement import evaluate
 
 
 def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True when the inner cortex explains much of what the outer one leaves open."""
+    """True when the inner cortex explains what the outer one leaves open, down to the noise of the source.
+
+    Two nearby sheets shrink the residuals of any bad fit, such as that of another person's bone; only a source that
+    lies on both leaves nothing but its noise.
+    """
     both = assessment.target.both_cortices
     if both is None:
         return False
     fit = evaluate(assessment.fit.T, assessment.source.points, both, config.refinement)
-    return bool(fit.sigma_mm < config.cortices.share * np.exp(assessment.features["log_sigma"]))
+    limits, noise_mm = config.cortices, max(assessment.source.noise_mm, config.refinement.smallest_sigma_mm)
+    explains = fit.sigma_mm < limits.share * np.exp(assessment.features["log_sigma"])
+    return bool(explains and fit.sigma_mm < limits.noise * noise_mm)

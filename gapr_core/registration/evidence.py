@@ -4,7 +4,8 @@ A frame's probability p says that the bone is the right one and that the pose is
 q = r = sqrt(p), q for the bone, r for the pose. The bone is the same in all frames, so their log odds of q add up. But
 frames see the same surface with the same errors: n equally correlated frames count as n / (1 + (n - 1) rho)
 (the variance of a mean of correlated variables). The answer for a frame is the stream's q times its own r. So frames
-that agree raise the confidence, and a wrong bone, which fits a little in every frame, is detected by the others.
+that agree raise the confidence, never beyond sqrt(p), and a wrong bone that fits well in one frame only is refused
+there too. After a jump nothing that spoke for the bone counts any more, and what spoke against it still does.
 """
 
 from __future__ import annotations
@@ -42,12 +43,17 @@ class Evidence:
         """The probability of a frame in the light of those before it.
 
         Args:
-            probability: 0 to 1, of this frame alone.
-            agrees: its pose continues the last one; after a jump the frames count for one.
+            probability: 0 to 1, of this frame alone; one that is no number comes back and is not counted.
+            agrees: its pose continues the last one; after a jump the answer is at most `probability`.
         """
+        if not np.isfinite(probability):
+            return probability
+        if not agrees and self._sum > 0.0:
+            self._sum = self._weight = 0.0
         part = float(np.sqrt(probability))
         forget = 1.0 - 1.0 / self.config.memory
         self._sum = forget * self._sum + float(np.clip(logit(part), -MOST_LOGIT, MOST_LOGIT))
         self._weight = forget * self._weight + 1.0
         self._agreeing = self._agreeing + 1 if agrees else 1
-        return float(expit(self.frames * self._sum / self._weight)) * part
+        combined = float(expit(self.frames * self._sum / self._weight)) * part
+        return combined if agrees else min(combined, probability)

@@ -144,7 +144,7 @@ def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTar
     """What lines of sight say: shares of the surface, and the margin to the best distinct rival."""
     explained, violating, compared = (float(x[0]) for x in (seen.explained, seen.violating, seen.compared))
     area_mm2 = explained * len(target.points) * target.spacing_mm**2
-    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else np.inf
+    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else 1.0
     return {
         "free_space_score": float(seen.score[0]),
         "log_explained_mm2": float(np.log(area_mm2 + 1.0)),

@@ -35,6 +35,8 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity: poses are often written with few digits
+
 
 class Registrar:
     """Lays partial sources on one or many prepared targets.
@@ -61,8 +63,11 @@ class Registrar:
         precision: Precision | None = None,
     ) -> None:
         self.config = config or RegistrarConfig()
-        self.proposers: tuple[Proposer, ...] = tuple(proposers or (_search(self.config),))
-        self.calibrations = tuple(calibrations or (Calibration.shipped(p.name) for p in self.proposers))
+        self.proposers: tuple[Proposer, ...] = (_search(self.config),) if proposers is None else tuple(proposers)
+        if not self.proposers:
+            raise ConfigError("at least one proposer", "an empty list", "leave `proposers` out for the search")
+        shipped = calibrations is None
+        self.calibrations = tuple((Calibration.shipped(p.name) for p in self.proposers) if shipped else calibrations)
         self._scene_calibration = scene_calibration
         if len(self.calibrations) != len(self.proposers):
             given = f"{len(self.calibrations)} for {len(self.proposers)} proposers"
@@ -161,7 +166,7 @@ class Registrar:
         if viewpoint is None and target.both_cortices is not None and cortices.follows_both(assessment, self.config):
             again = self._in_rounds(prepared, target.both_cortices, assessment.fit.T[None], clock)
             assessment = (again or assessment).limited(self.config.cortices.largest_confidence)
-        if assessment.is_sure(self.config.min_confidence):
+        if assessment.is_sure(self.config.min_confidence**2):  # as in `rules.by_geometry`
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
         return explained.named_clutter(assessment, self.config).corrected(self.precision)
@@ -173,10 +178,11 @@ class Registrar:
         config, assessment = self.config, None
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(config.seed)
-            poses = np.concatenate([poses, proposer.propose(source, target, rng).poses])
+            proposed = proposer.propose(source, target, rng).poses
             clock.lap("propose")
-            if not len(poses):
-                continue
+            if not len(proposed):
+                continue  # a pose that was given is not weighed against nothing
+            poses = np.concatenate([poses, proposed])
             candidates = verify(poses, source, target, config.verification, config.num_threads)
             clock.lap("verify")
             fit = refine_fully(candidates.poses[0], source.points, target, config.refinement, source.neighbours)
@@ -243,4 +249,8 @@ def _rigid(pose: ArrayLike) -> Array:
     T = np.asarray(pose, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InvalidPointCloudError("a finite (4, 4) initial pose", f"shape {T.shape}", "pass T_target_source in mm")
+    R = T[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
+        given = f"a matrix whose rotation part has determinant {np.linalg.det(R):.3g}"
+        raise InvalidPointCloudError("a rigid (4, 4) initial pose", given, "no scale and no reflection; lengths in mm")
     return se3.nearest_rigid(T)

@@ -66,4 +66,4 @@ def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarg
     elements = target.elements.copy()
     elements[:, :3] += offset_mm * elements[:, 3:6]
     both = None if target.both_cortices is None else offset_surface(target.both_cortices, sensor)
-    return replace(target, elements=np.ascontiguousarray(elements), both_cortices=both)
+    return replace(target, elements=np.ascontiguousarray(elements), both_cortices=both, offset_mm=offset_mm)

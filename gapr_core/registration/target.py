@@ -40,6 +40,7 @@ class PreparedTarget:
         elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
             surroundings, at an edge or a thin blade) side by side, for the compiled loops.
         cache: what proposers keep per target (a network's features).
+        offset_mm: how far outside of `points` a sensor sees the surface (`sensor.offset_surface`); in `elements`.
     """
 
     points: Array
@@ -53,6 +54,7 @@ class PreparedTarget:
     elements: Array
     both_cortices: PreparedTarget | None = None
     cache: dict[Any, Any] = dataclasses.field(default_factory=dict)
+    offset_mm: float = 0.0
 
     @property
     def faces(self) -> NDArray[np.int64] | None:
@@ -61,7 +63,7 @@ class PreparedTarget:
 
     @property
     def kernel_view(self) -> tuple[Array, NDArray[np.int32], Array, float, float]:
-        """Arguments that every loop of `refinement_kernels` takes."""
+        """Arguments that every loop of `kernels` takes."""
         return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
 
     @property

@@ -24,6 +24,34 @@ def test_frames_that_agree_raise_the_confidence_up_to_what_their_correlation_all
     assert [repeated.add(0.8, agrees=True) for _ in range(9)] == pytest.approx([0.8] * 9)
 
 
+def test_the_frames_that_ship_count_as_little_more_than_one():
+    evidence = Evidence()
+    assert max(evidence.add(0.47, agrees=True) for _ in range(100)) < 0.5
+
+
+def test_nothing_is_raised_beyond_its_square_root():
+    evidence = Evidence(EvidenceConfig(correlation=0.0))
+    for _ in range(100):
+        evidence.add(0.999, agrees=True)
+    assert evidence.add(0.25, agrees=True) == pytest.approx(0.5, abs=1e-2)
+    assert evidence.add(0.24, agrees=True) < 0.5
+
+
+def test_after_a_jump_what_spoke_for_the_bone_is_forgotten_and_what_spoke_against_it_is_not():
+    good, bad = Evidence(), Evidence()
+    for _ in range(20):
+        good.add(0.97, agrees=True)
+        bad.add(0.02, agrees=True)
+    assert good.add(0.28, agrees=False) == pytest.approx(0.28)
+    assert bad.add(0.9, agrees=False) < 0.5
+
+
+def test_a_probability_that_is_no_number_is_not_counted():
+    evidence = Evidence()
+    assert np.isnan(evidence.add(np.nan, agrees=True))
+    assert evidence.add(0.7, agrees=False) == pytest.approx(0.7)
+
+
 def test_a_wrong_bone_is_detected_by_the_other_frames():
     """One frame in five fits by chance."""
     evidence = Evidence()
@@ -32,7 +60,7 @@ def test_a_wrong_bone_is_detected_by_the_other_frames():
 
 
 def test_a_jump_makes_the_frames_count_for_one():
-    evidence = Evidence(EvidenceConfig(memory=1e6))
+    evidence = Evidence(EvidenceConfig(correlation=0.5, memory=1e6))
     for _ in range(20):
         before = evidence.add(0.8, agrees=True)
     assert evidence.add(0.8, agrees=False) == pytest.approx(0.8) and before > 0.85

@@ -96,7 +96,9 @@ def test_a_pose_that_can_be_pushed_refuses_alone_where_it_would_be_accepted(egg,
     refusal = judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.5)
     assert refusal.status is RegistrationStatus.DEGENERATE and "flat or straight" in refusal.reason
     assert asked[0][3] is CONFIG.verification
-    assert judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.49) is None and len(asked) == 1
+    assert judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.24) is None and len(asked) == 1
+    streamed = judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.26)  # a stream may raise it to 0.51
+    assert streamed.status is RegistrationStatus.DEGENERATE
     zero = replace(CONFIG, min_confidence=0.0)
     assert judged(egg, candidates(1.0, 2.0), uncertainty(), 0.0, zero).status is RegistrationStatus.DEGENERATE
 

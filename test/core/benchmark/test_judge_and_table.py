@@ -10,6 +10,7 @@ from benchmark_cases import make_pair, ok, record, shifted, some_records
 from gapr_core.benchmark import table
 from gapr_core.benchmark.judge import judge, pair_facts
 from gapr_core.benchmark.record import Verdict
+from gapr_core.geometry import se3
 from gapr_core.pages import sections
 from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus
 
@@ -48,6 +49,23 @@ def test_any_pose_for_a_wrong_pair_is_a_false_accept_and_a_refusal_is_not():
     assert judge(pair, ok(np.eye(4))) == Verdict(right=False, false_accept=True, best_right=False)
     refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE)
     assert judge(pair, refusal) == Verdict(right=False, false_accept=False)
+
+
+def test_nees_is_about_the_point_that_the_covariance_turns_about():
+    """A turn about the centre of the points that were used moves the centroid of all; the covariance knows the turn."""
+    pair = make_pair(0)
+    centre = se3.apply(pair.T_target_source, pair.source.mean(axis=0)[None])[0] + [20.0, 0.0, 0.0]
+    answer = ok(about_point(pair, centre), covariance=np.diag([0.01] * 3 + [1e-4] * 3))
+    assert judge(pair, replace(answer, centre_mm=centre)).nees == pytest.approx(0.02**2 / 1e-4, rel=1e-6)
+    assert judge(pair, answer).nees > 10.0  # about the centroid the turn is a shift of 0.4 mm as well
+
+
+def about_point(pair, centre):
+    """The true pose, then a turn of 0.02 rad about z and the centre."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(0.02), -np.sin(0.02)], [np.sin(0.02), np.cos(0.02)]]
+    turn[:3, 3] = centre - turn[:3, :3] @ centre
+    return turn @ pair.T_target_source
 
 
 def test_nees_and_the_ratio_to_the_bound_come_with_a_covariance_and_a_noise():

@@ -16,7 +16,8 @@ def made_answers(count=1500, seed=0, error_scale=1.0, people=40):
     errors = rng.normal(size=(count, 6))
     weights = np.array([0.6, 0.3, 0.1, 0.0, 0.0, 0.0])
     return Answers(
-        "search",
+        FEATURES,
+        rounds=np.full(count, "search"),
         names=np.array([f"0-{i}" for i in range(count)]),
         features=features,
         right=margin + 0.3 * rng.normal(size=count) > 0.0,

@@ -134,7 +134,7 @@ class _Pool:
     def __init__(self, asked):
         self.asked = asked
 
-    def map(self, _, tasks):
+    def map(self, _, tasks, chunksize):
         for task in tasks:
             self.asked.append(task)
             yield {"name": f"{task.seed}-{task.number}", "answers": {}}

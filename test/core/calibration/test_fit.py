@@ -7,7 +7,8 @@ import pytest
 from answer_cases import made_answers
 
 from gapr_core.calibration import fit as fits
-from gapr_core.calibration.answers import answers_of
+from gapr_core.calibration.answers import answers_of, together
+from gapr_core.calibration.pairs import HELD_OUT, TWINS
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.features import FEATURES
 
@@ -33,6 +34,32 @@ def test_no_model_judges_a_subject_whose_bone_is_in_any_pair_that_it_was_fitted_
         assert fitted.any() and not known & own
         judged += held_out
     assert (judged == 1).all()
+
+
+def test_nobody_is_judged_by_a_model_that_learned_from_a_twin(answers):
+    twins = sorted(TWINS[0])
+    people = tuple((twins[i % len(twins)] if i % 5 == 0 else f"p{i % 30}",) for i in range(len(answers)))
+    for fitted, held_out in replace(answers, people=people).people_folds():
+        judged = {group[0] for group, is_in in zip(people, held_out, strict=True) if is_in}
+        known = {group[0] for group, is_in in zip(people, fitted, strict=True) if is_in}
+        assert not (judged & set(twins) and known & set(twins))
+
+
+def test_the_family_that_is_held_out_is_in_no_fit(answers, monkeypatch):
+    seen = set()
+    monkeypatch.setattr(fits, "fit", lambda known: seen.update(known.family) or Additive(0.0, ()))
+    monkeypatch.setattr(fits, "probability", lambda model, judged: np.zeros(len(judged)))
+    fits.of_unseen_people(answers)
+    assert seen == set(answers.family) - {HELD_OUT}
+
+
+def test_the_rounds_together_keep_what_each_record_is(answers):
+    some, names = answers.of(np.arange(len(answers)) < 5), ("extent", "log_sigma")
+    other = replace(some, rounds=np.full(5, "track"), true_mm=some.true_mm + 1.0)
+    both = together([some.with_features(names), other.with_features(names)])
+    assert both.rounds.tolist() == ["search"] * 5 + ["track"] * 5 and both.people == some.people * 2
+    assert both.features[:5, 0] == pytest.approx(some.features[:, FEATURES.index("extent")])
+    assert both.true_mm[5:] == pytest.approx(some.true_mm + 1.0)
 
 
 def test_no_model_judges_a_family_that_it_was_fitted_on(answers, monkeypatch):

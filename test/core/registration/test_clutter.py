@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core.config import SensorConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
 from gapr_core.registration import clutter
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.features import SCENE_FEATURES
+from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.source import prepare
 
 T_SOURCE_TARGET = se3.exp(np.array([80.0, -40.0, 25.0, 0.4, -1.1, 0.7]), np.zeros(3))
@@ -40,6 +42,13 @@ def method():
 @pytest.fixture(scope="module")
 def result(method, target, scene):
     return method.register(scene[0], target, viewpoint=scene[1])
+
+
+def test_lines_of_sight_meet_the_surface_where_the_sensor_sees_it(target):
+    off = offset_surface(target, SensorConfig(kind="pointer", standoff_mm=1.5))
+    (plain, normals), (seen, _) = (clutter.spread(each, 500) for each in (target, off))
+    assert seen == pytest.approx(plain + 1.5 * normals)
+    assert clutter.spread(target, 500)[0] is plain
 
 
 def test_the_bone_is_found_between_what_is_not_bone(result, scene):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapr_core.config import SourceConfig
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.registration.crop import crop_box, crop_to_pose
 from gapr_core.registration.source import prepare, without_isolated
@@ -34,6 +34,14 @@ def test_what_is_far_from_the_bone_under_the_last_pose_is_dropped(target):
 def test_a_margin_that_is_not_positive_is_refused(target):
     with pytest.raises(ConfigError, match="margin"):
         crop_to_pose(target.points, np.eye(4), target, margin_mm=0.0)
+
+
+@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((5, 2)), np.zeros((2, 3, 3))])
+def test_what_is_not_a_list_of_points_is_refused(points, target):
+    with pytest.raises(InvalidPointCloudError, match=r"\(N, 3\)"):
+        crop_box(points, np.eye(4), np.zeros(3), np.ones(3))
+    with pytest.raises(InvalidPointCloudError, match=r"\(N, 3\)"):
+        crop_to_pose(points, np.eye(4), target, margin_mm=5.0)
 
 
 def test_uniform_far_clutter_is_removed_and_the_bone_stays(femur):

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
+from gapr_core.data.parametric import make_bone
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import quadrics, se3, visibility
+from gapr_core.registration import cortices
 
 WALL_MM = 4.0
 
@@ -63,6 +67,15 @@ def test_a_source_that_follows_both_cortices_is_registered_to_both(registrar, ho
     assert result.ok
     assert se3.pose_error(result.T_target_source, np.eye(4), source)[0] < 0.5
     assert result.confidence <= 0.85  # such sources were no part of the calibration
+
+
+def test_the_bone_of_somebody_else_does_not_follow_both_cortices(registrar, hollow):
+    """Two sheets shrink the residuals of any bad fit; that is no sign that the source lies on both."""
+    for seed in (1, 2):
+        other = Specimen(make_bone("femur", 5), "femur", "5")
+        source = make_pair("L2", other, seed).source
+        assessment = registrar.assess(source, hollow)
+        assert not cortices.follows_both(assessment, registrar.config)
 
 
 def test_who_wants_more_than_such_a_source_can_give_gets_a_refusal(hollow, hollow_cloud):

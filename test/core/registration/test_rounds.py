@@ -101,6 +101,10 @@ def test_the_network_alone_finds_a_one_sided_view(pair):
 def test_as_many_confidence_models_as_proposers_are_needed():
     with pytest.raises(ConfigError, match="2 for 1"):
         Registrar(calibrations=[Calibration.shipped("search")] * 2)
+    with pytest.raises(ConfigError, match="at least one proposer"):
+        Registrar(proposers=[])
+    with pytest.raises(ConfigError, match="one confidence model"):
+        Registrar(calibrations=[])
 
 
 def test_a_gpu_that_is_not_there_and_a_missing_torch_are_named(monkeypatch):

@@ -66,8 +66,9 @@ class Registrar:
         self.proposers: tuple[Proposer, ...] = (_search(self.config),) if proposers is None else tuple(proposers)
         if not self.proposers:
             raise ConfigError("at least one proposer", "an empty list", "leave `proposers` out for the search")
-        shipped = calibrations is None
-        self.calibrations = tuple((Calibration.shipped(p.name) for p in self.proposers) if shipped else calibrations)
+        if calibrations is None:
+            calibrations = [Calibration.shipped(proposer.name) for proposer in self.proposers]
+        self.calibrations = tuple(calibrations)
         self._scene_calibration = scene_calibration
         if len(self.calibrations) != len(self.proposers):
             given = f"{len(self.calibrations)} for {len(self.proposers)} proposers"

@@ -123,15 +123,7 @@ def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registr
 
 def test_one_viewpoint_for_clouds_of_many_views_is_refused(registrar, frames, prepared):
     with pytest.raises(ConfigError, match="without a viewpoint"):
-        Accumulator(registrar).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])
-
-
-def test_a_source_beyond_the_end_of_the_bone_lies_off_it(registrar, prepared, femur_cloud):
-    """The surface ends; its elements go on as planes, on which a source beyond the end would seem to lie."""
-    end = femur_cloud[np.argsort(femur_cloud[:, 2])[-400:]]
-    accumulator = Accumulator(registrar)
-    assert not accumulator._lies_off(end, femur_cloud, np.eye(4), prepared)
-    assert accumulator._lies_off(end + [0.0, 0.0, 6.0], femur_cloud, np.eye(4), prepared)
+        Accumulator(registrar, most=3).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])
 
 
 def test_a_reset_reaches_the_tracker(frames, prepared):

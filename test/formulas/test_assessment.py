@@ -112,7 +112,7 @@ def test_residuals_of_a_scene_are_those_of_the_whole_cloud_and_inliers_those_of_
 
 
 def test_an_answer_is_sure_from_its_limit_on_unless_a_rule_speaks_against_it(plane):
-    assert made(plane, 0.9).is_sure(0.9) and not made(plane, 0.8999).is_sure(0.9)
+    assert made(plane, 0.9).is_sure(0.9) and made(plane, 0.95).is_sure(0.9) and not made(plane, 0.8999).is_sure(0.9)
     assert not made(plane, 0.9, REFUSED).is_sure(0.0)
 
 

@@ -25,6 +25,8 @@ import bones
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from harness import NODE, Client, NodeProcess, wait_until
+from rclpy.time import Time
+from std_msgs.msg import Header
 
 from gapr_core.data import stream
 from gapr_core.data.pair import TARGET_POINTS, Pair
@@ -33,7 +35,8 @@ from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_ros.node import wire
-from msg_adapters import pose_to_matrix
+from gapr_ros.node.timeline import stamp_ns
+from msg_adapters import pose_to_matrix, xyz_to_cloud
 
 SEED, SUBJECT = 3, 900_001  # a subject that no training draws
 DISTINCT = 200  # clouds; they come again and again, to and fro
@@ -141,31 +144,30 @@ def soak(folder: Path, kind: str, seconds: float, hz: float = 10.0, distinct: in
         begin, steps = time.monotonic(), [*range(distinct), *range(distinct - 2, 0, -1)]
         while time.monotonic() - begin < seconds:
             points, truth = clouds[steps[result.sent % len(steps)]]
-            stamp_s = round(time.time(), 6)
-            sent[f"{stamp_s:.6f}"], truths[f"{stamp_s:.6f}"] = time.monotonic(), (points, truth)
-            client.send(points, stamp_s=stamp_s)
+            key = time.time_ns()
+            sent[key], truths[key] = time.monotonic(), (points, truth)
+            client.send(xyz_to_cloud(points, Header(frame_id="probe", stamp=Time(nanoseconds=key).to_msg())))
             result.sent += 1
             if result.sent % round(hz) == 0:
                 result.rss_mb.append(node.rss_mb())
             time.sleep(max(0.0, begin + result.sent / hz - time.monotonic()))
         _count(client, node, result)
         result.answered_s = [at - begin for at in result.answered_s]
-        heard = ((_key(pose.header.stamp), wire.core_pose(pose_to_matrix(pose))) for pose in client.poses)
-        result.errors_mm = [_error_mm(T, *truths[key]) for key, T in heard if key in truths]
+        result.errors_mm = [_error_mm(pose, *truths[stamp_ns(pose.header)]) for pose in client.poses]
     finally:
         client.close()
         result.exit_code = node.stop()
     return result
 
 
-def _listen(client: Client, result: Soak) -> dict[str, float]:
+def _listen(client: Client, result: Soak) -> dict[int, float]:
     """Note every answer; returns the dict in which the caller notes when it sent the cloud of a stamp."""
-    sent: dict[str, float] = {}
+    sent: dict[int, float] = {}
 
     def note(status: DiagnosticStatus) -> None:
         now, values = time.monotonic(), {pair.key: pair.value for pair in status.values}
         result.answered_s.append(now)
-        result.latency_s.append(now - sent[values["stamp"][:-3]])
+        result.latency_s.append(now - sent[int(values["stamp"].replace(".", ""))])
         if values["reason"]:
             result.reasons[values["reason"]] = result.reasons.get(values["reason"], 0) + 1
 
@@ -202,12 +204,8 @@ def _truth(pair: Pair, bone: Specimen) -> np.ndarray:
     return se3.from_rotation_translation(np.eye(3), origin) @ pair.T_target_source
 
 
-def _key(stamp: Any) -> str:
-    return f"{stamp.sec}.{stamp.nanosec:09d}"[:-3]
-
-
-def _error_mm(T: np.ndarray, points: np.ndarray, truth: np.ndarray) -> float:
-    return se3.pose_error(T, truth, points * 1000.0)[0]
+def _error_mm(pose: Any, points: np.ndarray, truth: np.ndarray) -> float:
+    return se3.pose_error(wire.core_pose(pose_to_matrix(pose)), truth, points * 1000.0)[0]
 
 
 def draw(results: list[Soak], path: Path) -> None:

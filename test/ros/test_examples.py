@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import signal
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -21,6 +22,7 @@ from std_msgs.msg import Header
 
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node.publishers import TOPICS
+from gapr_ros.parameters import FIELDS
 from msg_adapters import matrix_to_transform
 
 ROOT = Path(__file__).parents[2]
@@ -186,3 +188,19 @@ def test_the_service_and_the_container_start_the_program_and_stop_it_in_time():
     assert "exec ros2 run gapr_ros register_node" in unit and "KillSignal=SIGTERM" in unit
     container = (ROOT / "deploy" / "Containerfile").read_text()
     assert "ros:jazzy" in container and "exec /gapr/venv/bin/register_node" in container
+
+
+def test_topics_services_and_parameters_in_examples_and_deployment_are_those_of_the_node(graph):
+    """Whatever they name under the node's own name, or give with -p, exists."""
+    texts = {path: path.read_text() for folder in ("examples/ros", "deploy", "docs", "README.md", "docs/tutorials")
+             for path in (sorted((ROOT / folder).glob("*.*")) if (ROOT / folder).is_dir() else [ROOT / folder])
+             if path.is_file() and path.suffix != ".png"}  # fmt: skip
+    own = {name.split("/")[2] for names in graph.values() for name in names if name.startswith("/register_node/")}
+    optional = {"detection", "get_type_description"}
+    consumers = {"frame", "bone_frame", "register_node"}  # parameters of the examples
+    others = {"use_sim_time", "NAME"}
+    for path, text in texts.items():
+        named = set(re.findall(r"(?:/register_node|\{source\}|[`\s>(]~)/([a-z_]+)\b(?!\.py|/)", text))
+        assert named <= own | optional, (path.name, named - own - optional)
+        given = set(re.findall(r"-p (\w+):=", text))
+        assert given <= set(FIELDS) | consumers | others, (path.name, given - set(FIELDS))

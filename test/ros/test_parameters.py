@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from harness import NodeProcess, StandIn, context, node_in_thread, wait_until
+from rclpy.context import Context
 from rclpy.parameter import Parameter
 
 from gapr_ros import parameters
@@ -87,6 +88,19 @@ def test_the_shipped_file_starts_the_node_without_a_warning(tmp_path):
     time.sleep(2.0)
     assert node.stop() == 0, node.log
     assert "WARN" not in node.log and "unknown" not in node.log
+
+
+@pytest.mark.parametrize("side", ["femur", "tibia"])
+def test_the_shipped_file_of_two_bones_gives_each_node_its_own_parameters_and_those_of_all(side):
+    ros = Context()
+    ros.init(args=["--ros-args", "--params-file", str(FILE.parent / "two_bones.yaml"), "-r", f"__ns:=/{side}"])
+    node = RegisterNode(lambda _: StandIn(), context=ros, parameter_overrides=[Parameter("autostart", value=False)])
+    found = node.parameters
+    assert node.get_fully_qualified_name() == f"/{side}/register_node"
+    assert (found.model_frame, found.model_path) == (f"{side}_preop", f"/data/{side}.stl")
+    assert (found.model_unit, found.min_confidence, found.max_tre) == ("mm", 0.9, 0.002)
+    node.close()
+    ros.try_shutdown()
 
 
 def test_descriptions_ranges_and_choices_can_be_asked_for(ros):

@@ -103,10 +103,10 @@ def _variant(table: str, row: Any, models: Path, path: Path) -> Variant:
     return Variant(table, row["label"], models / f"{row['model']}.yaml", row.get("paper"))
 
 
-def trained_as(plan: Sequence[Variant], settings: Mapping[str, Any]) -> dict[Path, Path]:
+def trained_as(plan: Sequence[Variant], settings: Mapping[str, Any] | None = None) -> dict[Path, Path]:
     """For every yaml the first one with the same network: what is equal but for its name is trained once.
 
     `settings` are those that the run has over every yaml.
     """
-    networks = {v.model: replace(network_of(v.model, settings), name="") for v in plan}
+    networks = {v.model: replace(network_of(v.model, settings or {}), name="") for v in plan}
     return {path: next(p for p, other in networks.items() if other == network) for path, network in networks.items()}

@@ -167,6 +167,9 @@ class RulesConfig(Settings):
     largest_shift_mm: float = setting(5.0, "standard deviation of a shift that is not observed", low=0, unit="mm")
     equal_share: float = setting(0.015, "a rival whose mean square is larger by less is as good", low=0, high=1)
     equal_mm: float = setting(0.25, "the same as a length, whose square is added", low=0, high=10, unit="mm")
+    largest_scale_z: float = setting(
+        3.0, "standard deviations by which the size of a source may be off; more is another bone", low=0
+    )
     push: float = setting(1.5, "how far a pose is pushed, in units of verification.same_pose_mm", low=1, high=100)
     pushed_motions: int = setting(
         3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6

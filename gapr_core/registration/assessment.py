@@ -139,6 +139,7 @@ def judge(
     """The probability of a pose with these features, and what the safety rules say."""
     probability = calibration.probability(features)
     refusal = rules.by_geometry(fit, candidates, uncertainty, probability, source, target, config)
+    refusal = refusal or rules.by_size(features, config.rules)
     if refusal is not None:
         probability = min(probability, config.rules.ruled_out)
     return Assessment(

@@ -1,10 +1,12 @@
 """The safety rules: what refuses a pose, whatever its probability. Each rule refuses alone.
 
-Three rules are geometry and never look at the probability: a motion that is not observed, a pose that can be pushed
-aside, a rival that is as good. Two are the user's thresholds: `min_confidence` and `max_tre_mm`.
+Four rules never look at the probability: a motion that is not observed, a pose that can be pushed aside, a rival that
+is as good, a source of another size. Two are the user's thresholds: `min_confidence` and `max_tre_mm`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,19 @@ def by_geometry(
             "a pose a few mm away fits as well: the observed surface is flat or straight",
         )
     return None
+
+
+def by_size(features: Mapping[str, float], rules: RulesConfig = DEFAULT) -> Refusal | None:
+    """Why the source is not of this bone but of a larger or smaller one; None when its size agrees.
+
+    Args:
+        features: of the answer (`features.OTHER_BONE`): how far the size is off, in standard deviations.
+        rules: from how many on.
+    """
+    if not features["scale_z"] > rules.largest_scale_z:
+        return None
+    reason = f"the source fits best in another size ({features['scale_z']:.1f} standard deviations off)"
+    return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: is it of this bone, and is its scale right?")
 
 
 def by_threshold(probability: float, tre95_mm: float, config: RegistrarConfig) -> Refusal | None:

@@ -44,7 +44,7 @@ def made(plane, probability=0.9, refusal=None, known=None, scores=(1.0, 1.2), **
     poses = np.array([np.eye(4), *(se3.exp([30.0 * k, 0, 0, 0, 0, 0]) for k in range(1, len(scores)))])
     candidates = Candidates(poses, np.array(scores), np.ones(len(scores)))
     source = SimpleNamespace(points=POINTS)
-    features = {"inlier_ratio": 0.25, "margin": 0.5}
+    features = {"inlier_ratio": 0.25, "margin": 0.5, "scale_z": 0.0}
     return Assessment(fit, candidates, known or uncertainty(), features, probability, refusal, source, plane, **more)
 
 
@@ -155,6 +155,13 @@ def test_a_rule_that_refuses_limits_the_probability(plane, rule, says):
     assert found.contributions == {"margin": 1.0} and found.independent_points == 7.0
     assert (found.fit, found.source, found.target, found.features) == (a.fit, a.source, plane, a.features)
     assert rule.asked[0][3] == pytest.approx(0.8)  # the rules are asked about the probability before they limit it
+
+
+def test_a_source_of_another_size_is_refused_where_no_other_rule_speaks(plane, rule):
+    a, config = made(plane), RegistrarConfig()
+    other = {**a.features, "scale_z": 3.5}
+    found = judge(a.fit, a.candidates, a.uncertainty, other, a.source, plane, calibrated(0.8), config)
+    assert "another size" in found.refusal.reason and found.probability == config.rules.ruled_out
 
 
 def test_a_pose_that_a_rule_refuses_and_that_is_improbable_stays_improbable(plane, rule):

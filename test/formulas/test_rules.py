@@ -90,6 +90,15 @@ def test_a_rival_within_the_roughness_or_within_a_share_refuses_alone(egg, score
         assert refusal.status is RegistrationStatus.AMBIGUOUS and "30 mm and 0 deg away" in refusal.reason
 
 
+@pytest.mark.parametrize(("scale_z", "refused"), [(2.99, False), (3.01, True)])
+def test_a_source_of_another_size_refuses_alone(scale_z, refused):
+    refusal = rules.by_size({"scale_z": scale_z})
+    assert (refusal is not None) is refused
+    if refusal:
+        assert refusal.status is RegistrationStatus.LOW_CONFIDENCE
+        assert f"{scale_z:.1f} standard deviations" in refusal.reason and "scale" in refusal.reason
+
+
 def test_a_pose_that_can_be_pushed_refuses_alone_where_it_would_be_accepted(egg, monkeypatch):
     asked = []
     monkeypatch.setattr(rules, "can_be_pushed", lambda *args: asked.append(args) or True)

@@ -71,7 +71,7 @@ def refined(monkeypatch):
 
     def refine_agreeing(poses, points, normals, signed, *rest):
         asked.append((len(poses), len(points), tuple(rest[-2]), rest[-1], signed))
-        return poses + np.eye(4)[1][:, None] * np.eye(4)[3], None
+        return poses + np.eye(4)[1][:, None] * np.eye(4)[3]
 
     monkeypatch.setattr(clutter, "refine_agreeing", refine_agreeing)
     return asked

@@ -167,7 +167,12 @@ class Client:
         """Publish one cloud and wait for its answer: the diagnostics after it was counted."""
         before = _answered(self.values())
         self.send(cloud, **kwargs)
-        wait_until(lambda: _answered(self.values()) == before + 1, timeout_s, f"an answer; last: {self.values()}")
+        try:
+            wait_until(lambda: _answered(self.values()) > before, timeout_s, "an answer")
+        except AssertionError as error:
+            stamp = self.diagnostics[-1].header.stamp if self.diagnostics else "none"
+            text = f"{error} after {before} others; newest diagnostics of {stamp}: {self.values()}"
+            raise AssertionError(text) from error
         return self.values()
 
     def ready(self, kind: Any, name: str) -> Any:

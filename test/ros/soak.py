@@ -215,7 +215,7 @@ def draw(results: list[Soak], path: Path) -> None:
     from gapr_core.pages import palette
 
     figure = Figure(figsize=(8.0, 5.6), layout="constrained")
-    above, below = figure.subplots(2, 1)
+    above, below = figure.subplots(2, 1, sharex=True)
     for result, colour in zip(results, palette.SERIES, strict=False):
         above.plot(np.array(result.answered_s) / 60.0, result.latency_s, ".", ms=3, color=colour, label=result.kind)
         below.plot(np.arange(len(result.rss_mb)) / 60.0, result.rss_mb, color=colour, lw=1.6, label=result.kind)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from gapr_core.registration.features import FEATURES_OF
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Model = TypeVar("Model")
 FOLDS = 6
 NO_TRUTH = {
     "rte_mm": np.nan,
@@ -118,3 +119,16 @@ def together(groups: Sequence[Answers]) -> Answers:
         if isinstance(value, np.ndarray)
     }
     return replace(first, **columns, people=tuple(people for group in groups for people in group.people))
+
+
+def of_models_that_saw_neither(
+    answers: Answers, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
+) -> Array:
+    """(N,) predictions, each by a model that was fitted without the pair's subject and without its sensor family."""
+    found = np.full(len(answers), np.nan)
+    for family in np.unique(answers.family):
+        of_it: Mask = answers.family == family
+        for fitted, judged in answers.people_folds():
+            if (judged & of_it).any():
+                found[judged & of_it] = predict(fit(answers.of(fitted & ~of_it)), answers.of(judged & of_it))
+    return found

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.calibration.additive import fit_centre
-from gapr_core.calibration.answers import Answers, Mask
+from gapr_core.calibration.answers import Answers, of_models_that_saw_neither
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.precision_model import PRECISION_FEATURES, SCALE_LIMITS
 
@@ -44,14 +44,7 @@ def precision_table(answers: Answers) -> Array:
 
 def of_unseen(answers: Answers) -> Array:
     """(N,) scales by models that have seen neither the subject nor the sensor family."""
-    found = np.full(len(answers), np.nan)
-    for family in np.unique(answers.family):
-        of_it: Mask = answers.family == family
-        for fitted, judged in answers.people_folds():
-            if (judged & of_it).any():
-                model = fit_scale(answers.of(fitted & ~of_it))
-                found[judged & of_it] = scales(model, answers.of(judged & of_it))
-    return found
+    return of_models_that_saw_neither(answers, fit_scale, scales)
 
 
 def conformal_factor(scores: Array, *groupings: NDArray[np.str_]) -> float:

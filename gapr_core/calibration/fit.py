@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from gapr_core.calibration.additive import fit_log_odds
-from gapr_core.calibration.answers import Answers, Mask
+from gapr_core.calibration.answers import Answers, of_models_that_saw_neither
 from gapr_core.calibration.pairs import HELD_OUT
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
 from gapr_core.registration.additive import Additive
@@ -40,13 +40,7 @@ def of_unseen_people(answers: Answers) -> Array:
 
 def of_unseen_families(answers: Answers) -> Array:
     """(N,) probabilities, each by a model that has seen neither the subject nor the sensor family."""
-    found = np.full(len(answers), np.nan)
-    for family in np.unique(answers.family):
-        of_it: Mask = answers.family == family
-        for fitted, judged in answers.people_folds():
-            if (judged & of_it).any():
-                found[judged & of_it] = probability(fit(answers.of(fitted & ~of_it)), answers.of(judged & of_it))
-    return found
+    return of_models_that_saw_neither(answers, fit, probability)
 
 
 def judged(answers: Answers, confidence: Array) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import os
 import re
 import subprocess
 import sys
+from operator import attrgetter
 from pathlib import Path
 from posixpath import dirname, join, normpath, relpath
 from typing import Any
@@ -76,7 +77,7 @@ def settings_of_the_library() -> str:
         groups.setdefault(name.rpartition(".")[0], []).append((f"`{name}`", *rest))
     parts = [SETTINGS, markdown.table(header, groups.pop(""))]
     for group, rows in groups.items():
-        about = (type(getattr(RegistrarConfig(), group)).__doc__ or "").splitlines()[0]
+        about = (type(attrgetter(group)(RegistrarConfig())).__doc__ or "").splitlines()[0]
         parts += [f"## {group}", about, markdown.table(header, rows)]
     return "\n\n".join(parts)
 

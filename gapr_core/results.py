@@ -106,6 +106,16 @@ class Guidance:
     now_mm: float
     patches: tuple[Patch, ...]
 
+    def spots(self, most: int = 5, apart_mm: float = 30.0) -> tuple[Patch, ...]:
+        """The best patches whose centres are at least `apart_mm` from each other, best first, at most `most`."""
+        chosen: list[Patch] = []
+        for patch in self.patches:
+            if len(chosen) == most:
+                break
+            if all(np.linalg.norm(patch.centre - other.centre) >= apart_mm for other in chosen):
+                chosen.append(patch)
+        return tuple(chosen)
+
     def __str__(self) -> str:
         best = self.patches[0]
         where = "({:.0f}, {:.0f}, {:.0f})".format(*best.centre)

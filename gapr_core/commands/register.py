@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from gapr_core.commands import options
 from gapr_core.errors import ConfigError
-from gapr_core.results import RegistrationResult
+from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import files
 from gapr_core.runtime.console import say
 
@@ -47,6 +48,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
     parser.add_argument("--residuals", type=Path, help="signed distance of every point, as .json or coloured .ply")
     parser.add_argument("--slicer", type=Path, metavar="FOLDER", help="a scene for 3D Slicer")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="one page with all of it, on refusals too")
+    parser.add_argument("--guide", action="store_true", help="say where on the bone another look would help most")
     parser.add_argument("--json", type=Path, help="write the result here as well; keys: docs/reference/json.md")
     options.add_method(parser)
 
@@ -72,15 +75,28 @@ def run(args: Namespace) -> int:
     from gapr_core.benchmark import methods
 
     _check_outputs(args)
-    method = methods.make(args.method, options.registrar_config(args))
+    if args.guide and args.method not in methods.OWN:
+        raise ConfigError(f"--guide with one of {', '.join(methods.OWN)}", args.method, "leave --guide out")
+    config = options.registrar_config(args)
+    config = replace(config, guide=config.guide or args.guide)
+    method = methods.make(args.method, config)
     plan = _plan(args)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
     source = _load(args, args.source, tip_mm=args.tip, topic=args.topic, clouds=args.clouds).points
     result = method.register(source, method.prepare(target), **_hints(args, method))  # type: ignore[call-arg]
     errors = _errors(plan, result)
+    spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     if args.json:
-        files.write_json(args.json, as_json(result) | {"targets": [asdict(error) for error in errors]})
-    return _show(args, result, errors, target)
+        more = {"targets": [asdict(error) for error in errors], "guidance": _guidance_json(result, spots)}
+        files.write_json(args.json, as_json(result) | more)
+    if args.report:
+        from gapr_core.pages import registration_report
+
+        registration_report.write(args.report, registration_report.Registration(target, source, result, errors, spots))
+    code = _show(args, result, errors, target)
+    if config.guide:
+        _say_where_next(result, spots)
+    return code
 
 
 def _check_outputs(args: Namespace) -> None:
@@ -95,6 +111,10 @@ def _check_outputs(args: Namespace) -> None:
         raise ConfigError("a bag as the source of --topic", args.source.name, "give a bag, or leave --topic out")
     if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
         raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
+    if args.report:
+        if args.report.suffix.lower() not in (".html", ".htm"):
+            raise ConfigError("a report as .html", args.report.name, "let its name end with .html")
+        from gapr_core.pages import registration_report  # noqa: F401  a missing library is said before the work
 
 
 def _load(args: Namespace, path: Path, **how: Any) -> Surface:
@@ -149,6 +169,33 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
         say(f"{error.label}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")
     _write(args, result, errors, target)
     return OK
+
+
+def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
+    """The best patches in order, or why there are none."""
+    if result.guidance is None:
+        seen = "the source shows the whole bone" if result.best is not None else "no hypothesis was found"
+        say(f"where to look next: not known, {seen}")
+        return
+    say(f"where to look next (the error bound over the bone is {result.guidance.now_mm:.2f} mm, rivals included):")
+    for rank, spot in enumerate(spots, 1):
+        centre, normal = (
+            "({:.1f}, {:.1f}, {:.1f})".format(*spot.centre),
+            "({:.2f}, {:.2f}, {:.2f})".format(*spot.normal),
+        )
+        say(f"{rank}. {centre} mm, normal {normal}: expected tre95 {spot.tre95_mm:.2f} mm, "
+            f"gain {spot.gain_mm:.2f} mm, {100 * spot.rivals_excluded:.0f} % of the rivals excluded")  # fmt: skip
+
+
+def _guidance_json(result: RegistrationResult, spots: Sequence[Patch]) -> dict[str, Any] | None:
+    if result.guidance is None:
+        return None
+    patches = [
+        {"centre_mm": spot.centre.tolist(), "normal": spot.normal.tolist(), "tre95_mm": spot.tre95_mm,
+         "rivals_excluded": spot.rivals_excluded, "gain_mm": spot.gain_mm}
+        for spot in spots
+    ]  # fmt: skip
+    return {"now_mm": result.guidance.now_mm, "patches": patches}
 
 
 def _write(args: Namespace, result: RegistrationResult, errors: list[TargetError], target: Surface) -> None:

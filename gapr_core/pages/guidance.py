@@ -37,8 +37,11 @@ class GuidedStep:
     advice: tuple[Array, Array, Array] | None
 
 
-def guidance_figure(target: Surface, steps: Sequence[GuidedStep]) -> Any:
-    """A plotly figure with a slider over the looks; the first one is shown."""
+def guidance_figure(target: Surface, steps: Sequence[GuidedStep], facing: Array | None = None) -> Any:
+    """A plotly figure with a slider over the looks; the first one is shown.
+
+    `facing` is the direction (3,) in the target's frame from which the view begins; from the front where it is None.
+    """
     import plotly.graph_objects as go
 
     traces = [trace for k, step in enumerate(steps) for trace in _traces(target, step, visible=k == 0)]
@@ -47,7 +50,7 @@ def guidance_figure(target: Surface, steps: Sequence[GuidedStep]) -> Any:
     choices = [
         (step.label, np.repeat(np.arange(len(steps)) == k, each).tolist(), step.caption) for k, step in enumerate(steps)
     ]
-    figure.update_layout(**view_layout(target, choices, 0, "look "))
+    figure.update_layout(**view_layout(target, choices, 0, "look ", facing))
     return figure
 
 
@@ -74,9 +77,12 @@ def _bone(target: Surface, gain_mm: Array, visible: bool) -> Any:
     import plotly.graph_objects as go
 
     x, y, z = target.points.astype(np.float32).T
-    i, j, k = target.triangles.astype(np.int32).T
     bar = {"title": {"text": "gain of a look, mm", "side": "right"}, "len": 0.7}
     shade = {"colorscale": COLOURS, "cmin": 0.0, "cmax": max(1e-3, float(gain_mm.max())), "colorbar": bar}
+    if target.faces is None:
+        marker = {"size": 1.5, "color": gain_mm.astype(np.float32), **shade}
+        return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, visible=visible, hoverinfo="skip")
+    i, j, k = target.faces.astype(np.int32).T
     mesh = {"x": x, "y": y, "z": z, "i": i, "j": j, "k": k, "intensity": gain_mm.astype(np.float32)}
     lighting = {"ambient": 0.7, "diffuse": 0.5, "specular": 0.0}
     hover = "%{intensity:.1f} mm to gain<extra></extra>"

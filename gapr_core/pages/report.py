@@ -150,20 +150,34 @@ class Step:
     others: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def alignment_figure(target: Surface, steps: Sequence[Step], shown: int = -1, facing: Array | None = None) -> Any:
+def alignment_figure(
+    target: Surface,
+    steps: Sequence[Step],
+    shown: int = -1,
+    facing: Array | None = None,
+    word: str = "frame ",
+    always: Sequence[Any] = (),
+) -> Any:
     """A plotly figure: the target and on it the points of one step, coloured by distance; a slider chooses the step.
 
-    `facing` is the direction (3,) in the target's frame from which the view begins; from the front where it is None.
+    Args:
+        target: the bone.
+        steps: what the slider chooses from.
+        shown: which step the view begins with.
+        facing: (3,) direction in the target's frame from which the view begins; from the front where it is None.
+        word: what stands before the label of a step.
+        always: plotly traces that every step shows.
     """
     import plotly.graph_objects as go
 
     shown = range(len(steps))[shown]
     kinds = (_cloud_trace, _others_trace) if any(len(step.others) for step in steps) else (_cloud_trace,)
     clouds = [trace(step, visible=k == shown) for trace in kinds for k, step in enumerate(steps)]
-    figure = go.Figure([_target_trace(target), *clouds])
+    figure = go.Figure([_target_trace(target), *always, *clouds])
     own = np.tile(np.eye(len(steps), dtype=bool), len(kinds))
-    choices = [(step.label, [True, *visible], step.caption) for step, visible in zip(steps, own.tolist(), strict=True)]
-    figure.update_layout(**view_layout(target, choices, shown, "frame ", facing))
+    fixed = [True] * (1 + len(always))
+    choices = [(step.label, fixed + visible, step.caption) for step, visible in zip(steps, own.tolist(), strict=True)]
+    figure.update_layout(**view_layout(target, choices, shown, word, facing))
     return figure
 
 
@@ -191,7 +205,7 @@ def view_layout(
     slider = {"active": shown, "steps": steps, "currentvalue": {"prefix": word}, "pad": {"t": 0, "b": 40}}
     return {
         "title": {"text": choices[shown][2], "font": {"size": 15}, "x": 0.02},
-        "height": 600,
+        "height": 600 if len(choices) > 1 else 500,  # the slider needs the rest
         "margin": {"l": 0, "r": 0, "t": 44, "b": 0},
         "showlegend": False,
         "sliders": [slider] if len(choices) > 1 else [],
@@ -203,9 +217,9 @@ def _camera(target: Surface, facing: Array | None) -> dict[str, Any]:
     """From the side that `facing` says, a long bone lying across, as large as the page allows; true proportions."""
     size = np.ptp(target.points, axis=0)
     lies = size[2] > 1.5 * size[0]
-    up = {"x": -1, "y": 0, "z": 0} if lies else {"x": 0, "y": 0, "z": 1}
     ratio = size * (4.2 / size[2] if lies else 2.0 / size[[0, 2]].max())
     x, y = 1.2 * level(facing)
+    up = {"x": y, "y": -x, "z": 0} if lies else {"x": 0, "y": 0, "z": 1}
     camera = {"eye": {"x": x + 0.15, "y": y, "z": 0.15}, "up": up, "projection": {"type": "orthographic"}}
     return {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True)), "camera": camera}
 

@@ -1,0 +1,237 @@
+"""The page of one registration, and where to look next, as `gapr register` gives them."""
+
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from gapr_core.benchmark import methods
+from gapr_core.cli import main
+from gapr_core.formats import markups
+from gapr_core.geometry import se3
+from gapr_core.pages import registration_report
+from gapr_core.pages.report import Step, alignment_figure
+from gapr_core.registration.features import FEATURES, SCENE_FEATURES
+from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
+from gapr_core.surface import Surface
+
+T = se3.exp([10.0, -20.0, 30.0, 0.3, -0.2, 0.5])
+POINTS = np.random.default_rng(0).uniform(-40.0, 40.0, (20, 3))
+DISTANCES = np.r_[np.linspace(-2.0, 3.0, 19), np.nan]
+RESIDUALS = Residuals(POINTS, DISTANCES, np.r_[[True] * 15, [False] * 5])
+RIVAL = Hypothesis(T @ se3.exp([0.0, 0.0, 7.0, 0.0, 0.0, 0.0]), 0.25)
+NAMES = ("Qwistle", "4711", "1950")
+
+
+def patch(z, tre95_mm, gain_mm):
+    return Patch(np.array([1.0, 2.0, z]), np.array([0.0, 0.0, 1.0]), tre95_mm, 0.5, gain_mm)
+
+
+def guidance(bone):
+    """The second patch overlaps the first one."""
+    return Guidance(bone, np.linspace(0, 6, len(bone)), 7.5, (patch(90, 1.25, 6.0), patch(95, 1.5, 5.0),
+                                                              patch(10, 2.25, 4.0)))  # fmt: skip
+
+
+def accepted(bone, **more):
+    return RegistrationResult(
+        RegistrationStatus.OK, T, 1e-4 * np.eye(6), 0.93, 1.21, 2.34, 0.75, (Hypothesis(T, 0.7), RIVAL),
+        centre_mm=np.zeros(3), residuals=RESIDUALS, features={"margin": 2.5},
+        contributions={"residual": -0.5, "margin": 1.75}, **more,
+    )  # fmt: skip
+
+
+def refused(bone, **more):
+    return RegistrationResult(
+        RegistrationStatus.AMBIGUOUS, confidence=0.41, hypotheses=(Hypothesis(T, 0.41), RIVAL), residuals=RESIDUALS,
+        reason="another pose fits as well", contributions={"margin": -2.0}, **more,
+    )  # fmt: skip
+
+
+class StandIn:
+    """Answers what it is given; for the page it does not matter who registers."""
+
+    name = "gapr"
+    answer = staticmethod(accepted)
+
+    def __init__(self, config):
+        self.config = config
+
+    def prepare(self, target, units="mm"):
+        return target
+
+    def register(self, source, target):
+        found = guidance(target.points) if self.config.guide else None
+        return self.answer(target.points, guidance=found)
+
+
+@pytest.fixture
+def register(tmp_path, monkeypatch, femur):
+    """`gapr register` on a femur and some points, with a stand-in for the method."""
+    monkeypatch.setitem(methods.OWN, "gapr", StandIn)
+    np.savez(tmp_path / "Qwistle.npz", points=femur.points, faces=femur.faces)
+    np.save(tmp_path / "Qwistle_Jane_1950.npy", POINTS)
+    files = ["--source", str(tmp_path / "Qwistle_Jane_1950.npy"), "--target", str(tmp_path / "Qwistle.npz")]
+
+    def call(*options, answer=accepted, files=files):
+        monkeypatch.setattr(StandIn, "answer", staticmethod(answer))
+        code = main(["register", *files, "--report", str(tmp_path / "page.html"), *options])
+        page = tmp_path / "page.html"
+        return code, page.read_text(encoding="utf-8") if page.exists() else ""
+
+    return call
+
+
+def text_of(page):
+    """What a reader sees, without scripts, styles and tags."""
+    bare = re.sub(r"<(script|style)\b.*?</\1>", "", page, flags=re.DOTALL)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", bare))
+
+
+def test_the_page_of_a_pose_holds_all_of_it(register, tmp_path):
+    markups.save(tmp_path / "plan.mrk.json", markups.Markups(np.array([[0.0, 0.0, 100.0]]), ("<b>entry",)))
+    code, page = register("--targets", str(tmp_path / "plan.mrk.json"), "--guide")
+    text = text_of(page)
+    assert code == 0
+    assert "OK status" in text and "0.93 confidence" in text and "1.21 mm" in text and "2.34 mm" in text
+    assert "lead over the next hypothesis margin for +1.75 2.500" in text
+    assert "residual of the best hypothesis before refinement residual against -0.50" in text
+    expected = 1e-2 * np.sqrt(3.0 + 2.0 * 100.0**2)  # root of the trace of J C J^T, 100 mm from the pose's centre
+    assert f"&lt;b&gt;entry 0.0 0.0 100.0 {expected:.2f} mm" in text and "<b>entry" not in page
+    assert "1 0.700 0.0 mm 0.0°" in text and "2 0.250 7.0 mm 0.0°" in text
+    assert "Where to look next" in text and "1 1 2 90 0.00 0.00 1.00 1.25 mm 6.00 mm 50 %" in text
+    assert "Without a surface near: 1." in text
+    assert page.count("Plotly.newPlot(") == 3, "3-D view, histogram, guidance"
+    assert not re.search(r"<(script|link|img|iframe)[^>]+(src|href)\s*=", page)
+
+
+def test_the_page_of_a_refusal_says_why_and_offers_no_pose(register):
+    code, page = register(answer=refused)
+    text = text_of(page)
+    assert code == 2
+    assert "Refused (AMBIGUOUS): there is no pose to use" in text and "Reason: another pose fits as well" in text
+    assert "There is no pose, so there is no error to expect." in text and "Accepted" not in text
+    assert "lead over the next hypothesis margin against -2.00" in text and "2 0.250" in text
+    assert "Where to look next" not in text, "nobody asked"
+    assert page.count("Plotly.newPlot(") == 2
+
+
+def test_a_refusal_without_any_hypothesis_has_a_page_too(register):
+    few = RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason="3 points")
+    code, page = register(answer=lambda bone, guidance: few)
+    assert code == 2 and "Reason: 3 points" in page and "no hypothesis was found" in page
+    assert page.count("Plotly.newPlot(") == 1
+
+
+def test_a_pose_without_residuals_is_shown_with_the_source_in_grey():
+    bone = Surface(np.vstack([POINTS, -POINTS]))
+    result = RegistrationResult(RegistrationStatus.OK, T)
+    (step,) = registration_report._steps(registration_report.Registration(bone, POINTS, result))
+    assert len(step.points) == 0
+    np.testing.assert_allclose(step.others, se3.apply(T, POINTS))
+
+
+def test_the_view_colours_points_by_their_distance_and_shows_rivals_apart(femur):
+    best, rival = registration_report._steps(registration_report.Registration(femur, POINTS, accepted(None)))
+    np.testing.assert_allclose(best.points, se3.apply(T, POINTS[:19]))
+    np.testing.assert_allclose(best.distances_mm, np.abs(DISTANCES[:19]))
+    assert len(best.others) == 1 and len(rival.points) == 0
+    np.testing.assert_allclose(rival.others, se3.apply(RIVAL.T_target_source, POINTS))
+
+
+def test_the_histogram_counts_every_point_once():
+    near = np.isfinite(DISTANCES)
+    counted, aside = registration_report.residual_figure(DISTANCES[near], RESIDUALS.inlier[near]).data
+    assert sorted([*counted.x, *aside.x]) == DISTANCES[near].tolist() and len(counted.x) == 15
+
+
+def test_every_feature_of_the_confidence_has_words():
+    assert set(registration_report.WORDS) == {*FEATURES, *SCENE_FEATURES}
+
+
+def test_planned_targets_are_shown_with_every_hypothesis(femur):
+    steps = [Step(name, "", POINTS[:1], np.zeros(1)) for name in "ab"]
+    figure = alignment_figure(femur, steps, 0, None, "hypothesis ", [registration_report._spots(POINTS[:2], "red")])
+    shown = [np.flatnonzero(step.args[0]["visible"]).tolist() for step in figure.layout.sliders[0].steps]
+    assert shown == [[0, 1, 2], [0, 1, 3]] and len(figure.data[1].x) == 2
+
+
+@pytest.mark.parametrize("facing", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-3.0, -2.0, 5.0]])
+def test_a_long_bone_lies_across_from_whichever_side_it_is_seen(femur, facing):
+    figure = alignment_figure(femur, [Step("1", "", POINTS[:1], np.zeros(1))], facing=np.array(facing))
+    camera = figure.layout.scene.camera
+    up = np.array([camera.up.x, camera.up.y, camera.up.z])
+    assert up @ [*facing[:2], 0.0] == pytest.approx(0.0, abs=1e-9) and up[2] == 0.0 and np.linalg.norm(up) > 1.0
+
+
+def test_nothing_of_a_header_and_no_file_name_reaches_the_page(register, tmp_path, femur):
+    sitk = pytest.importorskip("SimpleITK", reason="it writes the header to read: pip install SimpleITK")
+    voxels = np.zeros((40, 40, 40), dtype=np.uint8)
+    voxels[8:32, 12:28, 10:30] = 1
+    image = sitk.GetImageFromArray(voxels)
+    image.SetSpacing([2.0, 2.0, 2.0])
+    for key, value in {"PatientName": "Qwistle^Jane", "PatientID": "4711", "StudyDate": "19500101"}.items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(tmp_path / "Qwistle.nrrd"))
+    assert b"Qwistle^Jane" in (tmp_path / "Qwistle.nrrd").read_bytes()
+    (tmp_path / "Qwistle.mrk.json").write_text(json.dumps({"markups": [{
+        "type": "Fiducial", "coordinateSystem": "LPS", "description": "Qwistle^Jane 4711 19500101",
+        "controlPoints": [{"label": "entry", "position": [1.0, 2.0, 3.0], "description": "Qwistle 1950"}],
+    }]}))  # fmt: skip
+    (tmp_path / "Qwistle.csv").write_text(
+        "# Qwistle^Jane 4711 1950\n" + "\n".join(",".join(map(str, p)) for p in POINTS) + "\n"
+    )
+    files = ["--source", str(tmp_path / "Qwistle.csv"), "--target", str(tmp_path / "Qwistle.nrrd"), "--label", "1"]
+    for answer in (accepted, refused):
+        _, page = register("--targets", str(tmp_path / "Qwistle.mrk.json"), "--guide", answer=answer, files=files)
+        data = re.sub(r"<script[^>]*>/\*\*\s*\* plotly\.js.*?</script>", "", page, flags=re.DOTALL)
+        words = text_of(page) + "".join(re.findall(r'"text":"[^"]*"', data))
+        assert "Registration" in words and ("entry" in words) == (answer is accepted)
+        assert "Qwistle" not in page
+        assert not [name for name in NAMES if name in words], words
+
+
+def test_guide_prints_ranked_patches_that_do_not_overlap(register, tmp_path, capsys):
+    code, _ = register("--guide", "--json", str(tmp_path / "out.json"), answer=refused)
+    lines = capsys.readouterr().out.splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("where to look next"))
+    assert code == 2 and "7.50 mm" in lines[at]
+    assert lines[at + 1].startswith("1. (1.0, 2.0, 90.0) mm") and "expected tre95 1.25 mm" in lines[at + 1]
+    assert lines[at + 2].startswith("2. (1.0, 2.0, 10.0) mm") and "expected tre95 2.25 mm" in lines[at + 2]
+    assert len(lines) == at + 3
+    found = json.loads((tmp_path / "out.json").read_text())["guidance"]
+    assert found["now_mm"] == 7.5 and [p["tre95_mm"] for p in found["patches"]] == [1.25, 2.25]
+
+
+def test_guide_says_when_it_knows_no_place(register, capsys):
+    register("--guide", answer=lambda bone, guidance: refused(bone))
+    assert "not known, the source shows the whole bone" in capsys.readouterr().out
+
+
+def test_guide_with_a_method_that_cannot_is_refused_in_one_line(register, capsys):
+    code, page = register("--guide", "--method", "icp")
+    error = capsys.readouterr().err
+    assert code == 1 and page == "" and error.count("\n") == 1 and "--guide" in error and "gapr_search" in error
+
+
+def test_a_report_that_cannot_be_written_is_refused_before_the_work(register, capsys, tmp_path, monkeypatch):
+    def fail(*_):
+        raise AssertionError("it registered")
+
+    assert register("--report", str(tmp_path / "page.pdf"), answer=fail)[0] == 1
+    assert ".html" in capsys.readouterr().err
+    monkeypatch.delitem(sys.modules, "gapr_core.pages.registration_report")
+    monkeypatch.delattr("gapr_core.pages.registration_report")
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    assert register(answer=fail)[0] == 1
+    assert "pip install 'gapr_ros[reports]'" in capsys.readouterr().err
+
+
+def test_guidance_of_a_cloud_without_faces_is_drawn_too(tmp_path):
+    bone = Surface(np.random.default_rng(1).uniform(0.0, 80.0, (50, 3)))
+    result = accepted(None, guidance=guidance(bone.points))
+    spots = result.guidance.spots()
+    registration_report.write(tmp_path / "a.html", registration_report.Registration(bone, POINTS, result, (), spots))
+    assert "Where to look next" in (tmp_path / "a.html").read_text(encoding="utf-8")

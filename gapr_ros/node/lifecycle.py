@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rclpy.node import Node
@@ -89,7 +91,8 @@ class RegisterNode(LifecycleNodeMixin, Node):
     def call_soon(self, call: Callable[[], None]) -> None:
         """Run in the executor's thread; from any thread."""
         self._calls.append(call)
-        self._bell.trigger()
+        with suppress(InvalidHandle):  # a bone that is read while the node is destroyed has nobody to go to
+            self._bell.trigger()
 
     def report_failure(self, text: str) -> None:
         """A transition failed: keep its reason for log and diagnostics."""

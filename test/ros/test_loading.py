@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 
 import bones
 import numpy as np
@@ -99,6 +100,20 @@ def test_while_it_reloads_clouds_are_registered_to_the_old_bone(blob_path, clien
         slow.gate.set()
         wait_until(reloaded.done)
         assert reloaded.result().success and client.ask(GOOD)["level"] == 0
+
+
+def test_a_bone_that_is_ready_after_the_node_was_destroyed_raises_nothing(blob_path, client, slow):
+    with node_in_thread(slow, blob_path) as node:
+        wait_until(lambda: "loading" in client.values().get("message", ""))
+        loading = node._loader._thread
+    raised = []
+    threading.excepthook, before = raised.append, threading.excepthook
+    try:
+        slow.gate.set()
+        loading.join(PATIENCE_S)
+    finally:
+        threading.excepthook = before
+    assert not loading.is_alive() and not raised
 
 
 def test_a_transition_that_the_state_does_not_allow_is_refused_and_survived(blob_path, client, method):

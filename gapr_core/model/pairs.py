@@ -160,7 +160,7 @@ class DensePairs(Pairs):
 
 def gather(x: Tensor, index: Tensor) -> Tensor:
     """Rows of x (N, C) at `index` (...): (..., C). A plain index_select: its backward is one index_add."""
-    return x.index_select(0, index.reshape(-1)).view(*index.shape, -1)
+    return x.index_select(0, index.reshape(-1)).view(*index.shape, x.shape[-1])
 
 
 def self_pairs(points: Tensor, normals: Tensor, valid: Tensor, c_k: Tensor, reach: Tensor) -> DensePairs:

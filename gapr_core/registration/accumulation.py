@@ -170,7 +170,7 @@ class Accumulator:
 
 
 def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:
-    """Median distance of (N, 3) points to the surface; what lies beside the end of it is off it."""
+    """Median distance of (N, 3) points to the surface; what lies beyond its end is off it."""
     signed, _, aside, _ = residuals_at(T, points, *target.kernel_view, 0.0)
     return float(np.median(np.hypot(np.nan_to_num(signed, nan=np.inf), aside)))
 

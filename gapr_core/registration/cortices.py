@@ -16,7 +16,7 @@ from gapr_core.registration.refinement import evaluate
 def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True when the inner cortex explains what the outer one leaves open, down to the noise of the source.
 
-    Two nearby sheets shrink the residuals of any bad fit, such as that of another person's bone; only a source that
+    Two nearby sheets shrink the residuals of any bad fit, such as that of another subject's bone; only a source that
     lies on both leaves nothing but its noise.
     """
     both = assessment.target.both_cortices

@@ -107,7 +107,7 @@ def test_a_pose_on_a_plane_stays_where_it_is_pushed(search):
 
 
 def test_the_motions_that_are_pushed_are_those_that_the_residuals_say_least_about():
-    points, motions = fit_of_plane().moved, rules._weakest_motions(fit_of_plane())
+    points, motions = fit_of_plane().moved, rules._weakest_motions(fit_of_plane(), 3)
     moves = np.array([motion[:3] + np.cross(motion[3:], points - points.mean(axis=0)) for motion in motions])
     assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(1.0)
     assert np.abs(moves[:, :, 2]).max() < 1e-6  # along the plane, never across

@@ -246,3 +246,14 @@ def test_distinct_poses_are_farther_apart_than_the_tolerance_in_the_root_mean_sq
     assert kernels.distinct(places, order, 0.4, 5).tolist() == [2, 0, 3, 1, 4]
     places[1, :, 1] = 0.0
     assert kernels.distinct(places[[0, 1]], np.array([0, 1]), 1.0, 5).tolist() == [0, 1]  # at the limit
+
+
+@pytest.mark.parametrize("spacing", [0.5, 5.0])  # beyond the element's reach, and within
+def test_a_turn_of_element_and_point_together_changes_no_residual(spacing):
+    for seed in range(5):
+        R = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+        place = np.array([4.0, -3.0, RADIUS + 0.5])
+        before, after = sphere_element([0.0, 0.0, 1.0]), sphere_element(R[:, 2])
+        wanted, turned = (kernels.residual(*p, 0, e, spacing, 0.04) for p, e in ((place, before), (R @ place, after)))
+        assert turned[0] == pytest.approx(wanted[0]) and turned[4] == pytest.approx(wanted[4])
+        assert turned[1:4] == pytest.approx(R @ wanted[1:4])

@@ -124,14 +124,15 @@ class Registrar:
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
 
+    @single_threaded_blas
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
         """The answer to an assessment: thresholds, guidance where asked for, times."""
         if isinstance(assessment, Refusal):
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
-        with single_threaded_blas():
-            guidance = guide(assessment, self.config.guidance) if self.config.guide else None
-            return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
+        guidance = guide(assessment, self.config.guidance) if self.config.guide else None
+        return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
 
+    @single_threaded_blas
     def assess(
         self,
         source: ArrayLike,
@@ -142,17 +143,7 @@ class Registrar:
     ) -> Assessment | Refusal:
         """What `register` knows before `min_confidence` and `max_tre_mm` decide: for calibration and research."""
         clock = clock or Clock()
-        with single_threaded_blas():
-            return self._assess(source, offset_surface(target, self.config.sensor), initial, viewpoint, clock)
-
-    def _assess(
-        self,
-        source: ArrayLike,
-        target: PreparedTarget,
-        initial: ArrayLike | None,
-        viewpoint: ArrayLike | None,
-        clock: Clock,
-    ) -> Assessment | Refusal:
+        target = offset_surface(target, self.config.sensor)
         prepared = sources.prepare(source, self.config.source)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):

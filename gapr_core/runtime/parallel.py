@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
-from contextlib import AbstractContextManager
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 
 def thread_count(requested: int) -> int:
@@ -14,13 +18,19 @@ def thread_count(requested: int) -> int:
     return requested or len(os.sched_getaffinity(0))
 
 
-def single_threaded_blas() -> AbstractContextManager[object]:
-    """Within it, NumPy's and SciPy's linear algebra uses one thread, in the whole process.
+def single_threaded_blas(call: Callable[Given, Result]) -> Callable[Given, Result]:
+    """The same call; while it runs, NumPy's and SciPy's linear algebra uses one thread, in the whole process.
 
     The matrices of a registration are small. Several threads gain nothing with them, and waste whole cores in busy
     waiting as soon as something else wants one. Threads of our own kernels are not affected.
     """
-    return _controller().limit(limits=1, user_api="blas")
+
+    @wraps(call)
+    def limited(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+        with _controller().limit(limits=1, user_api="blas"):
+            return call(*args, **kwargs)
+
+    return limited
 
 
 @cache

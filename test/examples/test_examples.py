@@ -12,7 +12,7 @@ from gapr_core import Registrar, RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
-pyigtl = pytest.importorskip("pyigtl")
+pyigtl = pytest.importorskip("pyigtl", reason="the other end of the OpenIGTLink bridge: pip install pyigtl")
 BRIDGE = Path(__file__).parents[2] / "examples" / "openigtlink" / "bridge.py"
 DEVICE = "StylusTipToTracker"
 WAIT_S = 60.0

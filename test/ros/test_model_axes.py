@@ -47,7 +47,7 @@ def test_a_model_that_is_ras_already_is_not_turned_by_lps_to_ras(tmp_path):
 
 
 def test_the_bone_of_a_label_map_is_named_by_its_label(tmp_path):
-    sitk = pytest.importorskip("SimpleITK")
+    sitk = pytest.importorskip("SimpleITK", reason="it writes the label map: pip install SimpleITK")
     voxels = np.zeros((40, 30, 30), dtype=np.uint8)
     voxels[5:15, 8:20, 8:20], voxels[25:35, 8:20, 8:20] = 75, 76
     sitk.WriteImage(sitk.GetImageFromArray(voxels), str(tmp_path / "seg.nrrd"))

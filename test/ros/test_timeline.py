@@ -23,6 +23,8 @@ GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 NS = 1_000_000_000
 MOVED = pose_mm([0, 0, 0], [50.0, 0, 0])
 
+NEEDS_TF2 = "the real tf2 buffer comes with a ROS installation: apt install ros-jazzy-tf2-py"
+
 
 def judged(timeline, stamp_s, now_s=0.0, **parameters):
     """True for time that starts over, False for a cloud of now, the reason for a refusal."""
@@ -123,7 +125,7 @@ class Real:
     """The buffer of tf2 itself."""
 
     def __init__(self):
-        self._buffer = pytest.importorskip("tf2_py", reason="part of a ROS installation").BufferCore()
+        self._buffer = pytest.importorskip("tf2_py", reason=NEEDS_TF2).BufferCore()
 
     def insert(self, transform):
         self._buffer.set_transform(transform, "register_node")

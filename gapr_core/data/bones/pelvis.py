@@ -1,4 +1,4 @@
-"""A pelvis with its sacrum, joints fused. Frame: x to the subject's left, y backwards, z up; origin amid the bone.
+"""A pelvis with its sacrum, joints fused. Frame: x to the subject's left, y back, z up; origin in the bone's middle.
 
 The left hip bone is laid out by landmarks in millimetres (an average adult); parameters move the landmarks, each side
 on its own, and the right side is mirrored.

@@ -16,7 +16,7 @@ class Config:
     seed: int = 0
 
 
-@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no repository here")
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="the commit is read from a git clone, and this is none")
 def test_the_commit_is_that_of_the_source_tree():
     head = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True).stdout
     found = origin.commit().removesuffix("-dirty").rpartition("-g")[2]  # after a tag: v1-3-gHASH

@@ -69,7 +69,7 @@ def expect_good(live):
     node, client, method = live
     values = client.ask(GOOD)
     assert values["level"] == 0, values
-    wait_until(lambda: client.poses)
+    wait_until(lambda: client.poses and client.confidences)
 
 
 def damaged(change) -> PointCloud2:
@@ -277,6 +277,7 @@ def test_a_reset_refuses_the_cloud_on_its_way(live):
     client.call("reset")
     method.gate.set()
     wait_until(lambda: client.confidences == [0.0, 0.0])
+    wait_until(lambda: int(client.values()["frames_refused"]) == node.counters.refused)  # else the last one passes for the next
     assert client.values()["last_refusal"].startswith("superseded_by_reset")
     assert len(method.calls) == before + 1, "the waiting cloud is not even registered"
     expect_good(live)

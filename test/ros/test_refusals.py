@@ -277,7 +277,8 @@ def test_a_reset_refuses_the_cloud_on_its_way(live):
     client.call("reset")
     method.gate.set()
     wait_until(lambda: client.confidences == [0.0, 0.0])
-    wait_until(lambda: int(client.values()["frames_refused"]) == node.counters.refused)  # else the last one passes for the next
+    # The next answer must not be the last one of these.
+    wait_until(lambda: int(client.values()["frames_refused"]) == node.counters.refused)
     assert client.values()["last_refusal"].startswith("superseded_by_reset")
     assert len(method.calls) == before + 1, "the waiting cloud is not even registered"
     expect_good(live)

@@ -7,6 +7,7 @@ Its value is a module with `read(path, options) -> Surface`, in the unit of the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ class Plugin:
 
 def of(path: Path) -> Plugin | None:
     """The plug-in that reads a file or folder; None without one."""
-    for entry in entry_points(group=GROUP):
+    for entry in _entries():
         if (path.is_file() and path.name.lower().endswith(f".{entry.name}")) or (path / entry.name).is_file():
             return Plugin(entry)
     return None
@@ -58,4 +59,10 @@ def of(path: Path) -> Plugin | None:
 
 def endings() -> list[str]:
     """What plug-ins read, by the names of their entries."""
-    return sorted(entry.name for entry in entry_points(group=GROUP))
+    return sorted(entry.name for entry in _entries())
+
+
+@cache
+def _entries() -> tuple[EntryPoint, ...]:
+    """Of the packages that are installed; looked up once, since it reads the metadata of all of them."""
+    return tuple(entry_points(group=GROUP))

@@ -54,13 +54,31 @@ def reader():
 
 @pytest.mark.parametrize("case", sorted((Path(__file__).parent / "cases").glob("*-*")), ids=lambda path: path.name)
 def test_what_was_found_once_is_refused_or_read_with_a_warning(case, reader):
-    assert reader.ask(case) == "refused" or reader.ask(case).endswith("with a warning")
+    (verdict,) = reader.ask(case)
+    assert verdict == "refused" or verdict.endswith("with a warning")
 
 
-def test_the_fuzzer_reports_a_dead_process_and_goes_on(tmp_path, monkeypatch):
-    child = files.Child()
-    assert child.ask(tmp_path / "none.ply") == "refused"
-    child._process.kill()
-    assert child.ask(tmp_path / "none.ply").startswith("process died")
-    assert child.ask(tmp_path / "none.ply") == "refused"
-    child.close()
+def test_the_fuzzer_reports_a_dead_process_and_goes_on(tmp_path):
+    reader, missing = files.Reader(), tmp_path / "none.ply"
+    assert reader.ask(missing) == ["refused"]
+    reader._child._process.kill()
+    verdicts = reader.ask(missing, missing, missing)
+    assert verdicts[0].startswith("process died") and verdicts[1:] == ["refused", "refused"]
+    reader.close()
+
+
+def test_files_after_one_that_took_too_much_are_read_by_a_fresh_process(tmp_path, monkeypatch):
+    asked, closed = [], []
+
+    class Scripted:
+        def ask(self, paths):
+            asked.append([path.name for path in paths])
+            yield from ("memory read 1 0" if path.name == "b.ply" else "refused" for path in paths)
+
+        def close(self):
+            closed.append(len(asked))
+
+    monkeypatch.setattr(files, "Child", Scripted)
+    names = ["a.ply", "b.ply", "c.ply"]
+    assert files.Reader().ask(*map(Path, names)) == ["refused", "memory read 1 0", "refused"]
+    assert asked == [names, ["c.ply"]] and closed == [1]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core import clouds
 from gapr_core.errors import ConfigError, InvalidPointCloudError
-from gapr_core.formats import markups, reading, tracker
+from gapr_core.formats import markups, plugins, reading, tracker
 from gapr_core.formats.options import ReadOptions
 
 POINTS = np.array([[10.0, 20.0, 30.0], [-40.0, 5.0, 60.0], [7.0, -8.0, 90.0]])
@@ -201,3 +201,11 @@ def test_files_that_say_their_own_axes_are_not_turned_by_those_of_a_mesh(tmp_pat
         reading.read(path, ReadOptions(axes="ras"))
     with pytest.raises(ConfigError, match="axes auto lps"):
         reading.read(path, ReadOptions(axes="up"))
+
+
+def test_which_packages_bring_readers_is_looked_up_once(tmp_path, monkeypatch):
+    """The look-up reads the metadata of every package that is installed: tens of milliseconds, for each file."""
+    np.savetxt(tmp_path / "a.xyz", POINTS)
+    clouds.load(tmp_path / "a.xyz", units="mm")
+    monkeypatch.setattr(plugins, "entry_points", pytest.fail)
+    clouds.load(tmp_path / "a.xyz", units="mm")

@@ -39,8 +39,9 @@ os.environ |= {
     "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
 }
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
-from mutants_session import LIMIT_S, OPTIONS, Session, in_function  # noqa: E402
+from mutants_session import NO_TEST, OPTIONS, Session, in_function  # noqa: E402
 
+LIMIT_S = 60  # of processor time, loading included: a mutant that takes longer hangs, and the tests noticed
 sys.setrecursionlimit(10_000)  # a tree of syntax is deep
 
 SKIPPED = ("BitOr", "BitAnd", "BitXor", "RShift", "LShift", "FloorDiv", "_Mod", "Mod_")  # no formula has them
@@ -78,7 +79,10 @@ TESTS = {
 
 @dataclass
 class Mutant:
-    """One mutation and what became of it: killed, survived, setting or equivalent; `digest` is of code and tests."""
+    """One mutation and what became of it: killed, survived, setting or equivalent.
+
+    `digest` is of code and tests, `killer` the test that failed.
+    """
 
     file: str
     line: int
@@ -87,6 +91,7 @@ class Mutant:
     text: str
     fate: str = ""
     digest: str = ""
+    killer: str = ""
 
     @property
     def key(self) -> str:
@@ -113,11 +118,19 @@ def mutants_of(file: str) -> Iterator[tuple[Mutant, str]]:
         places = [place for node in ast_nodes(tree) for place in operator.mutation_positions(node)]
         for occurrence, ((line, _), _) in enumerate(places):
             mutated = MutationVisitor(occurrence, operator).walk(pickle.loads(fresh)).get_code()
-            if ast.dump(ast.parse(mutated)) == unchanged:
+            if _dump(mutated) in ("", unchanged):
                 continue
             changed = next((b for a, b in zip(lines, mutated.splitlines(), strict=False) if a != b), "").strip()
             fate = "setting" if line in settings and name.startswith(REPLACED) else ""
             yield Mutant(file, line, name.removeprefix("core/"), occurrence, changed, fate, digest), mutated
+
+
+def _dump(text: str) -> str:
+    """The syntax tree in words; "" when the text is no Python, such as `a > not b`."""
+    try:
+        return ast.dump(ast.parse(text))
+    except SyntaxError:
+        return ""
 
 
 def _digest(file: str) -> str:
@@ -195,18 +208,18 @@ class Runner:
     def __init__(self) -> None:
         self._file, self._source, self._session = "", "", None
 
-    def fails(self, mutant: Mutant, text: str) -> bool:
-        """True when the tests of the mutant's file fail with this text."""
+    def killer(self, mutant: Mutant, text: str, first: str) -> str:
+        """The test of the mutant's file that fails with this text, "" when none does; `first` is tried first."""
         if mutant.file != self._file:
             self.close()
             self._file, self._source = mutant.file, (ROOT / mutant.file).read_text(encoding="utf-8")
             tests = [str(ROOT / test) for test in TESTS[mutant.file]]
             self._session = Session(mutant.file.removesuffix(".py").replace("/", "."), tests)
-            if self._session.fails(self._source):
-                raise SystemExit(f"mutants: the tests of {mutant.file} fail without any mutation: {' '.join(tests)}")
+            if name := self._session.killer(self._source):
+                raise SystemExit(f"mutants: the tests of {mutant.file} fail without any mutation: {name}")
         if self._session is not None and in_function(self._source, mutant.line):
-            return self._session.fails(text)
-        return run(mutant.file, text, TESTS[mutant.file])
+            return self._session.killer(text, mutant.line, first)
+        return NO_TEST if run(mutant.file, text, TESTS[mutant.file]) else ""
 
     def close(self) -> None:
         """End the process."""
@@ -230,7 +243,7 @@ def main() -> int:
     from tqdm import tqdm
 
     wanted = [file for file in TESTS if not args.files or any(part in file for part in args.files.split(","))]
-    known = _decided(args.out)
+    known, killers = _decided(args.out)
     listed = (ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines()
     equivalent = {line for line in listed if not line.startswith("#")}  # a reason stands above each
 
@@ -242,7 +255,8 @@ def main() -> int:
                 mutant.fate = "equivalent"
             mutant.fate = mutant.fate or known.get(_identity(mutant), "")
             if not mutant.fate:
-                mutant.fate = "killed" if runner.fails(mutant, text) else "survived"
+                mutant.killer = runner.killer(mutant, text, killers.get(_place(mutant), ""))
+                mutant.fate = "killed" if mutant.killer else "survived"
                 file.write(json.dumps(asdict(mutant)) + "\n")
                 file.flush()
             done.append(mutant)
@@ -250,15 +264,19 @@ def main() -> int:
     return report(done, args.least)
 
 
-def _decided(path: Path) -> dict[tuple[str, str, int, str], str]:
-    """Killed or survived, of every mutant that earlier runs wrote."""
+def _decided(path: Path) -> tuple[dict[tuple[str, ...], str], dict[tuple[str, ...], str]]:
+    """What became of every mutant that earlier runs wrote, and by which test, with these or other tests."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    mutants = (Mutant(**json.loads(line)) for line in lines)
-    return {_identity(mutant): mutant.fate for mutant in mutants if mutant.fate in ("killed", "survived")}
+    mutants = [Mutant(**json.loads(line)) for line in lines]
+    return {_identity(mutant): mutant.fate for mutant in mutants}, {_place(mutant): mutant.killer for mutant in mutants}
 
 
-def _identity(mutant: Mutant) -> tuple[str, str, int, str]:
-    return mutant.file, mutant.operator, mutant.occurrence, mutant.digest
+def _identity(mutant: Mutant) -> tuple[str, ...]:
+    return (*_place(mutant), mutant.digest)
+
+
+def _place(mutant: Mutant) -> tuple[str, ...]:
+    return mutant.file, mutant.operator, str(mutant.occurrence), mutant.text
 
 
 def report(done: list[Mutant], least: float) -> int:

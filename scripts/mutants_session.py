@@ -2,7 +2,8 @@
 
 Loading pytest, the libraries and the tests takes most of the time of a small test run: so it happens once a file. In
 the fork every function of the module gets the code of its mutated namesake. That reaches the functions that the tests
-have imported by name, too.
+have imported by name, too. The first failure ends a run, so the tests that found out about mutants of nearby lines go
+first.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any
 
-LIMIT_S = 30  # of processor time: a mutant that takes longer hangs, and the tests noticed
+LIMIT_S = 300  # of processor time, without a mutation
+NO_TEST = "no test: it crashed or took too long"
 OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-p", "no:timeout", "-o", "addopts=", "--import-mode=importlib")
 
 
@@ -38,10 +40,16 @@ class Session:
             _serve(module, tests, theirs)
         theirs.close()
 
-    def fails(self, text: str) -> bool:
-        """True when the tests fail with the functions of this text."""
-        self._pipe.send(text)
-        return bool(self._pipe.recv())
+    def killer(self, text: str, line: int = 0, first: str = "") -> str:
+        """The test that fails with the functions of this text, or why none could end; "" when all pass.
+
+        Args:
+            text: of the mutated module.
+            line: that differs.
+            first: name of the test to begin with.
+        """
+        self._pipe.send((text, line, first))
+        return str(self._pipe.recv())
 
     def close(self) -> None:
         """End the process."""
@@ -64,15 +72,18 @@ def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
 
         @pytest.hookimpl(tryfirst=True)
         def pytest_runtestloop(self, session: Any) -> bool:
+            order, limit_s = Order(), LIMIT_S
             while True:
                 try:
-                    text = pipe.recv()
+                    text, line, first = pipe.recv()
                 except EOFError:
                     return True
-                child = os.fork()
-                if child == 0:
-                    _run(session, module, text)
-                pipe.send(os.waitpid(child, 0)[1] != 0)
+                session.items.sort(key=lambda item: order.rank(item.nodeid, line, first))
+                killer, seconds = _forked(session, module, text, limit_s)
+                order.note(killer, line)
+                if not line:  # nothing was mutated
+                    limit_s = int(5.0 + 4.0 * seconds)
+                pipe.send(killer)
 
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -82,13 +93,48 @@ def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
         os._exit(0)
 
 
-def _run(session: Any, module: str, text: str) -> None:
-    """All tests on one mutation; exits with 1 when one fails."""
+class Order:
+    """Which test goes first: the one that is named, then those that found mutants of the nearest lines."""
+
+    def __init__(self) -> None:
+        self._lines: dict[str, list[int]] = {}
+
+    def note(self, killer: str, line: int) -> None:
+        """A test failed with a mutation of this line."""
+        self._lines.setdefault(killer, []).append(line)
+
+    def rank(self, test: str, line: int, first: str) -> tuple[bool, float, int]:
+        """Sorts tests for a mutation of this line."""
+        found = self._lines.get(test, [])
+        return test != first, min((abs(line - other) for other in found), default=float("inf")), -len(found)
+
+
+def _forked(session: Any, module: str, text: str, limit_s: int) -> tuple[str, float]:
+    """The test that fails, "" when none does; seconds of processor time."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        _run(session, module, text, limit_s, writing)
+    os.close(writing)
+    _, status, used = os.wait4(child, 0)
+    with os.fdopen(reading) as names:
+        name = names.read()
+    return (name or NO_TEST) if status else "", used.ru_utime + used.ru_stime
+
+
+def _run(session: Any, module: str, text: str, limit_s: int, writing: int) -> None:
+    """All tests on one mutation; writes the name of the one that fails, and exits with 1."""
     from _pytest.main import pytest_runtestloop
 
+    class Failures:
+        def pytest_runtest_logreport(self, report: Any) -> None:
+            if report.failed:
+                os.write(writing, report.nodeid.encode())
+
     code = 1
-    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
+    resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s))
     try:
+        session.config.pluginmanager.register(Failures())
         exchange(importlib.import_module(module), text)
         pytest_runtestloop(session)
         code = int(session.testsfailed > 0 or not session.testscollected)

@@ -39,7 +39,7 @@ os.environ |= {
     "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
 }
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
-from mutants_session import NO_TEST, OPTIONS, Session, in_function  # noqa: E402
+from mutants_session import NO_TEST, OPTIONS, Session, function_around  # noqa: E402
 
 LIMIT_S = 60  # of processor time, loading included: a mutant that takes longer hangs, and the tests noticed
 sys.setrecursionlimit(10_000)  # a tree of syntax is deep
@@ -215,10 +215,11 @@ class Runner:
             self._file, self._source = mutant.file, (ROOT / mutant.file).read_text(encoding="utf-8")
             tests = [str(ROOT / test) for test in TESTS[mutant.file]]
             self._session = Session(mutant.file.removesuffix(".py").replace("/", "."), tests)
-            if name := self._session.killer(self._source):
+            if name := self._session.killer(self._source, 0, range(0), ""):
                 raise SystemExit(f"mutants: the tests of {mutant.file} fail without any mutation: {name}")
-        if self._session is not None and in_function(self._source, mutant.line):
-            return self._session.killer(text, mutant.line, first)
+        around = function_around(self._source, mutant.line)
+        if self._session is not None and around:
+            return self._session.killer(text, mutant.line, around, first)
         return NO_TEST if run(mutant.file, text, TESTS[mutant.file]) else ""
 
     def close(self) -> None:

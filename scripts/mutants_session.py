@@ -2,22 +2,30 @@
 
 Loading pytest, the libraries and the tests takes most of the time of a small test run: so it happens once a file. In
 the fork every function of the module gets the code of its mutated namesake. That reaches the functions that the tests
-have imported by name, too. The first failure ends a run, so the tests that found out about mutants of nearby lines go
-first.
+have imported by name, too.
+
+Only tests that call the mutated function run on a mutant: a first run without a mutation notes which do. The first
+failure ends a run, so the tests that failed on mutants of nearby lines go first.
 """
 
 from __future__ import annotations
 
 import ast
 import functools
+import gc
 import importlib
+import json
 import os
 import resource
+import sys
+import threading
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any
+
+import pytest
 
 LIMIT_S = 300  # of processor time, without a mutation
 NO_TEST = "no test: it crashed or took too long"
@@ -40,15 +48,16 @@ class Session:
             _serve(module, tests, theirs)
         theirs.close()
 
-    def killer(self, text: str, line: int = 0, first: str = "") -> str:
+    def killer(self, text: str, line: int, around: range, first: str) -> str:
         """The test that fails with the functions of this text, or why none could end; "" when all pass.
 
         Args:
             text: of the mutated module.
-            line: that differs.
-            first: name of the test to begin with.
+            line: that differs; 0 when none does.
+            around: lines of the function that differs.
+            first: name of the test to begin with, or "".
         """
-        self._pipe.send((text, line, first))
+        self._pipe.send((text, line, around, first))
         return str(self._pipe.recv())
 
     def close(self) -> None:
@@ -57,33 +66,39 @@ class Session:
         os.waitpid(self.process, 0)
 
 
-def in_function(source: str, line: int) -> bool:
-    """True for a line in the body of a function: only such code can be exchanged."""
-    functions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
-    return any(node.body[0].lineno <= line <= (node.end_lineno or 0) for node in functions)
+def function_around(source: str, line: int) -> range:
+    """Lines of the outermost function whose body holds this line; empty outside: only functions can be exchanged."""
+    functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
+    for node in functions:  # the outermost come first
+        if node.body[0].lineno <= line <= (node.end_lineno or 0):
+            return range(min([node.lineno, *(part.lineno for part in node.decorator_list)]), (node.end_lineno or 0) + 1)
+    return range(0)
 
 
 def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
     """In the forked process; never returns."""
-    import pytest
 
     class Loop:
         """In place of pytest's own loop."""
 
         @pytest.hookimpl(tryfirst=True)
         def pytest_runtestloop(self, session: Any) -> bool:
-            order, limit_s = Order(), LIMIT_S
+            order, limit_s, items = Order(), LIMIT_S, session.items
+            gc.freeze()  # what is never looked at is never copied in a fork
             while True:
                 try:
-                    text, line, first = pipe.recv()
+                    text, line, around, first = pipe.recv()
                 except EOFError:
                     return True
-                session.items.sort(key=lambda item: order.rank(item.nodeid, line, first))
-                killer, seconds = _forked(session, module, text, limit_s)
-                order.note(killer, line)
-                if not line:  # nothing was mutated
+                wanted = [item for item in items if not line or order.calls(item.nodeid, around)]
+                session.items = sorted(wanted, key=lambda item: order.rank(item.nodeid, line, first))
+                said, failed, seconds = _forked(session, module, text, line, limit_s)
+                if not line and not failed:
                     limit_s = int(5.0 + 4.0 * seconds)
-                pipe.send(killer)
+                    order.called = json.loads(said)
+                if failed:
+                    order.note(said, line)
+                pipe.send((said or NO_TEST) if failed else "")
 
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -94,10 +109,19 @@ def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
 
 
 class Order:
-    """Which test goes first: the one that is named, then those that found mutants of the nearest lines."""
+    """Which tests run: those that call the function. First the one that is named, then those that failed nearby.
+
+    Attributes:
+        called: first lines of the functions that each test calls, and under "" those that fixtures call.
+    """
 
     def __init__(self) -> None:
+        self.called: dict[str, list[int]] = {}
         self._lines: dict[str, list[int]] = {}
+
+    def calls(self, test: str, around: range) -> bool:
+        """True when a function that begins within these lines is called."""
+        return any(line in around for line in (*self.called.get("", ()), *self.called.get(test, ())))
 
     def note(self, killer: str, line: int) -> None:
         """A test failed with a mutation of this line."""
@@ -109,35 +133,73 @@ class Order:
         return test != first, min((abs(line - other) for other in found), default=float("inf")), -len(found)
 
 
-def _forked(session: Any, module: str, text: str, limit_s: int) -> tuple[str, float]:
-    """The test that fails, "" when none does; seconds of processor time."""
+class Calls:
+    """A plugin that notes which functions of a file each test calls."""
+
+    def __init__(self, file: str) -> None:
+        self.file, self.of, self._into = file, {"": set()}, set()  # type: ignore[var-annotated]
+        threading.setprofile(self._note)
+        sys.setprofile(self._note)
+
+    def _note(self, frame: types.FrameType, event: str, _: Any) -> None:
+        if event == "call" and frame.f_code.co_filename == self.file:
+            self._into.add(frame.f_code.co_firstlineno)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_setup(self) -> Generator[None, Any, Any]:
+        self._into = self.of[""]  # a fixture may be shared with tests that come later
+        return (yield)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: Any) -> Generator[None, Any, Any]:
+        self._into = self.of.setdefault(item.nodeid, set())
+        return (yield)
+
+
+class Failures:
+    """A plugin that writes the name of a test that fails."""
+
+    def __init__(self, writing: int) -> None:
+        self._writing = writing
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        if report.failed:
+            os.write(self._writing, report.nodeid.encode())
+
+
+def _forked(session: Any, module: str, text: str, line: int, limit_s: int) -> tuple[str, bool, float]:
+    """What the fork said (the test that fails, or without a mutation the calls), whether one failed, seconds."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        _run(session, module, text, limit_s, writing)
+        os.close(reading)
+        _run(session, module, text, line, limit_s, writing)
     os.close(writing)
+    with os.fdopen(reading) as said:
+        words = said.read()
     _, status, used = os.wait4(child, 0)
-    with os.fdopen(reading) as names:
-        name = names.read()
-    return (name or NO_TEST) if status else "", used.ru_utime + used.ru_stime
+    return words, status != 0, used.ru_utime + used.ru_stime
 
 
-def _run(session: Any, module: str, text: str, limit_s: int, writing: int) -> None:
-    """All tests on one mutation; writes the name of the one that fails, and exits with 1."""
+def _run(session: Any, module: str, text: str, line: int, limit_s: int, writing: int) -> None:
+    """The tests on one mutation, until one fails; exits with 1 then."""
     from _pytest.main import pytest_runtestloop
-
-    class Failures:
-        def pytest_runtest_logreport(self, report: Any) -> None:
-            if report.failed:
-                os.write(writing, report.nodeid.encode())
 
     code = 1
     resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s))
     try:
-        session.config.pluginmanager.register(Failures())
-        exchange(importlib.import_module(module), text)
-        pytest_runtestloop(session)
-        code = int(session.testsfailed > 0 or not session.testscollected)
+        session.config.pluginmanager.register(Failures(writing))
+        loaded = importlib.import_module(module)
+        exchange(loaded, text)
+        if line:
+            pytest_runtestloop(session)
+        else:
+            calls = Calls(str(loaded.__file__))
+            session.config.pluginmanager.register(calls)
+            pytest_runtestloop(session)
+            sys.setprofile(None)
+            os.write(writing, json.dumps({test: sorted(lines) for test, lines in calls.of.items()}).encode())
+        code = int(session.testsfailed > 0)
     finally:
         os._exit(code)
 

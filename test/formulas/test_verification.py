@@ -85,6 +85,26 @@ def test_support_is_the_share_of_the_hypotheses_that_ended_at_the_pose(source, m
     assert [float(T[0, 3]) for T in crowded.poses] == [0.0, 6.0]
 
 
+@pytest.mark.parametrize(("apart_mm", "support"), [(1.24, 0.5), (1.26, 0.25)])
+def test_support_counts_the_poses_that_the_middle_stage_brought_within_the_distance(
+    source, monkeypatch, apart_mm, support
+):
+    """Root mean square over the markers: the second stage moves two of four poses close together."""
+    poses = np.array([se3.exp([x, 0.0, 0.0, 0.0, 0.0, 0.0]) for x in (0.0, 20.0, 40.0, 60.0)])
+    stage = []
+
+    def moved(poses, points, target, limits, threads):
+        stage.append(len(poses))
+        if len(stage) == 2:
+            poses = poses.copy()
+            poses[1] = se3.exp([0.0, apart_mm, 0.0, 0.0, 0.0, 0.0])
+        return poses, np.arange(1.0, len(poses) + 1.0)
+
+    monkeypatch.setattr(verification, "refine_many", moved)
+    config = VerificationConfig(same_pose_mm=1.25, final_poses=1, middle_poses=8)
+    assert verification.verify(poses, source, None, config).support.tolist() == [support]
+
+
 def test_a_pose_is_compared_by_the_same_spread_points(source):
     T = se3.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     markers = verification._markers(np.array([np.eye(4), T]), source, 16)

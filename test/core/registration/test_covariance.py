@@ -93,9 +93,9 @@ def test_a_motion_of_which_nothing_is_seen_has_the_variance_of_the_prior():
     flat = curved_fit()
     up = np.tile([0.0, 0.0, 1.0], (300, 1))
     flat = replace(flat, gradients=up, moved=flat.moved * [1.0, 1.0, 0.0])
-    C = covariance.sandwich(flat, bias_field.fields(flat, 20.0, 80), replace(NOTHING, noise_mm=0.5))
-    assert C[0, 0] == pytest.approx(0.25 / 1e-6, rel=0.01)  # noise variance over the prior's information
-    assert C[5, 5] == pytest.approx(0.25 / 1e-3, rel=0.01)
+    C = covariance.sandwich(flat, bias_field.fields(flat, 20.0, 80), replace(NOTHING, noise_mm=0.4))
+    assert C[0, 0] == pytest.approx(0.16 / 1e-6, rel=0.01)  # noise variance over the prior's information
+    assert C[5, 5] == pytest.approx(0.16 / 1e-3, rel=0.01)
     assert C[2, 2] < 0.01
 
 
@@ -145,6 +145,84 @@ def test_without_points_the_bias_is_what_the_sensor_is_known_for():
     assert covariance.expected_bias_mm(equations, 1.0, config) == pytest.approx(1.0, rel=0.1)
 
 
+@pytest.mark.parametrize("typical_mm", [0.3, 0.0])
+def test_without_points_the_bias_is_the_mean_square_of_a_log_normal_size(typical_mm):
+    """sqrt(E[s^2]) is m exp(v^2) for a median m and a standard deviation v of the logarithm."""
+    steps = np.random.default_rng(4).uniform(0.002, 0.03, 500)  # the sizes are not evenly spaced
+    sizes_mm = tuple(0.01 * np.exp(np.cumsum(steps)))
+    fit = replace(curved_fit(20), weights=np.zeros(20))
+    equations = bias_field.NormalEquations.of(fit, bias_field.fields(fit, 20.0, 80))
+    config = replace(CONFIG, bias_spread=0.4, no_bias_mm=0.0, sizes_mm=sizes_mm)
+    found = covariance.expected_bias_mm(equations, typical_mm, config)
+    if typical_mm:
+        assert found == pytest.approx(0.3 * np.exp(0.4**2), rel=2e-3)
+    else:  # the smallest size is the median
+        assert found == pytest.approx(covariance.expected_bias_mm(equations, sizes_mm[0], config), rel=1e-12)
+
+
+def test_what_residuals_without_a_bias_show_is_taken_off():
+    fit = replace(curved_fit(20), weights=np.zeros(20))
+    equations = bias_field.NormalEquations.of(fit, bias_field.fields(fit, 20.0, 80))
+    whole, less, none = (
+        covariance.expected_bias_mm(equations, 1.0, replace(CONFIG, bias_spread=0.1, no_bias_mm=size))
+        for size in (0.0, 0.6, 3.0)
+    )
+    assert less**2 == pytest.approx(whole**2 - 0.36) and none == 0.0
+
+
+def test_a_pose_is_never_surer_than_a_micrometre():
+    sensor = SensorConfig("laser", 0.0, noise_mm=1e-3, scale=0.0, known_standoff_mm=1e-3)
+    config = replace(CONFIG, bias_gain=0.0, noise_points=0.0)
+    C = covariance.estimate(curved_fit(300, sigma_mm=1e-5), config, sensor).covariance
+    assert (np.diag(C)[:3] >= 1e-6).all() and (np.diag(C)[3:] >= 1e-10).all()
+    assert np.linalg.eigvalsh(C).min() > 0.0
+
+
+def test_the_least_certain_directions_are_the_largest_axes_of_each_block():
+    shift, turn = (np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0] for seed in (0, 1))
+    C = np.zeros((6, 6))
+    C[:3, :3] = shift @ np.diag([0.04, 0.09, 0.01]) @ shift.T
+    C[3:, 3:] = turn @ np.diag(np.radians([0.5, 0.2, 2.0]) ** 2) @ turn.T
+    known = covariance.PoseUncertainty(C, 0.1, 0.1, 0.1, turn[:, 2], shift[:, 1])
+    assert known.largest_shift_mm == pytest.approx(0.3) and known.largest_turn_deg == pytest.approx(2.0)
+    assert np.abs(covariance._largest_axis(C[:3, :3])) == pytest.approx(np.abs(shift[:, 1]))
+
+
+def test_the_uncertainty_names_the_weakest_turn_and_shift_and_the_misfits():
+    fit = curved_fit(300)
+    fit = replace(fit, signed_mm=np.random.default_rng(0).normal(0.1, 0.5, 300))
+    found = covariance.estimate(fit, CONFIG)
+    C, misfits = found.covariance, covariance.smooth_misfits_mm(fit, (30, 12))
+    assert (found.smooth_mm, found.short_mm) == misfits and misfits[0] != misfits[1]
+    for axis, block in ((found.weakest_shift, C[:3, :3]), (found.weakest_turn, C[3:, 3:])):
+        assert axis @ block @ axis == pytest.approx(np.linalg.eigvalsh(block).max())
+
+
+def test_the_smooth_misfit_is_the_mean_square_of_local_averages_less_that_of_noise():
+    fit = curved_fit(60)
+    signed = 0.2 + 0.02 * fit.moved[:, 1] + np.random.default_rng(1).normal(0.0, 0.3, 60)
+    inlier = fit.weights > 0.0
+    fit = replace(fit, signed_mm=np.where(inlier, signed, np.nan))  # what lies far off has no residual
+    points, signed = fit.moved[inlier], signed[inlier]
+    nearest = np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
+    expected = [
+        np.sqrt(np.mean([signed[i[:count]].mean() ** 2 for i in nearest]) - signed.var() / count) for count in (12, 5)
+    ]
+    assert covariance.smooth_misfits_mm(fit, (12, 5)) == pytest.approx(expected)
+
+
+def test_fewer_points_than_an_average_needs_show_their_own_spread():
+    fit = curved_fit(40, sigma_mm=0.7)
+    fit = replace(fit, signed_mm=np.full(40, 0.4), weights=np.ones(40))
+    assert covariance.smooth_misfits_mm(fit, (30, 12)) == pytest.approx((0.4, 0.4))
+    for count, expected in ((13, (0.7, 0.4)), (12, (0.7, 0.7)), (5, (0.7, 0.7)), (0, (0.7, 0.7)), (30, (0.7, 0.4))):
+        few = replace(fit, weights=(np.arange(40) < count).astype(float))
+        assert covariance.smooth_misfits_mm(few, (30, 12)) == pytest.approx(expected)
+    alternating = replace(fit, signed_mm=np.tile([1.0, -1.0], 20))  # averages that are smaller than noise leaves
+    assert covariance.smooth_misfits_mm(alternating, (40, 39))[0] == 0.7
+    assert covariance.smooth_misfits_mm(alternating, (39,))[0] < 0.2
+
+
 def test_what_is_known_of_the_sensor_reaches_the_covariance():
     fit = curved_fit(100)
     fit = replace(fit, signed_mm=np.random.default_rng(0).normal(0.0, 0.5, 100))
@@ -161,7 +239,9 @@ def test_what_is_known_of_the_sensor_reaches_the_covariance():
     assert spread() == spread(kind="unknown")
 
 
-@pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="24 fits of 1000 points take minutes without the compiler")
+@pytest.mark.skipif(
+    "NUMBA_DISABLE_JIT" in os.environ, reason="24 fits of 1000 points take minutes without the compiler"
+)
 def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target):
     """Over draws of noise without bias, refined from the truth: the mean of NEES / 6 is about 1."""
     ratios = []

@@ -85,8 +85,8 @@ def test_a_motion_that_is_just_known_well_enough_does_not_refuse():
 
 @pytest.mark.parametrize(
     ("scores", "matched"),
-    [((4.0, 4.0624), True), ((4.0, 4.0625), False), ((4.0, 4.0626), False), ((16.0, 16.239), True), ((16.0, 16.241), False), ((1.0,), False),
-     ((0.01, 0.0724), True), ((0.01, 0.0726), False)],
+    [((4.0, 4.0624), True), ((4.0, 4.0625), False), ((4.0, 4.0626), False), ((16.0, 16.239), True),
+     ((16.0, 16.241), False), ((1.0,), False), ((0.01, 0.0724), True), ((0.01, 0.0726), False)],
 )  # fmt: skip
 def test_a_rival_within_the_roughness_or_within_a_share_refuses_alone(egg, scores, matched):
     refusal = judged(egg, candidates(*scores), uncertainty())

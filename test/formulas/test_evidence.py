@@ -46,6 +46,28 @@ def test_after_a_jump_what_spoke_for_the_bone_is_forgotten_and_what_spoke_agains
     assert bad.add(0.9, agrees=False) < 0.5
 
 
+def test_after_a_jump_a_frame_that_spoke_for_the_bone_is_as_if_it_had_not_been():
+    seen, fresh = Evidence(), Evidence()
+    seen.add(0.36, agrees=True)  # sqrt(0.36) = 0.6: a little more than even
+    seen.add(0.5, agrees=False)
+    fresh.add(0.5, agrees=False)
+    assert seen.add(0.5, agrees=True) == fresh.add(0.5, agrees=True)
+
+
+@pytest.mark.parametrize("before", [0.16, 0.25])
+def test_after_a_jump_a_frame_that_did_not_speak_for_the_bone_still_weighs(before):
+    """sqrt(0.16) = 0.4 speaks against it, sqrt(0.25) = 0.5 neither for nor against."""
+    evidence = Evidence(EvidenceConfig(memory=4.0))
+    evidence.add(before, agrees=True)
+    part = np.sqrt(0.9)
+    mean = (0.75 * logit(np.sqrt(before)) + logit(part)) / 1.75
+    assert evidence.add(0.9, agrees=False) == pytest.approx(expit(mean) * part)
+
+
+def test_a_stream_without_frames_counts_as_one():
+    assert Evidence().frames == 1.0
+
+
 def test_a_probability_that_is_no_number_is_not_counted():
     evidence = Evidence()
     assert np.isnan(evidence.add(np.nan, agrees=True))

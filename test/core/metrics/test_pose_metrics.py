@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
 from gapr_core.geometry.se3 import PoseError
 from gapr_core.metrics import pose
 
@@ -82,10 +82,21 @@ def test_extreme_points_of_a_box_are_at_the_ends_of_its_long_axis(rng):
     assert ends["axis2+"][1] > 25 and ends["axis2-"][1] < -25
 
 
+def test_the_plus_end_of_an_axis_is_the_one_towards_its_largest_positive_coordinate(rng):
+    """Also where the longest axis is not x: the sign is that of each axis's own largest coordinate."""
+    spread = rng.uniform(-1, 1, size=(500, 3)) * [30, 5, 200] + [0.0, 0.0, 900.0]
+    turn = Rotation.from_euler("zyx", [200.0, 25.0, 170.0], degrees=True).as_matrix()
+    for points in (spread, spread @ turn.T):
+        ends = pose.extreme_points(points)
+        for k in (1, 2, 3):
+            apart = ends[f"axis{k}+"] - ends[f"axis{k}-"]
+            assert apart[np.abs(extent.principal(points).axes[k - 1]).argmax()] > 0.0
+
+
 def test_the_paper_limit_scales_with_the_bone():
     small, large = ([[-half, 0.0, 0.0], [half, 0.0, 0.0]] for half in (100.0, 200.0))
     assert pose.within_paper_limit(1.9, small) and not pose.within_paper_limit(2.0, small)
-    assert pose.within_paper_limit(3.9, large)
+    assert pose.within_paper_limit(3.9, large) and not pose.within_paper_limit(4.1, large)
 
 
 def test_recall_counts_failures_and_is_nan_of_nothing():
@@ -113,7 +124,8 @@ def test_r2_of_rotation_punishes_wrap_around_as_the_method_page_says(rng):
 
 def test_r2_needs_two_pairs(rng):
     one = random_pose(rng)[None]
-    assert np.isnan(pose.r2_translation(one, one))
+    assert np.isnan(pose.r2_translation(one, one)) and np.isnan(pose.r2([[1.0]], [[2.0]]))
+    assert pose.r2([[1.0], [4.0]], [[1.0], [3.0]]) == pytest.approx(0.5)  # 1 of 2 is left
 
 
 def test_the_stand_in_for_a_refusal_lays_centroid_on_centroid(rng):

@@ -30,6 +30,13 @@ def test_the_probability_is_that_of_the_log_odds(model):
     usual = dict.fromkeys(FEATURES, 0.0)
     assert calibration.probability(usual) == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))
     assert calibration.probability(usual | {"margin": -1.0}) == pytest.approx(0.5)
+    assert calibration.probability(usual | {"margin": -2.0}) == pytest.approx(1.0 / (1.0 + math.exp(1.0)))
+
+
+@pytest.mark.parametrize("log_odds", [50.0, -50.0])
+def test_no_probability_is_surer_than_records_can_show(model, log_odds):
+    found = Calibration("search", Additive(log_odds, model.curves), {}).probability(dict.fromkeys(FEATURES, 0.0))
+    assert found == pytest.approx(1.0 / (1.0 + math.exp(-math.copysign(9.0, log_odds))), rel=1e-9)
 
 
 def test_contributions_say_what_speaks_for_and_against(model):
@@ -70,9 +77,9 @@ def test_a_missing_model_and_one_of_other_features_are_errors(model, tmp_path):
     fewer = Additive(0.0, model.curves[1:])
     with pytest.raises(WeightsError, match="fit it again"):
         Calibration.load(written(tmp_path / "fewer.json", fewer))
-    swapped = Additive(0.0, (*model.curves[1:], model.curves[0]))
-    with pytest.raises(WeightsError, match="fit it again"):
-        Calibration.load(written(tmp_path / "swapped.json", swapped))
+    for swapped in ((*model.curves[1:], model.curves[0]), model.curves[::-1]):
+        with pytest.raises(WeightsError, match="fit it again"):
+            Calibration.load(written(tmp_path / "swapped.json", Additive(0.0, swapped)))
 
 
 @pytest.mark.parametrize("damage", [

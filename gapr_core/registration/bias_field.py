@@ -8,6 +8,7 @@ Rasmussen and Williams 2006, section 2.7).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +24,12 @@ POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved mo
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
 
 
+@lru_cache(maxsize=4)  # covariance, size and bias of one fit ask in turn
 def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
-    """(N, m) whose products are the correlation of the bias between points, from m of the inliers (Nystrom)."""
+    """(N, m) whose products are the correlation of the bias between points, from m of the inliers (Nystrom).
+
+    Read-only: the same fit gets the same array.
+    """
     inliers = fit.moved[fit.weights > 0.0]
     if not len(inliers):
         return np.zeros((len(fit.moved), 1))
@@ -32,7 +37,9 @@ def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
     among = smooth_correlation(chosen, chosen, correlation_mm)
     to_points = smooth_correlation(chosen, fit.moved, correlation_mm)
     root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))
-    return np.asarray(solve_triangular(root, to_points, lower=True).T)
+    spanned = np.asarray(solve_triangular(root, to_points, lower=True).T)
+    spanned.flags.writeable = False
+    return spanned
 
 
 def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:

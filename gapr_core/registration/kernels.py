@@ -130,19 +130,47 @@ def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, sp
 
 @numba.njit(**FAST)
 def step(T, middle, H, g, count):
-    """Solve, limit the turn, move T in place."""
+    """Solve, limit the turn, move T in place; H is overwritten, g becomes the twist about the moved `middle`."""
     for a in range(3):
         H[a, a] += 1e-4 * count
         H[a + 3, a + 3] += 1e-4 * H[a + 3, a + 3] + 1.0
-    twist = np.linalg.solve(H, g)
-    angle = np.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2)
+    solve(H, g)
+    angle = np.sqrt(g[3] ** 2 + g[4] ** 2 + g[5] ** 2)
     if angle > LARGEST_TURN_RAD:
-        twist *= LARGEST_TURN_RAD / angle
+        for a in range(6):
+            g[a] *= LARGEST_TURN_RAD / angle
         angle = LARGEST_TURN_RAD
-    centre = np.array(moved(T, middle))
-    R = rotation(twist[3:], angle)
-    T[:3, :3] = R @ np.ascontiguousarray(T[:3, :3])
-    T[:3, 3] = R @ (T[:3, 3] - centre) + centre + twist[:3]
+    R = rotation(g[3:], angle)
+    centre = moved(T, middle)
+    for a in range(3):
+        T[a, 3] -= centre[a]
+    for j in range(4):
+        x, y, z = T[0, j], T[1, j], T[2, j]
+        for a in range(3):
+            T[a, j] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
+    for a in range(3):
+        T[a, 3] += centre[a] + g[a]
+
+
+@numba.njit(**FAST)
+def solve(A, b):
+    """Solve A x = b in place, A symmetric and positive definite: Cholesky on its lower triangle, x stands in b.
+
+    By hand, since Numba compiles a call of LAPACK for 13 s.
+    """
+    for i in range(len(b)):
+        for j in range(i + 1):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(A[i, i]) if i == j else A[i, j] / A[j, j]
+    for i in range(len(b)):
+        for k in range(i):
+            b[i] -= A[i, k] * b[k]
+        b[i] /= A[i, i]
+    for i in range(len(b) - 1, -1, -1):
+        for k in range(i + 1, len(b)):
+            b[i] -= A[k, i] * b[k]
+        b[i] /= A[i, i]
 
 
 @numba.njit(**FAST)
@@ -152,8 +180,11 @@ def rotation(vector, angle):
     if angle < 1e-12:
         return R
     x, y, z = vector[0] / angle, vector[1] / angle, vector[2] / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return R + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    s, c = np.sin(angle), 1.0 - np.cos(angle)
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
+    R[1, 0], R[1, 1], R[1, 2] = c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x
+    R[2, 0], R[2, 1], R[2, 2] = c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)
+    return R
 
 
 @numba.njit(**FAST)

@@ -169,15 +169,24 @@ def test_a_step_solves_the_damped_equations_about_the_middle_of_the_source(axis)
     damped = np.diag(H) + np.r_[[1e-4 * count] * 3, 1e-4 * np.diag(H)[3:] + 1.0]
     start = T.copy()
     moved = start.copy()
-    kernels.step(moved, middle, H.copy(), g, count)
+    kernels.step(moved, middle, H.copy(), g.copy(), count)
     centre = se3.apply(start, middle[None])[0]
     assert np.allclose(moved, se3.exp(g / damped, centre) @ start, atol=1e-12)
+
+
+def test_equations_are_solved_as_by_lapack():
+    for n in (1, 3, 6):
+        B = RNG.normal(size=(n, n))
+        A, b = B @ B.T + 0.1 * np.eye(n), RNG.normal(size=n)
+        x = b.copy()
+        kernels.solve(np.tril(A) + np.triu(np.full((n, n), np.nan), 1), x)  # only the lower triangle is read
+        assert x == pytest.approx(np.linalg.solve(A, b), rel=1e-9)
 
 
 def test_a_step_never_turns_farther_than_the_limit():
     H, g = np.eye(6) * 1e3, np.array([0.0, 0.0, 0.0, 600.0, -700.0, 800.0])
     moved = np.eye(4)
-    kernels.step(moved, np.zeros(3), H, g, 10)
+    kernels.step(moved, np.zeros(3), H, g.copy(), 10)
     assert se3.rotation_angle_deg(moved) == pytest.approx(np.degrees(kernels.LARGEST_TURN_RAD))
     axis = Rotation.from_matrix(moved[:3, :3]).as_rotvec()
     assert axis / np.linalg.norm(axis) == pytest.approx(g[3:] / np.linalg.norm(g[3:]))

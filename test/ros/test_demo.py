@@ -174,7 +174,7 @@ def test_the_second_act_finds_right_poses_in_a_wound(tmp_path):
     output, _ = process.communicate(timeout=280)
     assert process.returncode == 0, output
     assert "right %" in output and "WRONG" not in output
-    assert 20_000 < (tmp_path / "report.png").stat().st_size < 300_000
+    assert 20_000 < (tmp_path / "report.png").stat().st_size < 1_000_000
     assert "What the camera sees" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 

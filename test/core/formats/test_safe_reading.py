@@ -238,7 +238,7 @@ def large(kind):
     ).encode()  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["stl", "obj", "pcd", "ply"])
+@pytest.mark.parametrize("kind", ["stl", "pcd", *(pytest.param(k, marks=pytest.mark.slow) for k in ("obj", "ply"))])
 def test_a_load_takes_at_most_20_times_the_unpacked_data_and_200_mb(tmp_path, kind):
     (tmp_path / f"a.{kind}").write_bytes(large(kind))
     command = [sys.executable, "-c", MEMORY, str(tmp_path / f"a.{kind}")]

@@ -32,6 +32,7 @@ def test_a_cloud_is_the_same_after_being_taken_apart_and_put_together(cloud, net
         assert torch.equal(network.backbone(again).coarse, network.backbone(cloud).coarse)
 
 
+@pytest.mark.slow
 def test_the_backbone_exports_and_its_program_answers_alike_after_a_reload(cloud, network, tmp_path):
     flat = Flat(network.backbone, cloud)
     with torch.no_grad():

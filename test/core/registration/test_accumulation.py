@@ -22,15 +22,19 @@ def prepared(registrar, frames):
     return registrar.prepare(frames[0].target)
 
 
+@pytest.fixture(scope="module")
+def alone(registrar, frames, prepared):
+    return [registrar.register(pair.source, prepared) for pair in frames]
+
+
 def is_right(result, pair):
     shift_mm, turn_deg = se3.pose_error(result.T_target_source, pair.T_target_source, pair.source)
     return shift_mm < 4.0 and turn_deg < 5.0
 
 
 @pytest.mark.parametrize("tracked", [False, True])
-def test_pieces_that_say_little_alone_determine_the_pose_together(registrar, frames, prepared, tracked):
+def test_pieces_that_say_little_alone_determine_the_pose_together(registrar, frames, prepared, alone, tracked):
     accumulator = Accumulator(Tracker(registrar) if tracked else registrar, most=20)
-    alone = [registrar.register(pair.source, prepared) for pair in frames]
     together = [accumulator.register(pair.source, prepared) for pair in frames]
     assert sum(result.ok for result in alone) <= len(frames) // 2
     assert all(result.ok and is_right(result, pair) for result, pair in zip(together[2:], frames[2:], strict=True))

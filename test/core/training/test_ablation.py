@@ -54,6 +54,7 @@ def rows(out):
     return json.loads((out / "table.json").read_text())["rows"]
 
 
+@pytest.mark.slow
 def test_a_stopped_driver_goes_on_and_comes_to_the_same_table(plan, whole, anatomy, tmp_path, monkeypatch):
     """Every training is stopped after each of its two steps."""
     real, begun = ablation.train, []

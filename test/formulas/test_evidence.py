@@ -86,6 +86,9 @@ def test_a_jump_makes_the_frames_count_for_one():
     for _ in range(20):
         before = evidence.add(0.8, agrees=True)
     assert evidence.add(0.8, agrees=False) == pytest.approx(0.8) and before > 0.85
+    assert evidence.frames == 1.0
+    evidence.add(0.8, agrees=True)
+    assert evidence.frames == pytest.approx(2 / 1.5)
 
 
 def test_old_frames_are_forgotten():

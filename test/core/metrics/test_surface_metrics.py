@@ -27,6 +27,11 @@ def test_chamfer_is_symmetric_and_counts_clouds_far_apart_as_the_cut_off():
     assert chamfer_mm(a, b + 1000.0) == 20.0
 
 
+def test_a_pair_exactly_at_the_limit_does_not_count():
+    assert chamfer_mm([[0.0, 0.0, 0.0], [14.0, 0.0, 0.0]], [[4.0, 0.0, 0.0]], cutoff_mm=10.0) == 8.0
+    assert fine_inlier_ratio([[0.0, 0.0, 0.0]], [[3.0, 4.0, 0.0]], np.eye(4), 5.0) == 0.0
+
+
 def test_fine_inlier_ratio_counts_correspondences_under_the_truth():
     T = se3.exp([10, 0, 0, 0, 0, 1.0])
     source = np.random.default_rng(2).normal(size=(10, 3)) * 50

@@ -73,7 +73,7 @@ TESTS = {
     METRICS + "confidence.py": ["test/core/metrics/test_confidence_metrics.py"],
     METRICS + "surfaces.py": ["test/core/metrics/test_surface_metrics.py"],
     METRICS + "cramer_rao.py": ["test/core/test_twists.py"],
-    METRICS + "bootstrap.py": ["test/core/metrics/test_confidence_metrics.py"],
+    METRICS + "bootstrap.py": ["test/core/test_twists.py"],
 }
 
 
@@ -140,14 +140,17 @@ def _digest(file: str) -> str:
 
 
 def _lines_of_settings(source: str) -> set[int]:
-    """Lines of NAMES_IN_CAPITALS, of decorators, and of the defaults of parameters."""
+    """Lines of NAMES_IN_CAPITALS, of decorators, and of the defaults of parameters and of fields."""
     found: set[int] = set()
     for node in ast.walk(ast.parse(source)):
         parts: list[ast.expr] = []
         if isinstance(node, ast.Assign) and all(_is_setting(target) for target in node.targets):
             parts = [node.value]
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            parts = [*node.decorator_list, *(node.args.defaults if isinstance(node, ast.FunctionDef) else [])]
+        elif isinstance(node, ast.FunctionDef):
+            parts = [*node.decorator_list, *node.args.defaults]
+        elif isinstance(node, ast.ClassDef):
+            fields = (field.value for field in node.body if isinstance(field, ast.AnnAssign))
+            parts = [*node.decorator_list, *(value for value in fields if value is not None)]
         for part in parts:
             found |= set(range(part.lineno, (part.end_lineno or part.lineno) + 1))
     return found

@@ -111,6 +111,47 @@ def test_outliers_carry_no_information():
     )
 
 
+def test_the_bound_is_the_inverse_of_the_information_of_the_points_near_the_surface():
+    """J^T J / sigma^2, rows n and (p - c) x n; c is the mean of all points, outliers among them."""
+    rng = np.random.default_rng(11)
+    clean, normals = ellipsoid(rng, 60)
+    clean = clean + [100.0, -40.0, 20.0]
+    moved = clean + np.where(np.arange(60) < 10, 9.0, 0.0)[:, None] * normals
+    centre = moved.mean(axis=0)
+    J = np.hstack([normals, np.cross(moved - centre, normals)])[10:]
+    bound = cramer_rao.pose_bound(moved, clean, np.eye(4), 0.7, normals)
+    np.testing.assert_allclose(bound.covariance, np.linalg.inv(J.T @ J / 0.49), rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(bound.centre, centre)
+    moves = motion_jacobians(moved, centre)
+    variances = [np.trace(M @ bound.covariance @ M.T) for M in moves]
+    assert bound.rmse_mm == pytest.approx(np.sqrt(np.mean(variances)))
+
+
+def test_points_count_up_to_four_sigma_and_half_a_millimetre_along_the_normal():
+    clean, normals = ellipsoid(np.random.default_rng(12), 40)
+    for off_mm, counts in ((8.4, True), (8.6, False), (-8.4, True), (-8.6, False)):
+        bound = cramer_rao.pose_bound(clean + off_mm * normals, clean, np.eye(4), 2.0, normals)
+        assert (bound is not None) is counts
+    aside = np.cross(normals, np.roll(normals, 1, axis=1))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    few = slice(0, 8)  # so few that each is nearest to its own point
+    found = cramer_rao.pose_bound((clean + 3.0 * aside)[few], clean[few], np.eye(4), 0.1, normals[few])
+    assert found is not None
+
+
+def test_six_points_may_have_a_bound():
+    clean, normals = ellipsoid(np.random.default_rng(13), 6)
+    assert cramer_rao.pose_bound(clean, clean, np.eye(4), 0.5, normals) is not None
+
+
+def test_a_normal_is_the_least_axis_of_its_neighbours():
+    rng = np.random.default_rng(14)
+    turn = random_pose(rng)
+    points = se3.apply(turn, np.c_[rng.uniform(-10.0, 10.0, (200, 2)), np.zeros(200)])
+    found = cramer_rao.local_normals(points, points[:5])
+    assert np.abs(found @ turn[:3, 2]) == pytest.approx(np.ones(5))
+
+
 def test_a_sphere_or_no_noise_has_no_bound():
     rng = np.random.default_rng(8)
     sphere, normals = ellipsoid(rng, 500, (50.0, 50.0, 50.0))
@@ -118,7 +159,8 @@ def test_a_sphere_or_no_noise_has_no_bound():
     ball = 50.0 * normals
     assert cramer_rao.pose_bound(ball, ball, np.eye(4), 1.0, normals) is None
     bone, bone_normals = ellipsoid(rng, 500)
-    assert cramer_rao.pose_bound(bone, bone, np.eye(4), 0.0, bone_normals) is None
+    with np.errstate(all="raise"):
+        assert cramer_rao.pose_bound(bone, bone, np.eye(4), 0.0, bone_normals) is None
     assert cramer_rao.pose_bound(bone[:5], bone, np.eye(4), 1.0, bone_normals) is None
 
 

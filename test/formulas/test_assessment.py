@@ -111,6 +111,14 @@ def test_residuals_of_a_scene_are_those_of_the_whole_cloud_and_inliers_those_of_
     assert found.inlier.tolist() == [False, True, True, False, False, False]
 
 
+def test_residuals_of_a_scene_are_plain_distances_also_on_a_curved_bone():
+    """What noise adds on a curved surface is not taken off: the fit's own residuals hold that."""
+    egg, above = tiny.ellipsoid(), np.array([0.3, -0.2, 0.0, 0.4])
+    cloud = se3.apply(se3.inverse(T), egg.points[::101] + above[:, None] * egg.normals[::101])
+    found = made(egg, seen=SimpleNamespace(points=cloud), members=np.ones(4, dtype=bool)).residuals
+    assert found.distance_mm == pytest.approx(above, abs=1e-6)
+
+
 def test_an_answer_is_sure_from_its_limit_on_unless_a_rule_speaks_against_it(plane):
     assert made(plane, 0.9).is_sure(0.9) and made(plane, 0.95).is_sure(0.9) and not made(plane, 0.8999).is_sure(0.9)
     assert not made(plane, 0.9, REFUSED).is_sure(0.0)

@@ -45,5 +45,6 @@ def test_fine_inlier_ratio_counts_correspondences_under_the_truth():
 def test_coarse_inlier_ratio_asks_the_patches_that_were_matched():
     overlap = np.array([[0.0, 0.3], [0.6, 0.0]])
     assert coarse_inlier_ratio([[0, 1], [1, 0], [0, 0], [1, 1]], overlap) == 0.5
+    assert coarse_inlier_ratio([[0, 1], [1, 0], [0, 0]], overlap) == pytest.approx(2 / 3)
     assert coarse_inlier_ratio([[0, 1], [1, 0]], overlap, least=0.5) == 0.5
     assert coarse_inlier_ratio([], overlap) == 0.0

@@ -67,7 +67,7 @@ TESTS = {
     REGISTRATION + "covariance.py": ["test/core/registration/test_covariance.py"],
     REGISTRATION + "evidence.py": [f"{FORMULAS}/test_evidence.py"],
     GEOMETRY + "twists.py": ["test/core/test_twists.py"],
-    GEOMETRY + "se3.py": ["test/core/test_se3.py"],
+    GEOMETRY + "se3.py": ["test/core/test_se3.py", "test/core/metrics/test_pose_metrics.py"],
     GEOMETRY + "extent.py": ["test/core/test_extent.py"],
     METRICS + "pose.py": ["test/core/metrics/test_pose_metrics.py"],
     METRICS + "confidence.py": ["test/core/metrics/test_confidence_metrics.py"],

@@ -21,6 +21,17 @@ def test_kabsch_finds_the_motion_even_when_points_are_mirrored_flat():
     assert np.allclose(se3.apply(found, flat), se3.apply(T, flat))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_kabsch_agrees_with_scipy(seed):
+    """Random clouds: the singular vectors come with determinants of both signs."""
+    draw = np.random.default_rng(seed)
+    source, target = draw.normal(size=(2, 7, 3))
+    expected, _ = Rotation.align_vectors(target - target.mean(axis=0), source - source.mean(axis=0))
+    found = se3.kabsch(source, target)
+    np.testing.assert_allclose(found[:3, :3], expected.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(se3.apply(found, source).mean(axis=0), target.mean(axis=0), atol=1e-9)
+
+
 def test_kabsch_ignores_points_of_no_weight():
     moved = se3.apply(T, POINTS)
     moved[0] += 1000.0
@@ -32,6 +43,7 @@ def test_kabsch_of_a_batch_is_that_of_each_pair_of_clouds_with_its_own_weights()
     weights = rng.uniform(0.1, 1.0, (4, 9))
     one_by_one = [se3.kabsch(*each) for each in zip(source, target, weights, strict=True)]
     np.testing.assert_allclose(se3.kabsch(source, target, weights), one_by_one, atol=1e-12)
+    np.testing.assert_allclose(se3.kabsch(source, target), se3.kabsch(source, target, np.full((4, 9), 0.3)), atol=1e-12)
 
 
 def test_kabsch_beats_every_motion_nearby():
@@ -65,5 +77,7 @@ def test_the_translation_error_is_taken_at_the_source_not_at_the_origin():
 
 
 def test_the_nearest_rigid_motion_has_a_proper_rotation():
-    R = se3.nearest_rigid(T + rng.normal(size=(4, 4)) * 1e-3)[:3, :3]
+    bent = T + rng.normal(size=(4, 4)) * 1e-3
+    R = se3.nearest_rigid(bent)[:3, :3]
+    assert np.array_equal(se3.nearest_rigid(bent)[:, 3], [*bent[:3, 3], 1.0])
     assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)

@@ -174,6 +174,14 @@ def test_bootstrap_of_a_mean_has_the_width_of_the_normal_approximation():
     assert interval(values, statistic=np.median) != (low, high)
 
 
+def test_the_interval_of_two_values_follows_from_the_four_resamples():
+    """Means of 0, 1/2, 1/2 and 1, equally often: a quarter lies at either end."""
+    values = [0.0, 1.0]
+    for statistic in (None, np.mean):
+        assert interval(values, statistic=statistic, resamples=300) == (0.0, 1.0)
+        assert interval(values, statistic=statistic, resamples=300, level=0.4) == (0.5, 0.5)
+
+
 def test_pairs_of_one_person_do_not_count_as_independent():
     rng = np.random.default_rng(10)
     values = np.repeat(rng.normal(size=20), 30)

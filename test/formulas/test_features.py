@@ -9,6 +9,7 @@ import pytest
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import features
+from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.verification import Candidates
@@ -133,11 +134,30 @@ def test_of_few_points_nothing_is_said_of_the_size(points, inliers, is_known):
     assert (features.scale_of(fit, SURE_OF_NO_BIAS, ScaleConfig()) != (0.0, 1.0)) is is_known
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_size_and_deviation_have_ends(points, sign):
+@pytest.mark.parametrize("times", [3.0, -3.0])
+def test_a_size_ends_at_one_and_a_sure_one_keeps_a_small_deviation(points, times):
+    """Residuals y of a source that is `times` too small: y = -times g for foot points that grow by g = r - y."""
+    fit = fit_of(points, weights=np.ones(COUNT), sigma_mm=1e-6)
+    outward = (fit.gradients * (fit.moved - fit.moved.mean(axis=0))).sum(axis=1)
+    fit = replace(fit, signed_mm=-times / (1.0 - times) * outward)
+    scale, sd = features.scale_of(fit, SURE_OF_NO_BIAS, ScaleConfig(widest=1.0, standoff_mm=1e-3))
+    assert (scale, sd) == (np.sign(times), 1e-5)
+
+
+def test_a_size_of_which_nothing_is_seen_has_the_deviation_of_its_prior(points):
+    """Normals across the way out: the points do not move along them when the source grows."""
     fit = fit_of(points, weights=np.ones(COUNT))
-    growth = (fit.gradients * (fit.moved - fit.moved.mean(axis=0))).sum(axis=1)
-    wide = ScaleConfig(widest=1.0, standoff_mm=1e-3)
-    huge = replace(fit, signed_mm=-sign * 40.0 * np.abs(growth), sigma_mm=1e-6)
-    scale, sd = features.scale_of(huge, SURE_OF_NO_BIAS, wide)
-    assert abs(scale) <= 1.0 and sd == 1e-5
+    away = fit.moved - fit.moved.mean(axis=0)
+    aside = np.cross(away, [0.3, 0.5, -0.8])
+    fit = replace(fit, gradients=aside / np.linalg.norm(aside, axis=1, keepdims=True))
+    assert features.scale_of(fit, SURE_OF_NO_BIAS, ScaleConfig(widest=0.4)) == pytest.approx((0.0, 0.4), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", features.FEATURES_OF)
+def test_every_curve_that_ships_falls_or_rises_as_its_sign_says(kind):
+    curves = {curve.feature: curve.adds for curve in Calibration.shipped(kind).model.curves}
+    signed = {name: curves[name] for name in features.SIGNS if name in curves}
+    assert signed
+    for name, adds in signed.items():
+        assert features.SIGNS[name] in (-1, 1)
+        assert (features.SIGNS[name] * np.diff(adds) >= -1e-9).all(), name

@@ -22,8 +22,10 @@ REPORTS = ["matplotlib", "pillow", "plotly>=5.20", "rich"]
 BASELINES = [*DATA, "kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
 MEDICAL = ["SimpleITK>=2.3", "highdicom>=0.24", "scikit-image>=0.22"]
 BAGS = ["rosbags>=0.10"]
+CLUSTER = ["distributed>=2024.1"]
 ROS_WHEELS = ["ros-jazzy-rclpy", "ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-common-interfaces"]
 TEST = [
+    *CLUSTER,
     *MEDICAL,
     "colcon-common-extensions",
     "hypothesis",
@@ -75,6 +77,7 @@ setup(
         "reports": [*REPORTS, *DATA],
         "training": [*NETWORK, *DATA, *REPORTS],
         "bags": BAGS,
+        "cluster": CLUSTER,
         "medical": MEDICAL,
         "ros": [*ROS_WHEELS, *BAGS, *NETWORK, *DATA, *REPORTS],
         "baselines": BASELINES,

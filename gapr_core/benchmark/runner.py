@@ -21,6 +21,7 @@ from gapr_core.data.pair_files import load_pair, pair_hash
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult
+from gapr_core.runtime import cluster
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,20 @@ def run(tasks: Sequence[Task], jobs: int = 1, threads: int = 1) -> Iterator[Reco
             yield from _run_pool([task], 1, threads, deadly)
             if deadly:
                 yield _failure(task, load_pair(task.path), "the process died")
+
+
+def run_on_cluster(tasks: Sequence[Task], address: str) -> Iterator[Record]:
+    """The same on the workers of a Dask cluster, which read the pairs from the same folder.
+
+    A task whose worker dies goes to another one; one of which several have died is recorded as a failure.
+    """
+    for task, outcome in cluster.outcomes(address, run_task, tasks):
+        if not isinstance(outcome, Exception):
+            yield outcome
+        elif type(outcome).__name__ == "KilledWorker":
+            yield _failure(task, load_pair(task.path), "the process died")
+        else:
+            raise outcome
 
 
 def _run_pool(waiting: list[Task], jobs: int, threads: int, lost: list[Task]) -> Iterator[Record]:

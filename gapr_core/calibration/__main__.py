@@ -26,7 +26,7 @@ from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
 from gapr_core.registration.precision_model import PRECISION_FEATURES
-from gapr_core.runtime import origin
+from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.console import say
 from gapr_core.runtime.files import write_json, write_text
 
@@ -43,9 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
     args = parser.parse_args(arguments)
     tasks = [Task(str(args.anatomy), args.split, args.seed, number) for number in range(args.count)]
-    records = collect(tasks, args.out / "records.jsonl", args.jobs)
+    records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
     given = sys.argv[1:] if arguments is None else arguments
     commits = sorted({str(record.get("commit")) for record in records})
     made = {"commit": origin.commit(), "commits_of_pairs": commits,

@@ -40,11 +40,12 @@ from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Memory
 from gapr_core.results import Hypothesis
-from gapr_core.runtime import origin
+from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.files import write_text
 
 Array = NDArray[np.float64]
 Record = dict[str, Any]
+Shared = tuple[str, str, pairs.Bones]  # folder, split and the bones of both
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FOLLOWED = 0.5  # share of the pairs that become a stream
 LOOKED_AT = 3  # of the clean clouds with a viewpoint every third is registered as a scene as well: that takes seconds
@@ -53,13 +54,14 @@ FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 ACCEPTED = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
 
-def collect(tasks: Sequence[Task], path: Path, jobs: int) -> list[Record]:
+def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = None) -> list[Record]:
     """Register every pair that the records file does not hold yet, or holds with other features.
 
     Args:
         tasks: of one folder and split.
         path: of the records, one JSON object a line.
         jobs: processes.
+        dask: address of a Dask cluster that registers them instead; its workers see the folder of the bones.
 
     Returns:
         The records of these tasks.
@@ -69,14 +71,32 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int) -> list[Record]:
     done = {record["name"]: record for record in _read(path) if _is_current(record)}
     left = [task for task in tasks if _name(task) not in done]
     where = (tasks[0].folder, tasks[0].split)
-    bones = pairs.bones_of(*where) if left else {}
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(jobs, spawn, pairs.keep, (*where, bones)) as pool, path.open("a") as file:
-        for record in tqdm(pool.map(record_of, left, chunksize=pairs.IN_A_ROW), total=len(left), unit="pair"):
+    shared = *where, pairs.bones_of(*where) if left else {}
+    found = _on_cluster(left, dask, shared) if dask else _in_processes(left, jobs, shared)
+    with path.open("a") as file:
+        for record in tqdm(found, total=len(left), unit="pair"):
             file.write(json.dumps(record) + "\n")
             file.flush()
             done[record["name"]] = record
     return [record for name, record in done.items() if name in wanted]
+
+
+def _in_processes(tasks: Sequence[Task], jobs: int, shared: Shared) -> Iterator[Record]:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), pairs.keep, shared) as pool:
+        yield from pool.map(record_of, tasks, chunksize=pairs.IN_A_ROW)
+
+
+def _on_cluster(tasks: Sequence[Task], address: str, shared: Shared) -> Iterator[Record]:
+    rows = [tasks[i : i + pairs.IN_A_ROW] for i in range(0, len(tasks), pairs.IN_A_ROW)]  # they share a target
+    for _, outcome in cluster.outcomes(address, _records_of, rows, shared):
+        if isinstance(outcome, Exception):
+            raise outcome
+        yield from outcome
+
+
+def _records_of(tasks: Sequence[Task], shared: Shared) -> list[Record]:
+    pairs.keep(*shared)
+    return [record_of(task) for task in tasks]
 
 
 def record_of(task: Task) -> Record:

@@ -1,6 +1,7 @@
 """`gapr benchmark`: pairs x methods to one table, plots and a report; resumable, parallel, sharded.
 
 gapr benchmark --pairs DIR --methods gapr,kiss4,icp --out OUT [--shard 1/4] [--jobs 2] [--set NAME=VALUE]
+gapr benchmark --pairs DIR --out OUT --dask tcp://host:8786
 gapr benchmark merge OUT_1 OUT_2 ... --out OUT
 """
 
@@ -28,7 +29,7 @@ from gapr_core.data.make_pairs import MANIFEST, read_manifest
 from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
 from gapr_core.pages import benchmark_report, writers
-from gapr_core.runtime import origin
+from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import say
 
@@ -46,6 +47,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="worker processes (1)")
     parser.add_argument("--threads", type=at_least_one, default=1, help="cores for each worker (1)")
+    parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
     options.add_settings(parser)
     parser.add_argument("--ours", help="the method that the others are compared with (gapr, or the first one)")
 
@@ -62,7 +64,7 @@ def run(args: Namespace) -> int:
             raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
         methods = [name.strip() for name in args.methods.split(",") if name.strip()]
         config, shard = options.registrar_config(args), _shard(args.shard)
-        rows = benchmark(args.pairs, methods, args.out, shard, args.jobs, args.threads, args.ours, config)
+        rows = benchmark(args.pairs, methods, args.out, shard, args.jobs, args.threads, args.ours, config, args.dask)
     say(f"{len(rows)} rows in {args.out / 'table.md'}; to look at: {args.out / 'report.html'}")
     return 0
 
@@ -76,6 +78,7 @@ def benchmark(
     threads: int = 1,
     ours: str | None = None,
     config: RegistrarConfig | None = None,
+    dask: str | None = None,
 ) -> list[Row]:
     """Run what is not yet in `out`, then write table, plots and report there.
 
@@ -88,6 +91,7 @@ def benchmark(
         threads: cores for each of them.
         ours: the method the others are compared with.
         config: settings of our own methods; the others have none.
+        dask: address of a Dask cluster that runs it instead of processes here; `threads` is then its workers' affair.
 
     Returns:
         The rows of the table.
@@ -110,10 +114,12 @@ def benchmark(
     done = records.done(known, plan.pairs, {name: known_methods.settings_of(name, config) for name in methods})
     records.write_plan(out, plan)
     records.discard_cut_line(out / records.FILE)
-    tasks = [runner.Task(path, method, config) for path in paths[shard[0] - 1 :: shard[1]] for method in methods]
+    chosen = [path.resolve() for path in paths[shard[0] - 1 :: shard[1]]]
+    tasks = [runner.Task(path, method, config) for path in chosen for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
-        for record in runner.run(open_tasks, jobs, threads):
+        done_now = runner.run_on_cluster(open_tasks, dask) if dask else runner.run(open_tasks, jobs, threads)
+        for record in done_now:
             check_content(record, plan)
             records.append(out / records.FILE, replace(record, commit=plan.commit))
             bar.set_postfix_str(f"{record.method} {record.pair}", refresh=False)

@@ -17,7 +17,7 @@ from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
 from gapr_core.data.protocols import PROTOCOLS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
-from gapr_core.runtime import files
+from gapr_core.runtime import cluster, files
 from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import say
 
@@ -61,6 +61,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="whose bones: test to judge what was trained here, all where nobody has trained on these subjects",
     )  # fmt: skip
     parser.add_argument("--people", type=at_least_one, default=20, help="parametric subjects for each bone (20)")
+    parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
 
 
 def run(args: Namespace) -> int:
@@ -72,7 +73,7 @@ def run(args: Namespace) -> int:
     )
     begin(recipe, args.out)
     bones = {bone: _bones(args, bone) for bone in tqdm(recipe.bones, desc="bones", disable=None)}
-    manifest = write_pairs(recipe, bones, args.out)
+    manifest = write_pairs(recipe, bones, args.out, args.dask)
     for bone, found in bones.items():
         cohorts = ", ".join(sorted({s.cohort for s in found}))
         say(f"{bone}: {len(found)} subjects of split {recipe.split} ({cohorts})")
@@ -80,13 +81,16 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def write_pairs(recipe: Recipe, bones: dict[str, list[Specimen]], out: str | Path) -> dict[str, Any]:
+def write_pairs(
+    recipe: Recipe, bones: dict[str, list[Specimen]], out: str | Path, dask: str | None = None
+) -> dict[str, Any]:
     """Write every pair of the recipe that is not there yet, and the manifest.
 
     Args:
         recipe: which pairs.
         bones: specimens of each bone of the recipe.
         out: folder; made if missing.
+        dask: address of a Dask cluster that draws them instead of this process.
 
     Returns:
         The manifest: the recipe, every pair with its sha256, and one `hash` over all.
@@ -98,7 +102,10 @@ def write_pairs(recipe: Recipe, bones: dict[str, list[Specimen]], out: str | Pat
     begin(recipe, out)
     plan = list(_plan(recipe, bones))
     others = [specimen for found in bones.values() for specimen in found]
-    pairs = [_pair_entry(job, others, out) for job in tqdm(plan, desc="pairs", unit="pair", disable=None)]
+    shared = others, out.resolve()
+    entries = _on_cluster(dask, plan, shared) if dask else (_pair_entry(job, shared) for job in plan)
+    found = {e["name"]: e for e in tqdm(entries, desc="pairs", unit="pair", total=len(plan), disable=None)}
+    pairs = [found[job.name] for job in plan]
     digest = sha256("".join(f"{p['name']} {p['sha256']}\n" for p in pairs).encode()).hexdigest()
     return _write_manifest(out, recipe, pairs, digest)
 
@@ -154,7 +161,16 @@ def _plan(recipe: Recipe, bones: dict[str, list[Specimen]]) -> Iterator[_Job]:
                 yield _Job(name, protocol, specimen, 1_000_000 * recipe.seed + index, index)
 
 
-def _pair_entry(job: _Job, others: list[Specimen], out: Path) -> dict[str, Any]:
+def _on_cluster(address: str, plan: list[_Job], shared: tuple[list[Specimen], Path]) -> Iterator[dict[str, Any]]:
+    """Entries in the order in which they are drawn."""
+    for _, outcome in cluster.outcomes(address, _pair_entry, plan, shared):
+        if isinstance(outcome, Exception):
+            raise outcome
+        yield outcome
+
+
+def _pair_entry(job: _Job, shared: tuple[list[Specimen], Path]) -> dict[str, Any]:
+    others, out = shared
     path = out / f"{job.name}.npz"
     if not path.is_file():
         save_pair(path, make_pair(job.protocol, job.specimen, job.seed, others, job.turn))

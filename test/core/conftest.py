@@ -37,3 +37,26 @@ def anatomy_folder() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the real bones do not ship and {folder} is absent: set GAPR_ANATOMY")
     return folder
+
+
+@pytest.fixture
+def dask_cluster():
+    """Makes a Dask cluster; with `processes=False` its only worker is a thread of this process."""
+    distributed = pytest.importorskip("distributed", reason="--dask is optional: pip install '.[cluster]'")
+    made = []
+
+    def make(**options):
+        made.append(
+            distributed.LocalCluster(**{"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None} | options)
+        )
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def dask_address(dask_cluster):
+    """Of a cluster whose only worker is a thread of this process."""
+    return dask_cluster(processes=False).scheduler_address

@@ -11,6 +11,7 @@ from gapr_core.runtime.settings import from_dict
 
 FAKES = '''
 import os
+import time
 import numpy as np
 from gapr_core.errors import MethodUnavailableError
 from gapr_core.geometry import se3
@@ -57,6 +58,11 @@ class Deadly(Fake):
             os._exit(3)
         return super().answer(source, target, T)
 
+class Slow(Fake):
+    def answer(self, source, target, T):
+        time.sleep(0.3)
+        return super().answer(source, target, T)
+
 class Missing(Fake):
     def prepare(self, target, units="mm"):
         raise MethodUnavailableError("the library nope", "no module", "run: pip install nope")
@@ -66,6 +72,7 @@ turned = lambda: Turned("turned")
 shy = lambda: Shy("shy")
 raising = lambda: Raising("raising")
 deadly = lambda: Deadly("deadly")
+slow = lambda: Slow("slow")
 missing = lambda: Missing("missing")
 nothing = lambda: "a string"
 '''

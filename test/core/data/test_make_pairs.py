@@ -68,6 +68,11 @@ def test_the_same_seed_gives_the_same_hash_and_another_seed_another_one(tmp_path
     assert len(first["pairs"]) == 2 * 2 * 3 == len(list((tmp_path / "first").glob("*.npz")))
 
 
+def test_pairs_drawn_on_a_cluster_have_the_same_hash(tmp_path, dask_address):
+    one = write_pairs(RECIPE, BONES, tmp_path / "one")
+    assert write_pairs(RECIPE, BONES, tmp_path / "many", dask=dask_address) == one
+
+
 @pytest.mark.parametrize("protocol", ["paper", "L2"])
 def test_the_protocols_make_the_same_pairs_from_version_to_version(protocol):
     """Golden: what changes these points changes every frozen list. Then print the new ones and say so in CHANGELOG."""

@@ -63,10 +63,11 @@ MUTATIONS = (cut, flip, number, word, remove, repeat, rename)
 
 
 def mutated(data, seed):
-    """Name of the damage, and the damaged file; the same for the same seed."""
+    """Names of the damages, joined by `+`, and the damaged file; the same for the same seed."""
     rng = np.random.default_rng(seed)
-    kind = MUTATIONS[rng.integers(len(MUTATIONS))]
-    damaged = kind(data, rng)
+    kinds = [MUTATIONS[rng.integers(len(MUTATIONS))]]
+    damaged = kinds[0](data, rng)
     while len(damaged) > 4 and rng.random() < 0.2:
-        damaged = MUTATIONS[rng.integers(len(MUTATIONS))](damaged, rng)
-    return kind.__name__, damaged
+        kinds.append(MUTATIONS[rng.integers(len(MUTATIONS))])
+        damaged = kinds[-1](damaged, rng)
+    return "+".join(kind.__name__ for kind in kinds), damaged

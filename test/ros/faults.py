@@ -39,6 +39,7 @@ from msg_adapters import xyz_to_cloud
 
 ANSWER_S = 240.0  # for a cloud, or a start, on a busy machine
 END_S = 2.0  # of CPU time, from a signal to the end
+FULL_BYTES = 2**20
 NOT_NOW = ("frames_accepted", "frames_refused", "frames_dropped", "frames_lost", "frames_merged")
 
 PUBLISHER = textwrap.dedent("""
@@ -72,7 +73,7 @@ class Bench:
     def start(self, **parameters: object) -> None:
         """A new node, active."""
         self.end()
-        self.client.diagnostics.clear()
+        self.client.be_quiet()
         options = {"model_path": self.model, "model_unit": "mm", "timeout": ANSWER_S, "diagnostics_period": 0.2}
         self.node = NodeProcess(self.folder, keeps=True, **(options | parameters))
         self.client.wait_for_state("active", ANSWER_S)
@@ -275,13 +276,22 @@ def parameters_are_nonsense(bench: Bench) -> None:
 
 
 def the_disk_is_full(bench: Bench) -> None:
-    """No file of the process can grow any more: its own log, and what a library may cache."""
-    subprocess.run(["prlimit", f"--pid={bench.node.process.pid}", "--fsize=0:0"], check=True)
+    """The log files of the process cannot grow any more, nor any file to more than a megabyte.
+
+    Small files can: Fast DDS makes one in shared memory for every listener, and that is no disk.
+    """
+    pid = bench.node.process.pid
+    logs = [bench.node.log_path, *bench.folder.glob(f"*_{pid}_*.log")]
+    assert len(logs) == 2, "its output, and that of rclpy's logger"
+    for path in logs:
+        os.truncate(path, FULL_BYTES)
+    subprocess.run(["prlimit", f"--pid={pid}", f"--fsize={FULL_BYTES}:{FULL_BYTES}"], check=True)
     for _ in range(3):
         bench.client.ask(np.full((1000, 3), np.nan))  # a refusal is logged
     bench.is_well()
     assert bench.client.call("reload_model", timeout_s=ANSWER_S).success
     bench.is_well()
+    assert {path.stat().st_size for path in logs} == {FULL_BYTES}, "this row filled nothing"
     bench.start()
 
 

@@ -15,6 +15,10 @@ from msg_adapters import pose_to_matrix
 KINDS = ("accepted", "refused", "dropped", "merged", "lost")
 
 
+def stamp_of(pose):
+    return f"{pose.header.stamp.sec}.{pose.header.stamp.nanosec:09d}"
+
+
 def test_slices_of_a_probe_that_are_too_small_alone_give_the_pose_together(client, tmp_path):
     """As images of a tracked probe: 60 points each, in the frame of a reference on the bone."""
     bone = bones.bone()
@@ -33,7 +37,7 @@ def test_slices_of_a_probe_that_are_too_small_alone_give_the_pose_together(clien
             client.send(points)
             time.sleep(0.02)
         wait_until(lambda: sum(int(client.values()[f"frames_{kind}"]) for kind in KINDS) == 50, PATIENCE_S)
-        wait_until(lambda: client.poses)
+        wait_until(lambda: client.poses and stamp_of(client.poses[-1]) == client.values()["cloud_stamp"])
         estimate = wire.core_pose(pose_to_matrix(client.poses[-1]))
         translation_mm, rotation_deg = se3.pose_error(estimate, T, cloud * 1000.0)
         assert translation_mm < 1.0 and rotation_deg < 1.0

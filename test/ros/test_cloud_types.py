@@ -13,7 +13,7 @@ def test_points_of_a_digitiser_come_as_a_pose_array(client, method, blob_path):
     poses = [Pose(position=Point(x=x, y=y, z=z)) for x, y, z in points_m]
     with node_in_thread(method, blob_path, namespace="digitiser", cloud_type="PoseArray"):
         publisher = client.do(lambda: client.node.create_publisher(PoseArray, "/digitiser/points", 10))
-        wait_until(publisher.get_subscription_count, 20.0, "the subscription")
+        wait_until(publisher.get_subscription_count, what="the subscription")
         publisher.publish(PoseArray(header=Header(frame_id="tracker"), poses=poses))
-        wait_until(lambda: len(method.calls[-1]["source"]) == 300, 20.0, "the registration")
+        wait_until(lambda: len(method.calls[-1]["source"]) == 300, what="the registration")
     np.testing.assert_allclose(method.calls[-1]["source"], 1000.0 * points_m, atol=1e-9)

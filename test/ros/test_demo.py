@@ -81,7 +81,7 @@ def test_ctrl_c_ends_the_demo_and_its_node(tmp_path):
         time.sleep(0.2)
     assert ours
     process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=200)
     assert process.returncode == 130, output
     assert "Traceback" not in output
     assert not own_nodes(tmp_path)
@@ -113,7 +113,7 @@ def test_the_demo_replaces_a_bag_of_its_own_and_no_other(tmp_path):
 
 def test_an_unknown_bone_is_one_clear_line(tmp_path):
     process = start("--out", str(tmp_path), "--bone", "banana")
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=280)
     assert process.returncode == 1
     assert "banana" in output and "femur" in output and "Traceback" not in output
 

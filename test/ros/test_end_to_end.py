@@ -144,7 +144,7 @@ KINDS = ("received", "accepted", "refused", "dropped", "lost")
 def play(path):
     ros = context()
     node, bag = Node("player", context=ros), open_bag(path)
-    Replay(node, bag, ReplayOptions(progress=False, wait_s=5.0)).run()
+    Replay(node, bag, ReplayOptions(progress=False, wait_s=60.0)).run()
     bag.reader.close()
     node.destroy_node()
     ros.try_shutdown()

@@ -45,7 +45,7 @@ def test_two_nodes_that_publish_one_bone_frame_say_so_and_stop_when_one_has_gone
             for own, other in (("left", "right"), ("right", "left")):
                 wait_until(lambda own=own: text in message_of(client, own))
                 assert message_of(client, own).startswith(f"/{other}/register_node publishes")
-        wait_until(lambda: text not in message_of(client, "left"), 10.0)
+        wait_until(lambda: text not in message_of(client, "left"))
     said = [line for line in capfd.readouterr().err.splitlines() if text in line]
     assert len(said) == 2, "each says it once"
 
@@ -149,7 +149,7 @@ def test_a_best_effort_publisher_takes_nothing_from_a_reliable_one_and_is_forgot
         wait_until(weak.get_subscription_count)
         large = np.random.default_rng(0).normal(size=(200_000, 3)).astype(np.float32) * 0.02
         for _ in range(5):  # as best effort, most of such clouds are lost
-            assert client.ask(large, timeout_s=30.0)["level"] == 0
+            assert client.ask(large)["level"] == 0
         assert node.counters.received == 5, "what both subscriptions bring is one cloud"
         client.forget(weak)
         wait_until(lambda: client.values()["cloud_qos"] == "reliable")
@@ -164,7 +164,7 @@ def test_the_queue_is_as_long_as_the_collection(blob_path, client):
             if i == 0:
                 wait_until(lambda: node.counters.received == 1)
                 node.call_soon(lambda: time.sleep(1.0))
-        wait_until(lambda: node.counters.received == 31, 10.0, "every slice that came while the executor was busy")
+        wait_until(lambda: node.counters.received == 31, what="every slice that came while the executor was busy")
         assert node.counters.lost == 0
 
 

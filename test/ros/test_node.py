@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 
 import numpy as np
@@ -12,6 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from harness import Client, Collecting, accepted, node_in_thread, pose_mm, wait_until
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -71,8 +73,8 @@ def test_the_model_is_latched_in_metres_and_the_aligned_bone_is_sent_when_somebo
 
     aligned = []
     client.node.create_subscription(PointCloud2, "/register_node/aligned", aligned.append, 1)
+    wait_until(node.session._publishers._topics["aligned"].get_subscription_count)
     wait_until(lambda: client.node.count_publishers("/register_node/aligned"))
-    time.sleep(0.2)
     method.answer = accepted(T_TARGET_SOURCE)
     client.ask(GOOD)
     wait_until(lambda: aligned)
@@ -125,7 +127,7 @@ def test_diagnostics_come_as_often_as_asked_for_while_running(live):
         time.sleep(1.0)  # ten of the periods before
         return len(client.diagnostics) == count
 
-    wait_until(is_quiet, 10.0, "a second without diagnostics, after those that were on their way")
+    wait_until(is_quiet, what="a second without diagnostics, after those that were on their way")
     count = len(client.diagnostics)
     assert node.set_parameters([Parameter("diagnostics_period", value=0.05)])[0].successful
     wait_until(lambda: len(client.diagnostics) > count + 3)
@@ -136,9 +138,9 @@ def test_diagnostics_have_every_key_and_come_when_idle(live):
     client.ask(GOOD)
     assert REGISTRATION_KEYS <= set(client.values())
     count = len(client.diagnostics)
-    wait_until(lambda: len(client.diagnostics) >= count + 2, 4.0)
-    wait_until(lambda: client.values("input")["level"] == 1, 5.0)
-    assert client.values("input")["message"].startswith("no cloud for")
+    wait_until(lambda: len(client.diagnostics) >= count + 2)
+    wait_until(lambda: client.values("input")["message"].startswith("no cloud for"))
+    assert client.values("input")["level"] == 1
 
 
 def test_the_newest_cloud_wins_and_every_other_is_counted(live):
@@ -223,12 +225,14 @@ def test_another_frame_and_stamps_that_go_back_start_a_new_collection(blob_path,
 def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
     node, client, method = live
     client.ask(GOOD)
-    node.call_soon(lambda: time.sleep(0.6))
-    time.sleep(0.1)
+    busy, go_on = threading.Event(), threading.Event()
+    node.call_soon(lambda: (busy.set(), go_on.wait(60.0)))
+    assert busy.wait(60.0)
     for _ in range(5):
         client.send(GOOD)
-        time.sleep(0.02)
-    wait_until(lambda: node.counters.lost + node.counters.received == 6, 5.0, node.counters)
+    wait_until(lambda: client.points.wait_for_all_acked(Duration()))
+    go_on.set()
+    wait_until(lambda: node.counters.lost + node.counters.received == 6, what=node.counters)
     assert node.counters.lost >= 1
     settled = ("frames_accepted", "frames_refused", "frames_dropped", "frames_lost")
     wait_until(lambda: sum(int(client.values()[name]) for name in settled) == 6)
@@ -290,7 +294,7 @@ def test_a_reload_that_a_cleanup_overtakes_is_answered(live):
     for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
         assert change_state(client, transition)
     method.gate.set()
-    wait_until(reload_model.done, 10.0, "the answer of reload_model")
+    wait_until(reload_model.done, what="the answer of reload_model")
     assert not reload_model.result().success and "cleaned up" in reload_model.result().message
 
 
@@ -372,8 +376,13 @@ def test_best_effort_publishers_are_heard(blob_path, method, chosen):
     with node_in_thread(method, blob_path, cloud_reliability=chosen):
         client.wait_for_state("active")
         wait_until(lambda: "best_effort" in client.values()["cloud_qos"])
-        time.sleep(0.3)
-        assert client.ask(GOOD)["level"] == 0
+
+        def is_heard():  # what is sent before both ends know each other is lost
+            client.send(GOOD)
+            time.sleep(0.1)
+            return client.values()["frames_accepted"] != "0"
+
+        wait_until(is_heard)
         assert client.values("input")["level"] == 0
     client.close()
 
@@ -416,9 +425,10 @@ def test_before_the_clock_runs_clouds_have_no_age_and_are_not_stale(blob_path, c
 
 def test_a_cloud_without_a_stamp_gets_the_time_of_its_arrival(live):
     node, client, method = live
+    before = time.time()
     client.ask(xyz_to_cloud(GOOD, Header(frame_id="probe")))
     wait_until(lambda: client.poses)
-    assert abs(client.poses[0].header.stamp.sec - time.time()) < 5.0
+    assert before - 1.0 <= client.poses[0].header.stamp.sec <= time.time()
 
 
 @pytest.mark.parametrize("path", ["", "/absent/bone.stl", "text.ply", "empty.stl", "metres.npy", "bone.docx"])
@@ -468,9 +478,9 @@ def test_deactivating_tells_those_who_wait_and_sends_nothing_more(live):
     node, client, method = live
     client.ask(GOOD)
     method.gate.clear()
-    client.send(GOOD)
     calls = len(method.calls)
-    wait_until(lambda: len(method.calls) == calls + 1 or len(method.calls) > calls)
+    client.send(GOOD)
+    wait_until(lambda: len(method.calls) > calls)
     poses = len(client.poses)
     assert change_state(client, Transition.TRANSITION_DEACTIVATE)
     method.gate.set()
@@ -570,7 +580,7 @@ def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands
     with pytest.raises(RefusedError) as caught:
         looked_up.lookup("tracker", "unknown", None, 0.1)
     assert caught.value.reason is Reason.TF_MISSING
-    assert 0.1 <= time.monotonic() - start < 1.0
+    assert 0.1 <= time.monotonic() - start < 30.0
 
 
 def test_the_model_is_scaled_turned_and_converted_before_it_is_prepared(tmp_path, client, method):

@@ -158,13 +158,14 @@ def test_an_old_cloud_is_stale(live):
 def test_a_slow_registration_times_out(live):
     node, client, method = live
     node.set_parameters_atomically([Parameter("timeout", value=0.05)])
+    before = len(method.calls)
     method.gate.clear()
     client.send(GOOD)
-    wait_until(lambda: method.gate is not None and client.values()["frames_received"] != "0")
-    time.sleep(0.2)
+    wait_until(lambda: len(method.calls) > before)
+    time.sleep(0.1)
     method.gate.set()
-    wait_until(lambda: client.values()["last_refusal"].startswith("timeout: took 0."))
-    assert not client.poses
+    wait_until(lambda: client.values()["last_refusal"].startswith("timeout: took ") and client.confidences)
+    assert client.confidences == [0.0] and not client.poses
 
 
 @pytest.mark.parametrize(

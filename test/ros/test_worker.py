@@ -102,8 +102,9 @@ def test_the_rate_is_limited_and_the_newest_cloud_is_taken_when_the_time_has_com
         time.sleep(0.05)
     bench.worker.stop(5.0)
     starts = [moment - start for _, moment in bench.done]
-    assert 3 <= len(starts) <= 4
-    assert all(b - a > 0.19 for a, b in zip(starts, starts[1:], strict=False))
+    assert len(starts) >= 3
+    assert all(moment >= 0.2 * i for i, moment in enumerate(starts)), "they may come later, never sooner"
+    assert bench.names() == sorted(bench.names(), key=int)
 
 
 def test_tasks_go_before_clouds_and_an_exception_ends_nothing(caplog):

@@ -43,17 +43,21 @@ def main() -> int:
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     spacings = [0.0, *map(float, args.spacings.split(","))]
     rows: dict[tuple[str, float], list[list[float]]] = {}
-    for bone in BONES:
-        people = [s for s in specimens(bone, args.split, PEOPLE, args.anatomy) if is_closed(s.surface.triangles)]
-        for number in tqdm(range(args.count), bone, disable=None):
-            specimen = people[number % len(people)]
-            for spacing_mm in spacings:
-                target = registrar.prepare(model(specimen.surface, spacing_mm, number))
-                for protocol in args.protocols.split(","):
-                    row = measure(registrar, target, specimen, protocol, 700 + number)
-                    rows.setdefault((protocol, spacing_mm), []).append(row)
+    people = {bone: closed(bone, args.split, args.anatomy) for bone in BONES}
+    for number, bone in tqdm([(n, bone) for n in range(args.count) for bone in BONES], "bones", disable=None):
+        specimen = people[bone][number % len(people[bone])]
+        for spacing_mm in spacings:
+            target = registrar.prepare(model(specimen.surface, spacing_mm, number))
+            for protocol in args.protocols.split(","):
+                row = measure(registrar, target, specimen, protocol, 700 + number)
+                rows.setdefault((protocol, spacing_mm), []).append(row)
     say(table(rows))
     return 0
+
+
+def closed(bone: str, split: str, anatomy: Path | None) -> list[Specimen]:
+    """The people whose mesh has an inside."""
+    return [s for s in specimens(bone, split, PEOPLE, anatomy) if is_closed(s.surface.triangles)]
 
 
 def model(surface: Surface, spacing_mm: float, seed: int) -> Surface:

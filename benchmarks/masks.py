@@ -44,14 +44,16 @@ def main() -> int:
     spacings = [0.0, *map(float, args.spacings.split(","))]
     rows: dict[tuple[str, float], list[list[float]]] = {}
     people = {bone: closed(bone, args.split, args.anatomy) for bone in BONES}
-    for number, bone in tqdm([(n, bone) for n in range(args.count) for bone in BONES], "bones", disable=None):
-        specimen = people[bone][number % len(people[bone])]
-        for spacing_mm in spacings:
-            target = registrar.prepare(model(specimen.surface, spacing_mm, number))
-            for protocol in args.protocols.split(","):
-                row = measure(registrar, target, specimen, protocol, 700 + number)
-                rows.setdefault((protocol, spacing_mm), []).append(row)
-    say(table(rows))
+    try:
+        for number, bone in tqdm([(n, bone) for n in range(args.count) for bone in BONES], "bones", disable=None):
+            specimen = people[bone][number % len(people[bone])]
+            for spacing_mm in spacings:
+                target = registrar.prepare(model(specimen.surface, spacing_mm, number))
+                for protocol in args.protocols.split(","):
+                    row = measure(registrar, target, specimen, protocol, 700 + number)
+                    rows.setdefault((protocol, spacing_mm), []).append(row)
+    finally:  # a run that is stopped shows what it has
+        say(table(rows))
     return 0
 
 

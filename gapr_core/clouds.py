@@ -36,12 +36,16 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     """
     if isinstance(source, str | Path):
         name, surface = str(source), reading.read(Path(source), options)
-        units = "mm" if reading.format_of(Path(source)).in_patient else units
+        says_its_own = reading.format_of(Path(source)).in_patient
     else:
         name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
+        says_its_own = False
     surface = _drop_non_finite(surface, name)
     if surface.faces is not None and len(surface.faces):
         _check_faces(surface, name)
+    if says_its_own:
+        check_extent(surface.extent_mm, "mm", name, "in its header")
+        return surface
     scale = _mm_per_unit(surface, units, name)
     return Surface(surface.points * scale, surface.faces, surface.normals)
 
@@ -52,15 +56,23 @@ def finite_points(array: ArrayLike) -> Array:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def check_extent(extent_mm: float, unit: str, name: str) -> None:
-    """Raise `InvalidPointCloudError` when something of this size cannot be a bone or a piece of one."""
+def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> None:
+    """Raise `InvalidPointCloudError` when something of this size cannot be a bone or a piece of one.
+
+    Args:
+        extent_mm: its diagonal.
+        unit: that it was read as, "mm" or "m".
+        name: what it is called in the message.
+        where: the unit stands, if not in a call: "in its header".
+    """
     low, high = EXTENT_LIMITS_MM
     if low <= extent_mm <= high:
         return
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
-    hint = (
-        f"it looks like {other}: pass units={other!r}, or convert to {unit}" if other else "check the file and its unit"
-    )
+    hint = "check the file and its unit"
+    if other:
+        how = f"correct the unit {where}" if where else f"pass units={other!r}, or convert to {unit}"
+        hint = f"it looks like {other}: {how}"
     raise InvalidPointCloudError(
         f"a bone or a piece of one, {low:g} to {high:g} mm across",
         f"{name} of {extent_mm:.3g} mm read as {unit}",

@@ -67,6 +67,7 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
     image = reader.Execute()
     if image.GetDimension() != 3:
         raise InvalidPointCloudError("a volume", f"{image.GetDimension()} dimensions", "export one time step")
+    _check_axes(path, {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()})
     voxels = SimpleITK.GetArrayFromImage(image)
     layers = list(np.moveaxis(voxels, 3, 0)) if voxels.ndim == 4 else [voxels]
     metadata = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}
@@ -75,6 +76,18 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
         named = [Segment(name, value) for value, name in nifti.label_names(path).items()]
     direction = np.reshape(image.GetDirection(), (3, 3))
     return [_integers(layer) for layer in layers], _affine(direction * image.GetSpacing(), image.GetOrigin()), named
+
+
+def _check_axes(path: Path, metadata: dict[str, str]) -> None:
+    """Raise for a header that does not say how the voxels lie in the patient: the guess may be a mirror image."""
+    if path.name.lower().endswith(".nrrd"):  # ITK turns RAS and LAS to LPS as it reads, and takes all else as it is
+        space = metadata.get("NRRD_space", "none")
+        known, given = space == "left-posterior-superior", f"space: {space}"
+    else:
+        codes = [metadata.get(key, "1") for key in ("qform_code", "sform_code")]
+        known, given = codes != ["0", "0"], "qform_code and sform_code of 0"
+    if not known:
+        raise InvalidPointCloudError("patient axes in the header", given, "export it with its affine, LPS or RAS")
 
 
 def _read_dicom(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:

@@ -71,7 +71,9 @@ def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tup
     for label in wanted:
         segment = _by_number(int(label), named, present) if label.isdigit() else _by_name(label, named, present)
         if segment.value not in present.get(segment.layer, ()):
-            raise InvalidPointCloudError(f"voxels of {label}", "none", "choose another label, or segment it again")
+            raise InvalidPointCloudError(
+                f"voxels of {label}", f"none, but {_present(named, present)}", "choose one of these"
+            )
         chosen.append(segment)
         if label.isdigit():
             notes.append(f"label {label} is {_meaning(segment)}")
@@ -79,12 +81,23 @@ def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tup
 
 
 def _only(named: list[Segment], present: Present) -> Segment:
-    segments = [_by_number(value, named, {layer: {value}}) for layer in present for value in sorted(present[layer])]
+    segments = _segments(named, present)
     if len(segments) == 1:
         return segments[0]
-    given = f"{len(segments)} of them ({_listed([s.name or str(s.value) for s in segments])})" if segments else "none"
+    if not segments:
+        raise InvalidPointCloudError("a label map with a segment", "zeros only", "check the segmentation")
+    given = f"{len(segments)} of them ({_present(named, present)})"
     how = "name one with --label, labels= in Python, or model_label of the node"
     raise InvalidPointCloudError("one label", given, how)
+
+
+def _segments(named: list[Segment], present: Present) -> list[Segment]:
+    return [_by_number(value, named, {layer: {value}}) for layer in present for value in sorted(present[layer])]
+
+
+def _present(named: list[Segment], present: Present) -> str:
+    """What the file has voxels of, by name where it has one."""
+    return _listed([s.name or str(s.value) for s in _segments(named, present)]) or "zeros only"
 
 
 def _by_number(value: int, named: list[Segment], present: Present) -> Segment:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import IO
 from xml.etree import ElementTree
 
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
 
 EXTENSION_BYTES = 1 << 20
@@ -30,11 +31,11 @@ def check_length(path: Path, limits: FileLimits) -> None:
     """Every voxel that the header announces is in the file; ITK fills up what is missing in silence.
 
     Raises:
-        InvalidPointCloudError: more than the limit.
+        InvalidPointCloudError: more than the limit, or NIfTI-2.
         ValueError: a file that is cut.
     """
     with _opened(path) as file:
-        head = file.read(540)
+        head = file.read(348)
         if len(head) < 348:
             raise ValueError(f"{len(head)} bytes, less than a header")
         expected = _announced(head)
@@ -47,16 +48,15 @@ def check_length(path: Path, limits: FileLimits) -> None:
 
 
 def _announced(head: bytes) -> int:
-    """Bytes up to the end of the voxels, by a header of NIfTI-1 (348 bytes) or NIfTI-2 (540)."""
-    order = next((o for o in "<>" if struct.unpack(o + "i", head[:4])[0] in (348, 540)), None)
+    """Bytes up to the end of the voxels, by a header of NIfTI-1."""
+    sizes = {order: struct.unpack(order + "i", head[:4])[0] for order in "<>"}
+    if 540 in sizes.values():
+        raise InvalidPointCloudError("NIfTI-1", "NIfTI-2, which ITK does not read", "save it as NIfTI-1, NRRD or MHA")
+    order = next((o for o, size in sizes.items() if size == 348), None)
     if order is None:
         raise ValueError("no NIfTI header")
-    if struct.unpack(order + "i", head[:4])[0] == 540 and len(head) == 540:
-        bits, start, dims = struct.unpack_from(order + "h", head, 14), struct.unpack_from(order + "q", head, 168), "8q"
-        size = struct.unpack_from(order + dims, head, 16)
-    else:
-        bits, start = struct.unpack_from(order + "h", head, 72), struct.unpack_from(order + "f", head, 108)
-        size = struct.unpack_from(order + "8h", head, 40)
+    bits, start = struct.unpack_from(order + "h", head, 72), struct.unpack_from(order + "f", head, 108)
+    size = struct.unpack_from(order + "8h", head, 40)
     if not 1 <= size[0] <= 7 or min(size[1 : 1 + size[0]]) < 1:
         raise ValueError(f"a grid of {size[0]} dimensions with a size below one")
     return int(start[0]) + math.prod(size[1 : 1 + size[0]]) * bits[0] // 8

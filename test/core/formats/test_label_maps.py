@@ -156,7 +156,7 @@ def test_versions_of_totalsegmentator_are_named_where_the_file_has_no_names(tmp_
         clouds.load(path, options=options("femur_right"))
     mean_z(path, "76")
     assert "rib_right_7 in TotalSegmentator v1, femur_right in TotalSegmentator v2 total" in caplog.text
-    with pytest.raises(InvalidPointCloudError, match="voxels of 88; got two.nii.gz: none|got two.nii.gz: none"):
+    with pytest.raises(InvalidPointCloudError, match="voxels of 88; got two.nii.gz: none, but 75, 76"):
         clouds.load(path, options=options("88"))
 
 
@@ -258,7 +258,7 @@ def test_images_and_empty_and_cut_label_maps_are_refused_in_one_line(tmp_path, c
     sitk.WriteImage(image, str(tmp_path / "ct.nii.gz"))
     with pytest.raises(InvalidPointCloudError, match="a label map: numbers from 0"):
         clouds.load(tmp_path / "ct.nii.gz")
-    with pytest.raises(InvalidPointCloudError, match="one label; got empty.nrrd: none"):
+    with pytest.raises(InvalidPointCloudError, match="a segment; got empty.nrrd: zeros only"):
         clouds.load(write(tmp_path / "empty.nrrd", np.zeros((9, 9, 9)), affine))
     for ending in ("nii", "nii.gz", "nrrd", "mha"):
         whole = write(tmp_path / f"whole.{ending}", voxels_of(affine, size), affine).read_bytes()
@@ -268,6 +268,56 @@ def test_images_and_empty_and_cut_label_maps_are_refused_in_one_line(tmp_path, c
             with pytest.raises(InvalidPointCloudError, match=f"cut.{ending}") as caught:
                 clouds.load(cut)
             assert "\n" not in str(caught.value)
+
+
+def nifti_of(path, kind="Nifti1Image", millimetres=True, says_where=True):
+    """A ball as nibabel writes it."""
+    import nibabel
+
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    ras = np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
+    ras[:3] *= 1.0 if millimetres else 0.001
+    image = getattr(nibabel, kind)(voxels_of(affine, size).transpose(2, 1, 0).astype(np.uint8), ras)
+    for code in (image.set_sform, image.set_qform):
+        code(ras, int(says_where))
+    nibabel.save(image, path)
+    return path
+
+
+def test_a_header_that_does_not_say_the_patients_axes_is_refused(tmp_path):
+    with pytest.raises(InvalidPointCloudError, match="patient axes .* qform_code and sform_code of 0"):
+        clouds.load(nifti_of(tmp_path / "a.nii.gz", says_where=False))
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    voxels = voxels_of(affine, size).astype(np.uint8)
+    head = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: {} {} {}\nencoding: raw\n{}\n"
+    for space in ("", "space: scanner-xyz\nspace directions: (3,0,0) (0,3,0) (0,0,3)\nspace origin: (0,0,0)\n"):
+        (tmp_path / "a.nrrd").write_bytes(head.format(*size, space).encode() + voxels.tobytes())
+        with pytest.raises(
+            InvalidPointCloudError, match="patient axes in the header; got a.nrrd: space: (none|scanner)"
+        ):
+            clouds.load(tmp_path / "a.nrrd")
+
+
+@pytest.mark.parametrize("space", ["left-posterior-superior", "right-anterior-superior", "LAS"])
+def test_a_nrrd_comes_out_in_lps_whatever_its_space(tmp_path, space):
+    affine, size = affine_of((3.0, 3.0, 3.0), turn=(0.2, 0.4, 0.1))
+    to_space = {"l": np.eye(3), "r": np.diag([-1.0, -1.0, 1.0]), "L": np.diag([1.0, -1.0, 1.0])}[space[0]]
+    rows = [f"({','.join(map(repr, row.tolist()))})" for row in np.vstack([(to_space @ affine[:3]).T])]
+    head = f"NRRD0004\ntype: uint8\ndimension: 3\nspace: {space}\nsizes: {' '.join(map(str, size))}\nencoding: raw\n"
+    head += f"space directions: {' '.join(rows[:3])}\nspace origin: {rows[3]}\n\n"
+    (tmp_path / "a.nrrd").write_bytes(head.encode() + voxels_of(affine, size).astype(np.uint8).tobytes())
+    assert np.abs(error_mm(clouds.load(tmp_path / "a.nrrd").points)).max() < 2.0
+
+
+def test_a_wrong_unit_in_the_header_is_said_as_such(tmp_path):
+    with pytest.raises(InvalidPointCloudError, match="it looks like m: correct the unit in its header") as caught:
+        clouds.load(nifti_of(tmp_path / "a.nii.gz", millimetres=False), units="m")
+    assert "units=" not in str(caught.value)
+
+
+def test_nifti_2_is_refused_by_its_name(tmp_path):
+    with pytest.raises(InvalidPointCloudError, match="expected NIfTI-1; got a.nii: NIfTI-2"):
+        clouds.load(nifti_of(tmp_path / "a.nii", "Nifti2Image"))
 
 
 def test_a_label_map_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ DATA = ["open3d>=0.18"]  # rays and distances of simulated bones
 REPORTS = ["matplotlib", "pillow", "plotly>=5.20", "rich"]
 BASELINES = [*DATA, "kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
 MEDICAL = ["SimpleITK>=2.3", "highdicom>=0.24", "scikit-image>=0.22"]
+RERUN = ["rerun-sdk>=0.23"]
 BAGS = ["rosbags>=0.10"]
 CLUSTER = ["distributed>=2024.1"]
 ROS_WHEELS = ["ros-jazzy-rclpy", "ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-common-interfaces"]
@@ -79,6 +80,7 @@ setup(
         "bags": BAGS,
         "cluster": CLUSTER,
         "medical": MEDICAL,
+        "rerun": RERUN,
         "ros": [*ROS_WHEELS, *BAGS, *NETWORK, *DATA, *REPORTS],
         "baselines": BASELINES,
         "test": TEST,

@@ -49,6 +49,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--residuals", type=Path, help="signed distance of every point, as .json or coloured .ply")
     parser.add_argument("--slicer", type=Path, metavar="FOLDER", help="a scene for 3D Slicer")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="one page with all of it, on refusals too")
+    parser.add_argument("--rerun", type=Path, metavar="FILE.rrd", help="a recording for rerun, on refusals too")
     parser.add_argument("--guide", action="store_true", help="say where on the bone another look would help most")
     parser.add_argument("--json", type=Path, help="write the result here as well; keys: docs/reference/json.md")
     options.add_method(parser)
@@ -93,6 +94,10 @@ def run(args: Namespace) -> int:
         from gapr_core.pages import registration_report
 
         registration_report.write(args.report, registration_report.Registration(target, source, result, errors, spots))
+    if args.rerun:
+        from gapr_core.formats import recording
+
+        recording.write(args.rerun, target, source, result, errors)
     code = _show(args, result, errors, target)
     if config.guide:
         _say_where_next(result, spots)
@@ -111,6 +116,10 @@ def _check_outputs(args: Namespace) -> None:
         raise ConfigError("a bag as the source of --topic", args.source.name, "give a bag, or leave --topic out")
     if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
         raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
+    if args.rerun:
+        from gapr_core.formats import recording
+
+        recording.check(args.rerun)
     if args.report:
         if args.report.suffix.lower() not in (".html", ".htm"):
             raise ConfigError("a report as .html", args.report.name, "let its name end with .html")

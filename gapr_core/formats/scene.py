@@ -18,6 +18,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 
 FULL_COLOUR_MM = 3.0
+BLUE_TO_RED = "vtkMRMLColorTableNodeFileDivergingBlueRed.txt"  # of 3D Slicer; without one VTK's goes from red to blue
 GREY = np.array([150, 150, 150])
 
 
@@ -34,7 +35,7 @@ def write_coloured(path: Path, points: Array, residuals: Residuals) -> None:
 
     kinds = [(axis, "f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
     rows = np.empty(len(points), dtype=[*kinds, ("distance_mm", "f4")])
-    colours = _colours(residuals.distance_mm)
+    colours = colours_of(residuals.distance_mm)
     for i, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         rows[axis], rows[colour] = points[:, i], colours[:, i]
     rows["distance_mm"] = residuals.distance_mm
@@ -42,7 +43,8 @@ def write_coloured(path: Path, points: Array, residuals: Residuals) -> None:
         PlyData([PlyElement.describe(rows, "vertex")], comments=["SPACE=LPS"]).write(str(scratch))
 
 
-def _colours(distance_mm: Array) -> NDArray[np.int64]:
+def colours_of(distance_mm: Array) -> NDArray[np.int64]:
+    """(N, 3) red, green, blue of signed distances (N,) mm: blue inside, white on the bone, red outside; NaN is grey."""
     share = np.clip(np.nan_to_num(distance_mm) / FULL_COLOUR_MM, -1.0, 1.0)
     red, blue = 1.0 - np.maximum(-share, 0.0), 1.0 - np.maximum(share, 0.0)
     colours = (255 * np.stack([red, np.minimum(red, blue), blue], axis=1)).round().astype(np.int64)
@@ -90,7 +92,10 @@ def _mrml(with_targets: bool) -> str:
     scene = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
     _node(scene, "LinearTransform", "Transform", "pose", "pose.tfm", {})
     _model(scene, "target", "0.9 0.85 0.75", {"opacity": "0.6"}, {})
-    shown = {"scalarVisibility": "true", "activeScalarName": "distance_mm", "pointSize": "4"}
+    shown = {
+        "scalarVisibility": "true", "activeScalarName": "distance_mm", "pointSize": "4", "colorNodeID": BLUE_TO_RED,
+        "scalarRangeFlag": "UseManual", "scalarRange": f"{-FULL_COLOUR_MM:g} {FULL_COLOUR_MM:g}",
+    }  # fmt: skip
     _model(scene, "source", "0.9 0.2 0.2", shown, {"transformNodeRef": "vtkMRMLLinearTransformNodepose"})
     if with_targets:
         _node(scene, "MarkupsFiducial", "MarkupsFiducial", "targets", "targets.mrk.json", {})

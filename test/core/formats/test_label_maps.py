@@ -201,8 +201,8 @@ def test_a_dicom_segmentation_is_read_by_the_name_of_its_segment(tmp_path):
     assert np.sqrt((error_mm(surface.points, CENTRE + [0, 0, 20], [12, 12, 12]) ** 2).mean()) < 0.3
 
 
-def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia")):
-    """Balls of radius 12, written by highdicom against a CT of slices."""
+def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia"), layers=None):
+    """Balls of radius 12, or `layers` (affine, [k, j, i] of each name), written by highdicom against a CT of slices."""
     highdicom = pytest.importorskip(
         "highdicom", reason="it writes the DICOM segmentation to read: pip install highdicom"
     )
@@ -210,6 +210,11 @@ def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia")):
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
     affine, size = affine_of(spacing)
+    if layers is None:
+        balls = [voxels_of(affine, size, CENTRE + [0, 0, z], [12, 12, 12]) for z in (20, -20)][: len(names)]
+        layers = affine, balls
+    affine, voxels = layers
+    size, spacing = voxels[0].shape[::-1], np.linalg.norm(affine[:3, :3], axis=0).tolist()
     study, series, frame = generate_uid(), generate_uid(), generate_uid()
     slices = []
     for k in range(size[2]):
@@ -218,7 +223,7 @@ def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia")):
         s.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
         s.SOPClassUID, s.SOPInstanceUID = CTImageStorage, generate_uid()
         s.StudyInstanceUID, s.SeriesInstanceUID, s.FrameOfReferenceUID = study, series, frame
-        s.PatientName, s.PatientID, s.PatientBirthDate, s.PatientSex = "Doe^Jane", "4711", "19500101", "F"
+        s.PatientName, s.PatientID, s.PatientBirthDate, s.PatientSex = "Doe^Jane", "PAT-0815-4711", "19500101", "F"
         s.StudyID, s.StudyDate, s.StudyTime = "1", "20200101", "000000"
         s.AccessionNumber, s.ReferringPhysicianName = "", ""
         s.Modality, s.SeriesNumber, s.InstanceNumber = "CT", 1, k + 1
@@ -230,15 +235,13 @@ def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia")):
         s.BitsAllocated, s.BitsStored, s.HighBit, s.PixelRepresentation, s.SamplesPerPixel = 16, 16, 15, 0, 1
         s.PhotometricInterpretation = "MONOCHROME2"
         slices.append(s)
-    balls = np.stack([voxels_of(affine, size, CENTRE + [0, 0, z], [12, 12, 12]) for z in (20, -20)], axis=-1)
-    balls = balls[..., : len(names)]
     from pydicom.sr.codedict import codes
 
     kind = (codes.SCT.Bone, codes.SCT.Bone, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL)
     segments = [highdicom.seg.SegmentDescription(n, name, *kind) for n, name in enumerate(names, start=1)]
     seg = highdicom.seg.Segmentation(
-        slices, balls.astype(np.uint8), highdicom.seg.SegmentationTypeValues.BINARY, segments, generate_uid(), 2,
-        generate_uid(), 1, "GAPR", "test", "1", "1",
+        slices, np.stack(voxels, axis=-1).astype(np.uint8), highdicom.seg.SegmentationTypeValues.BINARY, segments,
+        generate_uid(), 2, generate_uid(), 1, "GAPR", "test", "1", "1",
     )  # fmt: skip
     seg.save_as(tmp_path / "seg.dcm")
     return tmp_path / "seg.dcm"
@@ -344,7 +347,7 @@ def test_names_of_patients_stay_in_their_file(tmp_path, caplog):
     with pytest.raises(InvalidPointCloudError) as caught:
         clouds.load(path, options=options("skull"))
     clouds.load(path, options=options("femur"))
-    assert "Doe" not in str(caught.value) + caplog.text and "4711" not in str(caught.value) + caplog.text
+    assert "Doe" not in str(caught.value) + caplog.text and "0815" not in str(caught.value) + caplog.text
 
 
 def test_a_header_with_a_document_type_has_no_names(tmp_path):

@@ -1,0 +1,112 @@
+"""A registration as a recording (.rrd) for the viewer of rerun: the bone, the points on it, rivals, planned targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.formats.planning import TargetError
+from gapr_core.formats.scene import GREY, colours_of
+from gapr_core.results import RegistrationResult
+from gapr_core.runtime import files
+from gapr_core.surface import Surface
+
+Array = NDArray[np.float64]
+
+ENDING = ".rrd"
+APPLICATION = "gapr"
+TIMELINE = "hypothesis"  # 1 is the best one
+MOST_HYPOTHESES = 5
+BONE_COLOUR, TARGET_COLOUR = (234, 223, 200), (209, 73, 91)
+POINT_MM, TARGET_MM = 0.7, 2.5  # radii
+
+
+def check(path: Path) -> None:
+    """Raise before the work what keeps a recording from being written.
+
+    Raises:
+        ConfigError: another ending than .rrd.
+        MethodUnavailableError: rerun is not installed.
+    """
+    if path.suffix.lower() != ENDING:
+        raise ConfigError(f"a recording as {ENDING}", path.name, f"let its name end with {ENDING}")
+    _rerun()
+
+
+def write(
+    path: Path, target: Surface, source: Array, result: RegistrationResult, errors: Sequence[TargetError] = ()
+) -> None:
+    """One .rrd file, for an accepted pose and for a refusal. Its timeline goes through the hypotheses.
+
+    Args:
+        path: ends with .rrd; open it with `rerun PATH`.
+        target: the bone, mm, LPS where its file says so.
+        source: (N, 3) the source as read, its own frame, mm.
+        result: of registering them.
+        errors: of the planned targets; none without a plan or a pose.
+
+    Raises:
+        ConfigError: another ending, or a path that cannot be written.
+        MethodUnavailableError: rerun is not installed.
+    """
+    check(path)
+    rr = _rerun()
+    stream = rr.RecordingStream(APPLICATION)
+    stream.log("/", rr.ViewCoordinates.LBU, static=True)  # left, back, up: LPS
+    stream.log("target", _bone(rr, target), static=True)
+    stream.log("answer", rr.TextDocument(_words(result)), static=True)
+    if errors:
+        stream.log("planned", _planned(rr, errors), static=True)
+    for number, (T, probability) in enumerate(_poses(result), 1):
+        stream.set_time(TIMELINE, sequence=number)
+        stream.log("source", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        stream.log("source", _points(rr, source, result, number))
+        stream.log("probability", rr.Scalars(probability))
+    with files.replacing(path) as scratch:
+        stream.save(scratch)
+        stream.disconnect()
+
+
+def _rerun() -> Any:
+    try:
+        import rerun
+    except ImportError as error:
+        raise MethodUnavailableError(f"{ENDING} files", "no rerun", "pip install 'gapr_ros[rerun]'") from error
+    return rerun
+
+
+def _bone(rr: Any, target: Surface) -> Any:
+    if target.faces is None:
+        return rr.Points3D(target.points, colors=BONE_COLOUR, radii=POINT_MM)
+    return rr.Mesh3D(vertex_positions=target.points, triangle_indices=target.faces, albedo_factor=BONE_COLOUR)
+
+
+def _words(result: RegistrationResult) -> str:
+    """The answer; of a refusal, that there is no pose to use."""
+    said = str(result) if result.ok else f"{result}\nRefused: what is shown is the best hypothesis, to look at only."
+    return f"{said}\n{TIMELINE} 1 is the best; blue points are inside the bone, red ones outside."
+
+
+def _poses(result: RegistrationResult) -> list[tuple[Array, float]]:
+    """The best pose and its rivals, each with its probability."""
+    ranked = [(h.T_target_source, h.probability) for h in result.hypotheses[:MOST_HYPOTHESES]]
+    return ranked or ([] if result.best is None else [(result.best, result.confidence)])
+
+
+def _points(rr: Any, source: Array, result: RegistrationResult, number: int) -> Any:
+    """The source, coloured by its distance under the best pose; grey under its rivals."""
+    if result.residuals is None:
+        return rr.Points3D(source, colors=GREY, radii=POINT_MM)
+    colours = colours_of(result.residuals.distance_mm) if number == 1 else GREY
+    return rr.Points3D(result.residuals.points, colors=colours, radii=POINT_MM)
+
+
+def _planned(rr: Any, errors: Sequence[TargetError]) -> Any:
+    labels = [f"{error.label}: {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)" for error in errors]
+    places = [error.position_mm for error in errors]
+    return rr.Points3D(places, labels=labels, colors=TARGET_COLOUR, radii=TARGET_MM)

@@ -6,6 +6,7 @@
     python scripts/mutants.py --every 5                   # a sample: every fifth mutant
 
 A run that was stopped goes on where it was: what is in `--out` of the same code and the same tests is not run again.
+A mutant that was killed stays killed as long as its file, the test that failed and what stands around the tests do.
 
 cosmic-ray finds and makes the mutations. Each runs in a forked process that has loaded the tests already
 (`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs count, too.
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import importlib.abc
 import importlib.util
 import json
@@ -81,7 +83,7 @@ TESTS = {
 class Mutant:
     """One mutation and what became of it: killed, survived, setting or equivalent.
 
-    `digest` is of code and tests, `killer` the test that failed.
+    `digest` is of code and tests, `killer` the test that failed, `grounds` what is to stay for that.
     """
 
     file: str
@@ -92,6 +94,7 @@ class Mutant:
     fate: str = ""
     digest: str = ""
     killer: str = ""
+    grounds: str = ""
 
     @property
     def key(self) -> str:
@@ -137,6 +140,18 @@ def _digest(file: str) -> str:
     """Of a file and its tests."""
     texts = [(ROOT / name).read_bytes() for name in (file, *TESTS.get(file, ()))]
     return sha256(b"".join(texts)).hexdigest()[:16]
+
+
+@functools.cache
+def grounds_of(file: str, killer: str) -> str:
+    """Digest of a file, of the test that failed with a mutant of it, and of all but the tests around that."""
+    if "::" not in killer:
+        return _digest(file)
+    path, name = killer.split("[")[0].split("::")
+    parts = ast.parse((ROOT / path).read_text(encoding="utf-8")).body
+    kept = [node for node in parts if not getattr(node, "name", "").startswith("test_") or node.name == name]
+    text = (ROOT / file).read_text(encoding="utf-8") + "".join(map(ast.dump, kept))
+    return sha256(text.encode()).hexdigest()[:16]
 
 
 def _lines_of_settings(source: str) -> set[int]:
@@ -247,7 +262,7 @@ def main() -> int:
     from tqdm import tqdm
 
     wanted = [file for file in TESTS if not args.files or any(part in file for part in args.files.split(","))]
-    known, killers = _decided(args.out)
+    earlier = _decided(args.out)
     listed = (ROOT / "scripts" / "mutants_equivalent.txt").read_text(encoding="utf-8").splitlines()
     equivalent = {line for line in listed if not line.startswith("#")}  # a reason stands above each
 
@@ -257,10 +272,12 @@ def main() -> int:
         for mutant, text in tqdm(found, unit="mutant"):
             if not mutant.fate and mutant.key in equivalent:
                 mutant.fate = "equivalent"
-            mutant.fate = mutant.fate or known.get(_identity(mutant), "")
+            before = earlier.get(_place(mutant), mutant)
+            mutant.fate = mutant.fate or _settled(mutant, before)
             if not mutant.fate:
-                mutant.killer = runner.killer(mutant, text, killers.get(_place(mutant), ""))
+                mutant.killer = runner.killer(mutant, text, before.killer)
                 mutant.fate = "killed" if mutant.killer else "survived"
+                mutant.grounds = grounds_of(mutant.file, mutant.killer) if mutant.killer else ""
                 file.write(json.dumps(asdict(mutant)) + "\n")
                 file.flush()
             done.append(mutant)
@@ -268,15 +285,18 @@ def main() -> int:
     return report(done, args.least)
 
 
-def _decided(path: Path) -> tuple[dict[tuple[str, ...], str], dict[tuple[str, ...], str]]:
-    """What became of every mutant that earlier runs wrote, and by which test, with these or other tests."""
+def _decided(path: Path) -> dict[tuple[str, ...], Mutant]:
+    """The last record of every mutant that earlier runs wrote, with these or other tests."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     mutants = [Mutant(**json.loads(line)) for line in lines]
-    return {_identity(mutant): mutant.fate for mutant in mutants}, {_place(mutant): mutant.killer for mutant in mutants}
+    return {_place(mutant): mutant for mutant in mutants}
 
 
-def _identity(mutant: Mutant) -> tuple[str, ...]:
-    return (*_place(mutant), mutant.digest)
+def _settled(mutant: Mutant, before: Mutant) -> str:
+    """What became of a mutant in an earlier run, where that is still so; else ""."""
+    if before.killer and before.grounds == grounds_of(mutant.file, before.killer):
+        return "killed"
+    return before.fate if before.digest == mutant.digest else ""
 
 
 def _place(mutant: Mutant) -> tuple[str, ...]:

@@ -43,6 +43,8 @@ def test_the_weights_end_farther_out_where_almost_nothing_lies_beyond_three_sigm
     assert refinement._tukey_limit(dirty, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.tukey_scale)
     dirty[:15] = np.nan
     assert refinement._tukey_limit(dirty, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.tukey_scale)
+    dirty[:15] = 7.0  # beyond 3 sigma of 2 mm
+    assert refinement._tukey_limit(dirty, 2.0, CONFIG) == pytest.approx(2.0 * CONFIG.tukey_scale)
     edge = np.r_[np.full(15, 3.0), np.zeros(985)]  # 3 sigma itself is not beyond
     assert refinement._tukey_limit(edge, 1.0, CONFIG) == pytest.approx(CONFIG.clean_tukey_scale)
 
@@ -72,6 +74,27 @@ def test_the_weights_of_a_fit_are_tukeys_times_the_share_of_the_noise_in_the_var
     J = fit.jacobian
     assert np.allclose((J * fit.weights[:, None]).T @ J, H)
     assert np.allclose(-J.T @ (fit.weights * np.nan_to_num(fit.signed_mm)), g)
+
+
+def test_a_point_beside_the_surface_weighs_less_by_how_far_aside_it_lies():
+    """On a plate of 40 mm with elements of 4 mm radius: 3 mm and 6 mm beyond the edge of the outermost elements."""
+    plate = tiny.plane(size_mm=40.0, step_mm=2.0)
+    points = np.array([[27.0, 0.0, 0.1], [24.5, 0.0, 0.1], *([x, 0.0, 0.1] for x in np.linspace(-10.0, 10.0, 9))])
+    fit = refinement.evaluate(np.eye(4), points, plate, replace(CONFIG, smallest_sigma_mm=1.0))
+    limit = refinement._tukey_limit(fit.signed_mm, 1.0, CONFIG)
+    aside = np.r_[27.0 - 24.0, 24.5 - 24.0, np.zeros(9)]
+    expected = np.clip(1.0 - (0.1**2 + aside**2) / limit**2, 0.0, 1.0) ** 2
+    assert fit.weights == pytest.approx(expected) and 0.0 < expected[0] < expected[1] < expected[2]
+
+
+def test_the_patch_of_a_point_is_its_nearest_points_with_itself(target, points, monkeypatch):
+    seen = []
+    monkeypatch.setattr(refinement, "evaluate_with_patches", lambda *words: seen.append(words[4]))
+    refinement.refine_fully(np.eye(4), points, target, replace(CONFIG, rounds=1, iterations=1))
+    refinement.refine_fully(np.eye(4), points[:5], target, replace(CONFIG, rounds=1, iterations=1))
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    assert np.array_equal(seen[0], np.argsort(apart, axis=1)[:, : refinement.PATCH_POINTS])
+    assert np.array_equal(seen[1], np.argsort(apart[:5, :5], axis=1))
 
 
 def test_the_jacobian_is_the_derivative_of_the_height_over_the_tangent_plane(target, points):

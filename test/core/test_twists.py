@@ -182,6 +182,11 @@ def test_the_interval_of_two_values_follows_from_the_four_resamples():
         assert interval(values, statistic=statistic, resamples=300, level=0.4) == (0.5, 0.5)
 
 
+def test_an_interval_of_no_width_is_the_median_of_the_resamples():
+    low, high = interval(np.random.default_rng(15).normal(size=50), resamples=301, level=0.0)
+    assert low == high
+
+
 def test_pairs_of_one_person_do_not_count_as_independent():
     rng = np.random.default_rng(10)
     values = np.repeat(rng.normal(size=20), 30)

@@ -10,7 +10,7 @@ from gapr_core.registration import bias_field
 from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square, smooth_correlation
 from gapr_core.registration.refinement import Fit
 
-COUNT, FIELDS, SIGMA_MM = 24, 4, 0.5
+COUNT, FIELDS, SIGMA_MM = 24, 4, 0.6
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +111,10 @@ def hand_made(information, score):
     return NormalEquations(np.eye(6), np.zeros((6, n)), np.diag(information), np.zeros(6), np.array(score))
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.01])
 @pytest.mark.parametrize(("share", "counted"), [(0.0, 3), (0.24, 2), (0.26, 1), (0.9, 1)])
-def test_fields_with_a_smaller_share_of_the_best_ones_information_do_not_count(share, counted):
-    information, score, size = np.array([0.1, 1.0, 4.0]), np.array([3.0, -2.0, 5.0]), 0.7
+def test_fields_with_a_smaller_share_of_the_best_ones_information_do_not_count(share, counted, scale):
+    information, score, size = scale * np.array([0.1, 1.0, 4.0]), np.array([3.0, -2.0, 5.0]), 0.7
     each = 0.5 * (size**2 * score**2 / (1.0 + size**2 * information) - np.log1p(size**2 * information))
     found = hand_made(information, score).log_likelihood(np.array([size]), share)
     assert found == pytest.approx([each[3 - counted :].sum()])

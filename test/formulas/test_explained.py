@@ -11,7 +11,9 @@ from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceC
 from gapr_core.geometry import se3
 from gapr_core.registration import explained
 from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.explained import Explained
+from gapr_core.registration.features import OTHER_BONE, SCENE_FEATURES
 from gapr_core.registration.free_space import Visible
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.verification import Candidates
@@ -150,8 +152,8 @@ def assessed(plane, probability=0.2, count=20, off=13, **more):
 
 
 @pytest.mark.parametrize(("change", "is_named"), [
-    ({}, True), ({"off": 12}, False), ({"probability": 0.5}, False), ({"count": 19, "off": 13}, False),
-    ({"seen": object()}, False),
+    ({}, True), ({"count": 40, "off": 26}, True), ({"off": 12}, False), ({"off": 5}, False),
+    ({"probability": 0.5}, False), ({"count": 19, "off": 13}, False), ({"seen": object()}, False),
 ])  # fmt: skip
 def test_a_dense_cloud_that_lies_mostly_off_the_bone_is_named_clutter(plane, change, is_named):
     """20 points are dense here; 7 of 20 on the bone are less than .4 of them, 8 are not."""
@@ -172,6 +174,47 @@ def test_lines_of_sight_give_shares_areas_and_the_margin_to_the_rival(plane):
     assert found["explained_of_compared"] == pytest.approx(0.5)
     assert found["violating_of_compared"] == pytest.approx(0.125)
     assert found["rival_margin"] == pytest.approx(np.log(1.5))
+
+
+def test_the_explained_area_counts_the_points_of_the_bone_by_their_spacing():
+    bone = SimpleNamespace(points=np.zeros((50, 3)), spacing_mm=3.0)
+    seen = Visible(*(np.array([x]) for x in (0.2, 0.05, 0.4)), CONFIG.clutter.free_space)
+    found = explained._visible_features(seen, Candidates(None, np.array([2.0, 3.0]), None), bone)
+    assert found["log_explained_mm2"] == pytest.approx(np.log(1.0 + 0.2 * 50 * 9.0))
+
+
+def test_every_feature_of_a_scene_says_what_its_name_says(monkeypatch):
+    """The part has 12 points, 9 of them inliers; the scene has 30."""
+    rng, T = np.random.default_rng(2), se3.exp([1.0, 2.0, 3.0, 0.3, -0.2, 0.1])
+    points, gradients = rng.uniform(-15.0, 15.0, (12, 3)) + [40.0, 0.0, -5.0], rng.normal(size=(12, 3))
+    gradients /= np.linalg.norm(gradients, axis=1, keepdims=True)
+    normals = rng.normal(size=(12, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    weights = np.where(np.arange(12) < 3, 0.0, 0.5)
+    fit = Fit(T, 0.5, np.zeros(12), weights, gradients, np.zeros(12, dtype=int), se3.apply(T, points))
+    part, members = SimpleNamespace(points=points, normals=normals), np.arange(30) < 12
+    known = PoseUncertainty(np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6]), 0.1, 0.2, 0.3, np.eye(3)[2], np.eye(3)[2])
+    candidates = Candidates(None, np.array([2.0, 3.0]), np.array([0.7, 0.1]))
+    bone = SimpleNamespace(points=np.zeros((50, 3)), spacing_mm=3.0, half_extent_mm=50.0)
+    scene, asked = SimpleNamespace(source=SimpleNamespace(noise_mm=0.3)), []
+    seen = Visible(*(np.array([x]) for x in (0.2, 0.05, 0.4)), CONFIG.clutter.free_space)
+    monkeypatch.setattr(explained.clutter, "seen_of", lambda *words: asked.append(words) or seen)
+    monkeypatch.setattr(explained, "of_another_bone", lambda *words: dict.fromkeys(OTHER_BONE, 0.125))
+    found = explained.measure(Explained(part, members, fit), candidates, known, scene, bone, CONFIG)
+    assert set(found) == set(SCENE_FEATURES) and np.array_equal(asked[0][0], T[None])
+    assert found["log_sigma"] == pytest.approx(np.log(0.5)) and found["log_excess"] == pytest.approx(np.log(0.5 / 0.3))
+    assert (found["smooth_misfit"], found["short_misfit"], found["support"]) == (0.2, 0.3, 0.7)
+    assert found["inlier_ratio"] == pytest.approx(9 / 30) and found["log_points"] == pytest.approx(np.log(12))
+    assert found["log_shift_sd"] == pytest.approx(np.log(2.0))
+    assert found["log_turn_sd"] == pytest.approx(np.log(np.degrees(0.02)))
+    cosines = [abs((T[:3, :3] @ normals[k]) @ gradients[k]) for k in range(3, 12)]
+    assert found["normal_agreement"] == pytest.approx(np.median(cosines))
+    reach = max(np.linalg.norm(p - points.mean(axis=0)) for p in points)
+    assert found["extent"] == pytest.approx(reach / 50.0) and found["scale_z"] == 0.125
+    scene.source.noise_mm = 0.01  # a source without roughness counts as a tenth of a millimetre rough
+    blind = Explained(part, members, replace(fit, weights=np.zeros(12)))
+    found = explained.measure(blind, candidates, known, scene, bone, CONFIG)
+    assert found["log_excess"] == pytest.approx(np.log(5.0)) and found["normal_agreement"] == 0.0
 
 
 @pytest.mark.parametrize(("scores", "margin"), [([1.0, 100.0], 3.0), ([1.0, 1e-9], -3.0)])

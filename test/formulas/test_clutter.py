@@ -150,6 +150,17 @@ def test_verification_gives_scores_that_are_small_for_good_and_the_support_of_th
     assert far.scores == pytest.approx([1e4, 1e4])  # a share below 0 counts as next to nothing
 
 
+@pytest.mark.parametrize(("apart_mm", "support"), [(1.24, 0.5), (1.26, 0.25)])
+def test_support_counts_what_the_middle_step_left_within_the_distance(scene, target, monkeypatch, apart_mm, support):
+    crowd = pool_of(0.0, 0.0, 40.0, 60.0, scores=[0.5, 0.4, 0.3, 0.2])
+    crowd.poses[1, 1, 3] = apart_mm
+    monkeypatch.setattr(clutter, "rank_roughly", lambda pool, *_: pool)
+    monkeypatch.setattr(clutter, "refine_around", lambda pool, *_: pool)
+    monkeypatch.setattr(clutter, "refine_on_all", lambda pool, *_: pool)
+    config = replace(CONFIG, same_pose_mm=1.25, final_poses=1)
+    assert clutter.verify(crowd, scene, target, config, 1).support.tolist() == [support]
+
+
 def test_given_poses_come_first_and_each_hypothesis_names_its_region(scene, target, refined, monkeypatch):
     found = {0: shifts(1.0, 2.0), 1: shifts(3.0)}
     by_centre = {tuple(region.centre): found[k] for k, region in enumerate(scene.regions)}
@@ -169,6 +180,12 @@ def test_the_points_of_a_target_are_spread_once_for_each_count(target):
     index = [int(np.flatnonzero((target.points == p).all(axis=1))[0]) for p in points]
     assert normals == pytest.approx(target.normals[index])
     assert clutter.spread(target, 37)[0] is points and 15 <= len(clutter.spread(target, 20)[0]) <= 20
+
+
+def test_the_points_of_a_target_lie_where_its_sensor_sees_them(target):
+    points, normals = clutter.spread(target, 37)
+    farther_out, same = clutter.spread(replace(target, offset_mm=0.5), 37)
+    assert farther_out == pytest.approx(points + 0.5 * normals) and np.array_equal(same, normals)
 
 
 def test_a_camera_sees_the_cloud_levelled_over_its_neighbours_along_the_normals(source, monkeypatch):

@@ -153,6 +153,31 @@ def test_the_normal_equations_are_those_of_weighted_least_squares(variance, elem
     assert np.allclose(H, expected_H) and np.allclose(g, expected_g)
 
 
+def test_a_point_aside_of_the_surface_weighs_less_by_both_distances():
+    """3 mm beyond the disc of the plane's first element, a corner: Tukey's weight of 0.1 and 3 mm."""
+    plane, limit = tiny.plane(size_mm=40.0, step_mm=2.0), 5.0
+    points, H, g = np.array([[-27.0, -20.0, 0.1]]), np.empty((6, 6)), np.empty(6)
+    kernels.accumulate(np.eye(4), points, np.ones(1), points[0], *view(plane), limit, 0.0, H, g)
+    weight = (1.0 - (0.1**2 + 3.0**2) / limit**2) ** 2
+    assert np.diag(H) == pytest.approx([0.0, 0.0, weight, 0.0, 0.0, 0.0])
+    assert g == pytest.approx([0.0, 0.0, -0.1 * weight, 0.0, 0.0, 0.0])
+
+
+def test_a_motion_that_nothing_holds_is_damped():
+    """1e-4 for every point along, 1 about an axis."""
+    T, g = np.eye(4), np.array([0.002, 0.0, 0.0, 0.03, 0.0, 0.0])
+    kernels.step(T, np.zeros(3), np.zeros((6, 6)), g, 50)
+    assert g == pytest.approx([0.002 / (1e-4 * 50), 0.0, 0.0, 0.03, 0.0, 0.0])
+    assert se3.apply(T, np.zeros((1, 3)))[0] == pytest.approx([0.4, 0.0, 0.0])
+
+
+def test_a_score_is_truncated_at_the_last_limit():
+    plane, far = tiny.plane(size_mm=40.0, step_mm=4.0), np.array([[0.0, 0.0, 500.0], [4.0, 0.0, 500.0]])
+    limits = np.array([6.0, 5.0, 3.0])
+    scores = kernels.refine_batch(np.eye(4)[None], far, np.ones(2), *view(plane), limits, 0.0 * limits)[1]
+    assert scores == pytest.approx([9.0])
+
+
 def test_a_residual_at_the_limit_weighs_nothing():
     target, H, g = tiny.plane(), np.empty((6, 6)), np.empty(6)
     for height, weighs in ((1.99, True), (2.0, False), (2.01, False)):

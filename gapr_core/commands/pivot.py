@@ -14,7 +14,7 @@ OK = 0
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr pivot`."""
     parser.add_argument("recording", type=Path, help="NDI Track's CSV, or a PLUS sequence (.igs.mha)")
-    parser.add_argument("--tool", type=int, default=0, help="which of the recorded tools, from 0")
+    parser.add_argument("--tool", type=int, help="which of several recorded tools, from 0")
     parser.add_argument("--json", type=Path, help="write tip, pivot and residual here as well")
 
 

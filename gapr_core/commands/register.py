@@ -40,6 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
     parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
+    parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
     parser.add_argument("--viewpoint", type=_point, help="X,Y,Z of the camera in the source's frame, mm")
     parser.add_argument(
         "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
@@ -83,7 +84,7 @@ def run(args: Namespace) -> int:
     method = methods.make(args.method, config)
     plan = _plan(args)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
-    source = _load(args, args.source, tip_mm=args.tip, topic=args.topic, clouds=args.clouds).points
+    source = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds).points
     result = method.register(source, method.prepare(target), **_hints(args, method))  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()

@@ -88,7 +88,9 @@ def _of_json(content: Any) -> Markups:
     points, labels = [], []
     for node in content["markups"]:
         space = _space(node.get("coordinateSystem"))
-        mm = MM_PER_UNIT[node.get("coordinateUnits", "mm")]
+        mm = _mm_per_unit(node.get("coordinateUnits", "mm"))
+        if "controlPoints" not in node:
+            raise ValueError(f"a {node.get('type', 'node')} without points")
         placed = [p for p in node["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
         positions = np.array([p["position"] for p in placed], dtype=np.float64).reshape(-1, 3)
         points.append(axes.to_lps(positions * mm, space))
@@ -108,6 +110,14 @@ def _of_fcsv(data: bytes) -> Markups:
     points = np.array([[float(row[i]) for i in at] for row in rows]).reshape(-1, 3)
     label = names.index("label") if "label" in names else 0
     return Markups(axes.to_lps(points, space), tuple(row[label] if label < len(row) else "" for row in rows))
+
+
+def _mm_per_unit(said: object) -> float:
+    """Of one unit, or of one for each axis if they are the same."""
+    units = set(map(str, said)) if isinstance(said, list) else {str(said)}
+    if len(units) != 1 or not units <= MM_PER_UNIT.keys():
+        raise ValueError(f"coordinateUnits {said!r}, none of {' '.join(MM_PER_UNIT)}")
+    return MM_PER_UNIT[units.pop()]
 
 
 def _space(said: object) -> str:

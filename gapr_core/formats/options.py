@@ -16,6 +16,7 @@ class ReadOptions:
             to RAS), or "auto": what a `SPACE=` comment in the file says, as_is without one.
         labels: names or numbers of the segments of a label map that make up one rigid target; none where it has one.
         tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.
+        tool: which of the tools of a recording, from 0; None where it has one.
         topic: of the clouds in a bag; empty where it has one such topic.
         clouds: (first, last) of the clouds of that topic, as in a slice; all of them are joined.
         limits: how large the file may be.
@@ -24,6 +25,7 @@ class ReadOptions:
     axes: str = "auto"
     labels: tuple[str, ...] = ()
     tip_mm: tuple[float, float, float] | None = None
+    tool: int | None = None
     topic: str = ""
     clouds: tuple[int | None, int | None] = (None, None)
     limits: FileLimits = field(default_factory=FileLimits.from_environment)

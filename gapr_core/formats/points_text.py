@@ -25,15 +25,15 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
     """Columns named x y z (any case), or the first three; of a recording of a tracked tool, where its tip was.
 
     Raises:
-        ValueError: a recording of a tracked tool without the tip of the tool.
+        InvalidPointCloudError: a recording of a tracked tool without the tip, or of several tools and none chosen.
     """
     data = options.limits.read(path)
     header = next(text.lines(data), "")
     names = [name.strip().lower() for name in next(csv.reader(io.StringIO(header)), [])]
     if "q0" in names and "tx" in names and options.tip_mm is not None:
-        return Surface(tracker.tips(tracker.read_poses(path, options.limits), options.tip_mm))
+        return Surface(tracker.tips(tracker.read_poses(path, options.limits, options.tool), options.tip_mm))
     if "q0" in names and "tx" in names:
-        raise ValueError("a recording of a tracked tool: give its tip with --tip X,Y,Z (gapr pivot finds it)")
+        raise tracker.needs_tip(path)
     return _surface(data, [names.index(axis) for axis in "xyz"] if set("xyz") <= set(names) else None)
 
 

@@ -7,25 +7,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.errors import GaprError
 from gapr_core.formats import sweeps, tracker
 from gapr_core.formats.reading import format_of, unreadable
 
 
-def poses_in(path: Path, tool: int = 0) -> NDArray[np.float64]:
+def poses_in(path: Path, tool: int | None = None) -> NDArray[np.float64]:
     """(N, 4, 4) poses of one recorded tool, mm, of NDI Track's CSV or a PLUS sequence.
 
     Raises:
-        InvalidPointCloudError: neither of them, or no pose of that tool.
+        InvalidPointCloudError: neither of them, no pose of that tool, or several tools and none chosen.
     """
     format_of(path)
     try:
         if not path.name.lower().endswith(".igs.mha"):
             return tracker.read_poses(path, tool=tool)
-        poses = sweeps.transforms(path)
-        if not 0 <= tool < len(poses):
-            raise InvalidPointCloudError(f"tool {tool}", f"{path.name} with {', '.join(poses)}", "count them from 0")
-        return list(poses.values())[tool]
+        return sweeps.pose_of(sweeps.transforms(path), tool, path)
     except GaprError:
         raise
     except Exception as error:

@@ -110,9 +110,11 @@ def format_of(path: Path) -> Format | plugins.Plugin:
 
 def unreadable(path: Path, why: str) -> InvalidPointCloudError:
     """The error for a file that cannot be read, in one line."""
-    kind, reason = _ending(path).lstrip(".").upper(), " ".join(why.split())
+    kind, reason = f"{_ending(path).lstrip('.').upper()} file", " ".join(why.split())
     short = reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
-    return InvalidPointCloudError(f"a readable {kind} file", f"{path.name} ({short})", "export it again")
+    return InvalidPointCloudError(
+        f"a readable {'folder' if path.is_dir() else kind}", f"{path.name} ({short})", "export it again"
+    )
 
 
 def _ending(path: Path) -> str:

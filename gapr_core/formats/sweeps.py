@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.formats import text
+from gapr_core.formats import text, tracker
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
 
@@ -23,12 +23,23 @@ def read_igs(path: Path, options: ReadOptions) -> Surface:
     """Tips of the tracked tool of a sequence: one point for each valid frame, in the tracker's frame, mm.
 
     Raises:
-        ValueError: no tip is given, or no frame is valid.
+        InvalidPointCloudError: no tip is given, or several tools and none chosen.
+        ValueError: no frame is valid.
     """
     if options.tip_mm is None:
-        raise ValueError("poses of a tool: give its tip with --tip X,Y,Z (gapr pivot finds it)")
-    poses = next(iter(transforms(path, options).values()))
+        raise tracker.needs_tip(path)
+    poses = pose_of(transforms(path, options), options.tool, path)
     return Surface(poses[:, :3, :3] @ np.asarray(options.tip_mm) + poses[:, :3, 3])
+
+
+def pose_of(poses: dict[str, Array], tool: int | None, path: Path) -> Array:
+    """(N, 4, 4) of one transform by its place in the list of their names.
+
+    Raises:
+        InvalidPointCloudError: none of them, or several and none chosen.
+    """
+    names = list(poses)
+    return poses[names[tracker.chosen(tool, names, path)]]
 
 
 def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,16 +41,16 @@ class Tip:
     poses: int
 
 
-def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> Array:
+def read_poses(path: Path, limits: FileLimits | None = None, tool: int | None = None) -> Array:
     """(N, 4, 4) poses of one tool in the tracker's frame, mm, of the rows in which it was seen.
 
     Args:
         path: NDI Track's CSV: for each tool columns State, Q0 Qx Qy Qz (the scalar first) and Tx Ty Tz.
         limits: how large it may be.
-        tool: which of the recorded tools, from 0.
+        tool: which of the recorded tools, from 0; None where there is one.
 
     Raises:
-        InvalidPointCloudError: no such columns, or no row in which the tool was seen.
+        InvalidPointCloudError: no such columns, several tools and none chosen, or no row in which the tool was seen.
         ValueError: a file that is cut.
     """
     data = (limits or FileLimits.from_environment()).read(path)
@@ -57,8 +58,11 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> A
     rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"))))
     names = [name.strip().lower() for name in rows[0]] if rows else []
     starts = [i for i, name in enumerate(names) if name == "q0"]
-    if not 0 <= tool < len(starts) or [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
-        given = f"{path.name} with {len(starts)} tools"
+    if not starts:
+        raise InvalidPointCloudError(f"columns {' '.join(POSE)}", f"{path.name} without", "export it from NDI Track")
+    tool = chosen(tool, [f"tool {i}" for i in range(len(starts))], path)
+    if [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
+        given = f"{path.name} with others"
         raise InvalidPointCloudError(f"columns {' '.join(POSE)} of tool {tool}", given, "export it from NDI Track")
     start = starts[tool]
     state = max((i for i, name in enumerate(names[:start]) if name.startswith("state")), default=None)
@@ -69,6 +73,27 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int = 0) -> A
     if len(values) == 0:
         raise InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
     return poses_of(values[:, :4], values[:, 4:])
+
+
+def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
+    """The place in the list of the tool that is meant, never a guess: a reference may be among them.
+
+    Raises:
+        InvalidPointCloudError: none of the recorded tools, or several and none chosen.
+    """
+    if tool is None and len(names) == 1:
+        return 0
+    if tool is None or not 0 <= tool < len(names):
+        listed = ", ".join(f"{i}: {name}" if name != f"tool {i}" else str(i) for i, name in enumerate(names))
+        asked = "one tool" if tool is None else f"tool {tool}"
+        raise InvalidPointCloudError(asked, f"{path.name} with {len(names)} ({listed})", "name one with --tool")
+    return tool
+
+
+def needs_tip(path: Path) -> InvalidPointCloudError:
+    """The error for a recording of poses without the tip of the tool."""
+    how = "give it with --tip X,Y,Z; gapr pivot finds it"
+    return InvalidPointCloudError("the tip of the tool", f"{path.name}, a recording of its poses", how)
 
 
 def _is_seen(state: str = "") -> bool:

@@ -136,6 +136,45 @@ def test_a_recorded_pointer_becomes_the_points_of_its_tip(tmp_path):
     np.testing.assert_allclose(surface.points, np.tile(PIVOT, (40, 1)), atol=1e-6)
 
 
+def two_tools(path):
+    """A reference at rest, then a pointer."""
+    rest, pointer = np.tile(np.eye(4), (12, 1, 1)), turned_poses(12)
+    if path.suffix == ".mha":
+        igs(path, pointer, ["OK"] * 12)
+        frames = "".join(f"Seq_Frame{i:04d}_ATransform = {' '.join(map(str, T.ravel()))}\n" for i, T in enumerate(rest))
+        path.write_bytes(frames.encode() + path.read_bytes())
+        return path
+    rows = [line.split(",") for line in ndi_csv(path, pointer).read_text().splitlines()]
+    still = [line.split(",") for line in ndi_csv(path, rest).read_text().splitlines()]
+    path.write_text("".join(",".join(a + b) + "\n" for a, b in zip(still, rows, strict=True)))
+    return path
+
+
+@pytest.mark.parametrize("name", ["two.csv", "two.igs.mha"])
+def test_one_of_several_tools_is_never_guessed(tmp_path, name):
+    path, tip = two_tools(tmp_path / name), tuple(TIP)
+    with pytest.raises(InvalidPointCloudError, match="one tool; got .* with 2 .0.*1.*; name one with --tool"):
+        reading.read(path, ReadOptions(tip_mm=tip))
+    with pytest.raises(InvalidPointCloudError, match="tool 2; got"):
+        reading.read(path, ReadOptions(tip_mm=tip, tool=2))
+    points = reading.read(path, ReadOptions(tip_mm=tip, tool=1)).points
+    np.testing.assert_allclose(points, np.tile(PIVOT, (12, 1)), atol=1e-6)
+    with pytest.raises(InvalidPointCloudError, match="the tip of the tool; got .*; give it with --tip"):
+        reading.read(path)
+
+
+def test_units_of_markups_are_one_for_all_axes(tmp_path):
+    points = [{"label": f"L{i}", "position": (p / 10.0).tolist()} for i, p in enumerate(POINTS)]
+    for said, expected in ((["cm", "cm", "cm"], POINTS), ("cm", POINTS), (["cm", "mm", "cm"], None), ("inch", None)):
+        node = {"coordinateSystem": "LPS", "coordinateUnits": said, "controlPoints": points}
+        (tmp_path / "a.mrk.json").write_text(json.dumps({"markups": [node]}))
+        if expected is not None:
+            np.testing.assert_allclose(markups.load(tmp_path / "a.mrk.json").points, expected)
+            continue
+        with pytest.raises(InvalidPointCloudError, match="coordinateUnits .* none of mm"):
+            markups.load(tmp_path / "a.mrk.json")
+
+
 def igs(path, poses, statuses):
     head = "ObjectType = Image\nNDims = 3\nDimSize = 1 1 2\n"
     for i, (T, status) in enumerate(zip(poses, statuses, strict=True)):

@@ -70,6 +70,7 @@ setup(
         files("launch", "*.launch.py"),
         files("rviz", "*.rviz"),
         files("deploy", "*"),
+        files("examples/ros", "*.py", "*.yaml"),
     ],
     install_requires=CORE,
     extras_require={

@@ -8,6 +8,7 @@ The file names a node a bone, `/femur/register_node`, `/tibia/register_node`, ..
 # ruff: noqa: I001  (this folder is not the package launch)
 
 from pathlib import Path
+from typing import Any
 
 import yaml
 from launch import LaunchContext, LaunchDescription
@@ -15,8 +16,10 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 EXECUTABLE = "register_node"
+ENDING = f"/{EXECUTABLE}"
+EXAMPLE = "copy share/gapr_ros/config/two_bones.yaml and pass params_file:=FILE"
 ARGUMENTS = {
-    "params_file": ("", "parameter file with one entry a bone"),
+    "params_file": ("", "parameter file with one entry a bone; config/two_bones.yaml is one to copy"),
     "points": ("points", "topic of the clouds, the same for all bones"),
 }
 
@@ -25,16 +28,28 @@ def bones(path: str) -> list[str]:
     """The namespaces that the file names, in its order.
 
     Raises:
-        ValueError: it names none, or two bones publish one frame.
+        ValueError: there is no such file, it names none, or two bones publish one frame.
     """
+    if not Path(path).is_file():
+        raise ValueError(f"params_file: expected a parameter file with one entry a bone, got {path!r}; {EXAMPLE}")
     entries = yaml.safe_load(Path(path).read_text())
-    names = [key.rsplit("/", 1)[0] for key in entries if key.endswith(f"/{EXECUTABLE}") and key != f"/{EXECUTABLE}"]
+    if not isinstance(entries, dict):
+        raise ValueError(
+            f"{path}: expected entries such as /femur/{EXECUTABLE}, got {type(entries).__name__}; {EXAMPLE}"
+        )
+    names = [key.rsplit("/", 1)[0] for key in map(str, entries) if key.endswith(ENDING) and key != ENDING]
     if not names:
-        raise ValueError(f"{path}: no entry such as /femur/{EXECUTABLE}, got {', '.join(entries)}")
-    frames = [entries[f"{name}/{EXECUTABLE}"]["ros__parameters"].get("model_frame") for name in names]
+        raise ValueError(f"{path}: no entry such as /femur/{EXECUTABLE}, got {', '.join(map(str, entries))}; {EXAMPLE}")
+    frames = [_parameters(entries[f"{name}/{EXECUTABLE}"]).get("model_frame") for name in names]
     if len(set(frames)) < len(frames):
         raise ValueError(f"{path}: every bone needs a model_frame of its own, got {frames}")
     return names
+
+
+def _parameters(entry: Any) -> dict[str, Any]:
+    """What stands under `ros__parameters`; empty without it."""
+    found = entry.get("ros__parameters") if isinstance(entry, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def nodes(context: LaunchContext) -> list[Node]:

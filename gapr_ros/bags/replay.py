@@ -98,12 +98,23 @@ class Replay:
         deadline = time.monotonic() + self._options.wait_s
         while not self._has_listeners():
             if time.monotonic() > deadline:
+                self._say_who_is_not_heard()
                 return
             time.sleep(0.02)
         time.sleep(SETTLE_S)
 
     def _has_listeners(self) -> bool:
-        return all(p.get_subscription_count() >= self._options.listeners for p in self._publishers.values())
+        return not self._unheard()
+
+    def _unheard(self) -> list[str]:
+        """Topics with fewer listeners than were asked for."""
+        wanted = self._options.listeners
+        return [topic for topic, p in self._publishers.items() if p.get_subscription_count() < wanted]
+
+    def _say_who_is_not_heard(self) -> None:
+        of, after = f"{self._options.listeners} listeners", f"after {self._options.wait_s:g} s"
+        text = f"{', '.join(self._unheard())}: fewer than {of} {after}; it is played now (--wait waits longer)"
+        self._node.get_logger().warning(text)
 
     def _play_once(self) -> int:
         origin, sent = time.monotonic(), 0

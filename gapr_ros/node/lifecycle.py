@@ -36,7 +36,7 @@ from gapr_ros.node.model import make_ready
 from gapr_ros.node.reporter import Reporter
 from gapr_ros.node.services import Services
 from gapr_ros.node.session import Session
-from gapr_ros.node.subscription import Subscriptions
+from gapr_ros.node.subscription import CLOUDS, Subscriptions
 from gapr_ros.parameters import NodeParameters
 
 LIBRARIES = ("gapr_core", "gapr_ros")  # whose logs go to the node's log
@@ -158,6 +158,8 @@ class RegisterNode(LifecycleNodeMixin, Node):
         result = super().on_activate(state)
         self.session.send_model()
         self.subscriptions_in = Subscriptions(self, self.session)
+        kind, unit = self.parameters.cloud_type, self.parameters.cloud_unit
+        self.get_logger().info(f"active, waits for clouds on {self.resolve_topic_name(CLOUDS)} ({kind}, in {unit})")
         return result
 
     @transition

@@ -113,6 +113,16 @@ def test_a_looped_bag_starts_over_until_it_is_interrupted(bag_path, listener, tm
     assert min(np.diff(clocks)) < -0.3, "time goes back when the bag starts over"
 
 
+def test_topics_that_nobody_hears_are_named(tmp_path, capfd):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_cloud("/to_nobody", np.ones((1, 3)), "probe", START_NS)
+    ros, opened = context(), open_bag(tmp_path / "bag")
+    assert Replay(Node("player", context=ros), opened, ReplayOptions(wait_s=0.1)).run() == 1
+    opened.reader.close()
+    ros.try_shutdown()
+    assert "/to_nobody: fewer than 1 listeners after 0.1 s; it is played now" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("reliable", [True, False])
 def test_the_recorded_qos_is_offered(reliable, tmp_path, listener):
     with BagWriter(tmp_path / "bag", qos=offered(reliable=reliable, latched=True, depth=3)) as bag:

@@ -97,14 +97,25 @@ def test_the_shipped_file_of_two_bones_starts_two_nodes_that_hear_one_topic(load
 @pytest.mark.parametrize(
     ("text", "hint"),
     [
+        (None, "expected a parameter file with one entry a bone, got .*copy share/gapr_ros/config/two_bones.yaml"),
+        ("", "got NoneType"),
+        ("- femur", "got list"),
         ("/**: {ros__parameters: {}}", "no entry such as /femur/register_node"),
+        ("1: 2", "no entry such as /femur/register_node, got 1"),
         (
             "/a/register_node: {ros__parameters: {}}\n/b/register_node: {ros__parameters: {}}",
             "a model_frame of its own",
         ),
+        ("/a/register_node:\n/b/register_node: [1]", "a model_frame of its own"),
     ],
 )
 def test_a_file_without_bones_and_one_frame_for_two_are_refused(load, tmp_path, text, hint):
-    (tmp_path / "bones.yaml").write_text(text)
+    if text is not None:
+        (tmp_path / "bones.yaml").write_text(text)
     with pytest.raises(ValueError, match=hint):
         started(load("bones.launch.py"), params_file=str(tmp_path / "bones.yaml"))
+
+
+def test_bones_without_a_file_are_refused_with_what_to_pass(load):
+    with pytest.raises(ValueError, match="got ''; copy .* pass params_file:=FILE"):
+        started(load("bones.launch.py"))

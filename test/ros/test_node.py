@@ -600,6 +600,13 @@ def test_a_guessed_model_unit_is_warned_about(tmp_path, client, method, capfd):
     assert "taken to be in m; name the unit to be sure" in capfd.readouterr().err
 
 
+def test_the_log_says_what_is_loaded_and_where_clouds_are_waited_for(blob_path, client, method, capfd):
+    with node_in_thread(method, blob_path, namespace="/left"):
+        wait_until(lambda: client.values().get("state") == "active")
+    lines = capfd.readouterr().err
+    assert f"loading {blob_path}" in lines and "active, waits for clouds on /left/points (PointCloud2, in m)" in lines
+
+
 def test_clouds_in_millimetres_are_taken_as_such(blob_path, client, method):
     with node_in_thread(method, blob_path, cloud_unit="mm"):
         client.wait_for_state("active")

@@ -1,8 +1,8 @@
 """How far the surface of a label lies from the bone that was voxelised, for three ways to take it out of the mask.
 
-    python benchmarks/contour.py [--anatomy DIR] [--split val] [--people 3] [--spacings 0.5,1,2,3]
+    python benchmarks/contour.py [--anatomy DIR] [--split val] [--subjects 3] [--spacings 0.5,1,2,3]
 
-Means over femur, tibia and pelvis of every person of the split; without --anatomy over parametric people.
+Means over femur, tibia and pelvis of the first subjects of the split; without --anatomy of parametric ones.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
     parser.add_argument("--split", default="val")
-    parser.add_argument("--people", type=int, default=3, help="of each bone")
+    parser.add_argument("--subjects", type=int, default=3, help="of each bone")
     parser.add_argument("--spacings", default="0.5,1,2,3", help="sizes of the voxels, mm, with commas")
     args = parser.parse_args()
     people = [s.surface for bone in BONES for s in closed(bone, args)]
@@ -49,9 +49,9 @@ def main() -> int:
 
 
 def closed(bone: str, args: argparse.Namespace) -> list:  # type: ignore[type-arg]
-    """The first people whose mesh has an inside."""
-    known = specimens(bone, args.split, args.people, args.anatomy)
-    return [s for s in known if is_closed(s.surface.triangles)][: args.people]
+    """The first subjects whose mesh has an inside."""
+    known = specimens(bone, args.split, args.subjects, args.anatomy)
+    return [s for s in known if is_closed(s.surface.triangles)][: args.subjects]
 
 
 def ways(mask: NDArray[np.uint8], affine: NDArray[np.float64]) -> list[tuple[str, Surface]]:

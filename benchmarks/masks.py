@@ -58,7 +58,7 @@ def main() -> int:
 
 
 def closed(bone: str, split: str, anatomy: Path | None) -> list[Specimen]:
-    """The people whose mesh has an inside."""
+    """The subjects whose mesh has an inside."""
     return [s for s in specimens(bone, split, PEOPLE, anatomy) if is_closed(s.surface.triangles)]
 
 

@@ -129,6 +129,8 @@ def test_what_lies_around_is_thinned_evenly(scene, source):
     assert some.tolist() == list(range(16))  # 16 points within 15 mm, fewer than twice 10
     wide = clutter._around(cKDTree(line), line[0], replace(CONFIG, middle_reach_mm=29.0))
     assert wide.tolist() == list(range(0, 30, 3))
+    few = clutter._around(cKDTree(line), line[0], replace(CONFIG, middle_reach_mm=5.0))
+    assert few.tolist() == list(range(6))  # all, where there are fewer than 10
 
 
 def test_the_last_step_refines_on_many_points_and_ranks_at_the_scale_of_the_noise(scene, target, scored, refined):

@@ -33,7 +33,7 @@ def test_the_element_near_a_place_is_that_of_the_nearest_cell_centre():
             x, y, z = origin + cell * np.array([i, j, k]) + off
             assert kernels.element_near(x, y, z, nearest, origin, 1.0 / cell) == nearest[i, j, k]
     for axis in range(3):
-        for end in (-1, nearest.shape[axis]):
+        for end in (-2, -1, nearest.shape[axis], nearest.shape[axis] + 1):
             cell_of = np.array([1.0, 1.0, 1.0])
             cell_of[axis] = end
             assert kernels.element_near(*(origin + cell * cell_of), nearest, origin, 1.0 / cell) == -1
@@ -233,6 +233,9 @@ def test_the_squared_distance_is_truncated_and_counts_what_lies_aside():
     assert kernels.squared_distance(np.eye(4), np.array([90.0, 0.0, 0.0]), *surface, 4.0) == 16.0
     aside = kernels.squared_distance(np.eye(4), np.array([4.0 + reach + 1.0, 0.0, 2.0]), *surface, 4.0)
     assert aside == pytest.approx(1.0 + 4.0)
+    egg = tiny.ellipsoid()
+    above = egg.points[7] + 1.5 * egg.normals[7]  # also of a curved surface: nothing is taken off for noise
+    assert kernels.squared_distance(np.eye(4), above, *view(egg), 4.0) == pytest.approx(2.25)
 
 
 def test_poses_near_the_truth_are_brought_home_and_scored_by_their_mean_square():
@@ -280,6 +283,10 @@ def test_distinct_poses_are_farther_apart_than_the_tolerance_in_the_root_mean_sq
     assert kernels.distinct(places, order, 0.4, 5).tolist() == [2, 0, 3, 1, 4]
     places[1, :, 1] = 0.0
     assert kernels.distinct(places[[0, 1]], np.array([0, 1]), 1.0, 5).tolist() == [0, 1]  # at the limit
+    for axis in range(3):
+        apart = np.zeros((2, 4, 3))
+        apart[1, :, axis] = 3.0
+        assert kernels.distinct(apart, np.array([0, 1]), 2.0, 5).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("spacing", [0.5, 5.0])  # beyond the element's reach, and within

@@ -63,6 +63,90 @@ def test_a_point_counts_where_its_normal_agrees(cosine, signed, counts):
     assert total == pytest.approx(0.75**2 if counts else 0.0)
 
 
+def test_the_normal_equations_of_a_pose_that_is_turned_far(egg, cloud):
+    """Every entry of the rotation counts, for the points and for their normals."""
+    turn = se3.exp([5.0, -7.0, 3.0, 0.9, -1.3, 0.7])
+    T = se3.exp([0.3, -0.2, 0.4, 0.02, -0.03, 0.05]) @ se3.inverse(turn)
+    points = se3.apply(turn, cloud[0])
+    rng = np.random.default_rng(3)
+    normals = cloud[1] @ turn[:3, :3].T + rng.normal(0.0, 0.6, points.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for signed in (True, False):
+        found, wanted = (of(T, points, normals, signed, egg, 2.0) for of in (equations, expected))
+        assert found[0] == pytest.approx(wanted[0]) and 0.0 < wanted[0] < len(points)
+        assert found[1] == pytest.approx(wanted[1]) and found[2] == pytest.approx(wanted[2])
+
+
+def test_a_step_is_that_of_the_damped_equations_about_the_middle_of_the_points(egg, cloud):
+    move = se3.exp([200.0, -90.0, 40.0, 0.0, 0.0, 0.0])
+    points, normals = se3.apply(move, cloud[0]), cloud[1]
+    T = se3.exp([0.3, -0.2, 0.4, 0.02, -0.03, 0.05]) @ se3.inverse(move)
+    weight, H, g = expected(T, points, normals, True, egg, 2.0)
+    damped = H + np.diag([1e-4 * weight] * 3 + list(1e-4 * np.diag(H)[3:] + 1.0))
+    centre = se3.apply(T, points.mean(axis=0)[None])[0]
+    wanted = se3.exp(np.linalg.solve(damped, g), centre) @ T
+    found = kernels.refine_agreeing(T[None], points, normals, True, *egg.kernel_view, np.array([2.0]), SAME)[0]
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
+
+
+def image_of_planes(rng, rows=9, columns=7, left=-0.3, top=-0.4, pixel=0.1):
+    """(rows, columns, 6) planes that face the camera, their depth and the least depth around; some without."""
+    normals = np.dstack([*rng.uniform(-0.4, 0.4, (2, rows, columns)), -np.ones((rows, columns))])
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    rays = np.dstack([left + pixel * j, top + pixel * i, np.ones((rows, columns))])
+    depth = rng.uniform(80.0, 120.0, (rows, columns))
+    offset = (normals * rays).sum(axis=2) * depth
+    pixels = np.dstack([normals, offset, depth, depth - rng.uniform(0.0, 5.0, (rows, columns))])
+    pixels[rng.random((rows, columns)) < 0.1] = 0.0
+    return pixels, rays
+
+
+def seen_by_hand(T, cloud, pixels, left, top, per_pixel, on, front, facing, hidden, slant, same):
+    """Explained, violating, compared: one point after the other."""
+    explained = violating = compared = 0.0
+    for p, n in zip(se3.apply(T, cloud[:, :3]), cloud[:, 3:] @ T[:3, :3].T, strict=True):
+        if p[2] < 1.0:
+            continue
+        j, i = np.floor((p[:2] / p[2] - [left, top]) * per_pixel + 0.5).astype(int)
+        if not (0 <= i < pixels.shape[0] and 0 <= j < pixels.shape[1]) or pixels[i, j, 4] == 0.0:
+            continue
+        plane, offset, depth, least = pixels[i, j, :3], *pixels[i, j, 3:]
+        violating += p[2] < least - front
+        if n @ p > -facing * p[2]:
+            continue
+        compared += least - front < p[2] < depth + hidden
+        off = plane @ p - offset
+        if abs(off) < on and abs(p[2] - depth) < slant and n @ plane > same:
+            explained += 1.0 - (off / on) ** 2
+    return np.array([explained, violating, compared]) / len(cloud)
+
+
+def test_what_an_image_says_of_a_target_is_what_each_line_of_sight_says():
+    """Random planes and points about them, some hidden, in front, turned away, outside, behind, next to the camera."""
+    rng = np.random.default_rng(5)
+    pixels, rays = image_of_planes(rng)
+    i, j = rng.integers(9, size=400), rng.integers(7, size=400)
+    depth = pixels[i, j, 4] + rng.normal(0.0, 4.0, 400)
+    depth[:40] = rng.choice([-60.0, 0.5, 50.0, 150.0], 40)
+    points = (rays[i, j] + np.c_[rng.uniform(-0.04, 0.04, (400, 2)), np.zeros(400)]) * depth[:, None]
+    points[40:60, :2] += rng.choice([-70.0, 70.0], (20, 2))
+    normals = pixels[i, j, :3] + rng.normal(0.0, 0.35, (400, 3))
+    normals *= rng.choice([1.0, 1.0, 1.0, -1.0], (400, 1)) / np.linalg.norm(normals, axis=1, keepdims=True)
+    T = se3.exp([12.0, -30.0, 25.0, 0.9, -1.3, 0.7])
+    back = se3.inverse(T)
+    cloud = np.hstack([se3.apply(back, points), normals @ back[:3, :3].T])
+    poses = np.array([T, se3.exp([1.0, -1.5, 2.0, 0.01, 0.02, 0.05]) @ T, se3.exp([0.0, 0.0, -6.0, 0.0, 0.1, 0.0]) @ T])
+    view = -0.3, -0.4, 10.0, 3.0, 4.0, 0.2, 3.0, 5.0, 0.6
+    small = [np.float32(x) for x in view]
+    found = kernels.compare_with_image(
+        poses[:, :3].astype(np.float32), cloud.astype(np.float32), pixels.astype(np.float32), *small
+    )
+    wanted = np.array([seen_by_hand(T, cloud, pixels, *view) for T in poses])
+    assert found == pytest.approx(wanted, abs=2e-5)
+    assert (wanted > 0.02).all() and (wanted < 0.9).all()
+
+
 def test_normals_turn_with_the_pose():
     plane, T = tiny.plane(), se3.exp([0.0, 0.0, 0.0, 0.7, -1.2, 0.4])
     point = se3.apply(se3.inverse(T), np.array([[1.0, 2.0, 0.0]]))

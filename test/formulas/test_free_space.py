@@ -8,7 +8,7 @@ import pytest
 from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.free_space import DepthImage, Visible, compare, see
+from gapr_core.registration.free_space import DepthImage, Visible, _looking_at, _pixels, compare, see
 
 EYE = np.array([0.0, 0.0, 400.0])
 ON_MM, FRONT_MM = 2.0, 4.0
@@ -70,6 +70,32 @@ def test_a_surface_of_another_direction_is_not_explained(image, cosine, explaine
         normal = (0.0, side * np.sqrt(1.0 - cosine**2), cosine)
         assert shares(image, normal)[0] == pytest.approx(explained, abs=1e-3)
         assert shares(image, normal)[2] == 1.0
+
+
+def test_a_pixel_holds_the_plane_of_its_point_and_the_least_depth_measured_around():
+    points = np.array([[1.0, 2.0, 0.5], [3.0, -1.0, 7.0], [0.0, 4.0, 9.0]])
+    normals = np.array([[0.0, 0.6, -0.8], [0.0, 0.0, -1.0], [0.6, 0.0, -0.8]])
+    none = len(points)  # where no point is near
+    nearest = np.array([[0, none, none, none, 1], [none, 2, none, 1, 2]])
+    found = _pixels(nearest, points, normals)
+    least = np.array([[0.5, 0.0, 0.0, 0.0, 7.0], [0.0, 0.5, 0.0, 7.0, 7.0]])
+    for i, j in np.ndindex(nearest.shape):
+        k = nearest[i, j]
+        wanted = np.zeros(6) if k == none else [*normals[k], normals[k] @ points[k], points[k, 2], least[i, j]]
+        assert found[i, j] == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("eye", [[30.0, -20.0, 90.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+def test_a_camera_looks_at_the_middle_of_the_points(eye):
+    """Along its third axis; along that of the cloud's frame where it stands in the middle."""
+    points = np.array([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0], [0.0, 3.0, 2.0], [0.0, -3.0, -2.0]])
+    T = _looking_at(np.array(eye), points)
+    length = np.linalg.norm(eye)
+    ahead = -np.array(eye) / length if length else np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(T[2, :3], ahead, atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(se3.apply(T, np.array([eye]))[0], 0.0, atol=1e-12)
 
 
 def test_points_outside_the_image_or_behind_the_camera_say_nothing(image):

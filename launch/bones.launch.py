@@ -17,6 +17,7 @@ from launch_ros.actions import Node
 
 EXECUTABLE = "register_node"
 ENDING = f"/{EXECUTABLE}"
+PATIENCE_S = "20"  # after Ctrl-C: the node ends with a second of work, which takes longer on a busy machine
 EXAMPLE = "copy share/gapr_ros/config/two_bones.yaml and pass params_file:=FILE"
 ARGUMENTS = {
     "params_file": ("", "parameter file with one entry a bone; config/two_bones.yaml is one to copy"),
@@ -63,6 +64,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             namespace=namespace,
             output="screen",
             emulate_tty=True,
+            sigterm_timeout=PATIENCE_S,
             parameters=[chosen["params_file"]],
             remappings=[("points", chosen["points"])],
         )

@@ -16,6 +16,7 @@ from launch_ros.substitutions import FindPackageShare
 
 from gapr_ros.parameters import FIELDS
 
+PATIENCE_S = "20"  # after Ctrl-C: the node ends with a second of work, which takes longer on a busy machine
 ARGUMENTS = {
     "points": ("points", "topic of the clouds"),
     "initialpose": ("initialpose", "topic of optional seeds"),
@@ -59,6 +60,7 @@ def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
         namespace=chosen["namespace"],
         output="screen",
         emulate_tty=True,
+        sigterm_timeout=PATIENCE_S,
         parameters=[chosen["params_file"], parameters],
         remappings=[("points", chosen["points"]), ("initialpose", chosen["initialpose"])],
     )

@@ -89,6 +89,7 @@ def test_the_shipped_file_of_two_bones_starts_two_nodes_that_hear_one_topic(load
     nodes = started(load("bones.launch.py"), params_file=str(path), points="/camera/points")
     assert [node.named["namespace"] for node in nodes] == ["/femur", "/tibia"]
     assert all(node.named["remappings"] == [("points", "/camera/points")] for node in nodes)
+    assert all(float(node.named["sigterm_timeout"]) > 5.0 for node in nodes), "launch's own patience"
     for entry in yaml.safe_load(path.read_text()).values():
         given = entry["ros__parameters"]
         assert [problem(FIELDS[name], value) for name, value in given.items()] == [""] * len(given)

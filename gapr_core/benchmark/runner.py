@@ -22,6 +22,7 @@ from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import cluster
+from gapr_core.runtime.parallel import end_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -144,7 +145,8 @@ def _record(
 
 
 def _start(counter: Any, threads: int) -> None:
-    """Bind this worker to its own cores, as far as there are enough."""
+    """Bind this worker to its own cores, as far as there are enough, and to the life of its parent."""
+    end_with_parent()
     with counter.get_lock():
         number = counter.value
         counter.value += 1

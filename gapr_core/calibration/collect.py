@@ -42,6 +42,7 @@ from gapr_core.registration.tracking import Memory
 from gapr_core.results import Hypothesis
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.files import write_text
+from gapr_core.runtime.parallel import end_with_parent
 
 Array = NDArray[np.float64]
 Record = dict[str, Any]
@@ -82,8 +83,13 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = Non
 
 
 def _in_processes(tasks: Sequence[Task], jobs: int, shared: Shared) -> Iterator[Record]:
-    with ProcessPoolExecutor(jobs, get_context("spawn"), pairs.keep, shared) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _start, shared) as pool:
         yield from pool.map(record_of, tasks, chunksize=pairs.IN_A_ROW)
+
+
+def _start(*shared: Any) -> None:
+    end_with_parent()
+    pairs.keep(*shared)
 
 
 def _on_cluster(tasks: Sequence[Task], address: str, shared: Shared) -> Iterator[Record]:

@@ -1,10 +1,12 @@
-"""How many threads to use."""
+"""How many threads to use, and processes that end with the one that started them."""
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from functools import cache, wraps
+from multiprocessing import parent_process
 from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -16,6 +18,16 @@ Result = TypeVar("Result")
 def thread_count(requested: int) -> int:
     """The number asked for; 0 means every core that this process may use."""
     return requested or len(os.sched_getaffinity(0))
+
+
+def end_with_parent() -> None:
+    """End this worker process when its parent has ended, however that happened; nothing in the first process.
+
+    Workers of a `ProcessPoolExecutor` wait for their next task for ever when a signal ends their parent.
+    """
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (parent.join(), os._exit(1)), name="end with parent", daemon=True).start()
 
 
 def single_threaded_blas(call: Callable[Given, Result]) -> Callable[Given, Result]:

@@ -42,6 +42,7 @@ from gapr_core.registration.refinement import refine_fully
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import say
+from gapr_core.runtime.parallel import end_with_parent
 from gapr_core.training.ablation.table import FIGURES, folder_of, write
 from gapr_core.training.config import TrainConfig, Variant, default_plan, read_plan, trained_as
 from gapr_core.training.dataset import available
@@ -161,7 +162,7 @@ def finish_all(tasks: Sequence[Task], jobs: int) -> Iterator[bool]:
         yield from map(finish, tasks)
         return
     threads = max(1, len(os.sched_getaffinity(0)) // jobs)
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), end_with_parent) as pool:
         waiting = [pool.submit(finish_quietly, task, threads) for task in tasks]
         yield from (future.result() for future in as_completed(waiting))
 

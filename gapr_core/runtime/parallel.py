@@ -26,8 +26,14 @@ def end_with_parent() -> None:
     Workers of a `ProcessPoolExecutor` wait for their next task for ever when a signal ends their parent.
     """
     parent = parent_process()
-    if parent is not None:
-        threading.Thread(target=lambda: (parent.join(), os._exit(1)), name="end with parent", daemon=True).start()
+    if parent is None:
+        return
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, name="end with parent", daemon=True).start()
 
 
 def single_threaded_blas(call: Callable[Given, Result]) -> Callable[Given, Result]:

@@ -64,7 +64,7 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Iterator[Record]:
     for task, outcome in cluster.outcomes(address, run_task, tasks):
         if not isinstance(outcome, Exception):
             yield outcome
-        elif type(outcome).__name__ == "KilledWorker":
+        elif isinstance(outcome, cluster.WorkersDiedError):
             yield _failure(task, load_pair(task.path), "the process died")
         else:
             raise outcome

@@ -94,10 +94,8 @@ def _start(*shared: Any) -> None:
 
 def _on_cluster(tasks: Sequence[Task], address: str, shared: Shared) -> Iterator[Record]:
     rows = [tasks[i : i + pairs.IN_A_ROW] for i in range(0, len(tasks), pairs.IN_A_ROW)]  # they share a target
-    for _, outcome in cluster.outcomes(address, _records_of, rows, shared):
-        if isinstance(outcome, Exception):
-            raise outcome
-        yield from outcome
+    for records in cluster.results(address, _records_of, rows, shared):
+        yield from records
 
 
 def _records_of(tasks: Sequence[Task], shared: Shared) -> list[Record]:

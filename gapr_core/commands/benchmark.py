@@ -118,8 +118,7 @@ def benchmark(
     tasks = [runner.Task(path, method, config) for path in chosen for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
-        done_now = runner.run_on_cluster(open_tasks, dask) if dask else runner.run(open_tasks, jobs, threads)
-        for record in done_now:
+        for record in runner.run_on_cluster(open_tasks, dask) if dask else runner.run(open_tasks, jobs, threads):
             check_content(record, plan)
             records.append(out / records.FILE, replace(record, commit=plan.commit))
             bar.set_postfix_str(f"{record.method} {record.pair}", refresh=False)

@@ -103,7 +103,8 @@ def write_pairs(
     plan = list(_plan(recipe, bones))
     others = [specimen for found in bones.values() for specimen in found]
     shared = others, out.resolve()
-    entries = _on_cluster(dask, plan, shared) if dask else (_pair_entry(job, shared) for job in plan)
+    here = (_pair_entry(job, shared) for job in plan)
+    entries = cluster.results(dask, _pair_entry, plan, shared) if dask else here
     found = {e["name"]: e for e in tqdm(entries, desc="pairs", unit="pair", total=len(plan), disable=None)}
     pairs = [found[job.name] for job in plan]
     digest = sha256("".join(f"{p['name']} {p['sha256']}\n" for p in pairs).encode()).hexdigest()
@@ -159,14 +160,6 @@ def _plan(recipe: Recipe, bones: dict[str, list[Specimen]]) -> Iterator[_Job]:
                 specimen = bones[bone][index % len(bones[bone])]
                 name = f"{protocol}_{bone}_{index:04d}"
                 yield _Job(name, protocol, specimen, 1_000_000 * recipe.seed + index, index)
-
-
-def _on_cluster(address: str, plan: list[_Job], shared: tuple[list[Specimen], Path]) -> Iterator[dict[str, Any]]:
-    """Entries in the order in which they are drawn."""
-    for _, outcome in cluster.outcomes(address, _pair_entry, plan, shared):
-        if isinstance(outcome, Exception):
-            raise outcome
-        yield outcome
 
 
 def _pair_entry(job: _Job, shared: tuple[list[Specimen], Path]) -> dict[str, Any]:

@@ -30,16 +30,20 @@ def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
 
     Read-only: the same fit gets the same array.
     """
-    inliers = fit.moved[fit.weights > 0.0]
-    if not len(inliers):
-        return np.zeros((len(fit.moved), 1))
-    chosen = inliers[sampling.thin(inliers, min(centres, len(inliers)))]
-    among = smooth_correlation(chosen, chosen, correlation_mm)
-    to_points = smooth_correlation(chosen, fit.moved, correlation_mm)
-    root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))
-    spanned = np.asarray(solve_triangular(root, to_points, lower=True).T)
+    spanned = _spanned(fit.moved, fit.weights > 0.0, correlation_mm, centres)
     spanned.flags.writeable = False
     return spanned
+
+
+def _spanned(points: Array, inlier: NDArray[np.bool_], correlation_mm: float, centres: int) -> Array:
+    inliers = points[inlier]
+    if not len(inliers):
+        return np.zeros((len(points), 1))
+    chosen = inliers[sampling.thin(inliers, min(centres, len(inliers)))]
+    among = smooth_correlation(chosen, chosen, correlation_mm)
+    to_points = smooth_correlation(chosen, points, correlation_mm)
+    root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))
+    return np.asarray(solve_triangular(root, to_points, lower=True).T)
 
 
 def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:

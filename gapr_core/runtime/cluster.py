@@ -15,13 +15,25 @@ WAITING = 3  # tasks that wait for each worker: memory stays flat however long t
 ARGUMENT = "address of a Dask scheduler, such as tcp://host:8786: run on its workers, which share the folders"
 
 
+class WorkersDiedError(RuntimeError):
+    """Three workers have died of one task."""
+
+
+def results(address: str, call: Callable[..., Result], tasks: Iterable[Task], shared: Any = None) -> Iterator[Result]:
+    """What the calls return, as `outcomes`; the first error of a task ends it, and is raised."""
+    for _, outcome in outcomes(address, call, tasks, shared):
+        if isinstance(outcome, Exception):
+            raise outcome
+        yield outcome
+
+
 def outcomes(
     address: str, call: Callable[..., Result], tasks: Iterable[Task], shared: Any = None
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Every task with what its call returned or raised, in the order in which they finish.
 
-    A task whose worker dies goes to another one. When three workers have died of it, its outcome is
-    `distributed.KilledWorker`.
+    A task whose worker dies goes to another one. When three workers have died of it, its outcome is a
+    `WorkersDiedError`.
 
     Args:
         address: of the scheduler.
@@ -54,7 +66,10 @@ def outcomes(
 
         finished = distributed.as_completed(submit(WAITING * len(workers)))
         for future in finished:
-            yield under_way.pop(future), future.exception() or future.result()
+            raised = future.exception()
+            if isinstance(raised, distributed.KilledWorker):
+                raised = WorkersDiedError(str(raised))
+            yield under_way.pop(future), raised or future.result()
             finished.update(submit(1))
 
 

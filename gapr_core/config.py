@@ -248,11 +248,12 @@ class ClutterConfig(Settings):
     seeds: tuple[int, ...] = setting((24, 12), "regions of each radius in a round", low=1, high=1000)
     rounds: int = setting(2, "rounds of other regions, until an answer is sure", low=1, high=100)
     references: int = setting(4, "points of a region that are laid on anchors", low=1, high=1000)
+    spins: int = setting(24, "turns about the normal", low=1, high=360)
     probes: int = setting(32, "points of a region that score a pose", low=3, high=1000)
     first_limit_mm: float = setting(
         5.0, "mean distance of the first probes above which a pose is bad", low=0, high=100, unit="mm"
     )
-    keep: int = setting(300, "poses that a region proposes", low=1, high=100_000)
+    keep: int = setting(150, "poses that a region proposes", low=1, high=100_000)
     region_points: int = setting(64, "points of a region that refine its poses", low=10)
     region_limits_mm: tuple[float, float, int] = setting((8.0, 4.0, 4), TUKEY, low=0.1, unit="mm")
     coarse_points: int = setting(500, "target points of the coarse step", low=10)
@@ -262,13 +263,13 @@ class ClutterConfig(Settings):
     coarse_front_mm: float = setting(
         6.0, "coarse step: target points farther in front of it are impossible", low=0.01, unit="mm"
     )
-    middle_poses: int = setting(1000, "poses that reach the middle step", low=1)
+    middle_poses: int = setting(500, "poses that reach the middle step", low=1)
     middle_reach_mm: float = setting(60.0, "around its region a pose is refined", low=5, unit="mm")
     middle_points: int = setting(300, "points of the middle step", low=10)
     middle_limits_mm: tuple[float, float, int] = setting((8.0, 2.5, 8), TUKEY, low=0.1, unit="mm")
     middle_target_points: int = setting(1500, "target points of the middle step", low=10)
     middle_on_mm: float = setting(2.5, "as coarse_on_mm, in the middle step", low=0.01, unit="mm")
-    final_poses: int = setting(200, "poses that reach the final step", low=1)
+    final_poses: int = setting(100, "poses that reach the final step", low=1)
     final_points: int = setting(1200, "points of the final step", low=10)
     final_limits_mm: tuple[float, float, int] = setting((5.0, 2.0, 8), TUKEY, low=0.1, unit="mm")
     final_target_points: int = setting(4000, "target points of the final step", low=10)

@@ -40,12 +40,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
     parser.add_argument("--out", required=True, type=Path, help="folder for records, models and their card")
     parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
+    parser.add_argument("--scenes", type=int, default=0, help="more pairs that are scenes (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
     args = parser.parse_args(arguments)
-    tasks = [Task(str(args.anatomy), args.split, args.seed, number) for number in range(args.count)]
+    which = (str(args.anatomy), args.split, args.seed)
+    tasks = [Task(*which, number) for number in range(args.count)]
+    tasks += [Task(*which, number, "scene") for number in range(args.scenes)]
     records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
     given = sys.argv[1:] if arguments is None else arguments
     commits = sorted({str(record.get("commit")) for record in records})

@@ -60,12 +60,13 @@ SCALES = (0.04, 0.07)  # by which a bone of a wrong scale is larger or smaller
 
 @dataclass(frozen=True)
 class Task:
-    """Which pair: number `number` of the list that folder, split and seed define."""
+    """Which pair: number `number` of the list that folder, split and seed define; or of a list of one family only."""
 
     folder: str
     split: str
     seed: int
     number: int
+    family: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +112,11 @@ class Drawn:
 def draw(task: Task) -> Drawn:
     """The pair of a task; the same task always gives the same pair."""
     rng = np.random.default_rng([task.seed, task.number, 62])
-    if rng.random() < SHAPE_SHARE:
+    if rng.random() < SHAPE_SHARE and not task.family:
         shape = sorted(SHAPES)[int(rng.integers(len(SHAPES)))]
         return Drawn(SHAPES[shape](int(rng.integers(2**31))), "shape", shape, "shape", ())
     setting = setting_of(task.folder, task.split, task.seed, task.number // IN_A_ROW)
-    family, seen_as = _choose_view(rng)
+    family, seen_as = _choose_view(rng, task.family)
     what = _choose(WHAT, rng)
     if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
         what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
@@ -226,9 +227,10 @@ def _one_of(specimens: Sequence[Specimen], rng: np.random.Generator) -> Specimen
     return specimens[int(rng.integers(len(specimens)))]
 
 
-def _choose_view(rng: np.random.Generator) -> tuple[str, str]:
-    """(family, how the bone is seen)."""
-    shares = {(family, name): share for family, views in SEEN_AS.items() for name, share in views.items()}
+def _choose_view(rng: np.random.Generator, only: str) -> tuple[str, str]:
+    """(family, how the bone is seen); of one family where that is named."""
+    families = {only: SEEN_AS[only]} if only else SEEN_AS
+    shares = {(family, name): share for family, views in families.items() for name, share in views.items()}
     return _choose(shares, rng)
 
 

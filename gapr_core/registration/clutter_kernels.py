@@ -6,7 +6,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gapr_core.registration.kernels import FAST, element_near, moved, residual, step
+from gapr_core.registration.kernels import FAST, add_up, element_near, moved, put_row, residual, rows_for, step, tukey
 
 
 @numba.njit(**FAST)
@@ -69,12 +69,12 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
     """
     out = poses.copy()
     surface = elements, nearest, origin, per_cell, spacing
-    H, g = np.empty((6, 6)), np.empty(6)
+    rows, H, g = np.empty((7, rows_for(len(points)))), np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
     for k in range(len(poses)):
         T = out[k]
         for i in range(len(limits)):
-            weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], same, middle, H, g)
+            weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], same, middle, rows, H, g)
             if weight > 0.0:
                 step(T, middle, H, g, weight)
     return out
@@ -82,14 +82,11 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
 
 @numba.njit(**FAST)
 def accumulate_agreeing(
-    T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limit, same, middle, H, g
+    T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limit, same, middle, rows, H, g
 ):
     """Normal equations H twist = g about the moved `middle` (3,), filled in place; returns the sum of the weights."""
-    H[:] = 0.0
-    g[:] = 0.0
-    J = np.empty(6)
-    total = 0.0
-    mx, my, mz = moved(T, middle)
+    middle = moved(T, middle)
+    count, total = 0, 0.0
     for p in range(len(points)):
         x, y, z = moved(T, points[p])
         q = element_near(x, y, z, nearest, origin, per_cell)
@@ -103,19 +100,9 @@ def accumulate_agreeing(
         if cosine < same and (signed or cosine > -same):
             continue
         r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, 0.0)
-        square = (r * r + aside * aside) / (limit * limit)
-        if square >= 1.0:
-            continue
-        w = (1.0 - square) ** 2
+        w = tukey(r * r + aside * aside, limit)
         total += w
-        x, y, z = x - mx, y - my, z - mz
-        J[0], J[1], J[2] = nx, ny, nz
-        J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-        for a in range(6):
-            g[a] -= w * J[a] * r
-            for b in range(a + 1):
-                H[a, b] += w * J[a] * J[b]
-    for a in range(6):
-        for b in range(a):
-            H[b, a] = H[a, b]
+        put_row(rows, count, w, x, y, z, middle, r, nx, ny, nz)
+        count += 1
+    add_up(rows, count, H, g)
     return total

@@ -102,18 +102,16 @@ def without_isolated(points: Array, config: SourceConfig) -> Array:
 
 def describe(points: Array, config: SourceConfig) -> PreparedSource:
     """Frames, neighbours and order of points (N, 3), mm, that are clean and thin already."""
-    tree = cKDTree(points)
-    neighbours = tree.query(points, k=_neighbour_count(len(points), config))[1]
+    gaps, neighbours = cKDTree(points).query(points, k=_neighbour_count(len(points), config))
     frames = quadrics.local_frames(points, neighbours)
-    reach_mm = np.linalg.norm(points[neighbours[:, -1]] - points, axis=1)
-    isolation = np.linalg.norm(points - points[neighbours].mean(axis=1), axis=1) / np.maximum(reach_mm, 1e-9)
+    isolation = np.linalg.norm(points - points[neighbours].mean(axis=1), axis=1) / np.maximum(gaps[:, -1], 1e-9)
     return PreparedSource(
         points,
         frames.axes,
         frames.flatness_mm,
         neighbours,
         _spread_order(points, isolation),
-        quadrics.spacing(points, tree),
+        float(np.median(gaps[:, 1])),
     )
 
 

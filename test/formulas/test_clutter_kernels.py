@@ -26,7 +26,9 @@ def cloud(egg):
 
 def equations(T, points, normals, signed, egg, limit, same=SAME):
     middle, H, g = points.mean(axis=0), np.full((6, 6), 7.0), np.full(6, 7.0)
-    total = kernels.accumulate_agreeing(T, points, normals, signed, *egg.kernel_view, limit, same, middle, H, g)
+    total = kernels.accumulate_agreeing(
+        T, points, normals, signed, *egg.kernel_view, limit, same, middle, tiny.rows(points), H, g
+    )
     return total, H, g
 
 

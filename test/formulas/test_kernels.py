@@ -148,7 +148,7 @@ def test_the_normal_equations_are_those_of_weighted_least_squares(variance, elem
     trust, small = RNG.uniform(0.2, 1.0, 60), se3.exp([0.5, -0.4, 0.3, 0.02, 0.03, -0.01])
     H, g = np.full((6, 6), 7.0), np.full(6, 7.0)
     middle = points.mean(axis=0)
-    kernels.accumulate(small, points, trust, middle, *view(target), 2.5, variance, H, g)
+    kernels.accumulate(small, points, trust, middle, *view(target), 2.5, variance, tiny.rows(points), H, g)
     expected_H, expected_g = expected_equations(small, points, trust, target, 2.5, variance)
     assert np.allclose(H, expected_H) and np.allclose(g, expected_g)
 
@@ -157,7 +157,7 @@ def test_a_point_aside_of_the_surface_weighs_less_by_both_distances():
     """3 mm beyond the disc of the plane's first element, a corner: Tukey's weight of 0.1 and 3 mm."""
     plane, limit = tiny.plane(size_mm=40.0, step_mm=2.0), 5.0
     points, H, g = np.array([[-27.0, -20.0, 0.1]]), np.empty((6, 6)), np.empty(6)
-    kernels.accumulate(np.eye(4), points, np.ones(1), points[0], *view(plane), limit, 0.0, H, g)
+    kernels.accumulate(np.eye(4), points, np.ones(1), points[0], *view(plane), limit, 0.0, tiny.rows(points), H, g)
     weight = (1.0 - (0.1**2 + 3.0**2) / limit**2) ** 2
     assert np.diag(H) == pytest.approx([0.0, 0.0, weight, 0.0, 0.0, 0.0])
     assert g == pytest.approx([0.0, 0.0, -0.1 * weight, 0.0, 0.0, 0.0])
@@ -182,7 +182,7 @@ def test_a_residual_at_the_limit_weighs_nothing():
     target, H, g = tiny.plane(), np.empty((6, 6)), np.empty(6)
     for height, weighs in ((1.99, True), (2.0, False), (2.01, False)):
         point = np.array([[0.0, 0.0, height]])
-        kernels.accumulate(np.eye(4), point, np.ones(1), point[0], *view(target), 2.0, 0.0, H, g)
+        kernels.accumulate(np.eye(4), point, np.ones(1), point[0], *view(target), 2.0, 0.0, tiny.rows(point), H, g)
         assert bool(H[2, 2] > 0.0) is weighs
 
 
@@ -258,7 +258,9 @@ def test_each_iteration_takes_its_own_limit_and_variance():
     done, _ = kernels.refine_batch(start[None], points, trust, *view(target), limits, variances)
     by_hand, H, g = start.copy(), np.empty((6, 6)), np.empty(6)
     for limit, variance in zip(limits, variances, strict=True):
-        kernels.accumulate(by_hand, points, trust, points.mean(axis=0), *view(target), limit, variance, H, g)
+        kernels.accumulate(
+            by_hand, points, trust, points.mean(axis=0), *view(target), limit, variance, tiny.rows(points), H, g
+        )
         kernels.step(by_hand, points.mean(axis=0), H, g, 40)
     assert np.allclose(done[0], by_hand, atol=1e-12)
 

@@ -74,6 +74,10 @@ def _part(source: PreparedSource, members: NDArray[np.int64]) -> PreparedSource:
 def search(region: Region, target: PreparedTarget, config: ClutterConfig) -> Proposals:
     """Hypotheses of one region."""
     few = SearchConfig(
-        references=config.references, probes=config.probes, keep=config.keep, first_limit_mm=config.first_limit_mm
+        references=config.references,
+        spins=config.spins,
+        probes=config.probes,
+        keep=config.keep,
+        first_limit_mm=config.first_limit_mm,
     )
     return NormalAlignedSearch(few, num_threads=1).propose(region.source, target, np.random.default_rng(0))

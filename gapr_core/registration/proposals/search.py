@@ -57,6 +57,7 @@ class NormalAlignedSearch:
         self, local: NDArray[np.float32], anchors: NDArray[np.float32], axes: NDArray[np.float32], field: DistanceField
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         limit = self.config.first_limit_mm * 255.0 / field.reach_mm
+        corner = (field.origin - 0.5 * field.cell_mm).astype(np.float32)
         with ThreadPoolExecutor(thread_count(self.num_threads)) as pool:
             rows = pool.map(
                 _best_spins,
@@ -64,7 +65,7 @@ class NormalAlignedSearch:
                 repeat(anchors),
                 repeat(axes),
                 repeat(field.distance),
-                repeat(field.origin.astype(np.float32)),
+                repeat(corner),
                 repeat(np.float32(1.0 / field.cell_mm)),
                 repeat(self.config.first_probes),
                 repeat(np.float32(limit)),
@@ -87,16 +88,16 @@ def _anchor_axes(target: PreparedTarget) -> Array:
 
 
 def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config: SearchConfig) -> NDArray[np.float32]:
-    """(spins, probes, 3) probe points in the frame of one reference, turned about its normal."""
+    """(probes, 3, spins) probe points in the frame of one reference, turned about its normal."""
     probes = (source.subset(config.probes) - source.points[reference]) @ _signed_axes(source, reference, sign).T
-    angle = 2.0 * np.pi * np.arange(config.spins)[:, None] / config.spins
-    x, y, z = probes.T
+    angle = 2.0 * np.pi * np.arange(config.spins) / config.spins
+    x, y, z = probes.T[:, :, None]
     turned = [
         np.cos(angle) * x - np.sin(angle) * y,
         np.sin(angle) * x + np.cos(angle) * y,
-        np.broadcast_to(z, (len(angle), len(z))),
+        np.broadcast_to(z, (len(z), len(angle))),
     ]
-    return np.stack(turned, axis=-1).astype(np.float32)
+    return np.stack(turned, axis=1).astype(np.float32)
 
 
 def _signed_axes(source: PreparedSource, reference: int, sign: float) -> Array:
@@ -125,33 +126,54 @@ def _poses(
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):  # type: ignore[no-untyped-def]
-    """For every anchor the lowest mean probe distance (in field steps) over the spins, and that spin."""
-    spins, probes = local.shape[0], local.shape[1]
-    nx, ny, nz = distance.shape
-    score = np.empty(len(anchors), dtype=np.float32)
-    best = np.zeros(len(anchors), dtype=np.int32)
+    """For every anchor the lowest mean probe distance (in field steps) over the spins, and that spin.
+
+    `local` (probes, 3, spins); `origin` is the corner of the field's first cell. All spins go side by side, which
+    compilers turn into wide instructions; after the `first` probes only those within `limit` go on.
+    """
+    probes, _, spins = local.shape
+    worst = 255 * probes
+    most = limit * np.float32(first) if first < probes else np.float32(worst)
+    first = min(first, probes)
+    score, best = np.empty(len(anchors), dtype=np.float32), np.zeros(len(anchors), dtype=np.int32)
+    totals, cells = np.empty(spins, dtype=np.int32), np.empty(spins, dtype=np.int32)
+    left = np.empty(spins, dtype=np.int32)
+    rest = np.empty((probes - first, 3, spins), dtype=np.float32)
     for a in range(len(anchors)):
-        ax = (anchors[a, 0] - origin[0]) * per_cell + np.float32(0.5)
-        ay = (anchors[a, 1] - origin[1]) * per_cell + np.float32(0.5)
-        az = (anchors[a, 2] - origin[2]) * per_cell + np.float32(0.5)
-        m = axes[a] * per_cell
-        lowest = 255 * probes
+        place, m = (anchors[a] - origin) * per_cell, axes[a] * per_cell
+        totals[:] = 0
+        _add_probes(totals, spins, local[:first], place, m, distance, cells)
+        count = np.intp(0)
         for s in range(spins):
-            total = 0
-            for k in range(probes):
-                x, y, z = local[s, k, 0], local[s, k, 1], local[s, k, 2]
-                i = int(np.floor(ax + m[0, 0] * x + m[1, 0] * y + m[2, 0] * z))
-                j = int(np.floor(ay + m[0, 1] * x + m[1, 1] * y + m[2, 1] * z))
-                h = int(np.floor(az + m[0, 2] * x + m[1, 2] * y + m[2, 2] * z))
-                if i < 0 or j < 0 or h < 0 or i >= nx or j >= ny or h >= nz:
-                    total += 255
-                else:
-                    total += distance[i, j, h]
-                if total >= lowest or (k < first < probes and total > limit * first):
-                    total = lowest
-                    break
-            if total < lowest:
-                lowest = total
-                best[a] = s
+            if totals[s] <= most:
+                left[count], totals[count] = s, totals[s]
+                count += 1
+        if count:
+            for k in range(first, probes):
+                for axis in range(3):
+                    for n in range(count):
+                        rest[k - first, axis, n] = local[k, axis, left[n]]
+            _add_probes(totals, count, rest, place, m, distance, cells)
+        lowest = worst
+        for n in range(count):
+            if totals[n] < lowest:
+                lowest, best[a] = totals[n], left[n]
         score[a] = np.float32(lowest) / np.float32(probes)
     return score, best
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _add_probes(totals, count, local, place, m, distance, cells):  # type: ignore[no-untyped-def]
+    """Add to the first `count` totals the field's value at every probe (probes, 3, spins), 255 outside of it."""
+    nx, ny, nz = distance.shape
+    flat = distance.ravel()
+    for k in range(len(local)):
+        for s in range(count):
+            x, y, z = local[k, 0, s], local[k, 1, s], local[k, 2, s]
+            i = np.int32(np.floor(place[0] + m[0, 0] * x + m[1, 0] * y + m[2, 0] * z))
+            j = np.int32(np.floor(place[1] + m[0, 1] * x + m[1, 1] * y + m[2, 1] * z))
+            h = np.int32(np.floor(place[2] + m[0, 2] * x + m[1, 2] * y + m[2, 2] * z))
+            inside = (i >= 0) & (j >= 0) & (h >= 0) & (i < nx) & (j < ny) & (h < nz)
+            cells[s] = (i * ny + j) * nz + h if inside else -1
+        for s in range(count):
+            totals[s] += flat[cells[s]] if cells[s] >= 0 else 255

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapr_core.calibration import pairs
+from gapr_core.calibration import collect, pairs
 from gapr_core.calibration.other_side import on_own_side
 from gapr_core.calibration.pairs import Task
 from gapr_core.calibration.shapes import SHAPES, turned_pair
@@ -142,6 +142,16 @@ def test_the_shares_hold(people, monkeypatch):
     assert what.count("own") / 400 == pytest.approx(0.66, abs=0.07)
     assert set(what) == set(pairs.WHAT)
     assert len({each.family for each in drawn}) == len(pairs.SEEN_AS)
+
+
+def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people, monkeypatch):
+    monkeypatch.setattr(pairs, "SHAPE_SHARE", 1.0)
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "_before", lambda setting, stranger, what, pair: pair)
+    drawn = [pairs.draw(Task(FOLDER, "train", 3, number, "scene")) for number in range(40)]
+    assert {each.seen_as for each in drawn} == set(pairs.SEEN_AS["scene"])
+    names = {collect._name(Task(FOLDER, "train", 3, 1, family)) for family in ("", "scene", "laser")}
+    assert names == {"3-1", "3-scene-1", "3-laser-1"}
 
 
 class _NoView:

@@ -245,8 +245,8 @@ class ClutterConfig(Settings):
     """Clouds of a camera that saw more than bone: regions propose, lines of sight decide."""
 
     radii_mm: tuple[float, ...] = setting((30.0, 45.0), "radii of the regions that propose", low=5, unit="mm")
-    seeds: tuple[int, ...] = setting((24, 12), "regions of each radius in a round", low=1, high=1000)
-    rounds: int = setting(2, "rounds of other regions, until an answer is sure", low=1, high=100)
+    seeds: tuple[int, ...] = setting((12, 6), "regions of each radius in a round", low=1, high=1000)
+    rounds: int = setting(4, "rounds of other regions, until an answer is sure", low=1, high=100)
     references: int = setting(4, "points of a region that are laid on anchors", low=1, high=1000)
     spins: int = setting(24, "turns about the normal", low=1, high=360)
     probes: int = setting(32, "points of a region that score a pose", low=3, high=1000)

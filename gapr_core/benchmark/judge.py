@@ -16,7 +16,10 @@ from gapr_core.results import RegistrationResult
 
 Array = NDArray[np.float64]
 
-FACTS = ("cohort", "overlap", "noise_mm", "bias_mm", "outlier_share", "wrong_kind", "degraded_as", "bone_share")
+FACTS = (
+    "cohort", "overlap", "noise_mm", "bias_mm", "outlier_share", "wrong_kind", "degraded_as", "source_person",
+    "bone_share",
+)  # fmt: skip
 
 
 def pair_facts(pair: Pair) -> PairFacts:

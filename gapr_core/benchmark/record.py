@@ -21,8 +21,8 @@ class PairFacts:
         has_truth: False where the right answer is a refusal.
         source_points, target_points: counts.
         half_extent_mm: of the target.
-        cohort, overlap, noise_mm, bias_mm, outlier_share, bone_share, wrong_kind, degraded_as: how the pair was made;
-            None where its file does not say.
+        cohort, overlap, noise_mm, bias_mm, outlier_share, bone_share, wrong_kind, degraded_as, source_person: how the
+            pair was made; None where its file does not say.
     """
 
     pair: str
@@ -41,6 +41,7 @@ class PairFacts:
     bone_share: float | None = None
     wrong_kind: str | None = None
     degraded_as: str | None = None
+    source_person: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

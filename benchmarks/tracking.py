@@ -1,6 +1,6 @@
 """Streams: every frame by itself, the `Tracker` and the `Accumulator`, on the same streams in one run.
 
-    python benchmarks/tracking.py --anatomy DIR [--split val] [--count 4] [--bones femur,tibia,pelvis]
+    python benchmarks/tracking.py --anatomy DIR [--split val] [--count 4] [--bones femur,tibia] [--kinds NAME ...]
 
 Each frame is a small one-sided view. The bone moves a little from frame to frame, or also jumps every eighth frame; or
 it is another subject's, so that every pose is wrong; or it rests, and each frame is a slice of it, as an image of a
@@ -56,12 +56,13 @@ def main() -> int:
     parser.add_argument("--split", default="val")
     parser.add_argument("--count", type=int, default=4, help="streams per bone and kind")
     parser.add_argument("--bones", default="femur,tibia,pelvis,thoracic", help="with commas")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="NAME", help="of streams")
     args = parser.parse_args()
     full = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     methods = {BY_ITSELF: full, "tracker": Tracker(full), "accumulator": Accumulator(Tracker(full), 24)}
     people = {bone: specimens(bone, args.split, 4, args.anatomy) for bone in args.bones.split(",")}
-    tallies = {(kind, name): Tally() for kind in KINDS for name in chosen(kind)}
-    runs = [(kind, bone, i) for kind in KINDS for bone in people for i in range(args.count)]
+    tallies = {(kind, name): Tally() for kind in args.kinds for name in chosen(kind)}
+    runs = [(kind, bone, i) for kind in args.kinds for bone in people for i in range(args.count)]
     for kind, bone, i in tqdm(runs, "streams"):
         frames = stream(kind, people[bone], i)
         target = full.prepare(frames[0].target)

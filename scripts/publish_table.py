@@ -18,6 +18,7 @@ from gapr_core.runtime import origin
 
 TABLES = Path(__file__).resolve().parents[1] / "docs" / "results" / "tables"
 ABSOLUTE = re.compile(r"(?<![\w.])/(?:[\w.+-]+/)*([\w.+-]+)/?")
+RULE = re.compile(r"\|(\s*-{3,}\s*\|)+$")  # the line under the head of a table
 
 
 def main() -> None:
@@ -40,8 +41,10 @@ def main() -> None:
 
 
 def printed(text: str, command: str, commit: str) -> str:
-    """The table lines of an output, and a line on where they come from."""
-    table = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    """The table lines of an output, a blank one before each next head, and a line on where they come from."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    rules = {number for number, line in enumerate(lines) if RULE.match(line)}
+    table = "\n".join("\n" * (number > 0 and number + 1 in rules) + line for number, line in enumerate(lines))
     machine = f"{origin.cpu_name()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     return f"{table}\n\nMade by `{command}` at commit {commit}, {machine}.\n"
 

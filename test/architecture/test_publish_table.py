@@ -24,3 +24,9 @@ def test_what_a_script_printed_keeps_its_table_and_says_command_and_commit(tmp_p
     text = publish(tmp_path, tmp_path / "printed.txt", "--command", "python x.py", "--commit", "abc")
     assert text.startswith("| a | b |\n|---|---|\n| 1 | 2 |\n\nMade by `python x.py` at commit abc, ")
     assert "done" not in text and "###" not in text
+
+
+def test_tables_that_follow_each_other_stay_apart_and_keep_all_their_rows(tmp_path):
+    (tmp_path / "printed.txt").write_text("| a |\n| --- |\n| 1 |\n| - |\n\n| b |\n|---|\nnoise\n| 2 |\n")
+    text = publish(tmp_path, tmp_path / "printed.txt", "--command", "python x.py", "--commit", "abc")
+    assert text.startswith("| a |\n| --- |\n| 1 |\n| - |\n\n| b |\n|---|\n| 2 |\n\nMade by")

@@ -7,11 +7,8 @@ scale of the noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +25,7 @@ from gapr_core.registration.proposals.regions import Region
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
-from gapr_core.runtime.parallel import thread_count
+from gapr_core.runtime.parallel import in_threads, thread_count
 
 Array = NDArray[np.float64]
 
@@ -90,7 +87,7 @@ def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterC
         poses = regions.search(region, target, config).poses
         return steps.refined(poses, region.source, region.source.order[: config.region_points])
 
-    found = _in_threads(work, scene.regions, num_threads)
+    found = in_threads(work, scene.regions, num_threads=num_threads)
     label = np.repeat(np.arange(-1, len(found)), [len(given), *map(len, found)])
     return Pool(np.concatenate([given, *found]), label, np.zeros(len(label)))
 
@@ -129,7 +126,7 @@ def refine_around(
         some = scene.source.order[near[near < len(scene.source.order)]]
         poses[of_it] = steps.refined(pool.poses[of_it], scene.source, some)
 
-    _in_threads(work, np.unique(pool.region), num_threads)
+    in_threads(work, np.unique(pool.region), num_threads=num_threads)
     pool = replace(pool, poses=poses)
     return _scored(pool, scene, target, config.middle_target_points, config.middle_on_mm, config.front_mm, num_threads)
 
@@ -141,7 +138,7 @@ def refine_on_all(
     steps = _Steps(target, np.linspace(*config.final_limits_mm), config.free_space.same_surface_cos)
     pieces = [p for p in np.array_split(pool.poses, 4 * thread_count(num_threads)) if len(p)]
     work = partial(steps.refined, source=scene.source, some=scene.source.order[: config.final_points])
-    pool = replace(pool, poses=np.concatenate(_in_threads(work, pieces, num_threads)))
+    pool = replace(pool, poses=np.concatenate(in_threads(work, pieces, num_threads=num_threads)))
     pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
     return _best_distinct(pool, scene, config, config.kept_poses)
 
@@ -200,8 +197,3 @@ def _moved_markers(pool: Pool, scene: Scene, count: int) -> Array:
     """(K, count, 3) the same spread source points under every pose."""
     markers = scene.source.subset(count)
     return np.asarray(np.einsum("kij,nj->kni", pool.poses[:, :3, :3], markers) + pool.poses[:, None, :3, 3])
-
-
-def _in_threads(work: Callable[[Any], Any], items: Iterable[Any], num_threads: int) -> list[Any]:
-    with ThreadPoolExecutor(thread_count(num_threads)) as pool:
-        return list(pool.map(work, items))

@@ -7,7 +7,6 @@ elements that fit their surroundings badly weigh less, and a patch of the source
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import kernels
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.runtime.parallel import thread_count
+from gapr_core.runtime.parallel import in_threads, thread_count
 
 Array = NDArray[np.float64]
 
@@ -70,15 +69,13 @@ def refine_many(
     Returns:
         (K, 4, 4) refined poses and (K,) mean squared distances truncated at the last limit, mm^2 (small is good).
     """
-    threads = thread_count(num_threads)
-    pieces = [p for p in np.array_split(np.ascontiguousarray(poses), 4 * threads) if len(p)]
+    pieces = [p for p in np.array_split(np.ascontiguousarray(poses), 4 * thread_count(num_threads)) if len(p)]
     variances, trust = np.zeros_like(limits_mm), np.ones(len(points))
 
     def work(piece: Array) -> tuple[Array, Array]:
         return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances)
 
-    with ThreadPoolExecutor(threads) as pool:
-        refined, scores = zip(*pool.map(work, pieces), strict=True)
+    refined, scores = zip(*in_threads(work, pieces, num_threads=num_threads), strict=True)
     return np.concatenate(refined), np.concatenate(scores)
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
 from multiprocessing import parent_process
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -18,6 +19,15 @@ Result = TypeVar("Result")
 def thread_count(requested: int) -> int:
     """The number asked for; 0 means every core that this process may use."""
     return requested or len(os.sched_getaffinity(0))
+
+
+def in_threads(work: Callable[..., Result], *columns: Iterable[Any], num_threads: int = 0) -> list[Result]:
+    """`list(map(work, *columns))`, in that many threads; 0 means every core. One thread is the caller's own."""
+    threads = thread_count(num_threads)
+    if threads == 1:
+        return list(map(work, *columns))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(work, *columns))
 
 
 def end_with_parent() -> None:

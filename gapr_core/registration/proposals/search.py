@@ -8,9 +8,7 @@ place has decided it.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import repeat
 
 import numba
 import numpy as np
@@ -22,7 +20,7 @@ from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.runtime.parallel import thread_count
+from gapr_core.runtime.parallel import in_threads
 
 Array = NDArray[np.float64]
 
@@ -58,19 +56,13 @@ class NormalAlignedSearch:
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         limit = self.config.first_limit_mm * 255.0 / field.reach_mm
         corner = (field.origin - 0.5 * field.cell_mm).astype(np.float32)
-        with ThreadPoolExecutor(thread_count(self.num_threads)) as pool:
-            rows = pool.map(
-                _best_spins,
-                local,
-                repeat(anchors),
-                repeat(axes),
-                repeat(field.distance),
-                repeat(corner),
-                repeat(np.float32(1.0 / field.cell_mm)),
-                repeat(self.config.first_probes),
-                repeat(np.float32(limit)),
-            )
-            scores, spins = zip(*rows, strict=True)
+        same = anchors, axes, field.distance, corner, np.float32(1.0 / field.cell_mm)
+        first = self.config.first_probes, np.float32(limit)
+
+        def work(turned: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+            return _best_spins(turned, *same, *first)  # type: ignore[no-any-return]
+
+        scores, spins = zip(*in_threads(work, local, num_threads=self.num_threads), strict=True)
         return np.stack(scores), np.stack(spins)
 
 

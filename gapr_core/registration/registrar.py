@@ -30,7 +30,7 @@ from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import verify
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
-from gapr_core.runtime.parallel import single_threaded_blas
+from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -95,6 +95,7 @@ class Registrar:
         """The confidence model of a source with a viewpoint, read when the first one comes."""
         return self._scene_calibration or Calibration.shipped(clutter.NAME)
 
+    @single_threaded_libraries
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
         prepared = targets.prepare(target, units, self.config.target)
@@ -124,7 +125,7 @@ class Registrar:
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
 
-    @single_threaded_blas
+    @single_threaded_libraries
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
         """The answer to an assessment: thresholds, guidance where asked for, times."""
         if isinstance(assessment, Refusal):
@@ -132,7 +133,7 @@ class Registrar:
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
         return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
 
-    @single_threaded_blas
+    @single_threaded_libraries
     def assess(
         self,
         source: ArrayLike,

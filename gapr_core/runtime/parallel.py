@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -46,21 +47,23 @@ def end_with_parent() -> None:
     threading.Thread(target=follow, name="end with parent", daemon=True).start()
 
 
-def single_threaded_blas(call: Callable[Given, Result]) -> Callable[Given, Result]:
-    """The same call; while it runs, NumPy's and SciPy's linear algebra uses one thread, in the whole process.
+def single_threaded_libraries(call: Callable[Given, Result]) -> Callable[Given, Result]:
+    """The same call; while it runs, linear algebra and OpenMP, and with it torch, use one thread.
 
-    The matrices of a registration are small. Several threads gain nothing with them, and waste whole cores in busy
-    waiting as soon as something else wants one. Threads of our own kernels are not affected.
+    The matrices of a registration are small. Several threads gain little with them, and wait for each other busily: as
+    soon as something else wants a core, a registration with two of them takes nine times as long. Threads of our own
+    loops are not affected, nor is OpenMP in other threads of the process; linear algebra is, everywhere.
     """
 
     @wraps(call)
     def limited(*args: Given.args, **kwargs: Given.kwargs) -> Result:
-        with _controller().limit(limits=1, user_api="blas"):
+        with _controller("torch" in sys.modules).limit(limits=1):
             return call(*args, **kwargs)
 
     return limited
 
 
 @cache
-def _controller() -> ThreadpoolController:
+def _controller(with_torch: bool) -> ThreadpoolController:
+    """Of the libraries that are loaded; torch brings its own OpenMP."""
     return ThreadpoolController()

@@ -1,4 +1,4 @@
-"""Threads of linear algebra during a registration, and workers that end with their parent."""
+"""Threads of libraries during a registration, and workers that end with their parent."""
 
 import signal
 import subprocess
@@ -8,6 +8,7 @@ import time
 import numpy as np
 import psutil
 import pytest
+import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from gapr_core import Registrar
@@ -15,20 +16,20 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.registration.proposals.base import Proposals
 
 
-def blas_threads():
-    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+def threads(api):
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == api}
 
 
 class Witness:
-    """Proposes nothing, and remembers how many threads linear algebra had."""
+    """Proposes nothing, and remembers how many threads linear algebra and torch had."""
 
     name = "search"
 
     def prepare(self, target):
-        pass
+        self.prepared_with = threads("blas"), torch.get_num_threads()
 
     def propose(self, source, target, rng):
-        self.seen = blas_threads()
+        self.proposed_with = threads("blas"), torch.get_num_threads()
         return Proposals(np.empty((0, 4, 4)), np.empty(0))
 
 
@@ -37,15 +38,36 @@ def cloud():
     return make_bone("tibia", 0).sample(3000, np.random.default_rng(0))[0]
 
 
-def test_linear_algebra_has_one_thread_while_a_cloud_is_registered_and_as_many_as_before_afterwards(cloud):
+def test_libraries_have_one_thread_while_a_cloud_is_registered_and_as_many_as_before_afterwards(cloud):
     witness = Witness()
     registrar = Registrar(proposers=[witness])
-    target = registrar.prepare(cloud)
-    with threadpool_limits(2, user_api="blas"):
-        before = blas_threads()
+    with threadpool_limits(2):
+        assert (threads("blas"), threads("openmp"), torch.get_num_threads()) == ({2}, {2}, 2)
+        target = registrar.prepare(cloud)
         registrar.register(cloud[:1500], target)
-        assert witness.seen == {1}
-        assert blas_threads() == before == {2}
+        assert (threads("blas"), threads("openmp"), torch.get_num_threads()) == ({2}, {2}, 2)
+    assert witness.prepared_with == witness.proposed_with == ({1}, 1)
+
+
+def test_torch_that_is_loaded_after_the_first_registration_has_one_thread_too():
+    done = subprocess.run([sys.executable, "-c", LATE_TORCH], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+LATE_TORCH = """
+from gapr_core.runtime.parallel import single_threaded_libraries
+
+@single_threaded_libraries
+def threads():
+    import sys
+    return sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
+
+assert threads() is None
+import torch
+from threadpoolctl import threadpool_limits
+with threadpool_limits(2):
+    assert threads() == 1 and torch.get_num_threads() == 2
+"""
 
 
 PARENT = """

@@ -24,6 +24,10 @@ class TrainConfig(Settings):
     model: str = setting("", "path of a yaml in config/model; empty: the defaults (best)")
     initial: str = setting("", "weights (safetensors) of the same network to begin with; empty: random ones")
     model_settings: dict[str, Any] = setting({}, "settings of the network over those of its yaml")
+    trained: str = setting(
+        "all", "what learns: all, or bone_head, a head on the network of `initial`, which stays as it is",
+        choices=("all", "bone_head"),
+    )  # fmt: skip
     bones: tuple[str, ...] = setting(("femur", "tibia", "pelvis", "thoracic"), "bone types")
     mix: dict[str, float] = setting(MIX, "protocols and how often each is drawn", low=0)
     target_frame: str = setting(

@@ -69,9 +69,8 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     network = (GAPRNet(model) if checkpoint.exists() else begin(config, model)).to(device)
     ema = GAPRNet(model).to(device)
     ema.load_state_dict(network.state_dict())
-    optimizer = torch.optim.AdamW(
-        network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
-    )
+    learns = learning(network, config.trained)
+    optimizer = torch.optim.AdamW(learns, config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay)
     state: dict[str, Any] = {"step": 0, "seconds": 0.0}
     if checkpoint.exists():
         state = load_checkpoint(checkpoint, network, ema, optimizer)
@@ -102,7 +101,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
                 losses = learner(pairs.to(device), generator)
                 (losses.total / per_step).backward()
             parts.append(losses)
-        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip)
+        norm = torch.nn.utils.clip_grad_norm_(learns, config.clip)
         lost = 0 if torch.isfinite(norm) else lost + 1
         if lost == MOST_LOST:
             raise FloatingPointError(f"{lost} steps in a row, up to {step + 1}, had gradients that are not finite")
@@ -144,15 +143,22 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
 def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
     """A network to train: with the weights of `config.initial`, or random ones.
 
+    Where the bone head alone is trained, `config.initial` need not have one.
+
     Raises:
-        ConfigError: the tensors of `config.initial` are not those of this network; other settings may differ.
-        WeightsError: it cannot be read.
+        ConfigError: the tensors of `config.initial` are not those of this network, other settings may differ; or the
+            bone head is to be trained alone, and there is none, or no network for it.
+        WeightsError: `config.initial` cannot be read.
     """
     network = GAPRNet(model)
+    if config.trained != "all":
+        check_head(config, model)
     if not config.initial:
         return network
     given = weights.load(config.initial)[0].state_dict()
     own = network.state_dict()
+    if config.trained != "all":
+        given = {name: tensor for name, tensor in own.items() if name.startswith(f"{config.trained}.")} | given
     if {name: tensor.shape for name, tensor in given.items()} != {name: tensor.shape for name, tensor in own.items()}:
         raise ConfigError(
             "initial weights of the network that is trained",
@@ -161,6 +167,21 @@ def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
         )
     network.load_state_dict(given)
     return network.train()
+
+
+def check_head(config: TrainConfig, model: ModelConfig) -> None:
+    """Raise `ConfigError` where there is no bone head to train alone, or no network that it could rest on."""
+    if model.bone_head == "none":
+        raise ConfigError("a network with a bone head", "bone_head: none", "train all, or choose bone_head: mlp")
+    if not config.initial:
+        raise ConfigError("weights of the network under the bone head", "no `initial`", "name them with --initial")
+
+
+def learning(network: GAPRNet, trained: str) -> list[nn.Parameter]:
+    """The parameters that a run changes, all or those of one part; the others get no gradient."""
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(trained == "all" or name.startswith(f"{trained}."))
+    return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 
 def bones_folder(folder: Path, config: TrainConfig) -> Path:

@@ -43,6 +43,7 @@ class ModelConfig(Settings):
     sigma_voxels: float = setting(2.0, "reach of a kernel point in voxels of its stage", low=0.1)
     small_ball: float = setting(0.5, "k_r: radius of the PGF's second ball over the first", low=0.01, high=1)
     bone_head: str = setting("none", "which source points are bone: none (all are), or mlp", choices=("none", "mlp"))
+    bone_scores: bool = setting(True, "the head's probabilities multiply the scores of matches")
     global_small_ball: str = setting(
         "part", "second ball of global self-attention: the bottleneck's whole ball (paper), or small_ball of it",
         choices=("part", "whole"),

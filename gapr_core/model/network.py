@@ -59,7 +59,8 @@ class GAPRNet(nn.Module):
         chosen = patch_pairs(coarse, self.config.test_pairs, source.coarse.lengths, target.coarse.lengths)  # C'
         fine = self.fine_matching(source, target, f_p.fine, f_q.fine, chosen)  # eq. (8)
         bone = self.bone(source, f_p, aggregated)
-        matches = self.fine_matching.correspondences(source, target, fine, chosen, bone.sigmoid())  # eq. (9)
+        weight = bone.sigmoid() if self.config.bone_scores else None
+        matches = self.fine_matching.correspondences(source, target, fine, chosen, weight)  # eq. (9)
         return Output(aggregated, coarse, chosen, fine, matches, bone)
 
     def bone(self, source: Cloud, features: Features, aggregated: Aggregated) -> Tensor:

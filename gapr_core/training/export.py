@@ -1,6 +1,7 @@
 """Turn the weights of a run into the file that ships: half precision, with a card in its header.
 
 python -m gapr_core.training.export runs/best --out gapr_core/weights/gapr_net.safetensors
+python -m gapr_core.training.export runs/bone_head --under OLD.safetensors --out gapr_core/weights/gapr_net.safetensors
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from typing import Any
 
 import torch
 
+from gapr_core.errors import WeightsError
 from gapr_core.model import weights
+from gapr_core.model.network import GAPRNet
 from gapr_core.runtime.console import say
 
 LICENCES = {
@@ -26,10 +29,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Read a run's averaged weights, write them as they ship."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder that `gapr train` wrote")
+    parser.add_argument("--under", type=Path, help="weights that a bone head was trained on: they must be unchanged")
     parser.add_argument("--out", required=True, type=Path, help="*.safetensors")
     args = parser.parse_args(arguments)
     network, trained = weights.load(args.run / "weights.safetensors")
-    digest = weights.save(network, args.out, card(trained), torch.float16)
+    under = {} if args.under is None else {"network": card_under(network, args.under)}
+    digest = weights.save(network, args.out, card(trained) | under, torch.float16)
     say(f"{args.out}: {args.out.stat().st_size / 1e6:.1f} MB, sha256 of the tensors {digest}")
     return 0
 
@@ -38,6 +43,20 @@ def card(trained: dict[str, Any]) -> dict[str, Any]:
     """What the header says about the weights: the run's own card, data, licences and split."""
     people = "train subjects of splits.json only, their shape models, and parametric bones"
     return {**trained, "data": people, "licences": LICENCES, "precision": "float16"}
+
+
+def card_under(network: GAPRNet, path: Path) -> dict[str, Any]:
+    """The card of the weights that a head was trained on.
+
+    Raises:
+        WeightsError: the network has other tensors in their place.
+    """
+    given, its_card = weights.load(path)
+    own = network.state_dict()
+    changed = [name for name, t in given.state_dict().items() if name not in own or not torch.equal(t, own[name])]
+    if changed:
+        raise WeightsError(f"the tensors of {path}, and a head", f"another {changed[0]}", "train the head alone")
+    return its_card
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ def tiny(path: Path, toy) -> ModelConfig:
                 "global_small_ball",
                 "early_features",
                 "bone_head",
+                "bone_scores",
             )
         },
     )

@@ -98,6 +98,28 @@ def test_a_run_can_begin_with_the_weights_of_another_one(settings, anatomy, tmp_
         trainer.train(replace(going_on, model=str(tmp_path / "wider.yaml")), tmp_path / "third", anatomy)
 
 
+def test_a_head_trained_alone_leaves_the_network_under_it_as_it_is_bit_by_bit(settings, anatomy, tmp_path):
+    under = trainer.train(replace(settings, pairs=4), tmp_path / "under", anatomy)
+    head = {"model_settings": {"bone_head": "mlp"}, "mix": {"scene-C2": 1.0}, "trained": "bone_head"}
+    alone = replace(settings, initial=str(under), pairs=8, validation_pairs=0, learning_rate=0.01, **head)
+    trainer.train(alone, tmp_path / "alone", anatomy, minutes=0.0)
+    begun = weights.load(tmp_path / "alone" / "weights.safetensors")[0].state_dict()
+    ended = weights.load(trainer.train(alone, tmp_path / "alone", anatomy))[0].state_dict()
+    before = weights.load(under)[0].state_dict()
+    assert all(torch.equal(tensor, ended[name]) for name, tensor in before.items())
+    learned = ended.keys() - before.keys()
+    assert learned and all(name.startswith("bone_head.") for name in learned)
+    assert all(not torch.equal(begun[name], ended[name]) for name in learned)
+
+
+def test_a_head_alone_needs_a_head_and_a_network_under_it(settings, anatomy, tmp_path):
+    alone = replace(settings, trained="bone_head")
+    with pytest.raises(ConfigError, match="a network with a bone head"):
+        trainer.train(alone, tmp_path / "headless", anatomy)
+    with pytest.raises(ConfigError, match="weights of the network under the bone head"):
+        trainer.train(replace(alone, model_settings={"bone_head": "mlp"}), tmp_path / "nothing", anatomy)
+
+
 def test_a_run_whose_gradients_are_never_finite_ends_with_an_error(settings, anatomy, tmp_path, monkeypatch):
     compute = trainer.compute_losses
 

@@ -1,16 +1,28 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
+from gapr_core.metrics import auroc
+from gapr_core.model import weights
 from gapr_core.model.bone_head import BelieveAll, ancestors
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
+from gapr_core.registration import source as sources
+from gapr_core.registration import target as targets
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 from gapr_core.training.losses import bone_loss, compute_losses
 from gapr_core.training.targets import join, training_pair
+
+# sha256 of the float16 tensors in the header of the file that shipped before there was a head (commit 07c00d2)
+WITHOUT_HEAD = "999f55e6de71bd0ae6316bc39a3314631e587d7c56d16845ca447184fed0ec92"
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +74,59 @@ def test_without_a_head_nothing_changes_and_nothing_is_learned(clouds, config):
     assert bone_loss(out.bone, torch.zeros(len(out.bone), dtype=torch.bool)) == 0.0
 
 
-def test_the_shipped_network_has_no_head():
-    assert NetworkProposer.from_weights(SHIPPED).network.config.bone_head == "none"
+def test_a_head_that_changes_no_score_leaves_every_match_as_it_is(clouds, toy):
+    config = toy.small_config(bone_head="mlp", bone_scores=False)
+    torch.manual_seed(0)
+    silent, bare = GAPRNet(config).eval(), GAPRNet(replace(config, bone_head="none")).eval()
+    weighing = GAPRNet(replace(config, bone_scores=True)).eval()
+    bare.load_state_dict({name: t for name, t in silent.state_dict().items() if not name.startswith("bone_head.")})
+    weighing.load_state_dict(silent.state_dict())
+    with torch.inference_mode():
+        said, without, weighed = (net(*clouds[:2]) for net in (silent, bare, weighing))
+    assert torch.isfinite(said.bone).all()
+    for name in ("source", "target", "score", "patch"):
+        assert torch.equal(getattr(said.matches, name), getattr(without.matches, name))
+    assert (weighed.matches.score < said.matches.score).all()
+
+
+def test_the_shipped_network_under_the_head_is_the_one_that_shipped_without_bit_by_bit():
+    network, card = weights.load(SHIPPED)
+    assert network.config.bone_head == "mlp" and not network.config.bone_scores
+    under = {name: t.half() for name, t in network.state_dict().items() if not name.startswith("bone_head.")}
+    assert weights.checksum(under) == WITHOUT_HEAD and card["network"]["step"] == 3750
+
+
+def test_the_shipped_features_and_matches_are_those_of_the_network_without_its_head(femur_cloud):
+    network = weights.load(SHIPPED)[0]
+    bare = GAPRNet(replace(network.config, bone_head="none")).eval()
+    bare.load_state_dict({name: t for name, t in network.state_dict().items() if not name.startswith("bone_head.")})
+    frame = target_frame(femur_cloud, network.config)
+    source = build_cloud(femur_cloud[femur_cloud[:, 2] > np.median(femur_cloud[:, 2])], frame, network.config)
+    target = build_cloud(femur_cloud, frame, network.config)
+    with torch.inference_mode():
+        one, other = network(source, target), bare(source, target)
+    for name in ("source", "target"):
+        assert torch.equal(getattr(one.aggregated, name), getattr(other.aggregated, name))
+    for name in ("source", "target", "score", "patch"):
+        assert torch.equal(getattr(one.matches, name), getattr(other.matches, name))
+
+
+def test_the_shipped_head_tells_bone_from_what_lies_around_it_in_a_scene(femur):
+    specimen = Specimen(femur, "femur", "3", "parametric")
+    proposer = NetworkProposer.from_weights(SHIPPED)
+    for level in ("scene-C2", "scene-C3"):
+        pair = make_pair(level, specimen, 5)
+        source = sources.prepare(pair.source)
+        said = proposer.bone(source, targets.prepare(pair.target))
+        is_bone = pair.metadata["is_bone"][cKDTree(pair.source).query(source.points)[1]]
+        assert said.shape == (len(source.points),) and ((said > 0.0) & (said < 1.0)).all()
+        assert auroc(said, is_bone) > 0.8
+
+
+def test_without_a_head_every_point_is_bone(femur, femur_cloud, config):
+    source = sources.prepare(femur_cloud[:1500])
+    said = NetworkProposer(GAPRNet(config)).bone(source, targets.prepare(femur_cloud))
+    assert (said == 1.0).all() and said.shape == (len(source.points),)
 
 
 def test_the_superpoint_of_a_point_is_found_level_by_level(clouds):

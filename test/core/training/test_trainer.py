@@ -14,11 +14,11 @@ import pytest
 import torch
 import yaml
 
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.export import leaves
 from gapr_core.surface import Surface
-from gapr_core.training import distributed, trainer
+from gapr_core.training import distributed, export, trainer
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
@@ -110,6 +110,14 @@ def test_a_head_trained_alone_leaves_the_network_under_it_as_it_is_bit_by_bit(se
     learned = ended.keys() - before.keys()
     assert learned and all(name.startswith("bone_head.") for name in learned)
     assert all(not torch.equal(begun[name], ended[name]) for name in learned)
+
+    shipped = tmp_path / "shipped.safetensors"
+    export.main([str(tmp_path / "alone"), "--under", str(under), "--out", str(shipped)])
+    card = weights.load(shipped)[1]
+    assert card["run"]["trained"] == "bone_head" and card["network"]["run"]["trained"] == "all"
+    other = trainer.train(replace(settings, pairs=4, seed=9), tmp_path / "other", anatomy)
+    with pytest.raises(WeightsError, match="and a head"):
+        export.main([str(tmp_path / "alone"), "--under", str(other), "--out", str(shipped)])
 
 
 def test_a_head_alone_needs_a_head_and_a_network_under_it(settings, anatomy, tmp_path):

@@ -153,3 +153,7 @@ def grown_from(values: Callable[[PreparedSource], Array] | None) -> AbstractCont
         return some[sampling.farthest_points(points, count, start)]
 
     return mock.patch.object(regions, "_seeds", seeds)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

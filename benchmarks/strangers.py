@@ -76,13 +76,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
     parser.add_argument("--split", default="val")
+    parser.add_argument("--bones", default=",".join(anatomy.BONES), help="with commas")
     parser.add_argument("--count", type=int, default=2000, help="pairs of another subject's bone")
     parser.add_argument("--mirrored", type=int, default=300, help="pairs of a mirrored femur or tibia")
     parser.add_argument("--sides", type=int, default=60, help="pairs of a mirrored pelvis or rib cage")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, required=True, help="folder for the records")
     args = parser.parse_args()
-    bones = bones_of(args.split, args.anatomy)
+    bones = bones_of(args.bones.split(","), args.split, args.anatomy)
     cases = cases_of(bones, args.count, args.mirrored, args.sides)
     args.out.mkdir(parents=True, exist_ok=True)
     found = run(cases, bones, args.out / records.FILE, args.jobs)
@@ -92,21 +93,23 @@ def main() -> int:
     return 0
 
 
-def bones_of(split: str, folder: Path | None) -> Bones:
+def bones_of(names: Sequence[str], split: str, folder: Path | None) -> Bones:
     """The bones of the split, and long parametric ones."""
-    known = [s for bone in anatomy.BONES for s in specimens(bone, split, PEOPLE, folder)]
-    known += [s for bone in LONG for s in specimens(bone, split, PARAMETRIC)]
+    known = [s for bone in names for s in specimens(bone, split, PEOPLE, folder)]
+    known += [s for bone in names if bone in LONG for s in specimens(bone, split, PARAMETRIC)]
     return {(s.bone, s.person): s for s in known}
 
 
 def cases_of(bones: Bones, count: int, mirrored: int, sides: int) -> list[Case]:
     """As many of each kind, in equal shares of the bones, those of one target in a row."""
+    known = list(dict.fromkeys(bone for bone, _ in bones))
     cases = [
         Case(bone, target, SUBJECT, source, "L3", seed)
-        for bone in anatomy.BONES
-        for seed, (target, source) in dealt(count // len(anatomy.BONES), others(bones, bone))
+        for bone in known
+        for seed, (target, source) in dealt(count // len(known), others(bones, bone))
     ]
-    for kind, names, number in ((MIRRORED, LONG, mirrored), (SIDE, SYMMETRIC, sides)):
+    for kind, mirrored_ones, number in ((MIRRORED, LONG, mirrored), (SIDE, SYMMETRIC, sides)):
+        names = [bone for bone in known if bone in mirrored_ones]
         for bone in names:
             subjects = [who for of_bone, who in bones if of_bone == bone]
             seen = [(who, LEVELS[(i + k) % len(LEVELS)]) for k in range(len(LEVELS)) for i, who in enumerate(subjects)]

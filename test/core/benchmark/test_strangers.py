@@ -39,6 +39,8 @@ def test_sources_are_of_every_other_subject_in_turn_and_have_no_true_pose(bones)
     of_two = Counter((case.target, case.source) for case in cases if case.bone == "tibia")
     assert len(of_two) == 6 and set(of_two.values()) == {2} and all(target != source for target, source in of_two)
     assert len({case.name for case in cases}) == 48
+    tibiae = {key: bone for key, bone in bones.items() if key[0] == "tibia"}
+    assert strangers.cases_of(tibiae, 12, 0, 0) == [case for case in cases if case.bone == "tibia"]
     case = next(case for case in cases if case.bone == "tibia")
     pair = strangers.pair_of(case, bones)
     assert not pair.has_truth and pair.person == case.target and pair.metadata["source_person"] == case.source

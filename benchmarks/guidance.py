@@ -69,7 +69,7 @@ def next_of(strategy: str, case: Case) -> Callable[[RegistrationResult, np.ndarr
     rng = np.random.default_rng([case.seed, 67])
     axis = extent.principal(case.surface).axes[0]
     along = case.surface @ axis
-    next_lane = se3.exp(np.concatenate([np.zeros(3), NEXT_LANE_RAD * axis]), np.zeros(3))
+    next_lane = se3.exp(np.concatenate([np.zeros(3), NEXT_LANE_RAD * axis]))
     way = 1.0 if along[case.start] < along.mean() else -1.0
 
     def guided(result: RegistrationResult, last: np.ndarray, number: int) -> np.ndarray:

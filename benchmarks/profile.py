@@ -1,4 +1,4 @@
-"""Where the time goes: every step of a registration and of the node, and how others do on the same clouds.
+"""Where the time goes: the steps of a registration, and how others do on the same clouds.
 
     python benchmarks/profile.py [--anatomy DIR] [--split val] [--repeats 20] [--threads 2]
 

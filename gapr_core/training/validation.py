@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from gapr_core.data import anatomy, parametric
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import Pair, make_pair
+from gapr_core.data.protocols import make_pair
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.se3 import PoseError
 from gapr_core.model.config import ModelConfig
@@ -26,6 +28,8 @@ from gapr_core.training.targets import TrainingPair, training_pair
 
 Array = NDArray[np.float64]
 
+FIRST_SEED, NEXT_SEED = 9000, 1000  # of a protocol's pairs; how far on the seed of a second try lies
+TRIES = 20
 NEAR_MM, NEAR_DEG = 20.0, 15.0  # from here refinement usually finds the truth
 
 
@@ -67,15 +71,23 @@ def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) 
         for number in range(train.validation_pairs):
             of_bone = people[number % len(people)]
             specimen = of_bone[(number // len(people) + p) % len(of_bone)]
-            found.append(_validation_pair(protocol, specimen.bone, make_pair(protocol, specimen, 9000 + number), model))
+            found.append(_validation_pair(protocol, specimen, FIRST_SEED + number, model))
     return found
 
 
-def _validation_pair(protocol: str, bone: str, made: Pair, model: ModelConfig) -> ValidationPair:
-    frame = target_frame(made.target, model)
-    source, target = build_cloud(made.source, frame, model), build_cloud(made.target, frame, model)
-    pair = training_pair(source, target, made.T_target_source, frame)
-    return ValidationPair(protocol, bone, pair, made.source, made.T_target_source)
+def _validation_pair(protocol: str, specimen: Specimen, seed: int, model: ModelConfig) -> ValidationPair:
+    """The pair of this seed; one that a network cannot see gives way to a later seed, as in training."""
+    for turn in range(TRIES):
+        try:
+            made = make_pair(protocol, specimen, seed + turn * NEXT_SEED)
+            frame = target_frame(made.target, model)
+            source, target = build_cloud(made.source, frame, model), build_cloud(made.target, frame, model)
+        except (ConfigError, InvalidPointCloudError):  # no wound shows enough bone; a scene larger than its bone
+            continue
+        pair = training_pair(source, target, made.T_target_source, frame)
+        return ValidationPair(protocol, specimen.bone, pair, made.source, made.T_target_source)
+    given = f"none of {TRIES} draws of {protocol} for {specimen.bone} {specimen.person}"
+    raise ConfigError("protocols whose sources the network can see", given, f"leave {protocol} out of `mix`")
 
 
 @torch.inference_mode()

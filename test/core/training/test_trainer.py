@@ -14,11 +14,12 @@ import pytest
 import torch
 import yaml
 
+from gapr_core.data import protocols
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.export import leaves
 from gapr_core.surface import Surface
-from gapr_core.training import distributed, export, trainer
+from gapr_core.training import distributed, export, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
@@ -63,6 +64,28 @@ def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
         moved = move(pair.T, pair.source.fine.points[None])[0]
         gap = torch.cdist(moved, pair.target.fine.points).amin(1)
         assert gap.median() < 0.1 and pair.overlaps.max() > 0.3
+
+
+def test_validation_draws_again_where_a_source_is_too_large_for_the_network(settings, anatomy, monkeypatch):
+    """A camera sees far more than the bone in many wounds; one such draw ended a run before its first step."""
+    model = trainer.ModelConfig.from_yaml(settings.model)
+    seeds = []
+
+    def large_at_first(protocol, specimen, seed):
+        seeds.append(seed)
+        pair = protocols.make_pair(protocol, specimen, seed)
+        return replace(pair, source=pair.source * 20.0) if len(seeds) == 1 else pair
+
+    monkeypatch.setattr(validation, "make_pair", large_at_first)
+    found = validation.validation_set(replace(settings, mix={"L1": 1.0}), model, anatomy)
+    assert [v.protocol for v in found] == ["L1"] and len(seeds) == 2 and seeds[0] != seeds[1]
+
+
+def test_a_protocol_that_the_network_never_sees_is_named(settings, anatomy):
+    """Points far away span many times the target: such a share of the mix would silently be drawn as something else."""
+    model = trainer.ModelConfig.from_yaml(settings.model)
+    with pytest.raises(ConfigError, match="L1-far10"):
+        validation.validation_set(replace(settings, mix={"L1-far10": 1.0}), model, anatomy)
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(settings, anatomy, tmp_path):

@@ -45,8 +45,11 @@ class FileLimits:
         It is read, not mapped: a mapped file that another program cuts meanwhile kills the process.
         """
         with path.open("rb") as file:
-            data = file.read(int(self.file_mb * MB) + 1)
-        if len(data) > self.file_mb * MB:
+            size = os.fstat(file.fileno()).st_size
+            data = (
+                b"" if size > self.file_mb * MB else file.read(size + 1)
+            )  # `read` takes as much memory as it may fill
+        if size > self.file_mb * MB or len(data) > self.file_mb * MB:
             self._refuse(f"a file of at most {self.file_mb:g} MB", "more", "GAPR_MAX_FILE_MB")
         return data
 

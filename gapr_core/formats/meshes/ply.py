@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -42,10 +43,13 @@ def read(path: Path, limits: FileLimits) -> Surface:
 def _parse(data: bytes) -> Any:
     from plyfile import PlyData, PlyParseError
 
-    try:  # triangles are read at once, other polygons one by one
-        return PlyData.read(io.BytesIO(data), known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
-    except PlyParseError:
-        return PlyData.read(io.BytesIO(data))
+    with TemporaryFile() as file:  # what it can map plyfile reads at once; no one else can cut this file
+        file.write(data)
+        file.seek(0)
+        try:
+            return PlyData.read(file, known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
+        except (PlyParseError, ValueError):  # other polygons, row by row; old NumPy maps nothing after the last page
+            return PlyData.read(io.BytesIO(data))
 
 
 def _columns(table: Any, names: Any) -> Array:

@@ -1,10 +1,12 @@
 """What damaged files did to the process once: it died, took memory as points, or asked for gigabytes."""
 
 import io
+import mmap
 import resource
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 import zlib
 
@@ -195,6 +197,49 @@ def test_a_ply_header_that_announces_more_than_the_file_holds_reserves_nothing(t
             f"element face {count if what == 'face' else 1}\nproperty list uchar int vertex_indices\nend_header\n"
         )
         refusal(tmp_path / "a.ply", text.encode() + CORNERS.tobytes() + bytes(13))
+
+
+def test_reading_takes_memory_for_the_file_and_not_for_the_limit(tmp_path):
+    (tmp_path / "a.xyz").write_bytes(TETRAHEDRON.encode())
+    tracemalloc.start()
+    try:
+        assert FileLimits(file_mb=64.0).read(tmp_path / "a.xyz") == TETRAHEDRON.encode()
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
+
+
+def ply_of(rows, faces, how="binary_little_endian", comment=""):
+    """A PLY file of CORNERS with the bytes of so many faces."""
+    head = (
+        f"ply\nformat {how} 1.0\ncomment {comment}\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    return head.encode() + CORNERS.astype("<f4" if "little" in how else ">f4").tobytes() + rows
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_triangles_and_other_polygons_of_a_binary_ply_are_the_same_faces(tmp_path, order):
+    def row(*corners):
+        return struct.pack(f"{'<' if order == 'little' else '>'}B{len(corners)}i", len(corners), *corners)
+
+    triangles, quad = row(0, 1, 2) + row(0, 2, 3), row(0, 1, 2, 3)
+    (tmp_path / "a.ply").write_bytes(ply_of(triangles, 2, f"binary_{order}_endian"))
+    (tmp_path / "b.ply").write_bytes(ply_of(quad, 1, f"binary_{order}_endian"))
+    (tmp_path / "c.ply").write_bytes(ply_of(row(0, 1, 2) + quad, 2, f"binary_{order}_endian"))
+    a, b, c = (clouds.load(tmp_path / f"{name}.ply") for name in "abc")
+    assert np.array_equal(a.points, CORNERS) and a.faces.tolist() == b.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert c.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]
+    assert all(surface.points.flags.owndata and surface.faces.flags.writeable for surface in (a, b, c))
+
+
+def test_a_ply_without_faces_that_ends_with_a_page_is_a_cloud(tmp_path):
+    missing = -len(ply_of(b"", 0)) % mmap.ALLOCATIONGRANULARITY
+    data = ply_of(b"", 0, comment="x" * missing)
+    assert len(data) % mmap.ALLOCATIONGRANULARITY == 0
+    (tmp_path / "a.ply").write_bytes(data)
+    assert np.array_equal(clouds.load(tmp_path / "a.ply").points, CORNERS)
 
 
 MEMORY = """

@@ -106,6 +106,11 @@ class CovarianceConfig(Settings):
     no_bias_mm: float = setting(0.035, "bias that residuals without any show on average", low=0, high=10, unit="mm")
     bias_spread: float = setting(1.5, "log standard deviation of the bias before the residuals", low=0.01, high=10)
     long_share: float = setting(0.5, "of the bias that all points share, over its size", low=0, high=10)
+    local_correlation_mm: float = setting(
+        8.0, "the same l of an error that near points share, such as that of a slice", low=0.1, high=1000, unit="mm"
+    )
+    local_centres: int = setting(160, "points that span that error", low=1, high=10_000)
+    one_sided: float = setting(0.3, "mean normal from which on a view has a beam", low=0, high=1)
     noise_points: float = setting(4.0, "points that the usual noise of the sensor is worth", low=0, high=1000)
     smooth_neighbours: int = setting(30, "points of an average that shows the smooth misfit", low=2, high=1000)
     short_neighbours: int = setting(12, "the same at short range, for the confidence alone", low=2, high=1000)

@@ -21,7 +21,7 @@ from gapr_core.calibration.answers import Answers, answers_of, together
 from gapr_core.calibration.card import as_markdown
 from gapr_core.calibration.collect import collect
 from gapr_core.calibration.fit import ACCEPTED, by_group, fit, of_unseen_families, of_unseen_people
-from gapr_core.calibration.pairs import HELD_OUT, Task
+from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes
 from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
@@ -41,6 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="folder for records, models and their card")
     parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
     parser.add_argument("--scenes", type=int, default=0, help="more pairs that are scenes (default: %(default)s)")
+    parser.add_argument("--look-alikes", type=int, default=0,
+                        help="more femora and tibiae at L3, half of others (default: %(default)s)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
@@ -49,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     which = (str(args.anatomy), args.split, args.seed)
     tasks = [Task(*which, number) for number in range(args.count)]
     tasks += [Task(*which, number, "scene") for number in range(args.scenes)]
+    tasks += look_alikes(*which, args.look_alikes)
     records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
     given = sys.argv[1:] if arguments is None else arguments
     commits = sorted({str(record.get("commit")) for record in records})
@@ -104,12 +107,17 @@ def fit_precision(rounds: Sequence[Answers]) -> tuple[Additive, float, dict[str,
     if not found:
         raise ConfigError("accepted answers with a truth", "none", "collect more pairs (--count)")
     answers = together(found)
-    scale = conformal.of_unseen(answers)
     known = answers.family != HELD_OUT
-    scores = answers.true_mm / (scale * answers.tre95_mm)
-    factor = conformal.conformal_factor(scores[known], answers.family[known], answers.rounds[known])
+    new_sensor, new_subject = conformal.of_unseen(answers), conformal.of_unseen_people(answers, known)
+    scores = [answers.true_mm / (scale * answers.tre95_mm) for scale in (new_sensor, new_subject)]
+    factor = max(
+        conformal.factor_overall(scores[0][known]),
+        conformal.factor_in_each(scores[1][known], answers.family[known], answers.rounds[known]),
+    )
     model = conformal.fit_scale(answers.of(known))
-    return model, factor, {"accepted": len(answers), "coverage": conformal.coverage(answers, scale, factor)}
+    tables = {"coverage": new_subject, "coverage_unseen_families": new_sensor}
+    rows = {name: conformal.coverage(answers, scale, factor) for name, scale in tables.items()}
+    return model, factor, {"accepted": len(answers), **rows}
 
 
 def _write(path: Path, kind: str, model: Additive, more: dict[str, Any], card: dict[str, Any]) -> None:

@@ -35,7 +35,9 @@ def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
     ]
     for name, card in cards.items():
         if name == "precision":
-            parts += ["## Precision: subjects and families that were not fitted", _table(card["coverage"], PRECISION)]
+            parts += ["## Precision: subjects that were not fitted", _table(card["coverage"], PRECISION),
+                      "## Precision: neither the subject nor the sensor family was fitted",
+                      _table(card["coverage_unseen_families"], PRECISION)]  # fmt: skip
         else:
             parts += [f"## Confidence, {name}: subjects that were not fitted",
                       _table(card["unseen_subjects"], CONFIDENCE),

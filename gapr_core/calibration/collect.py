@@ -241,7 +241,7 @@ def _prepared(cloud: Array) -> PreparedTarget:
 
 
 def _name(task: Task) -> str:
-    return "-".join(filter(None, (str(task.seed), task.family, str(task.number))))
+    return "-".join(filter(None, (str(task.seed), task.family, task.what, str(task.number))))
 
 
 def _read(path: Path) -> list[Record]:

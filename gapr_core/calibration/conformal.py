@@ -1,8 +1,9 @@
 """Fit the precision: how predicted errors at the whole bone compare with true ones, and a bound that holds.
 
 The scale of a predicted standard deviation is an additive model of a few features, of the logarithm of what the true
-errors and NEES ask for. The factor of the bound is the conformal quantile of true errors over bounds that models gave
-which had seen neither the subject nor the sensor family: large enough for all families together and for each alone.
+errors and NEES ask for. The factor of the bound is the conformal quantile of true errors over bounds: large enough for
+all answers together, of models that had seen neither the subject nor the sensor family, and for each family alone, of
+models that had not seen the subject.
 """
 
 from __future__ import annotations
@@ -47,19 +48,28 @@ def of_unseen(answers: Answers) -> Array:
     return of_models_that_saw_neither(answers, fit_scale, scales)
 
 
-def conformal_factor(scores: Array, *groupings: NDArray[np.str_]) -> float:
-    """The smallest factor with which bounds cover their share of all scores, and of those of each group.
+def of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array:
+    """(N,) scales by models of the known families that have not seen the subject."""
+    found = np.full(len(answers), np.nan)
+    for fitted, judged in answers.people_folds():
+        found[judged] = scales(fit_scale(answers.of(fitted & known)), answers.of(judged))
+    return found
+
+
+def factor_overall(scores: Array) -> float:
+    """The smallest factor with which bounds cover their share of all scores (N,), true errors over bounds."""
+    return conformal_quantile(scores, OVERALL)
+
+
+def factor_in_each(scores: Array, *groupings: NDArray[np.str_]) -> float:
+    """The smallest factor with which bounds cover their share of the scores (N,) of each group.
 
     Args:
-        scores: (N,) true errors over their bounds.
+        scores: true errors over their bounds.
         groupings: (N,) each: sensor families, rounds.
     """
-    levels = [conformal_quantile(scores, OVERALL)]
-    for grouping in groupings:
-        for name in np.unique(grouping):
-            if (grouping == name).sum() >= FEWEST:
-                levels.append(conformal_quantile(scores[grouping == name], IN_EACH))
-    return max(levels)
+    groups = [grouping == name for grouping in groupings for name in np.unique(grouping)]
+    return max((conformal_quantile(scores[of_it], IN_EACH) for of_it in groups if of_it.sum() >= FEWEST), default=0.0)
 
 
 def conformal_quantile(scores: Array, share: float) -> float:

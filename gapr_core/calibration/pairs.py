@@ -28,6 +28,8 @@ T = TypeVar("T")
 Bones = Mapping[str, Sequence[Specimen]]
 _KEPT: dict[tuple[str, str], Bones] = {}
 BONES = ("femur", "tibia", "pelvis", "thoracic")
+LOOK_ALIKES = ("femur", "tibia")  # of which a patch of one subject is much like that of another
+LOOK_ALIKE_SEEDS = 500  # added to the seed, so that no pair of the long list comes twice
 SYMMETRIC = ("pelvis",)  # a mirrored one is the other side of the same: judged against that side's pose
 PARAMETRIC_PEOPLE = 9  # for each bone, besides the subjects of the folder
 DRAWN_PEOPLE, DRAWN_SEED = {True: 40, False: 8}, 9  # new ones: of shape models, or parametric where there is none
@@ -60,13 +62,17 @@ SCALES = (0.04, 0.07)  # by which a bone of a wrong scale is larger or smaller
 
 @dataclass(frozen=True)
 class Task:
-    """Which pair: number `number` of the list that folder, split and seed define; or of a list of one family only."""
+    """Which pair: number `number` of the list that folder, split and seed define; or of a list of one family only.
+
+    With `what` (a key of `WHAT`) the source is of that bone, whatever the shares say.
+    """
 
     folder: str
     split: str
     seed: int
     number: int
     family: str = ""
+    what: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +115,14 @@ class Drawn:
     sensor: str = "unknown"
 
 
+def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
+    """Femora and tibiae at L3, every other one of another subject: which bone it is is hardest to see there."""
+    row, turn = IN_A_ROW, IN_A_ROW * len(BONES)
+    numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
+    own_list = seed + LOOK_ALIKE_SEEDS
+    return [Task(folder, split, own_list, number, "L3", ("own", "person")[number % 2]) for number in numbers[:count]]
+
+
 def draw(task: Task) -> Drawn:
     """The pair of a task; the same task always gives the same pair."""
     rng = np.random.default_rng([task.seed, task.number, 62])
@@ -117,7 +131,7 @@ def draw(task: Task) -> Drawn:
         return Drawn(SHAPES[shape](int(rng.integers(2**31))), "shape", shape, "shape", ())
     setting = setting_of(task.folder, task.split, task.seed, task.number // IN_A_ROW)
     family, seen_as = _choose_view(rng, task.family)
-    what = _choose(WHAT, rng)
+    what = task.what or _choose(WHAT, rng)
     if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
         what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
     stranger = _stranger(setting, what, bones_of(task.folder, task.split), rng)

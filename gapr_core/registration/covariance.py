@@ -5,7 +5,9 @@ smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), a stand-off of va
 relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
 Censi 2007 for the noise alone). A Hessian alone is over-confident. The size of the bias comes from the residuals
 (`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone hardly moves the
-pose, and one seen from one side does. A weak prior keeps a motion of which nothing was observed uncertain, but finite.
+pose, and one seen from one side does. Of an image, depths are wrong: both act along the beam. Slices of a tracked probe
+share an error each: another K, of short reach. A weak prior keeps a motion of which nothing was observed uncertain, but
+finite.
 """
 
 from __future__ import annotations
@@ -62,13 +64,9 @@ def estimate(fit: Fit, config: CovarianceConfig, sensor: SensorConfig | None = N
     known = sensors.errors(sensor or SensorConfig(), count)
     spanned = fields(fit, config.correlation_mm, config.centres)
     bias_mm = config.bias_gain * expected_bias_mm(NormalEquations.of(fit, spanned), known.bias_mm, config)
-    expected = replace(
-        known,
-        noise_mm=expected_noise_mm(fit.sigma_mm, count, known.noise_mm, config.noise_points),
-        bias_mm=bias_mm,
-        standoff_mm=float(np.hypot(known.standoff_mm, config.long_share * bias_mm)),
-    )
-    covariance = sandwich(fit, spanned, expected)
+    noise_mm = expected_noise_mm(fit.sigma_mm, count, known.noise_mm, config.noise_points)
+    expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
+    covariance = sandwich(fit, spanned, expected, config)
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     smooth_mm, short_mm = smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
     turn, shift = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
@@ -93,21 +91,51 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
     return float(np.sqrt(max(root_mean_square(sizes_mm, log_posterior) ** 2 - config.no_bias_mm**2, 0.0)))
 
 
-def sandwich(fit: Fit, fields: Array, errors: Errors) -> Array:
-    """(6, 6) G (s^2 I + b^2 F F^T + o^2 1 1^T + q^2 r r^T) G^T + the prior's share, for the gain G of the fit.
+def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
+    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + the prior's share.
 
-    s is the noise, b the bias with fields F, o the stand-off, which moves all points along their normals, and q the
-    scale, which moves a point by its distance r from the centroid along its normal.
+    G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`), e the
+    local error with fields E, o the stand-off and q the scale (see `directions`).
     """
     inlier = fit.weights > 0.0
     gain, prior = gain_of(fit, fields, errors.noise_mm)
-    offsets = fit.moved[inlier] - (fit.moved[inlier].mean(axis=0) if inlier.any() else 0.0)
-    outward = np.einsum("ni,ni->n", offsets, fit.gradients[inlier])
+    shift, growth = directions(fit, errors.along_beam, config.one_sided)
     common = np.column_stack(
-        [errors.bias_mm * fields[inlier], np.full(inlier.sum(), errors.standoff_mm), errors.scale * outward]
+        [
+            errors.bias_mm * fields[inlier],
+            np.full(inlier.sum(), config.long_share * errors.bias_mm),
+            errors.local_mm * _local_fields(fit, errors, config)[inlier],
+            errors.standoff_mm * shift,
+            errors.scale * growth,
+        ]
     )
     moved = gain @ common
     return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + prior)
+
+
+def directions(fit: Fit, along_beam: bool, one_sided: float) -> tuple[Array, Array]:
+    """How the residuals (n,) of the inliers change by a stand-off of 1 mm, and by an error of the size of 1.
+
+    A stand-off moves every point along its normal, another size by its distance from the centroid. Where only depths
+    are wrong, both move a point along the beam d: by n . d, and by (n . d) times its depth. The beam is taken for the
+    mean normal; where that is shorter than `one_sided`, the bone was seen from several sides and no beam is common.
+    """
+    inlier = fit.weights > 0.0
+    normals = fit.gradients[inlier]
+    if not inlier.any():
+        return np.zeros(0), np.zeros(0)
+    away, mean = fit.moved[inlier] - fit.moved[inlier].mean(axis=0), normals.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if not along_beam or length < one_sided:
+        return np.ones(len(normals)), np.einsum("ni,ni->n", away, normals)
+    beam = mean / length
+    return normals @ beam, (normals @ beam) * (away @ beam)
+
+
+def _local_fields(fit: Fit, errors: Errors, config: CovarianceConfig) -> Array:
+    if errors.local_mm == 0.0:
+        return np.zeros((len(fit.moved), 1))
+    return fields(fit, config.local_correlation_mm, config.local_centres)
 
 
 def gain_of(fit: Fit, fields: Array, noise_mm: float) -> tuple[Array, Array]:

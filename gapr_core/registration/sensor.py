@@ -20,6 +20,8 @@ class Errors:
         noise_mm: of a point.
         bias_mm: typical size of the smooth bias.
         scale: of the relative error of the size.
+        local_mm: of an error that near points share and others do not: a slice that the tracker puts elsewhere.
+        along_beam: stand-off and scale act along one beam, as depths of an image do, not along each point's normal.
     """
 
     offset_mm: float
@@ -27,16 +29,21 @@ class Errors:
     noise_mm: float
     bias_mm: float
     scale: float
+    local_mm: float = 0.0
+    along_beam: bool = False
 
 
 KINDS = {
     "unknown": Errors(offset_mm=0.0, standoff_mm=0.5, noise_mm=0.5, bias_mm=0.1, scale=0.001),
     "pointer": Errors(offset_mm=0.5, standoff_mm=0.35, noise_mm=0.4, bias_mm=0.15, scale=0.0),
-    "ultrasound": Errors(offset_mm=0.0, standoff_mm=0.6, noise_mm=0.5, bias_mm=0.2, scale=0.02),
+    "ultrasound": Errors(
+        offset_mm=0.0, standoff_mm=0.6, noise_mm=0.5, bias_mm=0.2, scale=0.02, local_mm=0.3, along_beam=True
+    ),
     "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.0),
-    "laser": Errors(offset_mm=0.0, standoff_mm=0.05, noise_mm=0.15, bias_mm=0.05, scale=0.002),
+    "laser": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.15, bias_mm=0.15, scale=0.002),
 }
-"""What is usual: a real pointer lies .34 to .62 mm outside, sound is 1 to 3 % faster or slower than assumed."""
+"""What is usual: a real pointer lies .34 to .62 mm outside, sound is 1 to 3 % faster or slower than assumed, a tracked
+slice lies .1 to .5 mm off, light enters wet bone before it comes back."""
 
 
 def errors(sensor: SensorConfig, points: int) -> Errors:

@@ -33,7 +33,7 @@ def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_famil
 
     answers = made_answers(3000, error_scale=doubled_where_smooth)
     scale = conformal.of_unseen(answers)
-    factor = conformal.conformal_factor(answers.true_mm / (scale * answers.tre95_mm), answers.family)
+    factor = conformal.factor_overall(answers.true_mm / (scale * answers.tre95_mm))
     rows = conformal.coverage(answers, scale, factor)
     assert 0.945 < rows["all"]["covered"] < 0.975
     assert 0.8 < rows["all"]["nees_over_median"] < 1.2
@@ -48,10 +48,9 @@ def test_a_family_with_larger_errors_has_a_say_of_its_own():
         return np.where(family == "pointer", 3.0, 1.0)
 
     answers = made_answers(3000, error_scale=tripled_for_pointers)
-    even = conformal.conformal_factor(answers.true_mm / answers.tre95_mm, np.full(3000, "one"))
     scores = answers.true_mm / answers.tre95_mm
-    factor = conformal.conformal_factor(scores, answers.family)
-    assert factor > even
+    factor = conformal.factor_in_each(scores, np.full(3000, "one"), answers.family)
+    assert factor > conformal.factor_overall(scores) > conformal.factor_in_each(scores, np.full(3000, "one"))
     rows = conformal.coverage(answers, np.ones(3000), factor)
     assert rows["pointer"]["covered"] == pytest.approx(conformal.IN_EACH, abs=0.01)
 
@@ -59,7 +58,8 @@ def test_a_family_with_larger_errors_has_a_say_of_its_own():
 def test_a_family_of_a_few_answers_does_not_decide_for_all():
     family = np.array(["many"] * 500 + ["few"] * 10)
     scores = np.r_[np.linspace(0.0, 1.0, 500), np.full(10, 9.0)]
-    assert conformal.conformal_factor(scores, family) < 1.0
+    assert 0.0 < conformal.factor_in_each(scores, family) < 1.0
+    assert conformal.factor_in_each(scores[:9], family[500:509]) == 0.0
 
 
 def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):
@@ -73,3 +73,21 @@ def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):
     monkeypatch.setattr(conformal, "scales", lambda model, judged: np.full(len(judged), float(model)))
     for family, model in zip(answers.family, conformal.of_unseen(answers).astype(int), strict=True):
         assert family not in seen[model - 1]
+
+
+def test_no_scale_of_an_unseen_subject_is_from_a_model_that_has_seen_him_or_an_unknown_family(monkeypatch):
+    answers, seen = made_answers(300), []
+    known = answers.family != answers.family[0]
+
+    def fit_nothing(fitted):
+        seen.append((set(fitted.family), {person for people in fitted.people for person in people}))
+        return len(seen)
+
+    monkeypatch.setattr(conformal, "fit_scale", fit_nothing)
+    monkeypatch.setattr(conformal, "scales", lambda model, judged: np.full(len(judged), float(model)))
+    found = conformal.of_unseen_people(answers, known).astype(int)
+    assert {model - 1 for model in found} == set(range(len(seen)))
+    for people, family, model in zip(answers.people, answers.family, found, strict=True):
+        families, subjects = seen[model - 1]
+        assert people[0] not in subjects and answers.family[0] not in families
+        assert family in families or family == answers.family[0]

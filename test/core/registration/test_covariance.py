@@ -12,6 +12,7 @@ from gapr_core.registration import bias_field, covariance, refinement
 from gapr_core.registration.sensor import Errors
 
 CONFIG = CovarianceConfig()
+NO_COMMON_BIAS = replace(CONFIG, long_share=0.0)
 NOTHING = Errors(offset_mm=0.0, standoff_mm=0.0, noise_mm=1e-6, bias_mm=0.0, scale=0.0)
 
 
@@ -49,8 +50,19 @@ def drawn(kind, fit, rng, count=4000):
     if kind == "scale":  # the source is larger by this factor about its centroid: points move along p - c
         away = points - points[inlier].mean(axis=0)
         return rng.normal(size=(count, 1)) * (away * fit.gradients).sum(axis=1)
-    correlation = bias_field.smooth_correlation(points, points, CONFIG.correlation_mm)
+    if kind == "beam standoff_mm":  # depths are off: all points move along the beam
+        return rng.normal(size=(count, 1)) * (fit.gradients @ beam_of(fit))
+    if kind == "beam scale":  # a point moves along the beam by its depth
+        depth = (points - points[inlier].mean(axis=0)) @ beam_of(fit)
+        return rng.normal(size=(count, 1)) * depth * (fit.gradients @ beam_of(fit))
+    length_mm = CONFIG.local_correlation_mm if kind == "local_mm" else CONFIG.correlation_mm
+    correlation = bias_field.smooth_correlation(points, points, length_mm)
     return rng.multivariate_normal(np.zeros(len(points)), correlation, count, method="eigh")
+
+
+def beam_of(fit):
+    mean = fit.gradients[fit.weights > 0.0].mean(axis=0)
+    return mean / np.linalg.norm(mean)
 
 
 def arms(fit):
@@ -59,17 +71,22 @@ def arms(fit):
 
 
 @pytest.mark.parametrize("corrected_mm", [0.0, 0.8])
-@pytest.mark.parametrize(("kind", "size"), [("noise_mm", 0.7), ("bias_mm", 0.3), ("standoff_mm", 0.3), ("scale", 0.03)])
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("noise_mm", 0.7), ("bias_mm", 0.3), ("standoff_mm", 0.3), ("scale", 0.03), ("local_mm", 0.3),
+     ("beam standoff_mm", 0.3), ("beam scale", 0.03)],
+)  # fmt: skip
 def test_each_error_spreads_the_pose_as_its_term_says(kind, size, corrected_mm):
     """Sizes other than 1: entering as b instead of b^2, or not at all, fails. So does another sign of the gain."""
     fit = curved_fit(bias_mm=corrected_mm)
     noise_mm = size if kind == "noise_mm" else 0.5
     fields = bias_field.fields(fit, CONFIG.correlation_mm, 80)
     twists = solved(fit, size * drawn(kind, fit, np.random.default_rng(1)), noise_mm, fields) * arms(fit)
-    errors = replace(NOTHING, **{"noise_mm": noise_mm, kind: size})
-    predicted = covariance.sandwich(fit, fields, errors)
+    along_beam, name = kind.startswith("beam"), kind.removeprefix("beam ")
+    errors = replace(NOTHING, along_beam=along_beam, **{"noise_mm": noise_mm, name: size})
+    predicted = covariance.sandwich(fit, fields, errors, NO_COMMON_BIAS)
     if kind != "noise_mm":
-        predicted = predicted - covariance.sandwich(fit, fields, replace(NOTHING, noise_mm=noise_mm))
+        predicted = predicted - covariance.sandwich(fit, fields, replace(NOTHING, noise_mm=noise_mm), NO_COMMON_BIAS)
     predicted = predicted * np.outer(arms(fit), arms(fit))
     sampled = twists.T @ twists / len(twists)
     assert np.abs(sampled - predicted).max() < 0.08 * np.abs(predicted).max()
@@ -93,7 +110,7 @@ def test_a_motion_of_which_nothing_is_seen_has_the_variance_of_the_prior():
     flat = curved_fit()
     up = np.tile([0.0, 0.0, 1.0], (300, 1))
     flat = replace(flat, gradients=up, moved=flat.moved * [1.0, 1.0, 0.0])
-    C = covariance.sandwich(flat, bias_field.fields(flat, 20.0, 80), replace(NOTHING, noise_mm=0.4))
+    C = covariance.sandwich(flat, bias_field.fields(flat, 20.0, 80), replace(NOTHING, noise_mm=0.4), CONFIG)
     assert C[0, 0] == pytest.approx(0.16 / 1e-6, rel=0.01)  # noise variance over the prior's information
     assert C[5, 5] == pytest.approx(0.16 / 1e-3, rel=0.01)
     assert C[2, 2] < 0.01
@@ -110,9 +127,37 @@ def test_a_standoff_does_not_move_a_pose_that_is_held_from_all_sides():
     one_sided = replace(around, weights=(normals[:, 2] > 0.2).astype(float))
     errors = replace(NOTHING, standoff_mm=0.5)
     shifts = [
-        np.sqrt(np.trace(covariance.sandwich(fit, np.zeros((4000, 1)), errors)[:3, :3])) for fit in (around, one_sided)
+        np.sqrt(np.trace(covariance.sandwich(fit, np.zeros((4000, 1)), errors, CONFIG)[:3, :3]))
+        for fit in (around, one_sided)
     ]
     assert shifts[0] < 0.01 < 0.4 < shifts[1]
+
+
+def test_depths_that_are_wrong_move_the_pose_along_the_beam_and_nowhere_else():
+    """The noise of 1e-6 mm aside: variance of the stand-off along the mean normal, none across it, none of a turn."""
+    fit, errors = curved_fit(), replace(NOTHING, standoff_mm=0.6, along_beam=True)
+    C = covariance.sandwich(fit, np.zeros((300, 1)), errors, CONFIG)
+    beam = beam_of(fit)
+    np.testing.assert_allclose(C[:3, :3], 0.36 * np.outer(beam, beam), atol=1e-4)
+    np.testing.assert_allclose(C[3:, 3:], 0.0, atol=1e-7)
+
+
+def test_a_view_from_several_sides_has_no_beam():
+    fit = curved_fit()
+    both_ways = replace(fit, gradients=fit.gradients * np.where(np.arange(300) % 2, 1.0, -0.9)[:, None])
+    seen = [covariance.directions(both_ways, along_beam, 0.3) for along_beam in (True, False)]
+    for ours, usual in zip(*seen, strict=True):
+        np.testing.assert_array_equal(ours, usual)
+    beam, usual = (covariance.directions(fit, along_beam, 0.3)[0] for along_beam in (True, False))
+    assert np.abs(beam - usual).max() > 0.1
+    assert covariance.directions(replace(fit, weights=np.zeros(300)), True, 0.3)[0].shape == (0,)
+
+
+def test_what_the_bias_has_in_common_is_a_standoff_of_its_own():
+    fit, fields = curved_fit(), np.zeros((300, 1))
+    shared = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), CONFIG)
+    standoff = covariance.sandwich(fit, fields, replace(NOTHING, standoff_mm=0.8 * CONFIG.long_share), CONFIG)
+    np.testing.assert_allclose(shared, standoff, rtol=1e-9, atol=1e-15)
 
 
 def test_the_noise_of_few_points_is_larger_than_their_residuals_say():

@@ -227,6 +227,7 @@ class GuidanceConfig(Settings):
     noise_mm: float = setting(0.5, "least white noise of a point", low=1e-3, high=100, unit="mm")
     bias_mm: float = setting(0.7, "least bias that the points of a look share", low=0, high=100, unit="mm")
     seen_mm: float = setting(6.0, "a target point with a source point this near counts as seen", low=0, unit="mm")
+    rivals: int = setting(50, "the likeliest other poses that a look is to exclude", low=0, high=100_000)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ every rival pose that the look would not exclude adds its own distance, weighted
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,14 +45,15 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
         assessment: the best pose so far, its covariance and its rivals.
         config: size of a patch, points and bias of a look.
     """
-    target, hypotheses = assessment.target, assessment.hypotheses
+    target, best = assessment.target, assessment.hypotheses[0]
+    rivals = sorted(assessment.hypotheses[1:], key=lambda rival: -rival.probability)[: config.rivals]
     patches = _unseen(_patches(target, config), assessment, config)
     if not len(patches.centres):
         return None
     bounds = _bounds_mm(assessment, patches, config)
-    distances = np.array([_apart_mm(hypotheses[0], rival, target) for rival in hypotheses[1:]])
-    weights = np.array([rival.probability for rival in hypotheses[1:]])
-    excluded = np.array([_excluded(assessment, members, config) for members in patches.members])
+    distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
+    weights = np.array([rival.probability for rival in rivals])
+    excluded = np.array([_excluded(assessment, rivals, members, config) for members in patches.members])
     open_mm2 = (weights * distances**2) @ (1.0 - excluded).T if len(weights) else np.zeros(len(bounds))
     now_mm = float(np.sqrt(assessment.tre95_mm**2 + weights @ distances**2))
     after_mm = np.sqrt(bounds**2 + open_mm2)
@@ -124,12 +126,14 @@ def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> fl
     return float(np.sqrt((gap**2).sum(axis=1).mean()))
 
 
-def _excluded(assessment: Assessment, members: NDArray[np.int64], config: GuidanceConfig) -> Array:
+def _excluded(
+    assessment: Assessment, rivals: Sequence[Hypothesis], members: NDArray[np.int64], config: GuidanceConfig
+) -> Array:
     """(R,) share of each rival's probability that a look at the patch would take.
 
     Under a rival the patch of the best pose lies d off the surface; its likelihood falls by exp(-d^2 / 2 (s^2 + b^2)).
     """
-    target, (best, *rivals) = assessment.target, assessment.hypotheses
+    target, best = assessment.target, assessment.hypotheses[0]
     variance = max(assessment.fit.sigma_mm, config.noise_mm) ** 2 + config.bias_mm**2
     points = se3.apply(se3.inverse(best.T_target_source), target.points[members])
     off = [target.tree.query(se3.apply(rival.T_target_source, points))[0] for rival in rivals]

@@ -89,6 +89,20 @@ def test_a_rival_sends_the_probe_to_where_it_differs(distal):
     assert min(patch.rivals_excluded for patch in found.patches) < 0.9
 
 
+def test_only_the_likeliest_rivals_count(distal):
+    """A ball has thousands of rivals; the second one here is the likelier, so that alone it decides."""
+    turns = [se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, angle], distal.fit.moved.mean(axis=0)) for angle in (0.2, 1.5)]
+    poses = np.stack([distal.fit.T, *(turn @ distal.fit.T for turn in turns)])
+    scores = distal.candidates.scores[0] * np.array([1.0, 1.3, 1.01])
+    many = replace(distal, candidates=replace(distal.candidates, poses=poses, scores=scores), probability=0.4)
+    first, second = (rival.probability for rival in many.hypotheses[1:])
+    assert 0.0 < first < second
+    alone = replace(many, candidates=replace(many.candidates, poses=poses[[0, 2]], scores=scores[[0, 2]]))
+    found, one, none = (guide(case, replace(CONFIG, rivals=count)) for case, count in ((many, 2), (many, 1), (many, 0)))
+    assert one.patches[0].rivals_excluded == guide(alone, CONFIG).patches[0].rivals_excluded
+    assert found.now_mm > one.now_mm > none.now_mm == pytest.approx(many.tre95_mm)
+
+
 def test_the_registrar_says_where_to_look_only_when_asked(target, distal):
     for asked in (False, True):
         registrar = Registrar(RegistrarConfig(num_threads=1, guide=asked, guidance=CONFIG))

@@ -8,6 +8,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.geometry.sampling import bounds
+from gapr_core.runtime.parallel import in_pieces
+
 Array = NDArray[np.float64]
 
 FAR = -1  # index of cells farther than the reach
@@ -40,46 +43,74 @@ class DistanceField:
 
 
 def build(
-    points: Array, normals: Array, spacing_mm: float, reach_mm: float = 12.0, most_cells: int = 2_500_000
+    points: Array,
+    normals: Array,
+    spacing_mm: float,
+    reach_mm: float = 12.0,
+    most_cells: int = 2_500_000,
+    num_threads: int = 1,
 ) -> DistanceField:
     """The field of a target (N, 3), mm, with unit normals (N, 3); cells as fine as `most_cells` allows, >= 1.5 mm."""
-    low, high = points.min(axis=0) - reach_mm, points.max(axis=0) + reach_mm
+    low, high = bounds(points)
+    low, high = low - reach_mm, high + reach_mm
     cell_mm = max(1.5, float(np.prod(high - low) / most_cells) ** (1.0 / 3.0))
     shape = np.ceil((high - low) / cell_mm).astype(int) + 1
-    nearest = _nearest_points(points, low, cell_mm, shape[0], shape[1], shape[2], reach_mm)
-    near = np.nonzero(nearest >= 0)
-    index = nearest[near]
-    centres = np.stack(near, axis=1) * cell_mm + low
-    gap = surface_distance(centres, points[index], normals[index], spacing_mm)
+    nearest = np.full(shape, FAR, dtype=np.int32)
     distance = np.full(shape, 255, dtype=np.uint8)
-    distance[near] = np.minimum(np.rint(gap * (255.0 / reach_mm)), 254.0)
+
+    def work(slab: NDArray[np.int64]) -> None:
+        part = slice(slab[0], slab[-1] + 1)
+        _nearest_points(points, low, cell_mm, slab[0], nearest[part], reach_mm)
+        _distances(points, normals, low, cell_mm, slab[0], nearest[part], spacing_mm, 255.0 / reach_mm, distance[part])
+
+    in_pieces(work, np.arange(shape[0]), num_threads)
     return DistanceField(low, cell_mm, nearest, distance, reach_mm)
 
 
-def surface_distance(points: Array, nearest: Array, normals: Array, spacing_mm: float) -> Array:
-    """Distance (N,) to the discs of radius `spacing_mm` that stand for the surface around each nearest point."""
-    offset = points - nearest
-    height = np.einsum("ni,ni->n", offset, normals)
-    aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", offset, offset) - height**2, 0.0))
-    return np.hypot(height, np.maximum(aside - spacing_mm, 0.0))
-
-
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _nearest_points(points, low, cell, nx, ny, nz, reach):  # type: ignore[no-untyped-def]
-    """Index of the nearest point for every cell whose centre is within the reach of one: each point fills its ball."""
-    nearest = np.full((nx, ny, nz), -1, dtype=np.int32)
-    squares = np.full((nx, ny, nz), np.float32(reach * reach), dtype=np.float32)
+def _nearest_points(points, low, cell, first, nearest, reach):  # type: ignore[no-untyped-def]
+    """Fill `nearest`, the cells from `first` on, with the nearest point within reach of their centres.
+
+    Each point fills its ball.
+    """
+    nx, ny, nz = nearest.shape
+    squares = np.full(nearest.size, np.float32(reach * reach), dtype=np.float32)
+    flat, aside, r = nearest.reshape(-1), np.empty(nz), reach / cell
     for q in range(len(points)):
         x, y, z = (points[q, 0] - low[0]) / cell, (points[q, 1] - low[1]) / cell, (points[q, 2] - low[2]) / cell
-        r = reach / cell
-        for i in range(max(0, int(np.ceil(x - r))), min(nx, int(x + r) + 1)):
-            ry = np.sqrt(max(r * r - (i - x) ** 2, 0.0))
-            for j in range(max(0, int(np.ceil(y - ry))), min(ny, int(y + ry) + 1)):
-                flat = (i - x) ** 2 + (j - y) ** 2
-                rz = np.sqrt(max(r * r - flat, 0.0))
-                for k in range(max(0, int(np.ceil(z - rz))), min(nz, int(z + rz) + 1)):
-                    square = np.float32((flat + (k - z) ** 2) * cell * cell)
-                    if square < squares[i, j, k]:
-                        squares[i, j, k] = square
-                        nearest[i, j, k] = q
-    return nearest
+        start, stop = max(0, int(np.ceil(z - r))), min(nz, int(z + r) + 1)
+        for k in range(start, stop):
+            aside[k - start] = (k - z) ** 2
+        for i in range(max(first, int(np.ceil(x - r))), min(first + nx, int(x + r) + 1)):
+            for j in range(max(0, int(np.ceil(y - r))), min(ny, int(y + r) + 1)):
+                across = (i - x) ** 2 + (j - y) ** 2
+                if across > r * r:
+                    continue
+                row = np.uint64(((i - first) * ny + j) * nz + start)  # unsigned, or the loop is not vectorised
+                for k in range(np.uint64(stop - start)):
+                    square = np.float32((across + aside[k]) * cell * cell)
+                    if square < squares[row + k]:
+                        squares[row + k] = square
+                        flat[row + k] = q
+
+
+@numba.njit(cache=True, nogil=True)
+def _distances(points, normals, low, cell, first, nearest, spacing, per_mm, distance):  # type: ignore[no-untyped-def]
+    """Fill `distance` with the distances of the cells from `first` on to the surface around their nearest points.
+
+    A disc of radius `spacing` stands for it.
+    """
+    nx, ny, nz = nearest.shape
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                q = nearest[i, j, k]
+                if q < 0:
+                    continue
+                x = (i + first) * cell + low[0] - points[q, 0]
+                y = j * cell + low[1] - points[q, 1]
+                z = k * cell + low[2] - points[q, 2]
+                height = (x * normals[q, 0] + z * normals[q, 2]) + y * normals[q, 1]  # in the order of NumPy's einsum
+                aside = np.sqrt(max((x * x + z * z) + y * y - height**2, 0.0))
+                gap = np.hypot(height, max(aside - spacing, 0.0))
+                distance[i, j, k] = min(np.rint(gap * per_mm), 254.0)

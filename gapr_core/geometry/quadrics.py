@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from gapr_core.geometry import quadric_kernels
+from gapr_core.runtime.parallel import in_pieces, thread_count
 
 Array = NDArray[np.float64]
 FEWEST_NEIGHBOURS = 16  # that give a trustworthy normal and quadric
@@ -30,22 +34,32 @@ class LocalFrames:
         return self.axes[:, 2]
 
 
-def spacing(points: Array, tree: cKDTree | None = None) -> float:
+def nearest(points: Array, count: int, tree: cKDTree | None = None, num_threads: int = 1) -> NDArray[np.int64]:
+    """(N, k) indices of each point's nearest ones, itself the first; k is `count`, or N where there are fewer."""
+    tree = cKDTree(points) if tree is None else tree
+    k = list(range(1, min(count, len(points)) + 1))  # a list: else a column is missing where there is one
+    return np.asarray(tree.query(points, k=k, workers=thread_count(num_threads))[1])
+
+
+def spacing(points: Array, tree: cKDTree | None = None, num_threads: int = 1) -> float:
     """Median distance to the nearest other point, mm."""
     tree = cKDTree(points) if tree is None else tree
-    return float(np.median(tree.query(points, k=2)[0][:, 1]))
+    return float(np.median(tree.query(points, k=2, workers=thread_count(num_threads))[0][:, 1]))
 
 
-def local_frames(points: Array, neighbours: NDArray[np.int64]) -> LocalFrames:
+def local_frames(points: Array, neighbours: NDArray[np.int64], num_threads: int = 1) -> LocalFrames:
     """Principal axes of each point's neighbourhood; the normal's sign is arbitrary.
 
     Args:
         points: (N, 3), mm.
         neighbours: (M, k) indices into points, one row for each frame.
+        num_threads: 0 for all cores.
     """
     around = points[neighbours]
     around = around - around.mean(axis=1, keepdims=True)
-    eigenvalues, eigenvectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / neighbours.shape[1])
+    spread = np.einsum("nki,nkj->nij", around, around) / neighbours.shape[1]
+    parts = zip(*in_pieces(np.linalg.eigh, spread, num_threads), strict=True)
+    eigenvalues, eigenvectors = map(np.concatenate, parts)
     axes = eigenvectors[:, :, ::-1].transpose(0, 2, 1).copy()
     axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])  # right-handed
     return LocalFrames(axes, np.sqrt(np.maximum(eigenvalues[:, 0], 0.0)))
@@ -56,7 +70,9 @@ def orient(normals: Array, towards: Array) -> Array:
     return normals * np.where(np.einsum("ni,ni->n", normals, towards) < 0.0, -1.0, 1.0)[:, None]
 
 
-def fit_quadrics(points: Array, normals: Array, neighbours: NDArray[np.int64]) -> tuple[Array, Array]:
+def fit_quadrics(
+    points: Array, normals: Array, neighbours: NDArray[np.int64], num_threads: int = 1
+) -> tuple[Array, Array]:
     """Second fundamental form in each point, and the normal corrected by the fit.
 
     Fits h(u, v) = a + b u + c v + (d u^2 + 2 e u v + f v^2) / 2 over the tangent plane by least squares with weights
@@ -66,34 +82,28 @@ def fit_quadrics(points: Array, normals: Array, neighbours: NDArray[np.int64]) -
         points: (N, 3), mm.
         normals: (N, 3), unit, consistently oriented.
         neighbours: (N, k), k >= 10, indices into points.
+        num_threads: 0 for all cores.
 
     Returns:
         normals (N, 3), and shapes (N, 3, 3): symmetric matrices with shape @ normal = 0 so that the surface near a
         point lies at height t^T shape t / 2 over its tangent plane, in 1/mm.
     """
-    offsets = points[neighbours] - points[:, None]
-    tangents = tangent_basis(normals)
-    uv = np.einsum("nki,nai->nka", offsets, tangents)
-    height = np.einsum("nki,ni->nk", offsets, normals)
-    reach = np.linalg.norm(offsets, axis=2).max(axis=1)[:, None] * 1.05
-    weight = np.clip(1.0 - (np.linalg.norm(offsets, axis=2) / reach) ** 2, 0.0, 1.0) ** 2
-    weight *= np.clip(np.einsum("nki,ni->nk", normals[neighbours], normals), 0.0, 1.0) ** 2
-    scale = reach[..., None]
-    u, v = uv[..., 0] / reach, uv[..., 1] / reach
-    design = np.stack([np.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], axis=2)
-    gram = np.einsum("nka,nk,nkb->nab", design, weight, design) + 1e-6 * np.eye(6)
-    coefficients = np.linalg.solve(gram, np.einsum("nka,nk,nk->na", design, weight, height)[..., None])[..., 0]
-    gradient = coefficients[:, 1:3] / reach
-    d, e, f = (coefficients[:, 3:] / scale[:, :, 0] ** 2).T
-    corrected = normals - np.einsum("na,nai->ni", gradient, tangents)
-    corrected /= np.linalg.norm(corrected, axis=1, keepdims=True)
-    form = np.stack([np.stack([d, e], axis=1), np.stack([e, f], axis=1)], axis=1)
-    tangents = tangent_basis(corrected, like=tangents[:, 0])
-    return corrected, np.einsum("nai,nab,nbj->nij", tangents, form, tangents)
+
+    def work(rows: NDArray[np.int64]) -> tuple[Array, Array]:
+        gram, right, tangents, reach = quadric_kernels.equations(points, normals, neighbours, rows)
+        return quadric_kernels.elements(normals[rows], np.linalg.solve(gram, right), tangents, reach)  # type: ignore[no-any-return]
+
+    corrected, shapes = zip(*in_pieces(work, np.arange(len(points)), num_threads), strict=True)
+    return np.concatenate(corrected), np.concatenate(shapes)
 
 
 def misfit_mm(
-    points: Array, normals: Array, shapes: Array, neighbours: NDArray[np.int64], most_mm: float = 5.0
+    points: Array,
+    normals: Array,
+    shapes: Array,
+    neighbours: NDArray[np.int64],
+    most_mm: float = 5.0,
+    num_threads: int = 1,
 ) -> Array:
     """(N,) root-mean-square distance, mm, of each point's neighbours to its quadric, each at most `most_mm`.
 
@@ -102,9 +112,10 @@ def misfit_mm(
         normals, shapes: (N, 3) and (N, 3, 3) from `fit_quadrics`.
         neighbours: (N, k) indices into points, without the points themselves.
         most_mm: beyond it a neighbour is simply elsewhere.
+        num_threads: 0 for all cores.
     """
-    offsets = points[neighbours] - points[:, None]
-    off = heights(offsets, normals[:, None], shapes[:, None])
+    work = partial(quadric_kernels.heights, points, normals, shapes, neighbours)
+    off = np.concatenate(in_pieces(work, np.arange(len(points)), num_threads))
     return np.asarray(np.sqrt((np.minimum(np.abs(off), most_mm) ** 2).mean(axis=1)))
 
 

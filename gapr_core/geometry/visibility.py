@@ -11,18 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.geometry import quadrics
 from gapr_core.geometry.sampling import fibonacci_directions
+from gapr_core.runtime.parallel import in_threads, thread_count
 
 Array = NDArray[np.float64]
 View = Callable[[Array, Array, Array, float], NDArray[np.bool_]]  # direction, points, normals, pixel_mm -> seen
 
 STEEPEST = 2.0  # tangent of the steepest slope that the depth buffer makes room for
 FEWEST_VIEWS = 0.05  # share of the views that must see a point of the outer layer: gaps between outer points let some
+TURNS = 4  # in which these views are taken, each evenly spread
 MOST_PIXELS = 1024  # across a view: points in pairs have next to no spacing, and a buffer that fine has no end
 HOLLOW_FROM = 0.15  # share of inner points that makes a bone a hollow one; deep folds of a solid pelvis reach 0.12
 
@@ -38,16 +41,7 @@ def seen_from(direction: Array, points: Array, normals: Array, pixel_mm: float) 
         normals: (N, 3), unit; the sign does not matter.
         pixel_mm: edge of a pixel; about 1.5 point spacings closes the surface.
     """
-    pixel, shape = _pixels(direction, points, pixel_mm)
-    height = points @ direction
-    flat = np.full(shape[0] * shape[1], -np.inf)
-    np.maximum.at(flat, pixel, height)
-    highest = flat.reshape(shape)
-    for axis in (0, 1):  # 3 x 3 maximum, one axis after the other
-        highest = np.maximum.reduce([highest, np.roll(highest, 1, axis), np.roll(highest, -1, axis)])
-    facing = np.abs(normals @ direction)
-    slope = np.minimum(np.sqrt(1.0 - np.minimum(facing, 1.0) ** 2) / np.maximum(facing, 1e-9), STEEPEST)
-    return height >= highest.ravel()[pixel] - pixel_mm * (0.5 + 1.5 * slope)
+    return np.asarray(_seen_from(direction, points, normals, pixel_mm))
 
 
 def unobstructed_from(direction: Array, points: Array, normals: Array, pixel_mm: float) -> NDArray[np.bool_]:
@@ -55,32 +49,88 @@ def unobstructed_from(direction: Array, points: Array, normals: Array, pixel_mm:
 
     Unlike a difference in height, the distance to the plane is the wall's thickness from wherever a wall is seen.
     """
-    pixel, shape = _pixels(direction, points, pixel_mm)
-    highest = np.full(shape[0] * shape[1], -1)
-    by_height = np.argsort(points @ direction, kind="stable")
-    highest[pixel[by_height]] = by_height  # the last one written stays
-    slant = normals @ direction
-    towards = normals * np.sign(slant)[:, None]
+    return np.asarray(_unobstructed_from(direction, points, normals, pixel_mm))
+
+
+@numba.njit(cache=True, nogil=True)
+def _pixels(direction, points, pixel_mm):  # type: ignore[no-untyped-def]
+    """In a view along `direction`: each point's height and flat pixel index, and how many rows and columns there are.
+
+    The outermost pixels are empty: every point has eight pixels around its own.
+    """
+    x, y, z = direction
+    side = np.array([0.0, z, -y]) if abs(x) < 0.9 else np.array([-z, 0.0, x])  # direction x first or second axis
+    a, b, c = side / np.sqrt(side[0] ** 2 + side[1] ** 2 + side[2] ** 2)
+    d, e, f = y * c - z * b, z * a - x * c, x * b - y * a
+    px, py, pz = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    height = px * x + py * y + pz * z
+    row = np.floor((px * a + py * b + pz * c) / pixel_mm).astype(np.int64)
+    column = np.floor((px * d + py * e + pz * f) / pixel_mm).astype(np.int64)
+    row += 1 - row.min()
+    column += 1 - column.min()
+    rows, columns = row.max() + 2, column.max() + 2
+    return height, row * columns + column, rows, columns
+
+
+@numba.njit(cache=True, nogil=True)
+def _seen_from(direction, points, normals, pixel_mm):  # type: ignore[no-untyped-def]
+    height, pixel, rows, columns = _pixels(direction, points, pixel_mm)
+    highest = np.full(rows * columns, -np.inf)
+    for p in range(len(points)):
+        highest[pixel[p]] = max(highest[pixel[p]], height[p])
+    for step in (1, columns):  # 3 x 3 maximum, one axis after the other
+        alone = highest.copy()
+        for i in range(step, len(highest) - step):
+            highest[i] = max(alone[i - step], alone[i], alone[i + step])
+    facing = np.abs(normals[:, 0] * direction[0] + normals[:, 1] * direction[1] + normals[:, 2] * direction[2])
+    slope = np.minimum(np.sqrt(1.0 - np.minimum(facing, 1.0) ** 2) / np.maximum(facing, 1e-9), STEEPEST)
+    return height >= highest[pixel] - pixel_mm * (0.5 + 1.5 * slope)
+
+
+@numba.njit(cache=True, nogil=True)
+def _unobstructed_from(direction, points, normals, pixel_mm):  # type: ignore[no-untyped-def]
+    height, pixel, rows, columns = _pixels(direction, points, pixel_mm)
+    highest = np.full(rows * columns, -1, dtype=np.int64)
+    for p in range(len(points)):
+        if highest[pixel[p]] < 0 or height[p] >= height[highest[pixel[p]]]:
+            highest[pixel[p]] = p
+    around = np.array([0, 1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns])
+    slant = normals[:, 0] * direction[0] + normals[:, 1] * direction[1] + normals[:, 2] * direction[2]
     free = np.abs(slant) > 0.1
-    for shift in (i * shape[1] + j for i in (-1, 0, 1) for j in (-1, 0, 1)):
-        above = highest[pixel + shift]
-        over_mm = np.einsum("ni,ni->n", points[above] - points, towards)
-        free &= (above < 0) | (over_mm < 0.5 * pixel_mm)
+    for p in range(len(points)):
+        x, y, z = points[p]
+        sign = 1.0 if slant[p] > 0.0 else -1.0
+        nx, ny, nz = sign * normals[p, 0], sign * normals[p, 1], sign * normals[p, 2]
+        i = 0
+        while free[p] and i < 9:
+            top = highest[pixel[p] + around[i]]
+            i += 1
+            if top >= 0:
+                over_mm = (points[top, 0] - x) * nx + (points[top, 1] - y) * ny + (points[top, 2] - z) * nz
+                free[p] = over_mm < 0.5 * pixel_mm
     return free
 
 
-def _pixels(direction: Array, points: Array, pixel_mm: float) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """Flat pixel index (N,) of each point in a view along `direction`, with an empty frame around, and the shape."""
-    side = np.cross(direction, [1.0, 0.0, 0.0] if abs(direction[0]) < 0.9 else [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    pixel = np.floor(points @ np.stack([side, np.cross(direction, side)], axis=1) / pixel_mm).astype(np.int64)
-    pixel -= pixel.min(axis=0) - 1
-    rows, columns = (int(n) + 2 for n in pixel.max(axis=0))
-    return pixel[:, 0] * columns + pixel[:, 1], (rows, columns)
+@numba.njit(cache=True, nogil=True)
+def _sum_of_views(views, directions):  # type: ignore[no-untyped-def]
+    """Sum (N, 3) of the directions (D, 3) whose views (D, N) are true, and their number (N,)."""
+    votes, counts = np.zeros((views.shape[1], 3)), np.zeros(views.shape[1], dtype=np.int64)
+    for d in range(len(views)):
+        for p in range(views.shape[1]):
+            if views[d, p]:
+                counts[p] += 1
+                for axis in range(3):
+                    votes[p, axis] += directions[d, axis]
+    return votes, counts
 
 
 def outward_votes(
-    points: Array, normals: Array, spacing_mm: float, directions: int = 96, seen_from: View = seen_from
+    points: Array,
+    normals: Array,
+    spacing_mm: float,
+    directions: int = 96,
+    seen_from: View = seen_from,
+    num_threads: int = 1,
 ) -> tuple[Array, NDArray[np.int64]]:
     """Sum of the directions from which each point is seen, and their number.
 
@@ -90,22 +140,30 @@ def outward_votes(
         spacing_mm: typical distance between neighbouring points.
         directions: how many views, evenly spread.
         seen_from: which depth buffer, `seen_from` or `unobstructed_from`.
+        num_threads: 0 for all cores.
 
     Returns:
         (N, 3) sums of unit view directions, which point out of the body, and (N,) counts; a count of zero marks a
         point inside the shell, such as the wall of a medullary canal.
     """
+    towards = fibonacci_directions(directions)
+    return _sum_of_views(_views(towards, points, normals, spacing_mm, seen_from, num_threads), towards)  # type: ignore[no-any-return]
+
+
+def _views(
+    directions: Array, points: Array, normals: Array, spacing_mm: float, seen_from: View, num_threads: int
+) -> NDArray[np.bool_]:
+    """(D, N) which points each of the directions (D, 3) sees."""
     pixel_mm = max(1.5 * spacing_mm, float(np.linalg.norm(np.ptp(points, axis=0))) / MOST_PIXELS)
-    votes, counts = np.zeros_like(points), np.zeros(len(points), dtype=np.int64)
-    for direction in fibonacci_directions(directions):
-        seen = seen_from(direction, points, normals, pixel_mm)
-        votes[seen] += direction
-        counts += seen
-    return votes, counts
+
+    def view(direction: Array) -> NDArray[np.bool_]:
+        return seen_from(direction, points, normals, pixel_mm)
+
+    return np.stack(in_threads(view, directions, num_threads=num_threads))
 
 
 def outer_layer(
-    points: Array, normals: Array, spacing_mm: float, directions: int = 96
+    points: Array, normals: Array, spacing_mm: float, directions: int = 96, num_threads: int = 1
 ) -> tuple[NDArray[np.bool_], Array] | None:
     """The outer one of the two surfaces of a hollow bone.
 
@@ -114,31 +172,39 @@ def outer_layer(
         normals: (N, 3), unit; the sign does not matter.
         spacing_mm: typical distance between neighbouring points.
         directions: how many views, evenly spread.
+        num_threads: 0 for all cores.
 
     Returns:
         (N,) mask and (N, 3) vectors that point out of the body; None for a bone of one surface. A wall thinner than
         the spacing of the points cannot be separated from one surface.
     """
-    votes, counts = outward_votes(points, normals, spacing_mm, directions, unobstructed_from)
-    outer = counts >= FEWEST_VIEWS * directions
+    towards, views = fibonacci_directions(directions), np.zeros((directions, len(points)), dtype=np.bool_)
+    for turn in range(TURNS):
+        some = slice(turn, None, TURNS)
+        views[some] = _views(towards[some], points, normals, spacing_mm, unobstructed_from, num_threads)
+        outer = views.sum(axis=0) >= FEWEST_VIEWS * directions
+        if outer.mean() > 1.0 - HOLLOW_FROM:  # of a bone of one surface a few views are enough: it only grows
+            return None
+    votes, _ = _sum_of_views(views, towards)
     if outer.sum() < quadrics.FEWEST_NEIGHBOURS:
         return None
     for _ in range(3):
-        if outer.mean() > 1.0 - HOLLOW_FROM:  # it only grows
+        _grow(outer, votes, points, spacing_mm, num_threads)
+        if outer.mean() > 1.0 - HOLLOW_FROM:
             return None
-        _grow(outer, votes, points, spacing_mm)
-    return None if outer.mean() > 1.0 - HOLLOW_FROM else (outer, votes)
+    return outer, votes
 
 
-def _grow(outer: NDArray[np.bool_], outward: Array, points: Array, spacing_mm: float) -> None:
+def _grow(outer: NDArray[np.bool_], outward: Array, points: Array, spacing_mm: float, num_threads: int) -> None:
     """Add, in place, the points that lie on the surface elements of those already in the mask."""
     inside = np.flatnonzero(outer)
     tree = cKDTree(points[inside])
-    neighbours = tree.query(points[inside], k=quadrics.FEWEST_NEIGHBOURS)[1]
-    normals = quadrics.orient(quadrics.local_frames(points[inside], neighbours).normals, outward[inside])
-    normals, shapes = quadrics.fit_quadrics(points[inside], normals, neighbours)
+    neighbours = quadrics.nearest(points[inside], quadrics.FEWEST_NEIGHBOURS, tree, num_threads)
+    frames = quadrics.local_frames(points[inside], neighbours, num_threads)
+    normals = quadrics.orient(frames.normals, outward[inside])
+    normals, shapes = quadrics.fit_quadrics(points[inside], normals, neighbours, num_threads)
     rest = np.flatnonzero(~outer)
-    apart, nearest = tree.query(points[rest])
+    apart, nearest = tree.query(points[rest], workers=thread_count(num_threads))
     off = quadrics.heights(points[rest] - points[inside[nearest]], normals[nearest], shapes[nearest])
     on_it = (np.abs(off) < 0.5 * spacing_mm) & (apart < 3.0 * spacing_mm)
     outer[rest[on_it]] = True

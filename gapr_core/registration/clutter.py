@@ -25,7 +25,7 @@ from gapr_core.registration.proposals.regions import Region
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
-from gapr_core.runtime.parallel import in_threads, thread_count
+from gapr_core.runtime.parallel import in_pieces, in_threads
 
 Array = NDArray[np.float64]
 
@@ -136,9 +136,8 @@ def refine_on_all(
 ) -> Pool:
     """Each refined on all points whose normals agree, ranked at the scale of the noise."""
     steps = _Steps(target, np.linspace(*config.final_limits_mm), config.free_space.same_surface_cos)
-    pieces = [p for p in np.array_split(pool.poses, 4 * thread_count(num_threads)) if len(p)]
     work = partial(steps.refined, source=scene.source, some=scene.source.order[: config.final_points])
-    pool = replace(pool, poses=np.concatenate(in_threads(work, pieces, num_threads=num_threads)))
+    pool = replace(pool, poses=np.concatenate(in_pieces(work, pool.poses, num_threads)))
     pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
     return _best_distinct(pool, scene, config, config.kept_poses)
 

@@ -18,7 +18,7 @@ from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import quadrics, se3
 from gapr_core.registration.clutter_kernels import compare_with_image
-from gapr_core.runtime.parallel import in_threads, thread_count
+from gapr_core.runtime.parallel import in_pieces
 
 Array = NDArray[np.float64]
 
@@ -155,7 +155,5 @@ def compare(
     def work(piece: NDArray[np.float32]) -> NDArray[np.float32]:
         return compare_with_image(piece, cloud, *view, *limits32)  # type: ignore[no-any-return]
 
-    pieces = [p for p in np.array_split(T, 4 * thread_count(num_threads)) if len(p)]
-    shares = np.concatenate(in_threads(work, pieces, num_threads=num_threads))
-    explained, violating, compared = shares.astype(np.float64).T
+    explained, violating, compared = np.concatenate(in_pieces(work, T, num_threads)).astype(np.float64).T
     return Visible(explained, violating, compared, config)

@@ -17,7 +17,7 @@ from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import kernels
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.runtime.parallel import in_threads, thread_count
+from gapr_core.runtime.parallel import in_pieces
 
 Array = NDArray[np.float64]
 
@@ -69,13 +69,12 @@ def refine_many(
     Returns:
         (K, 4, 4) refined poses and (K,) mean squared distances truncated at the last limit, mm^2 (small is good).
     """
-    pieces = [p for p in np.array_split(np.ascontiguousarray(poses), 4 * thread_count(num_threads)) if len(p)]
     variances, trust = np.zeros_like(limits_mm), np.ones(len(points))
 
     def work(piece: Array) -> tuple[Array, Array]:
         return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances)
 
-    refined, scores = zip(*in_threads(work, pieces, num_threads=num_threads), strict=True)
+    refined, scores = zip(*in_pieces(work, np.ascontiguousarray(poses), num_threads), strict=True)
     return np.concatenate(refined), np.concatenate(scores)
 
 

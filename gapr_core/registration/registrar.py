@@ -98,7 +98,7 @@ class Registrar:
     @single_threaded_libraries
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
-        prepared = targets.prepare(target, units, self.config.target)
+        prepared = targets.prepare(target, units, self.config.target, self.config.num_threads)
         for proposer in self.proposers:
             for each in filter(None, (prepared, prepared.both_cortices)):
                 proposer.prepare(each)

@@ -78,7 +78,10 @@ class PreparedTarget:
 
 
 def prepare(
-    target: str | Path | ArrayLike | Surface, units: str = "mm", config: TargetConfig | None = None
+    target: str | Path | ArrayLike | Surface,
+    units: str = "mm",
+    config: TargetConfig | None = None,
+    num_threads: int = 0,
 ) -> PreparedTarget:
     """Load and prepare a target.
 
@@ -86,34 +89,39 @@ def prepare(
         target: path, `Surface` or (M, 3) array (see `clouds.load`).
         units: "mm", "m" or "auto".
         config: sizes; the defaults suit bones from a cartilage to a pelvis.
+        num_threads: 0 for all cores; the answer does not depend on it.
 
     Raises:
         InvalidPointCloudError: when it cannot be read, cannot be a bone, or is a plane, a line or too small a set.
     """
     config = config or TargetConfig()
     surface = clouds.load(target, units)
-    points, normals = _surface_elements(surface, config)
+    points, normals = _surface_elements(surface, config, num_threads)
     _check_is_a_body(points, config)
-    spacing_mm = quadrics.spacing(points)
-    whole = _described(*_outer_shell(points, normals, spacing_mm, config), surface, config)
-    outer = _outer_cortex(points, normals, spacing_mm, config)
-    return whole if outer is None else replace(_described(*outer, surface, config), both_cortices=whole)
+    spacing_mm = quadrics.spacing(points, num_threads=num_threads)
+    shell = _outer_shell(points, normals, spacing_mm, config, num_threads)
+    whole = _described(*shell, surface, config, num_threads)
+    outer = _outer_cortex(points, normals, spacing_mm, config, num_threads)
+    return whole if outer is None else replace(_described(*outer, surface, config, num_threads), both_cortices=whole)
 
 
-def _described(points: Array, normals: Array, surface: Surface, config: TargetConfig) -> PreparedTarget:
+def _described(
+    points: Array, normals: Array, surface: Surface, config: TargetConfig, num_threads: int
+) -> PreparedTarget:
     """Everything that follows from points (M, 3) with outward normals (M, 3)."""
     tree = cKDTree(points)
-    spacing_mm = quadrics.spacing(points, tree)
-    neighbours = tree.query(points, k=min(config.quadric_neighbours, len(points)))[1]
+    spacing_mm = quadrics.spacing(points, tree, num_threads)
+    neighbours = quadrics.nearest(points, config.quadric_neighbours, tree, num_threads)
     for _ in range(2):  # the second fit knows better which neighbours are on the other side of a blade
-        normals, shapes = quadrics.fit_quadrics(points, normals, neighbours)
-    misfit = quadrics.misfit_mm(points, normals, shapes, neighbours[:, 1 : 1 + config.misfit_neighbours])
+        normals, shapes = quadrics.fit_quadrics(points, normals, neighbours, num_threads)
+    others = neighbours[:, 1 : 1 + config.misfit_neighbours]
+    misfit = quadrics.misfit_mm(points, normals, shapes, others, num_threads=num_threads)
     return PreparedTarget(
         points=points,
         normals=normals,
         shapes=shapes,
         tree=tree,
-        field=distance_field.build(points, normals, spacing_mm, config.field_reach_mm),
+        field=distance_field.build(points, normals, spacing_mm, config.field_reach_mm, num_threads=num_threads),
         anchors=sampling.thin(points, config.anchors),
         spacing_mm=spacing_mm,
         surface=surface,
@@ -123,7 +131,7 @@ def _described(points: Array, normals: Array, surface: Surface, config: TargetCo
     )
 
 
-def _surface_elements(surface: Surface, config: TargetConfig) -> tuple[Array, Array]:
+def _surface_elements(surface: Surface, config: TargetConfig, num_threads: int) -> tuple[Array, Array]:
     """Evenly thinned points (M, 3) with unit normals of arbitrary sign."""
     if surface.faces is not None and len(surface.faces):
         points, normals = surface.sample(4 * config.most_points, np.random.default_rng(0))
@@ -132,8 +140,8 @@ def _surface_elements(surface: Surface, config: TargetConfig) -> tuple[Array, Ar
     unique = sampling.distinct(surface.points)
     unique = unique[sampling.voxel_indices(unique, DOUBLES_MM)]
     points = unique[sampling.thin(unique, config.most_points)]
-    neighbours = cKDTree(points).query(points, k=min(config.normal_neighbours, len(points)))[1]
-    return points, quadrics.local_frames(points, np.atleast_2d(neighbours)).normals
+    neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
+    return points, quadrics.local_frames(points, neighbours, num_threads).normals
 
 
 def _check_is_a_body(points: Array, config: TargetConfig) -> None:
@@ -146,19 +154,25 @@ def _check_is_a_body(points: Array, config: TargetConfig) -> None:
         raise InvalidPointCloudError("a bone with extent in three directions", f"a {shape}", "check the file")
 
 
-def _outer_shell(points: Array, normals: Array, spacing_mm: float, config: TargetConfig) -> tuple[Array, Array]:
+def _outer_shell(
+    points: Array, normals: Array, spacing_mm: float, config: TargetConfig, num_threads: int
+) -> tuple[Array, Array]:
     """Points visible from outside with outward normals; everything, should that be less than half of them."""
-    votes, counts = visibility.outward_votes(points, normals, spacing_mm, config.view_directions)
+    votes, counts = visibility.outward_votes(
+        points, normals, spacing_mm, config.view_directions, num_threads=num_threads
+    )
     normals = quadrics.orient(normals, votes)
     shell = counts > 0
     return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)
 
 
-def _outer_cortex(points: Array, normals: Array, spacing_mm: float, config: TargetConfig) -> tuple[Array, Array] | None:
+def _outer_cortex(
+    points: Array, normals: Array, spacing_mm: float, config: TargetConfig, num_threads: int
+) -> tuple[Array, Array] | None:
     """Points and outward normals of a hollow bone's outer cortex; None for a bone of one surface."""
-    found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions)
+    found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions, num_threads)
     if found is None:
         return None
     points, outward = points[found[0]], found[1][found[0]]
-    neighbours = cKDTree(points).query(points, k=min(config.normal_neighbours, len(points)))[1]
-    return points, quadrics.orient(quadrics.local_frames(points, neighbours).normals, outward)
+    neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
+    return points, quadrics.orient(quadrics.local_frames(points, neighbours, num_threads).normals, outward)

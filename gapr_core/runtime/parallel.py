@@ -11,6 +11,8 @@ from functools import cache, wraps
 from multiprocessing import parent_process
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 Given = ParamSpec("Given")
@@ -29,6 +31,12 @@ def in_threads(work: Callable[..., Result], *columns: Iterable[Any], num_threads
         return list(map(work, *columns))
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(work, *columns))
+
+
+def in_pieces(work: Callable[[NDArray[Any]], Result], rows: NDArray[Any], num_threads: int = 0) -> list[Result]:
+    """`work` of consecutive pieces of `rows`, in threads; four for each, so that none waits long for another."""
+    count = min(4 * thread_count(num_threads), len(rows))
+    return in_threads(work, np.array_split(rows, max(count, 1)), num_threads=num_threads)
 
 
 def end_with_parent() -> None:

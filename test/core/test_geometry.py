@@ -22,6 +22,34 @@ def test_thinning_keeps_at_most_the_number_asked_for_and_spreads_them():
     assert np.quantile(gaps, 0.05) > 1.5 * np.quantile(cKDTree(random).query(random, k=2)[0][:, 1], 0.05)
 
 
+def central_points(points, voxel_mm):
+    """What `voxel_indices` finds, with NumPy."""
+    cells = np.floor((points - points.min(axis=0)) / voxel_mm).astype(np.int64)
+    _, voxel, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(voxel, weights=axis) for axis in points.T], axis=1) / counts[:, None]
+    order = np.lexsort((np.linalg.norm(points - means[voxel], axis=1), voxel))
+    return np.sort(order[np.concatenate([[0], np.cumsum(counts)[:-1]])])
+
+
+@pytest.mark.parametrize("voxel_mm", [0.01, 0.8, 5.0, 1000.0])
+def test_every_voxel_keeps_the_point_nearest_to_the_mean_even_where_rounding_decides(voxel_mm):
+    rng = np.random.default_rng(0)  # most voxels of 0.8 mm with two points have two that are equally near
+    points = np.vstack([rng.uniform(-5, 5, (1000, 3)), rng.normal(size=(300, 3)) * [1, 1, 300], np.zeros((3, 3))])
+    np.testing.assert_array_equal(sampling.voxel_indices(points, voxel_mm), central_points(points, voxel_mm))
+
+
+def test_thinning_takes_the_finest_grid_that_its_bisection_finds():
+    points = np.random.default_rng(0).normal(size=(5000, 3)) * [10, 20, 100]
+    low, high = 0.0, np.ptp(points, axis=0).max() + 1e-9
+    for _ in range(12):
+        middle = 0.5 * (low + high) if low else high / 16.0
+        kept = len(central_points(points, middle))
+        low, high = (middle, high) if kept > 700 else (low, middle)
+        if 0.97 * 700 < kept <= 700:
+            break
+    np.testing.assert_array_equal(sampling.thin(points, 700), central_points(points, high))
+
+
 def test_distinct_points_are_those_of_numpy_whatever_repeats():
     rng = np.random.default_rng(0)
     points = rng.integers(-2, 3, (400, 3)) * 0.5
@@ -80,6 +108,87 @@ def test_a_wall_inside_the_body_is_not_seen_from_outside():
     assert (counts[6000:] > 0).mean() < 0.01
 
 
+def bent_slab(count=1500):
+    """Points of a bent sheet and of its back, 3 mm below; outward normals of the points, and a direction of view."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-20, 20, (2, count))
+    top = np.stack([x, y, 0.01 * x**2 - 0.02 * x * y], axis=1)
+    normals = np.stack([-0.02 * x + 0.02 * y, 0.02 * x, np.ones(count)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    direction = np.array([0.6, 0.1, 0.9])
+    return np.vstack([top, top - 3.0 * normals]), np.vstack([normals, -normals]), direction / np.linalg.norm(direction)
+
+
+def in_a_view(direction, points, pixel_mm):
+    """Heights (N,), and for each point the indices of those in the 3 x 3 pixels around it."""
+    side = np.cross(direction, [1.0, 0.0, 0.0] if abs(direction[0]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    pixel = np.floor(points @ np.stack([side, np.cross(direction, side)], axis=1) / pixel_mm)
+    return points @ direction, [np.flatnonzero((np.abs(pixel - own) <= 1).all(axis=1)) for own in pixel]
+
+
+@pytest.mark.parametrize("turn", [[0, 1, 2], [2, 0, 1]])
+def test_a_point_is_seen_when_nothing_near_it_is_higher_than_its_slope_explains(turn):
+    points, normals, direction = (a[..., turn] for a in bent_slab())
+    direction = direction if turn[0] == 0 else np.array([0.95, 0.1, 0.3]) / np.linalg.norm([0.95, 0.1, 0.3])
+    height, around = in_a_view(direction, points, 2.0)
+    facing = np.abs(normals @ direction)
+    explained = 2.0 * (0.5 + 1.5 * np.minimum(np.sqrt(1.0 - facing**2) / facing, 2.0))
+    expected = [height[p] >= height[near].max() - explained[p] for p, near in enumerate(around)]
+    seen = visibility.seen_from(direction, points, normals, 2.0)
+    np.testing.assert_array_equal(seen, expected)
+    assert 0.1 < seen.mean() < 0.9
+
+
+def test_a_point_is_free_when_no_highest_point_of_a_pixel_near_it_is_above_its_plane():
+    points, normals, direction = bent_slab()
+    height, around = in_a_view(direction, points, 2.0)
+    side = np.cross(direction, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    pixel = np.floor(points @ np.stack([side, np.cross(direction, side)], axis=1) / 2.0)
+    highest = {tuple(own): p for own, p in zip(pixel[np.argsort(height)], np.argsort(height), strict=True)}
+    expected = np.abs(normals @ direction) > 0.1
+    for p, near in enumerate(around):
+        tops = points[sorted({highest[tuple(pixel[q])] for q in near})]
+        expected[p] &= ((tops - points[p]) @ normals[p] * np.sign(normals[p] @ direction) < 1.0).all()
+    free = visibility.unobstructed_from(direction, points, normals, 2.0)
+    np.testing.assert_array_equal(free, expected)
+    assert 0.1 < free.mean() < 0.9
+
+
+def test_a_quadric_is_the_weighted_least_squares_fit_to_the_neighbours():
+    points, normals, _ = bent_slab()
+    neighbours = cKDTree(points).query(points, k=16)[1]
+    corrected, shapes = quadrics.fit_quadrics(points, normals, neighbours, num_threads=2)
+    for p in range(0, len(points), 300):
+        tangents, offsets = quadrics.tangent_basis(normals[p : p + 1])[0], points[neighbours[p]] - points[p]
+        far = np.linalg.norm(offsets, axis=1)
+        reach = 1.05 * far.max()
+        weight = (1.0 - (far / reach) ** 2) ** 2 * np.clip(normals[neighbours[p]] @ normals[p], 0.0, 1.0) ** 2
+        u, v = tangents @ offsets.T / reach
+        design = np.stack([np.ones(16), u, v, 0.5 * u**2, u * v, 0.5 * v**2], axis=1) * np.sqrt(weight)[:, None]
+        ridge = np.vstack([design, 1e-3 * np.eye(6)])
+        height = np.concatenate([np.sqrt(weight) * (offsets @ normals[p]), np.zeros(6)])
+        fit = np.linalg.lstsq(ridge, height)[0]
+        normal = normals[p] - fit[1:3] / reach @ tangents
+        normal /= np.linalg.norm(normal)
+        basis = quadrics.tangent_basis(normal[None], like=tangents[:1])[0]
+        d, e, f = fit[3:] / reach**2
+        assert corrected[p] == pytest.approx(normal, abs=1e-9)
+        assert shapes[p] == pytest.approx(basis.T @ [[d, e], [e, f]] @ basis, abs=1e-9)
+
+
+def test_the_misfit_is_the_rms_height_of_the_neighbours_above_the_quadric_up_to_a_limit():
+    points, normals, _ = bent_slab()
+    neighbours = cKDTree(points).query(points, k=16)[1]
+    normals, shapes = quadrics.fit_quadrics(points, normals, neighbours)
+    offsets = points[neighbours[:, 1:11]] - points[:, None]
+    off = np.abs(quadrics.heights(offsets, normals[:, None], shapes[:, None]))
+    found = quadrics.misfit_mm(points, normals, shapes, neighbours[:, 1:11], 2.0, num_threads=2)
+    assert (off > 2.0).any()
+    assert found == pytest.approx(np.sqrt((np.minimum(off, 2.0) ** 2).mean(axis=1)), abs=1e-12)
+
+
 def test_quadrics_find_normals_and_curvature_of_a_sphere():
     points, outward = sphere(4000, 30.0)
     neighbours = cKDTree(points).query(points, k=16)[1]
@@ -107,6 +216,15 @@ def test_the_field_holds_the_nearest_point_of_every_cell_within_reach():
     assert ((found >= 0) == (gap < 8.0)).mean() > 0.9999
     near = (found >= 0) & (gap < 7.99)
     assert np.linalg.norm(centres[near] - points[found[near]], axis=1) == pytest.approx(gap[near], abs=1e-3)
+
+
+def test_a_cell_as_near_to_two_points_has_the_first_however_many_threads_fill_the_field():
+    points, outward = sphere(2000, 30.0)
+    twice, normals = np.vstack([points, points]), np.vstack([outward, outward])
+    one, two = (distance_field.build(twice, normals, 2.0, 8.0, num_threads=n) for n in (1, 2))
+    assert one.nearest.max() < 2000
+    np.testing.assert_array_equal(one.nearest, two.nearest)
+    np.testing.assert_array_equal(one.distance, two.distance)
 
 
 def test_the_field_gives_the_distance_to_the_surface_not_to_its_points():

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from gapr_core import Registrar
 from gapr_core.data.parametric import make_bone
 from gapr_core.registration.proposals.base import Proposals
+from gapr_core.runtime.parallel import in_pieces
 
 
 def threads(api):
@@ -47,6 +48,13 @@ def test_libraries_have_one_thread_while_a_cloud_is_registered_and_as_many_as_be
         registrar.register(cloud[:1500], target)
         assert (threads("blas"), threads("openmp"), torch.get_num_threads()) == ({2}, {2}, 2)
     assert witness.prepared_with == witness.proposed_with == ({1}, 1)
+
+
+@pytest.mark.parametrize(("rows", "num_threads"), [(0, 2), (1, 2), (3, 1), (50, 1), (50, 3)])
+def test_pieces_are_consecutive_and_four_for_each_thread(rows, num_threads):
+    pieces = in_pieces(lambda piece: piece, np.arange(rows), num_threads)
+    assert len(pieces) == min(4 * num_threads, rows) or (rows == 0 and len(pieces) == 1)
+    assert list(np.concatenate(pieces)) == list(range(rows))
 
 
 def test_torch_that_is_loaded_after_the_first_registration_has_one_thread_too():

@@ -57,12 +57,12 @@ class Surface:
     @property
     def extent_mm(self) -> float:
         """Diagonal of the axis-aligned bounding box, mm."""
-        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        return float(np.linalg.norm(np.ptp(np.ascontiguousarray(self.points.T), axis=1)))  # by rows it takes longer
 
     @property
     def face_areas_mm2(self) -> Array:
         """(F,) triangle areas, mm^2."""
-        return 0.5 * np.asarray(np.linalg.norm(self._face_crosses(), axis=1))
+        return 0.5 * self._face_crosses()[1]
 
     def mirrored(self) -> Surface:
         """The mesh of the other side of the body: x negated, faces turned so that normals stay outward.
@@ -83,21 +83,18 @@ class Surface:
         Raises:
             InvalidPointCloudError: for a cloud without faces.
         """
-        crosses = self._face_crosses()
-        areas = np.linalg.norm(crosses, axis=1)
+        crosses, areas = self._face_crosses()
         face = rng.choice(len(areas), size=count, p=areas / areas.sum())
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-        a, b, c = self._corners(face)
+        a, b, c = (self.points[self.triangles[face, i]] for i in range(3))
         return a + u * (b - a) + v * (c - a), crosses[face] / areas[face, None]
 
-    def _corners(self, face: NDArray[np.int64] | slice = slice(None)) -> tuple[Array, Array, Array]:
-        faces = self.triangles
-        return tuple(self.points[faces[face, i]] for i in range(3))  # type: ignore[return-value]
+    def _face_crosses(self) -> tuple[Array, Array]:
+        """(F, 3) vectors across the faces, as long as twice their areas, and these lengths (F,)."""
+        from gapr_core.geometry.triangles import crosses
 
-    def _face_crosses(self) -> Array:
-        a, b, c = self._corners()
-        return np.cross(b - a, c - a)
+        return crosses(self.points, self.triangles)  # type: ignore[no-any-return]
 
 
 def as_points(array: ArrayLike) -> Array:

@@ -34,17 +34,21 @@ class LocalFrames:
         return self.axes[:, 2]
 
 
-def nearest(points: Array, count: int, tree: cKDTree | None = None, num_threads: int = 1) -> NDArray[np.int64]:
-    """(N, k) indices of each point's nearest ones, itself the first; k is `count`, or N where there are fewer."""
+def nearest(
+    points: Array, count: int, tree: cKDTree | None = None, num_threads: int = 1
+) -> tuple[Array, NDArray[np.int64]]:
+    """Distances (N, k), mm, and indices (N, k) of each point's nearest ones, itself the first.
+
+    k is `count`, or N where there are fewer.
+    """
     tree = cKDTree(points) if tree is None else tree
     k = list(range(1, min(count, len(points)) + 1))  # a list: else a column is missing where there is one
-    return np.asarray(tree.query(points, k=k, workers=thread_count(num_threads))[1])
+    return tree.query(points, k=k, workers=thread_count(num_threads))  # type: ignore[no-any-return]
 
 
-def spacing(points: Array, tree: cKDTree | None = None, num_threads: int = 1) -> float:
+def spacing(points: Array, num_threads: int = 1) -> float:
     """Median distance to the nearest other point, mm."""
-    tree = cKDTree(points) if tree is None else tree
-    return float(np.median(tree.query(points, k=2, workers=thread_count(num_threads))[0][:, 1]))
+    return float(np.median(nearest(points, 2, num_threads=num_threads)[0][:, 1]))
 
 
 def local_frames(points: Array, neighbours: NDArray[np.int64], num_threads: int = 1) -> LocalFrames:

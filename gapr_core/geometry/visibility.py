@@ -199,7 +199,7 @@ def _grow(outer: NDArray[np.bool_], outward: Array, points: Array, spacing_mm: f
     """Add, in place, the points that lie on the surface elements of those already in the mask."""
     inside = np.flatnonzero(outer)
     tree = cKDTree(points[inside])
-    neighbours = quadrics.nearest(points[inside], quadrics.FEWEST_NEIGHBOURS, tree, num_threads)
+    _, neighbours = quadrics.nearest(points[inside], quadrics.FEWEST_NEIGHBOURS, tree, num_threads)
     frames = quadrics.local_frames(points[inside], neighbours, num_threads)
     normals = quadrics.orient(frames.normals, outward[inside])
     normals, shapes = quadrics.fit_quadrics(points[inside], normals, neighbours, num_threads)

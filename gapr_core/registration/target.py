@@ -110,8 +110,8 @@ def _described(
 ) -> PreparedTarget:
     """Everything that follows from points (M, 3) with outward normals (M, 3)."""
     tree = cKDTree(points)
-    spacing_mm = quadrics.spacing(points, tree, num_threads)
-    neighbours = quadrics.nearest(points, config.quadric_neighbours, tree, num_threads)
+    gaps, neighbours = quadrics.nearest(points, config.quadric_neighbours, tree, num_threads)
+    spacing_mm = float(np.median(gaps[:, 1]))
     for _ in range(2):  # the second fit knows better which neighbours are on the other side of a blade
         normals, shapes = quadrics.fit_quadrics(points, normals, neighbours, num_threads)
     others = neighbours[:, 1 : 1 + config.misfit_neighbours]
@@ -140,7 +140,7 @@ def _surface_elements(surface: Surface, config: TargetConfig, num_threads: int) 
     unique = sampling.distinct(surface.points)
     unique = unique[sampling.voxel_indices(unique, DOUBLES_MM)]
     points = unique[sampling.thin(unique, config.most_points)]
-    neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
+    _, neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
     return points, quadrics.local_frames(points, neighbours, num_threads).normals
 
 
@@ -174,5 +174,5 @@ def _outer_cortex(
     if found is None:
         return None
     points, outward = points[found[0]], found[1][found[0]]
-    neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
+    _, neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
     return points, quadrics.orient(quadrics.local_frames(points, neighbours, num_threads).normals, outward)

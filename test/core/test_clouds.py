@@ -190,3 +190,21 @@ def test_faces_that_make_no_surface_are_refused(tmp_path, faces, text):
     for source in (tmp_path / "a.npz", Surface(VERTICES, faces)):
         with pytest.raises(InvalidPointCloudError, match=text):
             clouds.load(source)
+
+
+def test_areas_and_samples_of_a_mesh_follow_its_triangles():
+    surface = Surface(VERTICES, FACES)
+    a, b, c = (VERTICES[FACES[:, i]] for i in range(3))
+    across = np.cross(b - a, c - a)
+    areas = 0.5 * np.linalg.norm(across, axis=1)
+    np.testing.assert_allclose(surface.face_areas_mm2, areas, rtol=1e-15)
+    points, normals = surface.sample(20_000, np.random.default_rng(0))
+    face = np.abs(normals[:, None] - across / (2.0 * areas[:, None])).sum(axis=2).argmin(axis=1)
+    np.testing.assert_allclose(normals, across[face] / (2.0 * areas[face, None]), atol=1e-15)
+    assert np.abs(np.einsum("ni,ni->n", points - a[face], normals)).max() < 1e-12
+    assert np.bincount(face) / 20_000 == pytest.approx(areas / areas.sum(), abs=0.01)
+
+
+def test_a_triangle_without_a_vertex_is_an_error_and_no_area():
+    with pytest.raises(IndexError):
+        Surface(VERTICES, np.array([[0, 1, 2], [0, 1, 4]])).face_areas_mm2  # noqa: B018

@@ -76,5 +76,6 @@ def _reflection(normal: Array, through: Array) -> Array:
 def _is_own_image(image: Array, target: PreparedTarget) -> bool:
     """True when a motion with a reflection lays the whole bone on itself."""
     some = target.points[:: max(1, len(target.points) // POINTS)]
-    gaps_mm = target.tree.query(some @ image[:3, :3].T + image[:3, 3])[0]
-    return bool(np.median(gaps_mm) < OWN_IMAGE_SHARE * target.half_extent_mm)
+    limit_mm = OWN_IMAGE_SHARE * target.half_extent_mm  # twice as far is infinitely far: no median of two gets below it
+    gaps_mm = target.tree.query(some @ image[:3, :3].T + image[:3, 3], distance_upper_bound=2.0 * limit_mm)[0]
+    return bool(np.median(gaps_mm) < limit_mm)

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from gapr_core.geometry.twists import motion_jacobians
-
 Array = NDArray[np.float64]
 
 QUANTILE = 0.95
@@ -40,6 +38,12 @@ def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = 
 
 
 def _mean_square(points: Array, centre: Array) -> Array:
-    """(6, 6) A with TRE^2 = e^T A e over points (M, 3)."""
-    J = motion_jacobians(points, centre)
-    return np.asarray(np.einsum("nij,nik->jk", J, J) / len(points))
+    """(6, 6) A with TRE^2 = e^T A e over points (M, 3): of their mean m and second moments S about the centre.
+
+    With [m]x the matrix of a cross product, A = [I, -[m]x; [m]x, tr(S) I - S].
+    """
+    offsets = points - centre
+    x, y, z = offsets.mean(axis=0)
+    S = offsets.T @ offsets / len(points)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[np.eye(3), -across], [across, np.trace(S) * np.eye(3) - S]])

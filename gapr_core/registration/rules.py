@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import motion_jacobians
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit, refine_many
 from gapr_core.registration.source import PreparedSource
@@ -127,8 +126,8 @@ def _weakest_motions(fit: Fit, count: int) -> Array:
     arm_mm = max(_rms_mm(fit.moved - fit.moved.mean(axis=0)), 1.0)
     scale = np.array([1.0] * 3 + [1.0 / arm_mm] * 3)
     motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:count] * scale
-    moves = motion_jacobians(fit.moved, fit.moved.mean(axis=0)) @ motions.T
-    return motions / np.array([[max(_rms_mm(move), 1e-6)] for move in moves.transpose(2, 0, 1)])
+    offsets = fit.moved - fit.moved.mean(axis=0)
+    return motions / np.array([[max(_rms_mm(each[:3] + np.cross(each[3:], offsets)), 1e-6)] for each in motions])
 
 
 def _rms_mm(vectors: Array) -> float:

@@ -21,6 +21,7 @@ from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
 from gapr_core.runtime.clock import Clock
+from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -117,6 +118,7 @@ class Tracker:
         """Everything static about a target; see `Registrar.prepare`."""
         return self.registrar.prepare(target, units)
 
+    @single_threaded_libraries
     def register(
         self,
         source: ArrayLike,

@@ -8,7 +8,7 @@ Rasmussen and Williams 2006, section 2.7).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,7 @@ from gapr_core.registration.refinement import Fit
 Array = NDArray[np.float64]
 
 POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
+ROUNDED = 6  # digits after the point, mm, by which centres are chosen: where two are as good, rounding must not choose
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
 
 
@@ -39,19 +40,21 @@ def _spanned(points: Array, inlier: NDArray[np.bool_], correlation_mm: float, ce
     inliers = points[inlier]
     if not len(inliers):
         return np.zeros((len(points), 1))
-    chosen = inliers[sampling.thin(inliers, min(centres, len(inliers)))]
+    chosen = inliers[sampling.thin(inliers.round(ROUNDED), min(centres, len(inliers)))]
     among = smooth_correlation(chosen, chosen, correlation_mm)
-    to_points = smooth_correlation(chosen, points, correlation_mm)
+    to_points = smooth_correlation(points, chosen, correlation_mm)
     root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))
-    return np.asarray(solve_triangular(root, to_points, lower=True).T)
+    return to_points @ solve_triangular(root, np.eye(len(chosen)), lower=True).T
 
 
 def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:
     """(N, M) exp(-d^2 / 2 l^2) between points (N, 3) and (M, 3): how alike a smooth bias is in both."""
-    return np.asarray(np.exp(-0.5 * cdist(a, b, "sqeuclidean") / length_mm**2))
+    exponent = cdist(a, b, "sqeuclidean")
+    exponent *= -0.5 / length_mm**2
+    return np.asarray(np.exp(exponent, out=exponent))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NormalEquations:
     """Weighted inner products of residuals y, motions J (N, 6) and fields F (N, m) of unit variance.
 
@@ -66,21 +69,31 @@ class NormalEquations:
     Fy: Array
 
     @classmethod
-    def of(cls, fit: Fit, fields: Array, more: Array | None = None, sizes: ArrayLike = ()) -> NormalEquations:
-        """Those of a fit; points without weight count for nothing.
+    def of(cls, fit: Fit, fields: Array) -> NormalEquations:
+        """Those of a fit and fields (N, m) of the bias; points without weight count for nothing."""
+        m, inlier = fields.shape[1], np.flatnonzero(fit.weights)
+        root = np.sqrt(fit.weights[inlier])[:, None] / fit.sigma_mm
+        R = np.empty((len(inlier), m + 7))
+        np.multiply(fields[inlier], root, out=R[:, :m])
+        np.multiply(fit.jacobian[inlier], root, out=R[:, m:-1])
+        np.multiply(fit.signed_mm[inlier, None], root, out=R[:, -1:])
+        P = R.T @ R  # the rows carry the root of W: a symmetric product takes half the time
+        return cls(P[m:-1, m:-1] + POSE_PRIOR, P[m:-1, :m], P[:m, :m], P[m:-1, -1], P[:m, -1])
+
+    def extended(self, fit: Fit, fields: Array, more: Array, sizes: ArrayLike) -> NormalEquations:
+        """The same with further unknowns, after the six of the motion.
 
         Args:
-            fit: its residuals and motions.
-            fields: (N, m) of the bias.
-            more: (N, k) derivatives of the residuals by further unknowns, after the six of the motion.
+            fit: its residuals and motions, as in `of`.
+            fields: (N, m) of the bias, as in `of`.
+            more: (N, k) derivatives of the residuals by the further unknowns.
             sizes: (k,) standard deviations of these before the residuals are seen.
         """
-        W = fit.weights[:, None] / fit.sigma_mm**2
-        J, y, prior = fit.jacobian, np.nan_to_num(fit.signed_mm), np.diag(POSE_PRIOR)
-        if more is not None:
-            J, prior = np.column_stack([J, more]), np.append(prior, 1.0 / np.square(sizes))
-        WJ, WF = W * J, W * fields
-        return cls(J.T @ WJ + np.diag(prior), WJ.T @ fields, fields.T @ WF, WJ.T @ y, WF.T @ y)
+        weighted = fit.weights[:, None] / fit.sigma_mm**2 * more
+        across, y = fit.jacobian.T @ weighted, np.nan_to_num(fit.signed_mm)
+        JJ = np.block([[self.JJ, across], [across.T, more.T @ weighted + np.diag(1.0 / np.square(sizes))]])
+        JF, Jy = np.vstack([self.JF, weighted.T @ fields]), np.append(self.Jy, weighted.T @ y)
+        return NormalEquations(JJ, JF, self.FF, Jy, self.Fy)
 
     def log_likelihood(self, sizes_mm: Array, smallest_share: float) -> Array:
         """(K,) restricted log likelihood of standard deviations (K,) of the bias; 0 without a bias.
@@ -88,13 +101,18 @@ class NormalEquations:
         Only the fields that the points determine best count: those with `smallest_share` of the information of the best
         one. The others are rough, and what the surface's model leaves at edges would pass for a bias.
         """
-        free = np.linalg.solve(self.JJ, np.column_stack([self.JF, self.Jy]))  # what a motion takes up
-        information, directions = np.linalg.eigh(self.FF - self.JF.T @ free[:, :-1])
-        score = directions.T @ (self.Fy - self.JF.T @ free[:, -1])
+        information, score = self._fields_alone
         smooth = information > smallest_share * max(information[-1], 0.0)
         variances = np.square(sizes_mm)[:, None]
         gain = 1.0 + variances * information[smooth]
         return np.asarray(0.5 * (variances * score[smooth] ** 2 / gain - np.log(gain)).sum(axis=1))
+
+    @cached_property
+    def _fields_alone(self) -> tuple[Array, Array]:
+        """(m,) information of independent fields, ascending, and their scores, without what a motion takes up."""
+        free = np.linalg.solve(self.JJ, np.column_stack([self.JF, self.Jy]))
+        information, directions = np.linalg.eigh(self.FF - self.JF.T @ free[:, :-1])
+        return information, directions.T @ (self.Fy - self.JF.T @ free[:, -1])
 
     def step(self, size_mm: float) -> Array:
         """(6 + k,) x y z (mm) rx ry rz (rad), then the further unknowns: the best fit with a bias of this size."""
@@ -109,6 +127,12 @@ class NormalEquations:
         """(m, 7 + k) what the bias takes up of the motions and of the residuals."""
         A = self.FF + np.eye(len(self.FF)) / size_mm**2
         return np.asarray(np.linalg.solve(A, np.column_stack([self.JF.T, self.Fy])))
+
+
+@lru_cache(maxsize=4)  # as `fields`
+def equations_of(fit: Fit, correlation_mm: float, centres: int) -> NormalEquations:
+    """`NormalEquations.of` a fit and its own `fields`."""
+    return NormalEquations.of(fit, fields(fit, correlation_mm, centres))
 
 
 def root_mean_square(sizes_mm: Array, log_posterior: Array) -> float:

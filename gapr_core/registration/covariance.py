@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.registration import sensor as sensors
-from gapr_core.registration.bias_field import POSE_PRIOR, NormalEquations, fields, root_mean_square
+from gapr_core.registration.bias_field import POSE_PRIOR, NormalEquations, equations_of, fields, root_mean_square
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.sensor import Errors
 
@@ -58,17 +58,30 @@ class PoseUncertainty:
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
 
 
-def estimate(fit: Fit, config: CovarianceConfig, sensor: SensorConfig | None = None) -> PoseUncertainty:
-    """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite."""
+def estimate(
+    fit: Fit,
+    config: CovarianceConfig,
+    sensor: SensorConfig | None = None,
+    misfits_mm: tuple[float, ...] | None = None,
+) -> PoseUncertainty:
+    """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
+
+    Args:
+        fit: the pose and its residuals.
+        config: of the errors.
+        sensor: what is known of them before.
+        misfits_mm: the smooth and the short misfit, where they are known; else they are measured.
+    """
     count = int(np.count_nonzero(fit.weights))
     known = sensors.errors(sensor or SensorConfig(), count)
     spanned = fields(fit, config.correlation_mm, config.centres)
-    bias_mm = config.bias_gain * expected_bias_mm(NormalEquations.of(fit, spanned), known.bias_mm, config)
+    equations = equations_of(fit, config.correlation_mm, config.centres)
+    bias_mm = config.bias_gain * expected_bias_mm(equations, known.bias_mm, config)
     noise_mm = expected_noise_mm(fit.sigma_mm, count, known.noise_mm, config.noise_points)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
     covariance = sandwich(fit, spanned, expected, config)
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
-    smooth_mm, short_mm = smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
+    smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
     turn, shift = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm, turn, shift)
 
@@ -100,16 +113,15 @@ def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) 
     inlier = fit.weights > 0.0
     gain, prior = gain_of(fit, fields, errors.noise_mm)
     shift, growth = directions(fit, errors.along_beam, config.one_sided)
-    common = np.column_stack(
+    moved = np.column_stack(
         [
-            errors.bias_mm * fields[inlier],
-            np.full(inlier.sum(), config.long_share * errors.bias_mm),
-            errors.local_mm * _local_fields(fit, errors, config)[inlier],
-            errors.standoff_mm * shift,
-            errors.scale * growth,
+            errors.bias_mm * gain @ fields[inlier],
+            config.long_share * errors.bias_mm * gain.sum(axis=1),
+            errors.local_mm * gain @ _local_fields(fit, errors, config)[inlier],
+            errors.standoff_mm * gain @ shift,
+            errors.scale * gain @ growth,
         ]
     )
-    moved = gain @ common
     return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + prior)
 
 
@@ -146,12 +158,12 @@ def gain_of(fit: Fit, fields: Array, noise_mm: float) -> tuple[Array, Array]:
     finite.
     """
     inlier = fit.weights > 0.0
-    J, F = fit.jacobian[inlier], fields[inlier]
-    precision = fit.weights[inlier, None] / noise_mm**2
+    J, precision = fit.jacobian[inlier], fit.weights[inlier, None] / noise_mm**2
     VJ = precision * J
     if fit.bias_mm > 0.0:
-        WF = precision * F
-        VJ -= WF @ np.linalg.solve(F.T @ WF + np.eye(F.shape[1]) / fit.bias_mm**2, WF.T @ J)
+        F = fields[inlier]
+        R = np.sqrt(precision) * F
+        VJ -= precision * (F @ np.linalg.solve(R.T @ R + np.eye(F.shape[1]) / fit.bias_mm**2, F.T @ VJ))
     P = POSE_PRIOR / noise_mm**2
     H_inverse = np.linalg.inv(J.T @ VJ + P)
     return H_inverse @ VJ.T, H_inverse @ P @ H_inverse

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
 from gapr_core.registration import mirror, sensor
-from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square
+from gapr_core.registration.bias_field import equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.source import PreparedSource
@@ -105,8 +105,8 @@ def scale_of(fit: Fit, config: CovarianceConfig, prior: ScaleConfig) -> tuple[fl
     outward = np.einsum("ni,ni->n", fit.gradients, fit.moved - fit.moved.mean(axis=0))
     growth = outward - np.nan_to_num(fit.signed_mm)  # of the foot points: the points' own noise is in the residuals
     more = np.column_stack([growth, np.ones_like(growth)])
-    spanned = fields(fit, config.correlation_mm, config.centres)
-    equations = NormalEquations.of(fit, spanned, more, (prior.widest, prior.standoff_mm))
+    bias = config.correlation_mm, config.centres
+    equations = equations_of(fit, *bias).extended(fit, fields(fit, *bias), more, (prior.widest, prior.standoff_mm))
     sizes_mm = np.array(config.sizes_mm)
     size_mm = root_mean_square(sizes_mm, equations.log_likelihood(sizes_mm, config.smallest_share))
     variance = equations.step_covariance(size_mm)[6, 6]

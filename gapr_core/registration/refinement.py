@@ -8,6 +8,7 @@ elements that fit their surroundings badly weigh less, and a patch of the source
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ class Fit:
     moved: Array
     bias_mm: float = 0.0
 
-    @property
+    @cached_property
     def jacobian(self) -> Array:
         """(N, 6) derivative of the residuals by x y z rx ry rz about the moved source's centroid."""
         return np.hstack([self.gradients, np.cross(self.moved - self.moved.mean(axis=0), self.gradients)])

@@ -18,7 +18,7 @@ from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist, nees
 from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square
+from gapr_core.registration.bias_field import NormalEquations, equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import estimate
 from gapr_core.registration.refinement import Fit, evaluate_with_patches
 from gapr_core.registration.source import PreparedSource
@@ -34,7 +34,10 @@ def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessmen
     """
     a = assessment
     fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config.smooth_bias, config.refinement)
-    return a if fit is a.fit else replace(a, fit=fit, uncertainty=estimate(fit, config.covariance, config.sensor))
+    if fit is a.fit:
+        return a
+    misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # those that were assessed
+    return replace(a, fit=fit, uncertainty=estimate(fit, config.covariance, config.sensor, misfits_mm))
 
 
 def corrected_fit(
@@ -59,8 +62,10 @@ def corrected_fit(
     if np.count_nonzero(fit.weights) < config.fewest_points:
         return fit
     spanned, corrected = fields(fit, config.correlation_mm, config.centres), fit
-    for _ in range(config.iterations):
-        equations = NormalEquations.of(corrected, spanned)
+    equations = equations_of(fit, config.correlation_mm, config.centres)
+    for number in range(config.iterations):
+        if number:
+            equations = NormalEquations.of(corrected, spanned)
         size_mm = believed_size_mm(equations, config)
         if size_mm == 0.0:
             break

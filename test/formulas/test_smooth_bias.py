@@ -53,6 +53,7 @@ def steps(monkeypatch):
     def use(*believed):
         equations = Equations(believed)
         monkeypatch.setattr(smooth_bias, "fields", lambda fit, length_mm, centres: (length_mm, centres))
+        monkeypatch.setattr(smooth_bias, "equations_of", lambda fit, *of_bias: equations.of(fit, of_bias))
         monkeypatch.setattr(smooth_bias, "NormalEquations", equations)
         monkeypatch.setattr(smooth_bias, "evaluate_with_patches", lambda T, points, *_: fit_of(T))
         return equations
@@ -113,13 +114,13 @@ def test_a_move_beyond_the_limit_in_its_covariance_is_not_made(steps, factor, is
 
 
 def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps, monkeypatch):
-    monkeypatch.setattr(smooth_bias, "estimate", lambda fit, *_: ("estimated", fit.bias_mm))
+    monkeypatch.setattr(smooth_bias, "estimate", lambda fit, *given: ("estimated", fit.bias_mm, given[-1]))
     config = RegistrarConfig(smooth_bias=CONFIG)
-    known = SimpleNamespace(covariance=EXACT)
+    known = SimpleNamespace(covariance=EXACT, smooth_mm=0.3, short_mm=0.4)
     assessment = Assessment(fit_of(np.eye(4)), None, known, {}, 0.9, None, SOURCE, None)
     steps(0.0)
     assert smooth_bias.bias_corrected(assessment, config) is assessment
     steps(9.0, 0.0)
     found = smooth_bias.bias_corrected(assessment, config)
     assert found.fit.T == pytest.approx(moved_by(1, np.eye(4)), abs=1e-12)
-    assert found.uncertainty == ("estimated", pytest.approx(0.5)) and found.probability == 0.9
+    assert found.uncertainty == ("estimated", pytest.approx(0.5), (0.3, 0.4)) and found.probability == 0.9

@@ -63,7 +63,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     rank, world, device = group.rank, group.world, group.device
     model = config.network()
     per_step = group.share(config.batch, config.micro_batch)
-    claim_folder(folder, config, model, rank)
+    check_folder(folder, config, model)
     torch.manual_seed(config.seed)
     checkpoint = folder / "checkpoint.safetensors"
     network = (GAPRNet(model) if checkpoint.exists() else begin(config, model)).to(device)
@@ -77,11 +77,11 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     learner = group.wrap(Learner(network, config))
     drawn = Drawn.of(anatomy, folder / f"subjects_{rank}.json")
     steps = config.pairs // config.batch
-    origin = provenance.append(folder, config, anatomy, state["step"], world) if rank == 0 else []
     bones = bones_folder(folder, config) if max(1, config.workers) * world > 1 else None
     first = state["step"] * config.batch // config.micro_batch
     batches = micro_batches(config, model, anatomy, first, rank, world, bones, device.type == "cuda")
     held_out = validation_set(config, model, anatomy) if rank == 0 else []
+    origin = claim_folder(folder, config, model, anatomy, state["step"], world) if rank == 0 else []
     begun, saved, validated = time.monotonic(), time.monotonic(), time.monotonic()
     earlier, lost = state["seconds"], 0
 
@@ -250,8 +250,8 @@ def average(ema: GAPRNet, network: GAPRNet, decay: float) -> None:
         kept.lerp_(new, 1.0 - decay)
 
 
-def claim_folder(folder: Path, config: TrainConfig, model: ModelConfig, rank: int) -> None:
-    """Write the run's settings, or check that they are those the folder was begun with.
+def check_folder(folder: Path, config: TrainConfig, model: ModelConfig) -> None:
+    """The folder is empty, or holds a run with these settings.
 
     The network's settings count, not the path of their yaml; an entry that did not exist then stood at its default.
 
@@ -264,8 +264,19 @@ def claim_folder(folder: Path, config: TrainConfig, model: ModelConfig, rank: in
         there = TrainConfig.from_dict(begun["train"]), ModelConfig.from_dict(begun["model"])
         if (replace(there[0], model=config.model), there[1]) != (config, model):
             raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
-    elif rank == 0:
+
+
+def claim_folder(
+    folder: Path, config: TrainConfig, model: ModelConfig, anatomy: Path | None, step: int, world: int
+) -> list[dict[str, Any]]:
+    """Write the run's settings, if they are not there yet, and where it goes on; returns all of provenance.json.
+
+    Only now, when nothing that the settings name was refused: the next try may have others.
+    """
+    path = folder / "config.json"
+    if not path.exists():
         files.write_json(path, {"train": config.to_dict(), "model": model.to_dict()})
+    return provenance.append(folder, config, anatomy, step, world)
 
 
 def log_row(

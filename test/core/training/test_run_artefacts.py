@@ -131,7 +131,7 @@ def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused
     begun = {"train": replace(TrainConfig(), model="old/best.yaml").to_dict(), "model": ModelConfig().to_dict()}
     del begun["train"]["share"], begun["model"]["centred_features"]
     (tmp_path / "config.json").write_text(json.dumps(begun))
-    trainer.claim_folder(tmp_path, replace(TrainConfig(), model="new/best.yaml"), ModelConfig(), 0)
+    trainer.check_folder(tmp_path, replace(TrainConfig(), model="new/best.yaml"), ModelConfig())
     for config, model in ((TrainConfig(share=3), ModelConfig()), (TrainConfig(), ModelConfig(centred_features=True))):
         with pytest.raises(ConfigError, match="begun"):
-            trainer.claim_folder(tmp_path, config, model, 0)
+            trainer.check_folder(tmp_path, config, model)

@@ -81,6 +81,17 @@ def test_validation_draws_again_where_a_source_is_too_large_for_the_network(sett
     assert [v.protocol for v in found] == ["L1"] and len(seeds) == 2 and seeds[0] != seeds[1]
 
 
+def test_a_run_that_was_refused_leaves_its_folder_to_the_next_one(settings, anatomy, tmp_path):
+    with pytest.raises(WeightsError):
+        trainer.train(replace(settings, initial=str(tmp_path / "nowhere.safetensors")), tmp_path / "run", anatomy)
+    with pytest.raises(ConfigError, match="L1-far10"):
+        trainer.train(replace(settings, mix={"L1-far10": 1.0}), tmp_path / "run", anatomy)
+    assert not (tmp_path / "run").exists()
+    trainer.train(settings, tmp_path / "run", anatomy, minutes=0.0)
+    with pytest.raises(ConfigError, match="begun"):
+        trainer.train(replace(settings, seed=1), tmp_path / "run", anatomy)
+
+
 def test_a_protocol_that_the_network_never_sees_is_named(settings, anatomy):
     """Points far away span many times the target: such a share of the mix would silently be drawn as something else."""
     model = trainer.ModelConfig.from_yaml(settings.model)

@@ -121,7 +121,7 @@ def assess(
     config: RegistrarConfig,
 ) -> Assessment:
     """Covariance, features, probability, and what the safety rules say."""
-    uncertainty = covariance.estimate(fit, config.covariance, config.sensor)
+    uncertainty = covariance.estimate(fit, config.covariance, config.sensor, source.around)
     features = measure(fit, candidates, uncertainty, source, target, config)
     return judge(fit, candidates, uncertainty, features, source, target, calibration, config)
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.registration import fit_kernels
 from gapr_core.registration import sensor as sensors
 from gapr_core.registration.bias_field import POSE_PRIOR, NormalEquations, equations_of, fields, root_mean_square
 from gapr_core.registration.refinement import Fit
@@ -62,6 +63,7 @@ def estimate(
     fit: Fit,
     config: CovarianceConfig,
     sensor: SensorConfig | None = None,
+    around: NDArray[np.int64] | None = None,
     misfits_mm: tuple[float, ...] | None = None,
 ) -> PoseUncertainty:
     """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
@@ -70,6 +72,7 @@ def estimate(
         fit: the pose and its residuals.
         config: of the errors.
         sensor: what is known of them before.
+        around: (N, k) neighbours of each point, where they are known (see `smooth_misfits_mm`).
         misfits_mm: the smooth and the short misfit, where they are known; else they are measured.
     """
     count = int(np.count_nonzero(fit.weights))
@@ -81,7 +84,8 @@ def estimate(
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
     covariance = sandwich(fit, spanned, expected, config)
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
-    smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, (config.smooth_neighbours, config.short_neighbours))
+    counts = config.smooth_neighbours, config.short_neighbours
+    smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)
     turn, shift = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm, turn, shift)
 
@@ -169,21 +173,28 @@ def gain_of(fit: Fit, fields: Array, noise_mm: float) -> tuple[Array, Array]:
     return H_inverse @ VJ.T, H_inverse @ P @ H_inverse
 
 
-def smooth_misfits_mm(fit: Fit, neighbours: tuple[int, ...]) -> tuple[float, ...]:
+def smooth_misfits_mm(
+    fit: Fit, neighbours: tuple[int, ...], around: NDArray[np.int64] | None = None
+) -> tuple[float, ...]:
     """Root mean square of the inliers' locally averaged residuals, less what noise leaves in an average.
 
     Args:
         fit: the residuals.
         neighbours: of how many points an average is taken; a figure for each count.
+        around: (N, k) indices of each point's nearest ones, itself first, inliers or not, where they are known; a point
+            that finds too few inliers among them is looked up.
     """
     inlier = fit.weights > 0.0
     points, signed = fit.moved[inlier], fit.signed_mm[inlier]
     if len(points) <= min(neighbours):
         return (fit.sigma_mm,) * len(neighbours)
-    nearest = cKDTree(points).query(points, k=min(max(neighbours), len(points)))[1]
+    known = np.empty((len(inlier), 0), dtype=np.int64) if around is None else around
 
     def misfit_mm(count: int) -> float:
-        averages = signed[nearest[:, :count]].mean(axis=1)
+        averages = fit_kernels.leading_means(fit.signed_mm, inlier, known, count)[inlier]
+        left = np.flatnonzero(np.isnan(averages))
+        if len(left):
+            averages[left] = signed[cKDTree(points).query(points[left], k=count)[1]].mean(axis=1)
         return float(np.sqrt(max((averages**2).mean() - signed.var() / count, 0.0)))
 
     return tuple(misfit_mm(count) if len(points) > count else fit.sigma_mm for count in neighbours)

@@ -82,7 +82,7 @@ def assess(
 ) -> Assessment:
     """As `assessment.assess`, for a pose that explains a part of a scene."""
     fit, part = explained.fit, explained.source
-    uncertainty = covariance.estimate(fit, config.covariance, config.sensor)
+    uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
     if judged.probability < config.min_confidence and explained.share < config.part.mostly_clutter:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import kernels
+from gapr_core.registration import fit_kernels, kernels
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.runtime.parallel import in_pieces
 
@@ -117,8 +117,7 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
     sigma_mm = _robust_sigma(signed, config)
     limit_mm = _tukey_limit(signed, sigma_mm, config)
     signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
-    square = (np.nan_to_num(signed, nan=np.inf) ** 2 + aside**2) / limit_mm**2
-    weights = np.clip(1.0 - square, 0.0, 1.0) ** 2 * sigma_mm**2 / (sigma_mm**2 + target.elements[elements, 12])
+    weights = fit_kernels.weights(signed, aside, elements, target.elements, sigma_mm**2, limit_mm)
     return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
 
 
@@ -136,20 +135,19 @@ def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfi
     A dent, a filled hole or soft tissue takes a patch off the surface as a whole by less than its points' noise: what
     no point shows alone its neighbours show together.
     """
-    signed = np.nan_to_num(fit.signed_mm)
-    means = (fit.weights * signed)[neighbours].sum(axis=1) / (fit.weights[neighbours].sum(axis=1) + 1e-9)
+    means = fit_kernels.patch_means(fit.signed_mm, fit.weights, neighbours)
     by_noise = fit.sigma_mm / np.sqrt(neighbours.shape[1])
-    limit_mm = config.patch_scale * max(1.4826 * float(np.median(np.abs(means))), by_noise)
+    limit_mm = config.patch_scale * max(1.4826 * fit_kernels.median_size(means), by_noise)
     return np.clip(1.0 - (means / limit_mm) ** 2, 0.0, 1.0) ** 2
 
 
 def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
     """1.4826 x median absolute residual, those without a surface near counted as large; within the limits set."""
-    spread = 1.4826 * float(np.median(np.nan_to_num(np.abs(signed), nan=np.inf)))
+    spread = 1.4826 * fit_kernels.median_size(signed)
     return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
 
 
 def _tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
     """Where Tukey's weight ends, mm: far out, and so more efficient, where almost nothing lies beyond 3 sigma."""
-    beyond = np.mean(np.nan_to_num(np.abs(signed), nan=np.inf) > 3.0 * sigma_mm)
+    beyond = fit_kernels.share_beyond(signed, 3.0 * sigma_mm)
     return sigma_mm * (config.clean_tukey_scale if beyond < config.clean_share else config.tukey_scale)

@@ -37,7 +37,7 @@ def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessmen
     if fit is a.fit:
         return a
     misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # those that were assessed
-    return replace(a, fit=fit, uncertainty=estimate(fit, config.covariance, config.sensor, misfits_mm))
+    return replace(a, fit=fit, uncertainty=estimate(fit, config.covariance, config.sensor, None, misfits_mm))
 
 
 def corrected_fit(

@@ -11,9 +11,13 @@ from scipy.spatial import cKDTree
 from gapr_core import clouds
 from gapr_core.config import SourceConfig
 from gapr_core.geometry import quadrics, sampling
+from gapr_core.geometry.planes import fit_planes
 from gapr_core.results import Refusal, RegistrationStatus
 
 Array = NDArray[np.float64]
+Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neighbours
+
+SPARE_NEIGHBOURS = 6  # of a point, for means over those that lie on the bone
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,26 +26,41 @@ class PreparedSource:
 
     Attributes:
         points: (N, 3) float64, mm, in the source frame.
-        axes: (N, 3, 3) local frames; rows are two tangents and the unit normal, whose sign is arbitrary.
+        normals: (N, 3) unit normals, of arbitrary sign unless `oriented`.
         flatness_mm: (N,) root-mean-square distance of a point's neighbours to their plane.
-        neighbours: (N, k) indices of each point's nearest points, itself first.
+        around: (N, k) indices of each point's nearest points, itself first, and a few more than give a normal.
+        whole: (M, 3), mm, the cloud that `patches` are of: the points, or more where these are a part.
+        patches: (N, k) indices into `whole` of what gave each normal.
         order: (N,) indices such that every prefix is spread over the whole cloud, trustworthy points first.
         spacing_mm: median distance between neighbouring points.
         oriented: the normals point out of the body, to where the sensor was, so that their sign says something.
     """
 
     points: Array
-    axes: Array
+    normals: Array
     flatness_mm: Array
-    neighbours: NDArray[np.int64]
+    around: NDArray[np.int64]
+    whole: Array
+    patches: NDArray[np.int64]
     order: NDArray[np.int64]
     spacing_mm: float
     oriented: bool = False
 
     @property
-    def normals(self) -> Array:
-        """(N, 3) unit normals, of arbitrary sign unless `oriented`."""
-        return self.axes[:, 2]
+    def neighbours(self) -> NDArray[np.int64]:
+        """(N, k) indices of each point's nearest points that give a normal, itself first."""
+        return self.around[:, : self.patches.shape[1]]
+
+    def axes(self, chosen: NDArray[np.int64]) -> Array:
+        """(K, 3, 3) local frames of the chosen (K,) points; rows are two tangents and the unit normal.
+
+        The normal's sign is that of `normals` where these are oriented, else arbitrary.
+        """
+        axes = quadrics.local_frames(self.whole, self.patches[chosen]).axes
+        if not self.oriented:
+            return axes
+        away = np.einsum("ni,ni->n", axes[:, 2], self.normals[chosen]) < 0.0
+        return np.asarray(axes * np.where(away[:, None], [1.0, -1.0, -1.0], 1.0)[..., None])
 
     @property
     def noise_mm(self) -> float:
@@ -51,7 +70,7 @@ class PreparedSource:
     def facing(self, viewpoint: Array) -> PreparedSource:
         """The same with normals that point to the viewpoint (3,), mm: a sensor sees surfaces from outside."""
         away = np.einsum("ni,ni->n", self.normals, viewpoint - self.points) < 0.0
-        return replace(self, axes=self.axes * np.where(away[:, None], [1.0, -1.0, -1.0], 1.0)[..., None], oriented=True)
+        return replace(self, normals=self.normals * np.where(away, -1.0, 1.0)[:, None], oriented=True)
 
     def subset(self, count: int) -> Array:
         """(min(count, N), 3) of its points, spread over the whole cloud."""
@@ -71,7 +90,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     points = clouds.finite_points(source)
     if len(points) > config.most_raw_points:
         points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
-    points = without_isolated(sampling.distinct(points), config)
+    points, found = _looked_up(sampling.distinct(points), config)
     if len(points) < config.fewest_points:
         return Refusal(
             RegistrationStatus.TOO_FEW_POINTS,
@@ -83,7 +102,9 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     width_mm = float(np.sqrt(np.linalg.eigvalsh(np.cov(points.T))[1]))
     if width_mm < config.smallest_width_mm:
         return Refusal(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
-    return describe(points[sampling.thin(points, config.most_points)], config)
+    if found is None:
+        points = points[sampling.thin(points, config.most_points)]
+    return describe(points, config, found)
 
 
 def without_isolated(points: Array, config: SourceConfig) -> Array:
@@ -96,28 +117,61 @@ def without_isolated(points: Array, config: SourceConfig) -> Array:
     if len(points) < config.dense_points:
         return points
     some = points[:: -(-len(points) // config.most_compared)]
-    gaps = cKDTree(some).query(points, k=config.companions + 1)[0][:, -1]
-    return points[gaps <= max(config.isolated_mm, config.isolated_gaps * float(np.median(gaps)))]
+    return points[_has_companions(cKDTree(some).query(points, k=config.companions + 1)[0][:, -1], config)]
 
 
-def describe(points: Array, config: SourceConfig) -> PreparedSource:
-    """Frames, neighbours and order of points (N, 3), mm, that are clean and thin already."""
-    gaps, neighbours = cKDTree(points).query(points, k=_neighbour_count(len(points), config))
-    frames = quadrics.local_frames(points, neighbours)
-    isolation = np.linalg.norm(points - points[neighbours].mean(axis=1), axis=1) / np.maximum(gaps[:, -1], 1e-9)
-    return PreparedSource(
-        points,
-        frames.axes,
-        frames.flatness_mm,
-        neighbours,
-        _spread_order(points, isolation),
-        float(np.median(gaps[:, 1])),
-    )
+def _has_companions(gaps: Array, config: SourceConfig) -> NDArray[np.bool_]:
+    """Which points are not isolated, from the distances (N,), mm, to the last companion of each."""
+    return gaps <= max(config.isolated_mm, config.isolated_gaps * float(np.median(gaps)))
+
+
+def _looked_up(points: Array, config: SourceConfig) -> tuple[Array, Found | None]:
+    """`without_isolated`, and the neighbours of what stays where one look-up gives both; else None.
+
+    A point whose neighbours all stay keeps them.
+    """
+    count = _around_count(len(points), config)
+    if not config.dense_points <= len(points) <= min(config.most_points, config.most_compared):
+        return without_isolated(points, config), None
+    if config.companions >= count:
+        return without_isolated(points, config), None
+    gaps, around = cKDTree(points).query(points, k=count)
+    stays = _has_companions(gaps[:, config.companions], config)
+    if stays.all():
+        return points, (gaps, around)
+    if _around_count(int(stays.sum()), config) != count:
+        return points[stays], None
+    points, number = points[stays], np.cumsum(stays) - 1
+    lost = ~stays[around].all(axis=1)[stays]
+    gaps, around = gaps[stays], number[around[stays]]
+    gaps[lost], around[lost] = cKDTree(points).query(points[lost], k=count)
+    return points, (gaps, around)
+
+
+def describe(points: Array, config: SourceConfig, found: Found | None = None) -> PreparedSource:
+    """Normals, neighbours and order of points (N, 3), mm, that are clean and thin already.
+
+    Args:
+        points: (N, 3), mm.
+        config: how many neighbours give a normal.
+        found: distances and indices of the neighbours, where they are known.
+    """
+    gaps, around = found or cKDTree(points).query(points, k=_around_count(len(points), config))
+    patches = np.ascontiguousarray(around[:, : _neighbour_count(len(points), config)])
+    normals, flatness_mm, means = fit_planes(points, patches)
+    isolation = np.linalg.norm(points - means, axis=1) / np.maximum(gaps[:, patches.shape[1] - 1], 1e-9)
+    order, spacing_mm = _spread_order(points, isolation), float(np.median(gaps[:, 1]))
+    return PreparedSource(points, normals, flatness_mm, around, points, patches, order, spacing_mm)
 
 
 def _neighbour_count(count: int, config: SourceConfig) -> int:
     """How many points give a normal: of few points a quarter, so that it stays one of a part of the source."""
     return min(config.normal_neighbours, max(count // 4, config.fewest_points), count)
+
+
+def _around_count(count: int, config: SourceConfig) -> int:
+    """How many neighbours are looked up: a few more, so that enough are left where some turn out not to be bone."""
+    return min(_neighbour_count(count, config) + SPARE_NEIGHBOURS, count)
 
 
 def _spread_order(points: Array, isolation: Array, spread: int = 512) -> NDArray[np.int64]:
@@ -126,5 +180,7 @@ def _spread_order(points: Array, isolation: Array, spread: int = 512) -> NDArray
     start = int(np.linalg.norm(points[trusted] - points[trusted].mean(axis=0), axis=1).argmin())
     spread_out = sampling.farthest_points(points[trusted], spread, start)
     first = trusted[spread_out[np.sort(np.unique(spread_out, return_index=True)[1])]]  # some may lie on each other
-    rest = np.setdiff1d(np.arange(len(points)), first)
+    is_rest = np.ones(len(points), dtype=bool)
+    is_rest[first] = False
+    rest = np.flatnonzero(is_rest)
     return np.concatenate([first, np.random.default_rng(0).permutation(rest)])

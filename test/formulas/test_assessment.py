@@ -43,7 +43,7 @@ def made(plane, probability=0.9, refusal=None, known=None, scores=(1.0, 1.2), **
     fit = Fit(T, 0.5, signed, weights, np.tile(AXIS, (4, 1)), np.zeros(4, dtype=int), moved)
     poses = np.array([np.eye(4), *(se3.exp([30.0 * k, 0, 0, 0, 0, 0]) for k in range(1, len(scores)))])
     candidates = Candidates(poses, np.array(scores), np.ones(len(scores)))
-    source = SimpleNamespace(points=POINTS)
+    source = SimpleNamespace(points=POINTS, around=np.arange(4)[:, None])
     features = {"inlier_ratio": 0.25, "margin": 0.5, "scale_z": 0.0}
     return Assessment(fit, candidates, known or uncertainty(), features, probability, refusal, source, plane, **more)
 
@@ -185,7 +185,7 @@ def test_a_fit_is_assessed_by_its_covariance_and_features(plane, rule, monkeypat
     config = RegistrarConfig()
     found = assessments.assess(a.fit, a.candidates, a.source, plane, calibrated(0.8), config)
     assert seen == [
-        (a.fit, config.covariance, config.sensor),
+        (a.fit, config.covariance, config.sensor, a.source.around),
         (a.fit, a.candidates, a.uncertainty, a.source, plane, config),
     ]
     assert found.uncertainty is a.uncertainty and found.probability == pytest.approx(0.8)

@@ -111,7 +111,7 @@ def part_of(share, count=10):
     zeros = np.zeros(count)
     weights = (np.arange(count) < round(share * count)).astype(float)
     fit = Fit(np.eye(4), 0.5, zeros, weights, None, zeros, np.zeros((count, 3)))
-    return Explained(SimpleNamespace(points=np.zeros((count, 3))), np.ones(count, dtype=bool), fit)
+    return Explained(SimpleNamespace(points=np.zeros((count, 3)), around=None), np.ones(count, dtype=bool), fit)
 
 
 @pytest.fixture

@@ -64,9 +64,10 @@ def _part(source: PreparedSource, members: NDArray[np.int64]) -> PreparedSource:
     return replace(
         source,
         points=points,
-        axes=source.axes[members],
+        normals=source.normals[members],
         flatness_mm=source.flatness_mm[members],
-        neighbours=np.empty((len(points), 0), dtype=np.int64),
+        around=np.empty((len(points), 0), dtype=np.int64),
+        patches=source.patches[members],
         order=order,
     )
 

@@ -93,7 +93,7 @@ def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config
 
 
 def _signed_axes(source: PreparedSource, reference: int, sign: float) -> Array:
-    return source.axes[reference] * np.array([1.0, sign, sign])[:, None]
+    return source.axes(np.array([reference]))[0] * np.array([1.0, sign, sign])[:, None]
 
 
 def _poses(
@@ -110,7 +110,7 @@ def _poses(
     turn = np.stack([c, -s, o, s, c, o, o, o, i], axis=1).reshape(-1, 3, 3)
     flip = np.stack([i, signs, signs], axis=1)[:, :, None]
     poses = np.tile(np.eye(4), (len(angles), 1, 1))
-    poses[:, :3, :3] = anchor_axes[anchors].transpose(0, 2, 1) @ turn @ (source.axes[references] * flip)
+    poses[:, :3, :3] = anchor_axes[anchors].transpose(0, 2, 1) @ turn @ (source.axes(references) * flip)
     moved = np.einsum("kij,kj->ki", poses[:, :3, :3], source.points[references])
     poses[:, :3, 3] = target.points[target.anchors[anchors]] - moved
     return poses

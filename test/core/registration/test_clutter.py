@@ -100,5 +100,6 @@ def test_normals_of_a_camera_point_to_it(scene):
     points, viewpoint, _ = scene
     facing = prepare(points).facing(viewpoint)
     assert facing.oriented and (np.einsum("ni,ni->n", facing.normals, viewpoint - facing.points) >= 0.0).all()
-    frames = np.linalg.det(facing.axes)
-    assert frames == pytest.approx(np.ones(len(frames)))
+    axes = facing.axes(np.arange(len(facing.points)))
+    assert np.linalg.det(axes) == pytest.approx(np.ones(len(axes)))
+    assert np.einsum("ni,ni->n", axes[:, 2], facing.normals) == pytest.approx(np.ones(len(axes)))

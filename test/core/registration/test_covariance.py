@@ -257,6 +257,9 @@ def test_the_smooth_misfit_is_the_mean_square_of_local_averages_less_that_of_noi
         np.sqrt(np.mean([signed[i[:count]].mean() ** 2 for i in nearest]) - signed.var() / count) for count in (12, 5)
     ]
     assert covariance.smooth_misfits_mm(fit, (12, 5)) == pytest.approx(expected)
+    for count in (5, 14, 20):  # too few inliers among those known, for some or for all points
+        around = np.argsort(np.linalg.norm(fit.moved[:, None] - fit.moved, axis=2), axis=1)[:, :count]
+        assert covariance.smooth_misfits_mm(fit, (12, 5), around) == pytest.approx(expected)
 
 
 def test_fewer_points_than_an_average_needs_show_their_own_spread():

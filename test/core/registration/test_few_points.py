@@ -15,7 +15,7 @@ def test_few_points_are_prepared(count):
     points = np.random.default_rng(count).normal(size=(count, 3)) * [30.0, 20.0, 10.0]
     prepared = sources.prepare(points)
     assert len(prepared.points) == count
-    assert np.isfinite(prepared.axes).all()
+    assert np.isfinite(prepared.axes(prepared.order)).all()
     assert np.linalg.norm(prepared.normals, axis=1) == pytest.approx(np.ones(count))
     assert sorted(prepared.order) == list(range(count))
     assert prepared.neighbours.shape[1] <= max(6, count // 4)

@@ -1,0 +1,78 @@
+"""Compiled loops over the residuals of a pose: their scale, the weights that follow, and the means of patches.
+
+No fast mathematics here: where no surface is near a residual is NaN, and counts as infinitely large.
+"""
+
+# mypy: ignore-errors
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+@numba.njit(**EXACT)
+def median_size(residuals):
+    """Median of the absolute values of (N,) residuals."""
+    sizes = np.empty(len(residuals))
+    for p in range(len(residuals)):
+        sizes[p] = np.inf if np.isnan(residuals[p]) else abs(residuals[p])
+    return np.median(sizes)
+
+
+@numba.njit(**EXACT)
+def share_beyond(residuals, limit):
+    """Share of (N,) residuals that are larger than `limit`."""
+    count = 0
+    for p in range(len(residuals)):
+        count += not abs(residuals[p]) <= limit
+    return count / len(residuals)
+
+
+@numba.njit(**EXACT)
+def weights(residuals, aside, nearest, elements, variance, limit):
+    """(N,) Tukey's weights, times the share of the noise's variance in that of a residual.
+
+    `nearest` (N,) are rows of `elements`, whose last column is a variance; -1 where none is near.
+    """
+    out = np.zeros(len(residuals))
+    for p in range(len(residuals)):
+        if nearest[p] >= 0:
+            square = (residuals[p] * residuals[p] + aside[p] * aside[p]) / (limit * limit)
+            inside = min(max(1.0 - square, 0.0), 1.0)
+            out[p] = inside * inside * variance / (variance + elements[nearest[p], 12])
+    return out
+
+
+@numba.njit(**EXACT)
+def patch_means(residuals, weights, neighbours):
+    """(N,) weighted means of the residuals of each point's neighbours (N, k), which count where they have a weight."""
+    out = np.empty(len(neighbours))
+    for p in range(len(neighbours)):
+        total, weight = 0.0, 1e-9
+        for q in neighbours[p]:
+            if weights[q] > 0.0:
+                total += weights[q] * residuals[q]
+                weight += weights[q]
+        out[p] = total / weight
+    return out
+
+
+@numba.njit(**EXACT)
+def leading_means(values, counts, neighbours, count):
+    """(N,) means of `values` over the first `count` of each point's neighbours (N, k) that count; NaN where too few do.
+
+    `counts` (N,) says which points count.
+    """
+    out = np.full(len(neighbours), np.nan)
+    for p in range(len(neighbours)):
+        total, found = 0.0, 0
+        for q in neighbours[p]:
+            if counts[q]:
+                total += values[q]
+                found += 1
+                if found == count:
+                    out[p] = total / count
+                    break
+    return out

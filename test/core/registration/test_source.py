@@ -1,0 +1,49 @@
+"""What one look-up of the neighbours gives is what separate ones give."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gapr_core.config import SourceConfig
+from gapr_core.geometry import quadrics, sampling
+from gapr_core.registration import source as sources
+
+CONFIG = SourceConfig(isolated_mm=1.0)
+
+
+def cloud(isolated=0, count=900):
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(0.0, 60.0, (2, count))
+    far = rng.uniform(-20.0, 80.0, (isolated, 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 15.0]
+    return np.concatenate([np.column_stack([u, v, 0.01 * (u - 30.0) ** 2]), far])
+
+
+@pytest.mark.parametrize("isolated", [0, 1, 40])
+def test_neighbours_after_isolated_points_are_gone_are_those_of_a_new_look_up(isolated):
+    prepared = sources.prepare(cloud(isolated), CONFIG)
+    clean = sources.without_isolated(sampling.distinct(cloud(isolated)), CONFIG)
+    assert np.array_equal(prepared.points, clean)
+    assert (len(clean) < 900 + isolated) is (isolated > 0)
+    again = sources.describe(clean, CONFIG)
+    assert np.array_equal(prepared.around, cKDTree(clean).query(clean, k=36)[1])
+    assert np.array_equal(prepared.around, again.around) and np.array_equal(prepared.order, again.order)
+    assert prepared.spacing_mm == again.spacing_mm
+
+
+def test_a_source_that_is_thinned_is_looked_up_afterwards():
+    prepared = sources.prepare(cloud(), replace(CONFIG, most_points=500))
+    assert len(prepared.points) <= 500
+    assert np.array_equal(prepared.around, cKDTree(prepared.points).query(prepared.points, k=36)[1])
+
+
+def test_frames_are_the_principal_axes_and_face_the_viewpoint_where_that_is_known():
+    prepared, chosen = sources.prepare(cloud(), CONFIG), np.array([5, 77, 301])
+    wanted = quadrics.local_frames(prepared.points, prepared.neighbours).axes[chosen]
+    assert np.array_equal(prepared.axes(chosen), wanted)
+    for viewpoint in ([30.0, 30.0, 500.0], [30.0, 30.0, -500.0]):
+        facing = prepared.facing(np.array(viewpoint))
+        assert (np.einsum("ni,ni->n", facing.normals, viewpoint - facing.points) > 0.0).all()
+        signs = np.sign(np.einsum("ni,ni->n", wanted[:, 2], viewpoint - facing.points[chosen]))
+        assert np.array_equal(facing.axes(chosen), wanted * np.stack([signs**2, signs, signs], axis=1)[:, :, None])

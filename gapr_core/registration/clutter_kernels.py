@@ -6,7 +6,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gapr_core.registration.kernels import FAST, add_up, element_near, moved, put_row, residual, rows_for, step, tukey
+from gapr_core.registration.kernels import step
+from gapr_core.registration.surface_kernels import FAST, element_near, moved, residual, tukey
 
 
 @numba.njit(**FAST)
@@ -106,3 +107,40 @@ def accumulate_agreeing(
         count += 1
     add_up(rows, count, H, g)
     return total
+
+
+@numba.njit(inline="always", **FAST)
+def put_row(rows, i, w, x, y, z, middle, r, nx, ny, nz):
+    """Column i of `rows`: derivatives of a residual r by the twist about `middle` (3), and r, times the root of w."""
+    root = np.sqrt(w)
+    nx, ny, nz = root * nx, root * ny, root * nz
+    x, y, z = x - middle[0], y - middle[1], z - middle[2]
+    rows[0, i], rows[1, i], rows[2, i] = nx, ny, nz
+    rows[3, i], rows[4, i], rows[5, i] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+    rows[6, i] = root * r
+
+
+@numba.njit(**FAST)
+def add_up(rows, count, H, g):
+    """Normal equations (6, 6) and (6,) of the first `count` columns of `rows` (7, N), filled in place.
+
+    One product of whole rows after the other, and padded, so that the compiler takes several columns at a time.
+    """
+    padded = rows_for(count)
+    rows[:, count:padded] = 0.0
+    for a in range(6):
+        total = 0.0
+        for p in range(padded):
+            total -= rows[a, p] * rows[6, p]
+        g[a] = total
+        for b in range(a + 1):
+            total = 0.0
+            for p in range(padded):
+                total += rows[a, p] * rows[b, p]
+            H[a, b] = H[b, a] = total
+
+
+@numba.njit(inline="always", **FAST)
+def rows_for(count):
+    """Columns that `add_up` needs for `count` residuals."""
+    return (count + 15) // 16 * 16

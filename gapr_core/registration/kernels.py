@@ -12,55 +12,10 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-ELEMENT_RADIUS = 2.0  # of a surface element, in point spacings; beyond it the quadric is not extrapolated
+from gapr_core.registration.block_kernels import accumulate, mean_square
+from gapr_core.registration.surface_kernels import FAST, element_near, moved, residual
+
 LARGEST_TURN_RAD = 0.35  # of one step
-FAST = {"cache": True, "nogil": True, "fastmath": True}
-
-
-@numba.njit(inline="always", **FAST)
-def moved(T, p):
-    """Point p (3,) moved by T (4, 4)."""
-    return (
-        T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3],
-        T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3],
-        T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3],
-    )
-
-
-@numba.njit(inline="always", **FAST)
-def element_near(x, y, z, nearest, origin, per_cell):
-    """Index of the target point near (x, y, z), -1 where there is none."""
-    i = int(np.floor((x - origin[0]) * per_cell + 0.5))
-    j = int(np.floor((y - origin[1]) * per_cell + 0.5))
-    k = int(np.floor((z - origin[2]) * per_cell + 0.5))
-    if i < 0 or j < 0 or k < 0 or i >= nearest.shape[0] or j >= nearest.shape[1] or k >= nearest.shape[2]:
-        return -1
-    return nearest[i, j, k]
-
-
-@numba.njit(inline="always", **FAST)
-def residual(x, y, z, q, elements, spacing, variance):
-    """Signed distance to element q, its gradient, and how far aside of the element's disc the point lies.
-
-    A row of `elements` is point (3), normal (3), shape xx xy xz yy yz zz, variance.
-    """
-    e = elements[q]
-    dx, dy, dz = x - e[0], y - e[1], z - e[2]
-    nx, ny, nz = e[3], e[4], e[5]
-    height = nx * dx + ny * dy + nz * dz
-    tx, ty, tz = dx - height * nx, dy - height * ny, dz - height * nz
-    aside, reach = np.sqrt(tx * tx + ty * ty + tz * tz), ELEMENT_RADIUS * spacing
-    if aside > reach:
-        tx, ty, tz = tx * reach / aside, ty * reach / aside, tz * reach / aside
-    sx = e[6] * tx + e[7] * ty + e[8] * tz
-    sy = e[7] * tx + e[9] * ty + e[10] * tz
-    sz = e[8] * tx + e[10] * ty + e[11] * tz
-    nx, ny, nz = nx - sx, ny - sy, nz - sz
-    length = np.sqrt(nx * nx + ny * ny + nz * nz)
-    lift = 0.5 * variance * (e[6] + e[9] + e[11])
-    most = 0.5 * np.sqrt(variance)  # the expansion ends at sharp edges
-    signed = (height - 0.5 * (sx * tx + sy * ty + sz * tz)) / length + min(max(lift, -most), most)
-    return signed, nx / length, ny / length, nz / length, max(aside - reach, 0.0)
 
 
 @numba.njit(**FAST)
@@ -73,91 +28,15 @@ def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spac
     """
     out, scores = poses.copy(), np.empty(len(poses))
     surface = elements, nearest, origin, per_cell, spacing
-    rows, H, g = np.empty((7, rows_for(len(points)))), np.empty((6, 6)), np.empty(6)
+    H, g = np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
     for k in range(len(poses)):
-        T, total = out[k], 0.0
+        T = out[k]
         for i in range(len(limits)):
-            accumulate(T, points, trust, middle, *surface, limits[i], variances[i], rows, H, g)
+            accumulate(T, points, trust, middle, *surface, limits[i], variances[i], H, g)
             step(T, middle, H, g, len(points))
-        for p in range(len(points)):
-            total += squared_distance(T, points[p], *surface, limits[-1])
-        scores[k] = total / len(points)
+        scores[k] = mean_square(T, points, trust, *surface, limits[-1])
     return out, scores
-
-
-@numba.njit(**FAST)
-def squared_distance(T, point, elements, nearest, origin, per_cell, spacing, limit):
-    """Squared distance of one moved point to the surface, truncated."""
-    x, y, z = moved(T, point)
-    q = element_near(x, y, z, nearest, origin, per_cell)
-    if q < 0:
-        return limit * limit
-    r, _, _, _, aside = residual(x, y, z, q, elements, spacing, 0.0)
-    return min(limit * limit, r * r + aside * aside)
-
-
-@numba.njit(**FAST)
-def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, rows, H, g):
-    """Normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle of the source."""
-    middle = moved(T, middle)
-    count = 0
-    for p in range(len(points)):
-        x, y, z = moved(T, points[p])
-        q = element_near(x, y, z, nearest, origin, per_cell)
-        if q < 0:
-            continue
-        r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, variance)
-        w = trust[p] * tukey(r * r + aside * aside, limit)
-        if variance > 0.0:
-            w *= variance / (variance + elements[q, 12])
-        put_row(rows, count, w, x, y, z, middle, r, nx, ny, nz)
-        count += 1
-    add_up(rows, count, H, g)
-
-
-@numba.njit(inline="always", **FAST)
-def tukey(square, limit):
-    """Tukey's biweight of a squared residual; without a branch, which a processor would often guess wrong."""
-    inside = max(1.0 - square / (limit * limit), 0.0)
-    return inside * inside
-
-
-@numba.njit(inline="always", **FAST)
-def put_row(rows, i, w, x, y, z, middle, r, nx, ny, nz):
-    """Column i of `rows`: derivatives of a residual r by the twist about `middle` (3), and r, times the root of w."""
-    root = np.sqrt(w)
-    nx, ny, nz = root * nx, root * ny, root * nz
-    x, y, z = x - middle[0], y - middle[1], z - middle[2]
-    rows[0, i], rows[1, i], rows[2, i] = nx, ny, nz
-    rows[3, i], rows[4, i], rows[5, i] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-    rows[6, i] = root * r
-
-
-@numba.njit(**FAST)
-def add_up(rows, count, H, g):
-    """Normal equations (6, 6) and (6,) of the first `count` columns of `rows` (7, N), filled in place.
-
-    One product of whole rows after the other, and padded, so that the compiler takes several columns at a time.
-    """
-    padded = rows_for(count)
-    rows[:, count:padded] = 0.0
-    for a in range(6):
-        total = 0.0
-        for p in range(padded):
-            total -= rows[a, p] * rows[6, p]
-        g[a] = total
-        for b in range(a + 1):
-            total = 0.0
-            for p in range(padded):
-                total += rows[a, p] * rows[b, p]
-            H[a, b] = H[b, a] = total
-
-
-@numba.njit(inline="always", **FAST)
-def rows_for(count):
-    """Columns that `add_up` needs for `count` residuals."""
-    return (count + 15) // 16 * 16
 
 
 @numba.njit(**FAST)

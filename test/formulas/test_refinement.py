@@ -70,7 +70,7 @@ def test_the_weights_of_a_fit_are_tukeys_times_the_share_of_the_noise_in_the_var
     assert (fit.weights[:5] == 0.0).all() and fit.moved == pytest.approx(se3.apply(T, dirty))
     H, g = np.empty((6, 6)), np.empty(6)
     middle, surface = dirty.mean(axis=0), target.kernel_view
-    kernels.accumulate(T, dirty, np.ones(len(dirty)), middle, *surface, limit, sigma**2, tiny.rows(dirty), H, g)
+    kernels.accumulate(T, dirty, np.ones(len(dirty)), middle, *surface, limit, sigma**2, H, g)
     J = fit.jacobian
     assert np.allclose((J * fit.weights[:, None]).T @ J, H)
     assert np.allclose(-J.T @ (fit.weights * np.nan_to_num(fit.signed_mm)), g)

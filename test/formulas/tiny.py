@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.geometry.sampling import fibonacci_directions
-from gapr_core.registration.kernels import rows_for
+from gapr_core.registration.clutter_kernels import rows_for
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.surface import Surface
 

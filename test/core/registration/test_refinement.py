@@ -160,8 +160,7 @@ def test_the_loops_and_numpy_weigh_residuals_alike(femur, target):
     limit_mm = refinement._tukey_limit(signed, fit.sigma_mm, CONFIG)
     H, g = np.empty((6, 6)), np.empty(6)
     ones, middle = np.ones(len(source)), source.mean(axis=0)
-    rows = np.empty((7, kernels.rows_for(len(source))))
-    kernels.accumulate(pose, source, ones, middle, *target.kernel_view, limit_mm, fit.sigma_mm**2, rows, H, g)
+    kernels.accumulate(pose, source, ones, middle, *target.kernel_view, limit_mm, fit.sigma_mm**2, H, g)
     weighted = fit.jacobian * fit.weights[:, None]
     assert (fit.weights == 0.0).sum() > 50 and np.ptp(fit.weights) > 0.5
     np.testing.assert_allclose(weighted.T @ fit.jacobian, H, rtol=1e-6, atol=1e-6 * np.abs(H).max())

@@ -37,7 +37,7 @@ def rough_misfit_mm(fit: Fit) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def covariances_mm2(points, residuals, chosen, limits_mm):  # type: ignore[no-untyped-def]
-    """(K,) mean product of the residuals of two points, one of them chosen, that lie within limits (K, 2) of each other.
+    """(K,) mean product of two residuals, one of a chosen point, that lie within limits (K, 2), mm, of each other.
 
     NaN where no two do.
     """

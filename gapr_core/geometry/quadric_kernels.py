@@ -14,19 +14,19 @@ EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}  # no fast mathem
 RIDGE = 1e-6  # added to the diagonal of the normal equations
 
 
-@numba.njit(inline="always", **EXACT)
+@numba.njit(**EXACT)
 def dot(ax, ay, az, bx, by, bz):
     """Scalar product of a and b."""
     return (ax * bx + az * bz) + ay * by
 
 
-@numba.njit(inline="always", **EXACT)
+@numba.njit(**EXACT)
 def length(x, y, z):
     """|(x, y, z)|."""
     return np.sqrt(x * x + y * y + z * z)
 
 
-@numba.njit(inline="always", **EXACT)
+@numba.njit(**EXACT)
 def tangents(nx, ny, nz, lx, ly, lz):
     """Two orthonormal tangents of the unit normal n, the first one close to l."""
     along = dot(lx, ly, lz, nx, ny, nz)
@@ -41,24 +41,29 @@ def equations(points, normals, neighbours, rows):
     """Of some rows: normal equations (R, 6, 6) and (R, 6, 1) of the fit, tangents (R, 2, 3) and reach (R,)."""
     gram, right = np.zeros((len(rows), 6, 6)), np.zeros((len(rows), 6, 1))
     basis, reach = np.empty((len(rows), 2, 3)), np.empty(len(rows))
-    far, design = np.empty(neighbours.shape[1]), np.empty(6)
-    for r, p in enumerate(rows):
-        px, py, pz = points[p]
-        nx, ny, nz = normals[p]
+    far, design = np.empty(neighbours.shape[1]), np.ones(6)
+    for r in range(len(rows)):
+        p = rows[r]
+        px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+        nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
         lx = 1.0 if abs(nx) < 0.7 else 0.0
         (fx, fy, fz), (sx, sy, sz) = tangents(nx, ny, nz, lx, 1.0 - lx, 0.0)
         basis[r, 0, 0], basis[r, 0, 1], basis[r, 0, 2] = fx, fy, fz
         basis[r, 1, 0], basis[r, 1, 1], basis[r, 1, 2] = sx, sy, sz
-        for j, q in enumerate(neighbours[p]):
+        farthest = 0.0
+        for j in range(len(far)):
+            q = neighbours[p, j]
             far[j] = length(points[q, 0] - px, points[q, 1] - py, points[q, 2] - pz)
-        reach[r] = far.max() * 1.05
-        for j, q in enumerate(neighbours[p]):
+            farthest = max(farthest, far[j])
+        reach[r] = farthest * 1.05
+        for j in range(len(far)):
+            q = neighbours[p, j]
             x, y, z = points[q, 0] - px, points[q, 1] - py, points[q, 2] - pz
             agreement = dot(normals[q, 0], normals[q, 1], normals[q, 2], nx, ny, nz)
             weight = min(max(1.0 - (far[j] / reach[r]) ** 2, 0.0), 1.0) ** 2 * min(max(agreement, 0.0), 1.0) ** 2
             u, v = dot(x, y, z, fx, fy, fz) / reach[r], dot(x, y, z, sx, sy, sz) / reach[r]
             height = dot(x, y, z, nx, ny, nz)
-            design[:] = 1.0, u, v, 0.5 * u * u, u * v, 0.5 * v * v
+            design[1], design[2], design[3], design[4], design[5] = u, v, 0.5 * u * u, u * v, 0.5 * v * v
             for a in range(6):
                 right[r, a, 0] += design[a] * weight * height
                 for b in range(6):
@@ -73,7 +78,8 @@ def elements(normals, coefficients, basis, reach):
     """Corrected normals (R, 3) and shapes (R, 3, 3) from solutions (R, 6, 1) of the normal equations."""
     corrected, shapes = np.empty((len(normals), 3)), np.empty((len(normals), 3, 3))
     for r in range(len(normals)):
-        (fx, fy, fz), (sx, sy, sz) = basis[r, 0], basis[r, 1]
+        fx, fy, fz = basis[r, 0, 0], basis[r, 0, 1], basis[r, 0, 2]
+        sx, sy, sz = basis[r, 1, 0], basis[r, 1, 1], basis[r, 1, 2]
         g, h = coefficients[r, 1, 0] / reach[r], coefficients[r, 2, 0] / reach[r]
         square = reach[r] ** 2
         d, e, f = coefficients[r, 3, 0] / square, coefficients[r, 4, 0] / square, coefficients[r, 5, 0] / square
@@ -94,10 +100,12 @@ def elements(normals, coefficients, basis, reach):
 def heights(points, normals, shapes, neighbours, rows):
     """(R, k) signed distances of the neighbours of some rows to these rows' quadrics, as `quadrics.heights`."""
     found = np.empty((len(rows), neighbours.shape[1]))
-    for r, p in enumerate(rows):
-        nx, ny, nz = normals[p]
+    for r in range(len(rows)):
+        p = rows[r]
+        nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
         s = shapes[p]
-        for j, q in enumerate(neighbours[p]):
+        for j in range(neighbours.shape[1]):
+            q = neighbours[p, j]
             x, y, z = points[q, 0] - points[p, 0], points[q, 1] - points[p, 1], points[q, 2] - points[p, 2]
             height = x * nx + y * ny + z * nz
             x, y, z = x - height * nx, y - height * ny, z - height * nz

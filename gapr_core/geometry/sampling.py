@@ -74,22 +74,24 @@ def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
             found += 1
             table[slot, 0], table[slot, 1] = key, found
         voxel_of[p] = table[slot, 1] - 1
-    means, counts = np.zeros((found, 3)), np.zeros((found, 1))
-    for p, c in enumerate(voxel_of):
-        counts[c] += 1.0
+    means, counts = np.zeros((found, 3)), np.zeros(found)
+    for p in range(len(points)):
+        counts[voxel_of[p]] += 1.0
         for axis in range(3):
-            means[c, axis] += points[p, axis]
-    means /= counts
+            means[voxel_of[p], axis] += points[p, axis]
     nearest, least = np.empty(found, dtype=np.int64), np.full(found, np.inf)
-    for p, c in enumerate(voxel_of):
-        x, y, z = points[p, 0] - means[c, 0], points[p, 1] - means[c, 1], points[p, 2] - means[c, 2]
+    for p in range(len(points)):
+        c = voxel_of[p]
+        x = points[p, 0] - means[c, 0] / counts[c]
+        y = points[p, 1] - means[c, 1] / counts[c]
+        z = points[p, 2] - means[c, 2] / counts[c]
         distance = np.sqrt(x * x + y * y + z * z)  # two points are equally near but for rounding: it decides as NumPy's
         if distance < least[c]:
             nearest[c], least[c] = p, distance
     return nearest
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _voxel(points, p, low, high, voxel):  # type: ignore[no-untyped-def]
     """The number of the voxel that point p is in."""
     key = np.int64(0)

@@ -58,33 +58,45 @@ def _pixels(direction, points, pixel_mm):  # type: ignore[no-untyped-def]
 
     The outermost pixels are empty: every point has eight pixels around its own.
     """
-    x, y, z = direction
-    side = np.array([0.0, z, -y]) if abs(x) < 0.9 else np.array([-z, 0.0, x])  # direction x first or second axis
-    a, b, c = side / np.sqrt(side[0] ** 2 + side[1] ** 2 + side[2] ** 2)
+    x, y, z = direction[0], direction[1], direction[2]
+    a, b, c = (0.0, z, -y) if abs(x) < 0.9 else (-z, 0.0, x)  # direction x first or second axis
+    size = np.sqrt(a * a + b * b + c * c)
+    a, b, c = a / size, b / size, c / size
     d, e, f = y * c - z * b, z * a - x * c, x * b - y * a
-    px, py, pz = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
-    height = px * x + py * y + pz * z
-    row = np.floor((px * a + py * b + pz * c) / pixel_mm).astype(np.int64)
-    column = np.floor((px * d + py * e + pz * f) / pixel_mm).astype(np.int64)
-    row += 1 - row.min()
-    column += 1 - column.min()
-    rows, columns = row.max() + 2, column.max() + 2
-    return height, row * columns + column, rows, columns
+    count = len(points)
+    height, row, column = np.empty(count), np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    for p in range(count):
+        px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+        height[p] = px * x + py * y + pz * z
+        row[p] = np.int64(np.floor((px * a + py * b + pz * c) / pixel_mm))
+        column[p] = np.int64(np.floor((px * d + py * e + pz * f) / pixel_mm))
+    first_row, last_row, first_column, last_column = row[0], row[0], column[0], column[0]
+    for p in range(count):
+        first_row, last_row = min(first_row, row[p]), max(last_row, row[p])
+        first_column, last_column = min(first_column, column[p]), max(last_column, column[p])
+    rows, columns = last_row - first_row + 3, last_column - first_column + 3
+    for p in range(count):
+        row[p] = (row[p] - first_row + 1) * columns + column[p] - first_column + 1
+    return height, row, rows, columns
 
 
 @numba.njit(cache=True, nogil=True)
 def _seen_from(direction, points, normals, pixel_mm):  # type: ignore[no-untyped-def]
     height, pixel, rows, columns = _pixels(direction, points, pixel_mm)
-    highest = np.full(rows * columns, -np.inf)
+    highest, alone = np.full(rows * columns, -np.inf), np.empty(rows * columns)
     for p in range(len(points)):
         highest[pixel[p]] = max(highest[pixel[p]], height[p])
     for step in (1, columns):  # 3 x 3 maximum, one axis after the other
-        alone = highest.copy()
+        for i in range(len(highest)):
+            alone[i] = highest[i]
         for i in range(step, len(highest) - step):
             highest[i] = max(alone[i - step], alone[i], alone[i + step])
-    facing = np.abs(normals[:, 0] * direction[0] + normals[:, 1] * direction[1] + normals[:, 2] * direction[2])
-    slope = np.minimum(np.sqrt(1.0 - np.minimum(facing, 1.0) ** 2) / np.maximum(facing, 1e-9), STEEPEST)
-    return height >= highest[pixel] - pixel_mm * (0.5 + 1.5 * slope)
+    seen = np.empty(len(points), dtype=np.bool_)
+    for p in range(len(points)):
+        facing = abs(normals[p, 0] * direction[0] + normals[p, 1] * direction[1] + normals[p, 2] * direction[2])
+        slope = min(np.sqrt(1.0 - min(facing, 1.0) ** 2) / max(facing, 1e-9), STEEPEST)
+        seen[p] = height[p] >= highest[pixel[p]] - pixel_mm * (0.5 + 1.5 * slope)
+    return seen
 
 
 @numba.njit(cache=True, nogil=True)
@@ -95,11 +107,12 @@ def _unobstructed_from(direction, points, normals, pixel_mm):  # type: ignore[no
         if highest[pixel[p]] < 0 or height[p] >= height[highest[pixel[p]]]:
             highest[pixel[p]] = p
     around = np.array([0, 1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns])
-    slant = normals[:, 0] * direction[0] + normals[:, 1] * direction[1] + normals[:, 2] * direction[2]
-    free = np.abs(slant) > 0.1
+    free = np.empty(len(points), dtype=np.bool_)
     for p in range(len(points)):
-        x, y, z = points[p]
-        sign = 1.0 if slant[p] > 0.0 else -1.0
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        slant = normals[p, 0] * direction[0] + normals[p, 1] * direction[1] + normals[p, 2] * direction[2]
+        free[p] = abs(slant) > 0.1
+        sign = 1.0 if slant > 0.0 else -1.0
         nx, ny, nz = sign * normals[p, 0], sign * normals[p, 1], sign * normals[p, 2]
         i = 0
         while free[p] and i < 9:

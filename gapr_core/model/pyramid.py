@@ -90,10 +90,10 @@ def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Clou
 def choose_voxel(points: Array, config: ModelConfig, steps: int = 12) -> float:
     """First voxel, in units, for which the cloud keeps about the middle of `config.superpoints` at the bottleneck."""
     wanted = 0.5 * sum(config.superpoints)
-    low, high = 1e-3, 0.5
+    low, high, turned = 1e-3, 0.5, points @ principal_axes(points)
     for _ in range(steps):
         middle = float(np.sqrt(low * high))
-        count = len(pyramid(points, middle, config)[-1])
+        count = len(_stages(turned, middle, config)[-1])
         if config.superpoints[0] <= count <= config.superpoints[1] and abs(count - wanted) < 0.1 * wanted:
             return middle
         low, high = (middle, high) if count > wanted else (low, middle)
@@ -108,11 +108,16 @@ def stage_radii(voxel: float, config: ModelConfig) -> list[float]:
 def pyramid(points: Array, voxel: float, config: ModelConfig) -> list[Array]:
     """The points of every stage, finest first."""
     axes = principal_axes(points)
-    resolutions = [voxel_means(points @ axes, voxel)]
+    return [p @ axes.T for p in _stages(points @ axes, voxel, config)]
+
+
+def _stages(turned: Array, voxel: float, config: ModelConfig) -> list[Array]:
+    """The points of every stage, of points along their principal axes."""
+    resolutions = [voxel_means(turned, voxel)]
     for _ in range(config.stages - 1):
         voxel *= config.voxel_growth
         resolutions.append(voxel_means(resolutions[-1], voxel))
-    return [p @ axes.T for p in resolutions]
+    return resolutions
 
 
 def principal_axes(points: Array) -> Array:
@@ -125,10 +130,10 @@ def principal_axes(points: Array) -> Array:
 
 def voxel_means(points: Array, voxel: float) -> Array:
     """Means of the points of each occupied voxel, in the order of the voxels."""
-    cells = np.floor(points / voxel).astype(np.int64)
-    cells -= cells.min(axis=0)
-    size = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    cells = np.floor(np.ascontiguousarray(points.T) / voxel).astype(np.int64)
+    cells -= cells.min(axis=1, keepdims=True)
+    size = cells.max(axis=1) + 1
+    keys = (cells[0] * size[1] + cells[1]) * size[2] + cells[2]
     _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse, points[:, axis], len(counts)) for axis in range(3)], axis=1)
     return np.asarray(sums / counts[:, None])

@@ -100,8 +100,7 @@ class Registrar:
         """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
         prepared = targets.prepare(target, units, self.config.target, self.config.num_threads)
         for proposer in self.proposers:
-            for each in filter(None, (prepared, prepared.both_cortices)):
-                proposer.prepare(each)
+            proposer.prepare(prepared)  # and `both_cortices` when a source first follows both
         return prepared
 
     def register(

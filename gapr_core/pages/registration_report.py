@@ -47,6 +47,7 @@ WORDS = {
     "scale_off": "size with which the source fits best",
     "log_scale_sd": "uncertainty of that size",
     "mirror_margin": "fit of the mirrored source",
+    "rough_misfit": "misfit that changes within centimetres",
     "free_space_score": "score against the camera's lines of sight",
     "log_explained_mm2": "measured surface that the bone explains",
     "explained_of_compared": "share of the compared surface that is explained",

@@ -10,13 +10,14 @@ from gapr_core.registration import mirror, sensor
 from gapr_core.registration.bias_field import equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
+from gapr_core.registration.roughness import rough_misfit_mm
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
 
 Array = NDArray[np.float64]
 
-OTHER_BONE = ("scale_z", "scale_off", "log_scale_sd", "mirror_margin")
+OTHER_BONE = ("scale_z", "scale_off", "log_scale_sd", "mirror_margin", "rough_misfit")
 FEATURES = (
     "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "residual", "margin", "support",
     "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
@@ -29,8 +30,8 @@ SCENE_FEATURES = (
 FEATURES_OF = {"network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES}
 SIGNS = {
     "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1, "log_shift_sd": -1,
-    "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "mirror_margin": 1, "free_space_score": 1,
-    "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
+    "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "mirror_margin": 1, "rough_misfit": -1,
+    "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
 
@@ -79,7 +80,7 @@ def measure(
 def of_another_bone(
     fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> dict[str, float]:
-    """What tells a bone of another size or of the other side of the body; `OTHER_BONE` are the names."""
+    """What tells a bone of another size, side of the body or subject; `OTHER_BONE` are the names."""
     (scale, scale_sd), known = scale_of(fit, config.covariance, config.scale), config.scale
     usual = max(known.sure, sensor.errors(config.sensor, len(source.points)).scale)
     return {
@@ -87,6 +88,7 @@ def of_another_bone(
         "scale_off": abs(scale) * known.usual**2 / (known.usual**2 + scale_sd**2),
         "log_scale_sd": float(np.log(scale_sd)),
         "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),
+        "rough_misfit": rough_misfit_mm(fit),
     }
 
 

@@ -33,6 +33,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.pages import markdown
 from gapr_core.registration import source as sources
+from gapr_core.results import RegistrationResult
 from gapr_core.runtime.console import say
 
 Case = Callable[[], object]
@@ -42,10 +43,11 @@ GICP_VOXEL_MM = 2.0
 TARGET, OPEN3D = "prepare a target of 200 000 triangles", "Open3D: read it, and its normals"
 FULL, KISS = "register, one round (paper)", "KISS-Matcher and refinement, of that pair"
 TRACK, GICP = "track a frame of 4000 points", "small_gicp: thin and align that frame"
+STAGED = FULL, TRACK  # whose stages are printed too
 
 
 def main() -> int:
-    """Time all cases in turn, print two tables."""
+    """Time all cases in turn, print three tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anatomy", type=Path, help="folder with the bones; else a parametric one")
     parser.add_argument("--split", default="val")
@@ -60,16 +62,19 @@ def main() -> int:
 
 
 def report(cases: dict[str, Case], repeats: int) -> None:
-    """Let the cases take turns, print what each took and the ratios."""
+    """Let the cases take turns, print what each took, the ratios and the stages."""
     for case in cases.values():
         case()  # compile, and fill what is kept
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in cases}
+    stages: dict[str, list[dict[str, float]]] = {}
     most_threads = dict.fromkeys(cases, 0)
     for _ in tqdm(range(repeats), unit="repetition"):
         for name, case in cases.items():
             start = time.perf_counter(), time.process_time()
-            case()
+            result = case()
             times[name].append((time.perf_counter() - start[0], time.process_time() - start[1]))
+            if name in STAGED and isinstance(result, RegistrationResult):
+                stages.setdefault(name, []).append(dict(result.stage_ms))
             most_threads[name] = max(most_threads[name], psutil.Process().num_threads())
     say(markdown.head(("case", "wall ms", "CPU ms", "allocated MB", "threads")))
     for name, case in cases.items():
@@ -77,6 +82,8 @@ def report(cases: dict[str, Case], repeats: int) -> None:
         say(markdown.row((name, f"{wall:.1f}", f"{cpu:.1f}", f"{allocated_mb(case):.1f}", most_threads[name])))
     say("")
     say(ratios({name: np.array(taken)[:, 0] for name, taken in times.items()}))
+    say("")
+    say(parts(stages))
 
 
 def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -> dict[str, Case]:
@@ -144,6 +151,14 @@ def allocated_mb(case: Case) -> float:
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return most / 2**20
+
+
+def parts(stages: dict[str, list[dict[str, float]]]) -> str:
+    """Median wall time of each stage; a smooth bias is corrected in `refine`."""
+    names = list(dict.fromkeys(stage for taken in stages.values() for each in taken for stage in each))
+    rows = [markdown.row((case, *(f"{np.median([each.get(stage, 0.0) for each in taken]):.1f}" for stage in names)))
+            for case, taken in stages.items()]  # fmt: skip
+    return "\n".join([markdown.head(("stages, wall ms", *names)), *rows])
 
 
 def ratios(wall: dict[str, np.ndarray]) -> str:

@@ -131,9 +131,9 @@ def test_a_transition_that_the_state_does_not_allow_is_refused_and_survived(blob
 
 @pytest.fixture(scope="module")
 def huge_model(tmp_path_factory):
-    """Three million points: 15 s of CPU time to prepare, longer than any of these tests lasts."""
+    """Eight million points: 15 s of CPU time to prepare, longer than any of these tests lasts."""
     path = tmp_path_factory.mktemp("model") / "huge.npy"
-    np.save(path, bones.bone().sample(3_000_000, np.random.default_rng(0))[0])
+    np.save(path, bones.bone().sample(8_000_000, np.random.default_rng(0))[0])
     return path
 
 

@@ -44,12 +44,14 @@ class FileLimits:
 
         It is read, not mapped: a mapped file that another program cuts meanwhile kills the process.
         """
+        most, data = int(self.file_mb * MB), b""
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            data = (
-                b"" if size > self.file_mb * MB else file.read(size + 1)
-            )  # `read` takes as much memory as it may fill
-        if size > self.file_mb * MB or len(data) > self.file_mb * MB:
+            if size <= most:
+                data = file.read(size + 1)  # takes as much memory as it may fill
+            if len(data) > size:  # a pipe has no size, and a file may have grown
+                data += file.read(most + 1 - len(data))
+        if max(size, len(data)) > most:
             self._refuse(f"a file of at most {self.file_mb:g} MB", "more", "GAPR_MAX_FILE_MB")
         return data
 

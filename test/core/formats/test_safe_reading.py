@@ -2,10 +2,12 @@
 
 import io
 import mmap
+import os
 import resource
 import struct
 import subprocess
 import sys
+import threading
 import tracemalloc
 import zipfile
 import zlib
@@ -197,6 +199,17 @@ def test_a_ply_header_that_announces_more_than_the_file_holds_reserves_nothing(t
             f"element face {count if what == 'face' else 1}\nproperty list uchar int vertex_indices\nend_header\n"
         )
         refusal(tmp_path / "a.ply", text.encode() + CORNERS.tobytes() + bytes(13))
+
+
+def test_a_pipe_is_read_to_its_end(tmp_path):
+    """It has no size; once one byte of it was taken for the whole file."""
+    os.mkfifo(tmp_path / "a.xyz")
+    writer = threading.Thread(target=(tmp_path / "a.xyz").write_bytes, args=(TETRAHEDRON.encode(),))
+    writer.start()
+    try:
+        assert FileLimits().read(tmp_path / "a.xyz") == TETRAHEDRON.encode()
+    finally:
+        writer.join()
 
 
 def test_reading_takes_memory_for_the_file_and_not_for_the_limit(tmp_path):

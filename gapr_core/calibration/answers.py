@@ -121,6 +121,16 @@ def together(groups: Sequence[Answers]) -> Answers:
     return replace(first, **columns, people=tuple(people for group in groups for people in group.people))
 
 
+def of_models_that_saw_no_subject(
+    answers: Answers, known: Mask, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
+) -> Array:
+    """(N,) predictions, each by a model that was fitted to the known answers (N,) without the pair's subject."""
+    found = np.full(len(answers), np.nan)
+    for fitted, judged in answers.people_folds():
+        found[judged] = predict(fit(answers.of(fitted & known)), answers.of(judged))
+    return found
+
+
 def of_models_that_saw_neither(
     answers: Answers, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
 ) -> Array:

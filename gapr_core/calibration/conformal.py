@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.calibration.additive import fit_centre
-from gapr_core.calibration.answers import Answers, of_models_that_saw_neither
+from gapr_core.calibration.answers import Answers, of_models_that_saw_neither, of_models_that_saw_no_subject
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.precision_model import PRECISION_FEATURES, SCALE_LIMITS
 
@@ -50,10 +50,7 @@ def of_unseen(answers: Answers) -> Array:
 
 def of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array:
     """(N,) scales by models of the known families that have not seen the subject."""
-    found = np.full(len(answers), np.nan)
-    for fitted, judged in answers.people_folds():
-        found[judged] = scales(fit_scale(answers.of(fitted & known)), answers.of(judged))
-    return found
+    return of_models_that_saw_no_subject(answers, known, fit_scale, scales)
 
 
 def factor_overall(scores: Array) -> float:

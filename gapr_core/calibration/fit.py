@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from gapr_core.calibration.additive import fit_log_odds
-from gapr_core.calibration.answers import Answers, of_models_that_saw_neither
+from gapr_core.calibration.answers import Answers, of_models_that_saw_neither, of_models_that_saw_no_subject
 from gapr_core.calibration.pairs import HELD_OUT
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
 from gapr_core.registration.additive import Additive
@@ -32,10 +32,7 @@ def probability(model: Additive, answers: Answers) -> Array:
 
 def of_unseen_people(answers: Answers) -> Array:
     """(N,) probabilities, each by a model fitted without the pair's subject and the held-out family."""
-    found, known = np.full(len(answers), np.nan), answers.family != HELD_OUT
-    for fitted, judged in answers.people_folds():
-        found[judged] = probability(fit(answers.of(fitted & known)), answers.of(judged))
-    return found
+    return of_models_that_saw_no_subject(answers, answers.family != HELD_OUT, fit, probability)
 
 
 def of_unseen_families(answers: Answers) -> Array:

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent / "ros"))
 import domain  # noqa: E402
@@ -13,6 +14,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a message field of the wrong type is an error, not garbage
 domain.claim()
+settings.register_profile("the same every time", derandomize=True)  # `make fuzz` draws other cases
+settings.load_profile("the same every time")
 
 
 @pytest.fixture(autouse=True, scope="session")

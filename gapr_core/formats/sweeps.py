@@ -46,7 +46,7 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Arra
     """(N, 4, 4) poses of the valid frames by the transform's name, such as `ProbeToTracker` (PLUS sequence format).
 
     Raises:
-        ValueError: no transform in any valid frame, or a header that is cut.
+        ValueError: no transform in any valid frame, one with a number that is not finite, or a header that is cut.
     """
     data = (options or ReadOptions()).limits.read(path)
     end = data.find(b"ElementDataFile")
@@ -59,13 +59,20 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Arra
         if kind == "TransformStatus":
             invalid |= {(name, int(number))} if value.strip().upper() != "OK" else set()
         else:
-            values[name, int(number)] = np.array(value.split(), dtype=np.float64).reshape(4, 4)
+            values[name, int(number)] = _matrix(value)
     names = sorted({name for name, _ in values})
     poses = {name: [T for key, T in sorted(values.items()) if key[0] == name and key not in invalid] for name in names}
     found = {name: np.stack(matrices) for name, matrices in poses.items() if matrices}
     if not found:
         raise ValueError("no valid transform in its header")
     return found
+
+
+def _matrix(numbers: str) -> Array:
+    T = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
+    if not np.isfinite(T).all():
+        raise ValueError("a transform with a number that is not finite")
+    return T
 
 
 def read_folder(path: Path, options: ReadOptions) -> Surface:

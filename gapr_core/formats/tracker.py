@@ -22,6 +22,7 @@ POSE = ("q0", "qx", "qy", "qz", "tx", "ty", "tz")
 SEEN = ("ok", "enabled", "valid")
 FEWEST_POSES = 10
 SMALLEST_TURN_DEG = 20.0
+MOST_NAMES, LONGEST_NAME = 8, 40  # of the tools that an error lists, and characters of a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,8 @@ def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
     if tool is None and len(names) == 1:
         return 0
     if tool is None or not 0 <= tool < len(names):
-        listed = ", ".join(f"{i}: {name}" if name != f"tool {i}" else str(i) for i, name in enumerate(names))
+        shown = [f"{i}: {name[:LONGEST_NAME]}" if name != f"tool {i}" else str(i) for i, name in enumerate(names)]
+        listed = ", ".join(shown[:MOST_NAMES] + ["..."] * (len(names) > MOST_NAMES))
         asked = "one tool" if tool is None else f"tool {tool}"
         raise InvalidPointCloudError(asked, f"{path.name} with {len(names)} ({listed})", "name one with --tool")
     return tool

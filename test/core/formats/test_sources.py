@@ -1,6 +1,7 @@
 """Points of pointers, probes and markups, with the traps of each format."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -148,6 +149,21 @@ def two_tools(path):
     still = [line.split(",") for line in ndi_csv(path, rest).read_text().splitlines()]
     path.write_text("".join(",".join(a + b) + "\n" for a, b in zip(still, rows, strict=True)))
     return path
+
+
+def test_an_error_lists_at_most_eight_tools_and_cuts_their_names(tmp_path):
+    named = [f"tool{i}{100 * 'x'}" for i in range(9)]
+    with pytest.raises(InvalidPointCloudError) as found:
+        tracker.chosen(None, named, tmp_path / "many.igs.mha")
+    assert "with 9 (0: tool0" in str(found.value) and "7: tool7" in str(found.value) and "tool8" not in str(found.value)
+    assert 40 * "x" not in str(found.value)
+
+
+def test_a_transform_that_is_not_finite_is_refused(tmp_path):
+    path = igs(tmp_path / "tool.igs.mha", turned_poses(3), ["OK"] * 3)
+    path.write_bytes(re.sub(rb"(Seq_Frame0001_\w+Transform = )\S+", rb"\1nan", path.read_bytes()))
+    with pytest.raises(InvalidPointCloudError, match="not finite"):
+        reading.read(path, ReadOptions(tip_mm=tuple(TIP)))
 
 
 @pytest.mark.parametrize("name", ["two.csv", "two.igs.mha"])

@@ -88,9 +88,9 @@ class Answers:
 
 
 def answers_of(records: Sequence[dict[str, Any]], round_name: str) -> Answers:
-    """The answers of one round: "network", "search", "track" or "scene"."""
-    found = [(record, NO_TRUTH | record["answers"][round_name])
-             for record in records if round_name in record["answers"]]  # fmt: skip
+    """The answers of one round: a key of `FEATURES_OF`; a record has several of "stream", one for each frame."""
+    found = [(record, NO_TRUTH | answer) for record in records
+             for name, answer in record["answers"].items() if round_of(name) == round_name]  # fmt: skip
     columns: dict[str, Any] = {
         key: np.array([record[key if key != "names" else "name"] for record, _ in found], dtype=str)
         for key in ("names", "family", "seen_as", "what", "bone")
@@ -108,6 +108,11 @@ def answers_of(records: Sequence[dict[str, Any]], round_name: str) -> Answers:
         people=tuple(tuple(record["people"]) or (record["name"],) for record, _ in found),
         **columns,
     )
+
+
+def round_of(name: str) -> str:
+    """Of "stream 7": which round answered."""
+    return name.split()[0]
 
 
 def together(groups: Sequence[Answers]) -> Answers:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gapr_core import metrics
-from gapr_core.calibration import pairs
+from gapr_core.calibration import pairs, streams
+from gapr_core.calibration.answers import round_of
 from gapr_core.calibration.pairs import Drawn, Task
 from gapr_core.config import ClutterConfig, RegistrarConfig, SensorConfig
 from gapr_core.data import degradation, protocols
@@ -30,7 +31,7 @@ from gapr_core.registration import clutter
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import Calibration
-from gapr_core.registration.features import FEATURES_OF
+from gapr_core.registration.features import FEATURES_OF, STREAM
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals, Proposer
 from gapr_core.registration.proposals.network import NetworkProposer
@@ -104,7 +105,9 @@ def _records_of(tasks: Sequence[Task], shared: Shared) -> list[Record]:
 
 
 def record_of(task: Task) -> Record:
-    """One pair registered in every way, judged, and its features kept."""
+    """One pair registered in every way, or the frames of a stream one after another; judged, with their features."""
+    if task.family == STREAM:
+        return {"name": _name(task), "commit": origin.commit()} | streams.record_of(task)
     drawn = pairs.draw(task)
     target = _prepared(drawn.pair.target)
     facts = {"name": _name(task), "family": drawn.family, "seen_as": drawn.seen_as, "what": drawn.what,
@@ -261,4 +264,4 @@ def _read(path: Path) -> list[Record]:
 
 def _is_current(record: Record) -> bool:
     answers = record.get("answers", {}).items()
-    return all(set(FEATURES_OF.get(name, ())) == answer["features"].keys() for name, answer in answers)
+    return all(set(FEATURES_OF.get(round_of(name), ())) == answer["features"].keys() for name, answer in answers)

@@ -131,14 +131,11 @@ def draw(task: Task) -> Drawn:
         return Drawn(SHAPES[shape](int(rng.integers(2**31))), "shape", shape, "shape", ())
     setting = setting_of(task.folder, task.split, task.seed, task.number // IN_A_ROW)
     family, seen_as = _choose_view(rng, task.family)
-    what = task.what or _choose(WHAT, rng)
-    if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
-        what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
-    stranger = _stranger(setting, what, bones_of(task.folder, task.split), rng)
+    what, stranger = source_of(task, setting, rng)
     seed = int(rng.integers(2**31))
     pair = view(seen_as, stranger, seed)
     if what != "own" or seen_as not in OWN_TARGET:
-        pair = _before(setting, stranger, what, pair)
+        pair = before(setting, stranger, what, pair)
     sensor = family.replace("-", "_") if rng.random() < DESCRIBED else "unknown"
     people = tuple(dict.fromkeys((setting.whole.person, stranger.person)))
     return Drawn(pair, family, seen_as, what, people, sensor if sensor in SENSOR_KINDS else "unknown")
@@ -158,11 +155,15 @@ def setting_of(folder: str, split: str, seed: int, number: int) -> Setting:
     return Setting(specimen, whole, end, cloud - origin_mm, origin_mm)
 
 
-def _stranger(setting: Setting, what: str, bones: Bones, rng: np.random.Generator) -> Specimen:
-    """Whose bone the source is of; only one end of it where the target is short."""
+def source_of(task: Task, setting: Setting, rng: np.random.Generator) -> tuple[str, Specimen]:
+    """(key of `WHAT`, whose bone the source is of); only one end of it where the target is short."""
+    what = task.what or _choose(WHAT, rng)
+    if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
+        what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
+    bones = bones_of(task.folder, task.split)
     others = without_twins(setting.whole, [each for group in bones.values() for each in group])
     stranger = STRANGERS[what](setting.specimen, others, rng)
-    return stranger.end(*setting.end) if setting.end and what in ("person", "bone") else stranger
+    return what, stranger.end(*setting.end) if setting.end and what in ("person", "bone") else stranger
 
 
 def without_twins(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:
@@ -183,7 +184,7 @@ def view(seen_as: str, specimen: Specimen, seed: int) -> protocols.Pair:
     return protocols.make_pair(seen_as, specimen, seed)
 
 
-def _before(setting: Setting, stranger: Specimen, what: str, pair: protocols.Pair) -> protocols.Pair:
+def before(setting: Setting, stranger: Specimen, what: str, pair: protocols.Pair) -> protocols.Pair:
     """A source before the setting's target; of another subject's bone no pose is right."""
     truth = np.full((4, 4), np.nan)
     if what == "own" or (what == "mirrored" and setting.whole.bone in SYMMETRIC):

@@ -24,7 +24,9 @@ class Motion:
         frames: clouds of the stream.
         share: of the whole surface, in one view.
         points: of one view at most.
-        noise_mm, bias_mm, outlier_share: as in `protocols.Level`; the smooth bias is drawn again for each frame.
+        noise_mm, bias_mm, outlier_share: as in `protocols.Level`.
+        smooth_bias: its kind, a key of `smooth_bias.SMOOTH_BIASES`.
+        bias_stays: the smooth bias is the same in all frames, as that of soft tissue; else each frame has its own.
         step_mm, step_deg: largest motion of the bone from frame to frame, about its own centre.
         jump_every: after so many frames the bone is somewhere else altogether; 0: never.
         swing_deg: how far the probe goes around the bone, to either side.
@@ -36,6 +38,8 @@ class Motion:
     noise_mm: float = 1.0
     bias_mm: float = 0.7
     outlier_share: float = 0.05
+    smooth_bias: str = "waves-peak"
+    bias_stays: bool = False
     step_mm: float = 3.0
     step_deg: float = 2.0
     jump_every: int = 0
@@ -53,6 +57,10 @@ def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> lis
     towards = np.cross(axis, degradation.random_directions(1, rng)[0])
     towards /= np.linalg.norm(towards)
     pose = _anywhere(rng)
+    bias_mm = 0.0 if motion.bias_stays else motion.bias_mm
+    tissue = np.zeros_like(points)
+    if motion.bias_stays:
+        tissue = degradation.bias_along_normals(points, normals, motion.bias_mm, rng, motion.smooth_bias)
     pairs = []
     for frame in range(motion.frames):
         if frame:
@@ -62,11 +70,19 @@ def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> lis
         kept = rng.permutation(_view(specimen, points, axis, towards, at, motion))
         seen = kept[: motion.points]
         measured = degradation.measured(
-            specimen, points[seen], normals[seen], motion.noise_mm, motion.bias_mm, motion.outlier_share, rng
+            specimen,
+            points[seen] + tissue[seen],
+            normals[seen],
+            motion.noise_mm,
+            bias_mm,
+            motion.outlier_share,
+            rng,
+            motion.smooth_bias,
         )
         source = se3.apply(pose, measured - origin)
         name = f"stream_{specimen.bone}_{specimen.person}_{seed}_{frame:03d}"
-        pairs.append(Pair(source, target - origin, se3.inverse(pose), name, specimen.bone, specimen.person, "stream"))
+        facts = specimen.bone, specimen.person, "stream", {"origin_mm": origin}
+        pairs.append(Pair(source, target - origin, se3.inverse(pose), name, *facts))
     return pairs
 
 

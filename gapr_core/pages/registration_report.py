@@ -48,6 +48,7 @@ WORDS = {
     "log_scale_sd": "uncertainty of that size",
     "mirror_margin": "fit of the mirrored source",
     "rough_misfit": "misfit that changes within centimetres",
+    "shared_misfit": "the same, shared by the sources of a stream",
     "free_space_score": "score against the camera's lines of sight",
     "log_explained_mm2": "measured surface that the bone explains",
     "explained_of_compared": "share of the compared surface that is explained",

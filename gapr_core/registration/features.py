@@ -27,11 +27,16 @@ SCENE_FEATURES = (
     "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "support", "log_shift_sd",
     "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
 )  # fmt: skip  # of `explained.measure`
-FEATURES_OF = {"network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES}
+STREAM = "stream"
+STREAM_FEATURES = ("frames_log_odds", "shared_misfit")  # of `tracking`: what frames say one by one, and together
+FEATURES_OF = {
+    "network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES, STREAM: STREAM_FEATURES,
+}  # fmt: skip
 SIGNS = {
     "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1, "log_shift_sd": -1,
     "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "mirror_margin": 1, "rough_misfit": -1,
     "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
+    "frames_log_odds": 1, "shared_misfit": -1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
 

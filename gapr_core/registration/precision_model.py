@@ -21,7 +21,7 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "precision.json"
 PRECISION_FEATURES = (
     "log_tre", "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "log_points", "extent", "log_turn_sd",
 )  # fmt: skip
-SCALE_LIMITS = (0.5, 6.0)  # of a standard deviation: no model makes a prediction smaller or larger by more
+SCALE_LIMITS = (0.9, 6.0)  # of a standard deviation: what was learned may enlarge it, and hardly make it smaller
 
 
 @dataclass(frozen=True, eq=False)

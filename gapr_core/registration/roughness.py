@@ -18,6 +18,7 @@ from gapr_core.registration.refinement import Fit
 Array = NDArray[np.float64]
 
 NEAR_MM, FAR_MM = (0.0, 8.0), (14.0, 22.0)  # between foot points on the bone
+LIMITS_MM = np.array([NEAR_MM, FAR_MM])
 CENTRES = 300  # inliers, evenly spread, of which each is compared with all
 
 
@@ -26,29 +27,40 @@ def rough_misfit_mm(fit: Fit) -> float:
 
     0 where no two inliers are as near, or none as far.
     """
+    feet, signed = on_the_bone(fit)
+    chosen = sampling.thin(feet, CENTRES)
+    total, count = products_mm2(feet[chosen], signed[chosen], feet, signed, LIMITS_MM, chosen)
+    return signed_root(*(total / count)) if count.all() else 0.0
+
+
+def on_the_bone(fit: Fit) -> tuple[Array, Array]:
+    """(M, 3) foot points of the inliers and their (M,) residuals: noise must not decide which points are near."""
     inlier = fit.weights > 0.0
     signed = np.ascontiguousarray(fit.signed_mm[inlier])
-    feet = fit.moved[inlier] - signed[:, None] * fit.gradients[inlier]  # noise must not decide which points are near
-    near, far = covariances_mm2(feet, signed, sampling.thin(feet, CENTRES), np.array([NEAR_MM, FAR_MM]))
-    if np.isnan(near) or np.isnan(far):
-        return 0.0
-    return float(np.sign(near - far) * np.sqrt(abs(near - far)))
+    return fit.moved[inlier] - signed[:, None] * fit.gradients[inlier], signed
+
+
+def signed_root(near_mm2: float, far_mm2: float) -> float:
+    """Root of the difference of two covariances, with its sign, mm."""
+    return float(np.sign(near_mm2 - far_mm2) * np.sqrt(abs(near_mm2 - far_mm2)))
 
 
 @numba.njit(cache=True, nogil=True)
-def covariances_mm2(points, residuals, chosen, limits_mm):  # type: ignore[no-untyped-def]
-    """(K,) mean product of two residuals, one of a chosen point, that lie within limits (K, 2), mm, of each other.
+def products_mm2(points, residuals, others, other_residuals, limits_mm, own):  # type: ignore[no-untyped-def]
+    """Products of two residuals, one of the points (N, 3) and one of the others (M, 3), by their distance.
 
-    NaN where no two do.
+    Returns:
+        (K,) sums and (K,) counts of those within limits (K, 2), mm; `own` (N,) says which of the others is the point
+        itself and takes no part, -1 where none is.
     """
     total, count = np.zeros(len(limits_mm)), np.zeros(len(limits_mm))
-    for i in chosen:
-        for j in range(len(points)):
+    for i in range(len(points)):
+        for j in range(len(others)):
             apart = 0.0
             for axis in range(3):
-                apart += (points[i, axis] - points[j, axis]) ** 2
+                apart += (points[i, axis] - others[j, axis]) ** 2
             for k in range(len(limits_mm)):
-                if i != j and limits_mm[k, 0] ** 2 <= apart < limits_mm[k, 1] ** 2:
-                    total[k] += residuals[i] * residuals[j]
+                if j != own[i] and limits_mm[k, 0] ** 2 <= apart < limits_mm[k, 1] ** 2:
+                    total[k] += residuals[i] * other_residuals[j]
                     count[k] += 1.0
-    return np.where(count > 0.0, total / np.maximum(count, 1.0), np.nan)
+    return total, count

@@ -8,15 +8,18 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.evidence import Evidence
+from gapr_core.registration.features import STREAM
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.shared_misfit import SharedMisfit
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
@@ -66,13 +69,15 @@ class Tracker:
 
     The last pose and its rivals are refined on the new source first. Where that answer is sure (`RegistrarConfig.sure`)
     it stands; else the registrar's proposers are asked as for a single source. So a jump, another frame or a wrong
-    track costs time, not truth. The confidence of a source also rests on those before it (`Evidence`): sources that
-    agree raise it, and those that fit badly lower it. Used by one thread at a time.
+    track costs time, not truth. The confidence of a source also rests on those before it: sources that agree raise it,
+    those that fit badly lower it (`Evidence`), and so does a misfit that they share (`SharedMisfit`). Used by one
+    thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
         recheck: at least every so many sources is registered in full, so that a wrong track cannot live for long.
         calibration: the confidence model of tracked answers; the shipped one when not given.
+        stream: the one of a source in the light of those before it; the shipped one when not given.
 
     Raises:
         ConfigError: `recheck` is less than 1.
@@ -81,7 +86,11 @@ class Tracker:
     name = "gapr_tracker"
 
     def __init__(
-        self, registrar: Registrar | None = None, recheck: int = 10, calibration: Calibration | None = None
+        self,
+        registrar: Registrar | None = None,
+        recheck: int = 10,
+        calibration: Calibration | None = None,
+        stream: Calibration | None = None,
     ) -> None:
         if recheck < 1:
             raise ConfigError("recheck of at least 1", str(recheck), "1 registers every source in full")
@@ -92,6 +101,8 @@ class Tracker:
         calibrations = (calibration or Calibration.shipped(Memory.name), *self.registrar.calibrations)
         self._tracking = Registrar(self.registrar.config, proposers, calibrations, precision=self.registrar.precision)
         self._evidence = Evidence(self.registrar.config.evidence)
+        self._stream = stream or Calibration.shipped(STREAM)
+        self._shared: SharedMisfit | None = SharedMisfit(self.registrar.config.evidence.memory)
         self.reset()
 
     @classmethod
@@ -104,10 +115,14 @@ class Tracker:
         self._forget_track()
         self._bone: PreparedTarget | None = None
         self._evidence.reset()
+        self._shared_for_bone = False
+        if self._shared is not None:
+            self._shared.forget()
 
     def share_points(self) -> None:
         """The sources of this stream share their points, as those of an `Accumulator` do: many count as one."""
         self._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
+        self._shared = None  # the same points have the same noise
 
     def _forget_track(self) -> None:
         self._target: PreparedTarget | None = None
@@ -165,7 +180,34 @@ class Tracker:
             return assessment
         agrees = self._last is not None and _gap_mm(assessment, self._last) <= self._evidence.config.agree_mm
         self._last = assessment.fit.T
-        return replace(assessment, probability=self._evidence.add(assessment.probability, agrees))
+        alone = assessment.probability
+        one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))
+        together = self._with_shared_misfit(one_by_one, agrees)
+        return together if agrees else together.limited(alone)
+
+    def _with_shared_misfit(self, assessment: Assessment, agrees: bool) -> Assessment:
+        """The probability in the light of what the residuals of the frames have in common.
+
+        After a jump it may be another bone: what spoke for the last one is forgotten, what spoke against it is not.
+        """
+        if self._shared is None or not np.isfinite(assessment.probability):
+            return assessment
+        if not agrees and self._shared_for_bone:
+            self._shared.forget()
+        shared_mm = self._shared.add(assessment.fit)
+        if shared_mm is None:
+            self._shared_for_bone = False
+            return assessment
+        log_odds = float(np.clip(logit(assessment.probability), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS))
+        features = {"frames_log_odds": log_odds, "shared_misfit": shared_mm}
+        adds = self._stream.contributions(features)["shared_misfit"]
+        self._shared_for_bone = adds > 0.0
+        return replace(
+            assessment,
+            probability=self._stream.probability(features),
+            features={**assessment.features, **features},
+            contributions={**assessment.contributions, "shared_misfit": adds},
+        )
 
     def _remember(self, result: RegistrationResult, source: Array, target: PreparedTarget) -> None:
         """A refusal changes no pose: the bone may be where it was."""

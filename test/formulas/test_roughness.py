@@ -54,9 +54,9 @@ def test_how_far_noise_lifts_the_points_does_not_decide_which_are_near():
     lifted = plane_fit(noise, feet)
     on_the_feet = roughness.rough_misfit_mm(lifted)
     chosen = np.arange(300)
-    limits = np.array([roughness.NEAR_MM, roughness.FAR_MM])
-    by_points = roughness.covariances_mm2(lifted.moved, noise, chosen, limits)
-    assert abs(on_the_feet) < 1.0 < 1.5 < np.sqrt(by_points[0] - by_points[1])
+    moved = lifted.moved
+    total, count = roughness.products_mm2(moved[chosen], noise[chosen], moved, noise, roughness.LIMITS_MM, chosen)
+    assert abs(on_the_feet) < 1.0 < 1.5 < roughness.signed_root(*(total / count))
 
 
 def test_outliers_take_no_part():

@@ -1,0 +1,100 @@
+"""Streams that the confidence of a `Tracker` learns from: what the frames say together of own and of other bones.
+
+The frames are answered by the models that are installed: those of single answers are fitted first. Each stream has its
+own noise, and a smooth bias of one kind, drawn again for each frame or, as that of soft tissue, the same in all.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from gapr_core import metrics
+from gapr_core.calibration import pairs
+from gapr_core.calibration.pairs import Task
+from gapr_core.config import RegistrarConfig
+from gapr_core.data.pair import Pair
+from gapr_core.data.stream import Motion, simulate
+from gapr_core.registration.additive import Additive, Curve
+from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
+from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.tracking import Tracker
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+FRAMES = 12
+JUMPS = 0.2  # share of the streams in which the bone is somewhere else halfway
+BIASES = {
+    "wave": ("wave", "wave-rms"),
+    "waves": ("waves-peak", "waves-rms"),
+    "gp": ("gp-peak", "gp-rms"),
+}  # family: kinds of smooth bias
+STREAM_SEEDS = 900  # added to the seed: other targets than those of single pairs
+
+
+def record_of(task: Task) -> dict[str, Any]:
+    """The facts of a stream, and an answer "stream K" for each frame of which those before it say something."""
+    family, what, people, frames = draw(task)
+    tracker, target = tracker_of_frames_alone(), _prepared(frames[0])
+    answers = {}
+    for number, frame in enumerate(frames):
+        result = tracker.register(frame.source, target)
+        if STREAM_FEATURES[-1] in result.features:
+            answers[f"{STREAM} {number}"] = judged(result, frame)
+    return {"family": f"stream-{family}", "seen_as": "stream", "what": what, "sensor": "unknown",
+            "bone": frames[0].bone, "people": list(people), "answers": answers}  # fmt: skip
+
+
+def draw(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
+    """(family of the bias, key of `pairs.WHAT`, everybody whose bone it is, frames on one target); always the same."""
+    rng = np.random.default_rng([task.seed, task.number, 63])
+    setting = pairs.setting_of(task.folder, task.split, task.seed + STREAM_SEEDS, task.number)
+    what, source = pairs.source_of(task, setting, rng)
+    family = str(rng.choice(sorted(BIASES)))
+    motion = Motion(
+        frames=FRAMES,
+        share=rng.uniform(0.08, 0.35),
+        points=round(np.exp(rng.uniform(*np.log((400, 3000))))),
+        noise_mm=rng.uniform(0.3, 1.6),
+        bias_mm=rng.uniform(0.0, 1.5),
+        outlier_share=rng.uniform(0.0, 0.2),
+        smooth_bias=str(rng.choice(BIASES[family])),
+        bias_stays=bool(rng.random() < 0.5),
+        step_mm=rng.uniform(0.0, 5.0),
+        swing_deg=rng.uniform(10.0, 60.0),
+        jump_every=FRAMES // 2 if rng.random() < JUMPS else 0,
+    )
+    frames = simulate(source, int(rng.integers(2**31)), motion)
+    people = tuple(dict.fromkeys((setting.whole.person, source.person)))
+    return family, what, people, [pairs.before(setting, source, what, frame) for frame in frames]
+
+
+def judged(result: RegistrationResult, frame: Pair) -> dict[str, Any]:
+    """The features of a frame in its stream, whether a rule speaks against it, and whether its best pose is right."""
+    features = {name: round(result.features[name], 6) for name in STREAM_FEATURES}
+    by_rule = result.status not in (RegistrationStatus.OK, RegistrationStatus.LOW_CONFIDENCE)
+    record = {"features": features, "refusal": result.status.value if by_rule else None, "right": False}
+    if not frame.has_truth:
+        return record
+    error = metrics.pose_error(result.hypotheses[0].T_target_source, frame.T_target_source, frame.source)
+    return record | {"right": error.is_right, "rte_mm": error.rte_mm, "rre_deg": error.rre_deg}
+
+
+def tracker_of_frames_alone() -> Tracker:
+    """A tracker for one stream that counts its frames one by one, whatever misfit they share."""
+    limits = np.array([-LARGEST_LOG_ODDS, LARGEST_LOG_ODDS])
+    frames, shared = STREAM_FEATURES
+    same = Additive(0.0, (Curve(frames, limits, limits), Curve(shared, np.zeros(1), np.zeros(1))))
+    return Tracker(_registrar(), stream=Calibration(STREAM, same, {}))
+
+
+@cache
+def _registrar() -> Registrar:
+    return Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+
+
+def _prepared(frame: Pair) -> PreparedTarget:
+    return _registrar().prepare(frame.target)

@@ -1,0 +1,61 @@
+"""The misfit that the frames of a stream share: a sign of another bone that one frame does not show as well.
+
+A sensor's noise is another one in every frame, and so is much of its bias. Another subject's ridges stay where they are
+on the bone. So the mean product of two residuals of different frames, whose foot points are near each other, is the
+variance of what stays there. Soft tissue stays as well, but is smooth: as in `roughness`, what points 14 to 22 mm apart
+have in common does not count. It grows clear with the frames: each adds pairs with all that are remembered.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.geometry import sampling
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.roughness import CENTRES, LIMITS_MM, on_the_bone, products_mm2, signed_root
+
+Array = NDArray[np.float64]
+
+FRAMES, POINTS = 6, 500  # that are remembered, and of each of them
+FEWEST_PAIRS = 300  # with fewer near ones nothing is known
+USUAL_PAIRS = 1000  # with so many the covariance counts by half: the fewer, the more chance is in it
+
+
+class SharedMisfit:
+    """Of the frames of one stream on one target.
+
+    Args:
+        memory: frames after which the weight of a pair has fallen to 1/e.
+    """
+
+    def __init__(self, memory: float) -> None:
+        self._kept_share = 1.0 - 1.0 / memory
+        self.forget()
+
+    def forget(self) -> None:
+        """All frames."""
+        self._frames: deque[tuple[Array, Array]] = deque(maxlen=FRAMES)
+        self._total, self._count = np.zeros(len(LIMITS_MM)), np.zeros(len(LIMITS_MM))
+
+    def add(self, fit: Fit) -> float | None:
+        """Root of the covariance that this frame and those before share at short range only, mm.
+
+        Negative where the covariance is; None while too few points of different frames are near each other.
+        """
+        feet, signed = on_the_bone(fit)
+        if self._frames and len(feet):
+            chosen = sampling.thin(feet, CENTRES)
+            others, other_signed = (np.concatenate(each) for each in zip(*self._frames, strict=True))
+            nobody = np.full(len(chosen), -1)
+            total, count = products_mm2(feet[chosen], signed[chosen], others, other_signed, LIMITS_MM, nobody)
+            self._total = self._kept_share * self._total + total
+            self._count = self._kept_share * self._count + count
+        few = sampling.thin(feet, POINTS)
+        self._frames.append((feet[few], signed[few]))
+        if self._count.min() < FEWEST_PAIRS:
+            return None
+        near, far = self._total / (self._count + USUAL_PAIRS)
+        return signed_root(near, far)

@@ -6,6 +6,7 @@ from answer_cases import made_answers
 
 from gapr_core.calibration import conformal
 from gapr_core.registration.features import FEATURES
+from gapr_core.registration.precision_model import SCALE_LIMITS
 
 
 def test_the_conformal_quantile_covers_the_next_score_as_often_as_it_says():
@@ -27,9 +28,15 @@ def test_errors_three_times_the_predicted_ones_triple_the_scale():
     assert np.median(scale) == pytest.approx(3.0, rel=0.1)
 
 
+def test_the_scale_makes_an_error_hardly_smaller():
+    answers = made_answers(3000, error_scale=0.3)
+    scale = conformal.scales(conformal.fit_scale(answers), answers)
+    assert np.median(scale) == SCALE_LIMITS[0] == 0.9
+
+
 def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_families():
     def doubled_where_smooth(features, family):
-        return np.exp(0.7 * features[:, FEATURES.index("smooth_misfit")])
+        return np.exp(0.7 * np.abs(features[:, FEATURES.index("smooth_misfit")]))
 
     answers = made_answers(3000, error_scale=doubled_where_smooth)
     scale = conformal.of_unseen(answers)

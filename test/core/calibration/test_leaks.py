@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gapr_core.calibration import pairs
+from gapr_core.calibration import pairs, streams
 from gapr_core.calibration.pairs import Task
 from gapr_core.data import anatomy
 from gapr_core.data.parametric import make_bone
@@ -67,5 +67,9 @@ def test_calibration_pairs_never_touch_val_or_test_subjects_and_say_whose_bone_t
         drawn = pairs.draw(Task(str(poisoned), "train", 0, number))
         assert np.isfinite(drawn.pair.source).all() and np.isfinite(drawn.pair.target).all()
         named |= set(drawn.people)
+    for number in range(8):
+        _, _, people, frames = streams.draw(Task(str(poisoned), "train", 0, number, "stream"))
+        assert all(np.isfinite(frame.source).all() and np.isfinite(frame.target).all() for frame in frames)
+        named |= set(people)
     assert named & set(TRAIN) and not named & set(HELD_OUT)
     assert {person.split("_")[0] for person in named - set(TRAIN)} == {"drawn", "parametric"}

@@ -16,19 +16,6 @@ from gapr_core.geometry import se3
 FOLDER = "folder"
 
 
-@pytest.fixture(scope="module")
-def bones():
-    return {bone: [parametric_specimen(bone, number) for number in (0, 1, 2)] for bone in ("femur", "tibia")}
-
-
-@pytest.fixture
-def people(bones, monkeypatch):
-    monkeypatch.setattr(pairs, "BONES", ("femur", "tibia"))
-    monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones})
-    monkeypatch.setattr(pairs, "SHAPE_SHARE", 0.0)
-    return bones
-
-
 def draw(monkeypatch, seen_as, what, target="own", number=5):
     monkeypatch.setattr(pairs, "SEEN_AS", {"family": {seen_as: 1.0}})
     monkeypatch.setattr(pairs, "WHAT", {what: 1.0})
@@ -134,9 +121,10 @@ def test_a_solid_of_revolution_is_one():
 
 def test_the_shares_hold(people, monkeypatch):
     monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
-    monkeypatch.setattr(pairs, "_before", lambda setting, stranger, what, pair: pair)
+    monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     monkeypatch.setattr(pairs, "setting_of", lambda *_: _NoView("none"))
-    monkeypatch.setattr(pairs, "_stranger", lambda setting, what, bones, rng: setting.whole)
+    monkeypatch.setattr(pairs, "STRANGERS", dict.fromkeys(pairs.WHAT, lambda specimen, others, rng: specimen))
+    monkeypatch.setattr(pairs, "without_twins", lambda specimen, others: others)
     drawn = [pairs.draw(Task(FOLDER, "train", 3, number)) for number in range(400)]
     what = [each.what for each in drawn]
     assert what.count("own") / 400 == pytest.approx(0.66, abs=0.07)
@@ -147,7 +135,7 @@ def test_the_shares_hold(people, monkeypatch):
 def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people, monkeypatch):
     monkeypatch.setattr(pairs, "SHAPE_SHARE", 1.0)
     monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
-    monkeypatch.setattr(pairs, "_before", lambda setting, stranger, what, pair: pair)
+    monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     drawn = [pairs.draw(Task(FOLDER, "train", 3, number, "scene")) for number in range(40)]
     assert {each.seen_as for each in drawn} == set(pairs.SEEN_AS["scene"])
     names = {collect._name(Task(FOLDER, "train", 3, 1, family)) for family in ("", "scene", "laser")}
@@ -156,7 +144,7 @@ def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people
 
 def test_look_alikes_are_long_bones_at_l3_and_every_other_one_is_of_another_subject(monkeypatch):
     monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
-    monkeypatch.setattr(pairs, "_before", lambda setting, stranger, what, pair: pair)
+    monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     bones = {bone: [parametric_specimen(bone, number) for number in (0, 1)] for bone in ("femur", "tibia")}
     monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
     pairs.setting_of.cache_clear()
@@ -172,5 +160,5 @@ def test_look_alikes_are_long_bones_at_l3_and_every_other_one_is_of_another_subj
 
 class _NoView:
     def __init__(self, seen_as):
-        self.seen_as, self.whole, self.person = seen_as, self, "nobody"
+        self.seen_as, self.whole, self.specimen, self.person = seen_as, self, self, "nobody"
         self.bone, self.end = "femur", None

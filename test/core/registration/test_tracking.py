@@ -2,13 +2,16 @@
 
 import numpy as np
 import pytest
+from scipy.special import expit
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.additive import Additive, Curve
+from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
+from gapr_core.registration.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.tracking import Memory
 
@@ -171,3 +174,96 @@ def test_what_a_stream_says_of_the_bone_decides_with_the_frame(tracker, frames, 
     assert late.status is RegistrationStatus.LOW_CONFIDENCE and late.confidence < 0.5
     tracker.reset()
     assert tracker.register(frames[2].source, prepared).ok
+
+
+class Scripted:
+    """Says of each frame what the frames share, and counts how often it is to forget."""
+
+    def __init__(self, *shared_mm):
+        self.left, self.forgotten = list(shared_mm), 0
+
+    def add(self, fit):
+        return self.left.pop(0)
+
+    def forget(self):
+        self.forgotten += 1
+
+
+def stream_model():
+    """Log odds of the frames as they are; 3 more without a shared misfit, 6 less where it is 1 mm."""
+    curves = (Curve(STREAM_FEATURES[0], np.array([-9.0, 9.0]), np.array([-9.0, 9.0])),
+              Curve(STREAM_FEATURES[1], np.array([0.0, 1.0]), np.array([3.0, -6.0])))  # fmt: skip
+    return Calibration(STREAM, Additive(0.0, curves), {})
+
+
+@pytest.fixture
+def scripted(registrar):
+    """A tracker of frames whose shared misfit is scripted."""
+
+    def of(*shared_mm):
+        tracker = Tracker(registrar, stream=stream_model())
+        tracker._shared = Scripted(*shared_mm)
+        return tracker
+
+    return of
+
+
+def test_a_shared_misfit_alone_refuses_a_frame_that_fits(scripted, frames, prepared):
+    clear, off = scripted(None, 0.0), scripted(None, 1.0)
+    for tracker in (clear, off):
+        first = tracker.register(frames[0].source, prepared)
+        assert first.ok and "shared_misfit" not in first.features
+    good, bad = (tracker.register(frames[1].source, prepared) for tracker in (clear, off))
+    assert good.ok and bad.status is RegistrationStatus.LOW_CONFIDENCE
+    log_odds = good.features["frames_log_odds"]
+    assert log_odds == pytest.approx(bad.features["frames_log_odds"])
+    expected = [expit(min(log_odds + adds, LARGEST_LOG_ODDS)) for adds in (3.0, -6.0)]
+    assert [good.confidence, bad.confidence] == pytest.approx(expected, rel=1e-6)
+    assert [r.contributions["shared_misfit"] for r in (good, bad)] == [3.0, -6.0]
+
+
+def test_after_a_jump_what_the_frames_shared_counts_only_against_the_bone(scripted, frames, prepared):
+    elsewhere = se3.exp([90.0, -60.0, 40.0, 1.2, -0.8, 2.0])
+    jumped = se3.apply(elsewhere, frames[2].source)
+    alone = scripted(None).register(jumped, prepared).confidence
+    for shared_mm, forgotten in ((0.0, 1), (1.0, 0)):
+        tracker = scripted(None, shared_mm, 0.0)
+        tracker.register(frames[0].source, prepared)
+        tracker.register(frames[1].source, prepared)
+        before = tracker._shared.forgotten
+        after = tracker.register(jumped, prepared)
+        assert tracker._shared.forgotten - before == forgotten
+        assert after.confidence <= alone + 1e-9
+
+
+def test_sources_that_share_their_points_share_their_noise_as_well(scripted, frames, prepared):
+    tracker = scripted(None, 1.0)
+    tracker.share_points()
+    results = [tracker.register(frames[i].source, prepared) for i in range(2)]
+    assert all(r.ok and "shared_misfit" not in r.features for r in results)
+
+
+def test_another_target_and_a_reset_forget_what_the_frames_shared(scripted, frames, prepared, registrar):
+    tracker = scripted(None, None)
+    tracker.register(frames[0].source, prepared)
+    before = tracker._shared.forgotten
+    tracker.register(frames[0].source, registrar.prepare(frames[0].target))
+    assert tracker._shared.forgotten == before + 1
+    tracker.reset()
+    assert tracker._shared.forgotten == before + 2
+
+
+def test_bumps_that_no_frame_shows_alone_show_in_the_stream(registrar, specimen):
+    """Ridges of 1 mm, 25 mm apart and the same in all frames, as another subject's bone has them."""
+    frames = simulate(specimen, 1, Motion(frames=5, share=0.35, points=2000, step_mm=1.0, step_deg=1.0))
+    prepared = registrar.prepare(frames[0].target)
+    own, other = Tracker(registrar), Tracker(registrar)
+    for frame in frames:
+        on_bone = se3.apply(frame.T_target_source, frame.source)
+        outward = (on_bone - np.median(on_bone, axis=0)) * [1.0, 1.0, 0.0]
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        bumpy = on_bone + np.sin(on_bone[:, 2:] / 4.0) * outward
+        plain = own.register(frame.source, prepared)
+        rough = other.register(se3.apply(se3.inverse(frame.T_target_source), bumpy), prepared)
+    assert plain.features["shared_misfit"] < 0.25 < rough.features["shared_misfit"]
+    assert plain.confidence > rough.confidence

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 from gapr_core.benchmark.judge import judge
+from gapr_core.calibration.pairs import without_twins
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import Pair
 from gapr_core.data.stream import Motion, simulate
@@ -33,6 +34,7 @@ KINDS = {
     "rests, slices": SLICES,
     "rests, slices of another subject's bone": SLICES,
 }
+PEOPLE = 20  # of a bone, at most
 ANOTHER_SUBJECT, RESTS, BY_ITSELF = "another subject's bone", "rests", "every frame by itself"
 
 
@@ -60,7 +62,7 @@ def main() -> int:
     args = parser.parse_args()
     full = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     methods = {BY_ITSELF: full, "tracker": Tracker(full), "accumulator": Accumulator(Tracker(full), 24)}
-    people = {bone: specimens(bone, args.split, 4, args.anatomy) for bone in args.bones.split(",")}
+    people = {bone: specimens(bone, args.split, PEOPLE, args.anatomy) for bone in args.bones.split(",")}
     tallies = {(kind, name): Tally() for kind in args.kinds for name in chosen(kind)}
     runs = [(kind, bone, i) for kind in args.kinds for bone in people for i in range(args.count)]
     for kind, bone, i in tqdm(runs, "streams"):
@@ -100,7 +102,8 @@ def stream(kind: str, people: list, number: int) -> list[Pair]:
     frames = simulate(own, 500 + number, KINDS[kind])
     if ANOTHER_SUBJECT not in kind:
         return frames
-    other = simulate(people[(number + 1) % len(people)], 500 + number, replace(KINDS[kind], frames=1))[0]
+    others = [o for o in without_twins(own, people) if o.person != own.person]
+    other = simulate(others[number % len(others)], 500 + number, replace(KINDS[kind], frames=1))[0]
     return [replace(pair, target=other.target, T_target_source=np.full((4, 4), np.nan)) for pair in frames]
 
 

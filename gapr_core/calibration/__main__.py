@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gapr_core.calibration import conformal
+from gapr_core.calibration import conformal, streams
 from gapr_core.calibration.answers import Answers, answers_of, together
 from gapr_core.calibration.card import as_markdown
 from gapr_core.calibration.collect import collect
@@ -25,7 +25,6 @@ from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes
 from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
-from gapr_core.registration.features import STREAM
 from gapr_core.registration.precision_model import PRECISION_FEATURES
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.console import say
@@ -44,7 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", type=int, default=0, help="more pairs that are scenes (default: %(default)s)")
     parser.add_argument("--look-alikes", type=int, default=0,
                         help="more femora and tibiae at L3, half of others (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--streams", type=int, default=0, help="streams of frames (default: %(default)s)")
+    parser.add_argument(
+        "--streams", type=int, default=0, help="streams of frames, half of look-alikes (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tasks = [Task(*which, number) for number in range(args.count)]
     tasks += [Task(*which, number, "scene") for number in range(args.scenes)]
     tasks += look_alikes(*which, args.look_alikes)
-    tasks += [Task(*which, number, STREAM) for number in range(args.streams)]
+    tasks += streams.tasks(*which, args.streams)
     records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
     given = sys.argv[1:] if arguments is None else arguments
     commits = sorted({str(record.get("commit")) for record in records})

@@ -28,11 +28,21 @@ from gapr_core.results import RegistrationResult, RegistrationStatus
 FRAMES = 12
 JUMPS = 0.2  # share of the streams in which the bone is somewhere else halfway
 BIASES = {
-    "wave": ("wave", "wave-rms"),
-    "waves": ("waves-peak", "waves-rms"),
-    "gp": ("gp-peak", "gp-rms"),
-}  # family: kinds of smooth bias
+    "wave": {"wave": 1.5},
+    "waves": {"waves-peak": 1.5, "waves-rms": 1.06},
+    "gp": {"gp-peak": 1.5, "gp-rms": 1.06},
+}  # family: kinds of smooth bias, and the largest size of each, mm, that of L3
 STREAM_SEEDS = 900  # added to the seed: other targets than those of single pairs
+
+
+def tasks(folder: str, split: str, seed: int, count: int) -> list[Task]:
+    """Every other one as `pairs.WHAT` says; between them femora and tibiae, in turn own and another subject's."""
+    bones = len(pairs.BONES)
+    long = (number for number in range(bones * count) if pairs.BONES[number % bones] in pairs.LOOK_ALIKES)
+    found = [Task(folder, split, seed, number, STREAM) for number in range((count + 1) // 2)]
+    what = ("own", "own", "person", "person")  # bones come in turn, too
+    found += [Task(folder, split, seed, next(long), STREAM, what[k % 4]) for k in range(count // 2)]
+    return found
 
 
 def record_of(task: Task) -> dict[str, Any]:
@@ -50,18 +60,19 @@ def record_of(task: Task) -> dict[str, Any]:
 
 def draw(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
     """(family of the bias, key of `pairs.WHAT`, everybody whose bone it is, frames on one target); always the same."""
-    rng = np.random.default_rng([task.seed, task.number, 63])
+    rng = np.random.default_rng([task.seed, task.number, 63, len(task.what)])
     setting = pairs.setting_of(task.folder, task.split, task.seed + STREAM_SEEDS, task.number)
     what, source = pairs.source_of(task, setting, rng)
     family = str(rng.choice(sorted(BIASES)))
+    kind = str(rng.choice(sorted(BIASES[family])))
     motion = Motion(
         frames=FRAMES,
         share=rng.uniform(0.08, 0.35),
         points=round(np.exp(rng.uniform(*np.log((400, 3000))))),
         noise_mm=rng.uniform(0.3, 1.6),
-        bias_mm=rng.uniform(0.0, 1.5),
+        bias_mm=rng.uniform(0.0, BIASES[family][kind]),
         outlier_share=rng.uniform(0.0, 0.2),
-        smooth_bias=str(rng.choice(BIASES[family])),
+        smooth_bias=kind,
         bias_stays=bool(rng.random() < 0.5),
         step_mm=rng.uniform(0.0, 5.0),
         swing_deg=rng.uniform(10.0, 60.0),
@@ -86,8 +97,8 @@ def judged(result: RegistrationResult, frame: Pair) -> dict[str, Any]:
 def tracker_of_frames_alone() -> Tracker:
     """A tracker for one stream that counts its frames one by one, whatever misfit they share."""
     limits = np.array([-LARGEST_LOG_ODDS, LARGEST_LOG_ODDS])
-    frames, shared = STREAM_FEATURES
-    same = Additive(0.0, (Curve(frames, limits, limits), Curve(shared, np.zeros(1), np.zeros(1))))
+    nothing = tuple(Curve(name, np.zeros(1), np.zeros(1)) for name in STREAM_FEATURES[1:])
+    same = Additive(0.0, (Curve(STREAM_FEATURES[0], limits, limits), *nothing))
     return Tracker(_registrar(), stream=Calibration(STREAM, same, {}))
 
 

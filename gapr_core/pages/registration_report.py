@@ -49,6 +49,7 @@ WORDS = {
     "mirror_margin": "fit of the mirrored source",
     "rough_misfit": "misfit that changes within centimetres",
     "shared_misfit": "the same, shared by the sources of a stream",
+    "shared_smooth": "smooth misfit that they share",
     "free_space_score": "score against the camera's lines of sight",
     "log_explained_mm2": "measured surface that the bone explains",
     "explained_of_compared": "share of the compared surface that is explained",

@@ -28,7 +28,7 @@ SCENE_FEATURES = (
     "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
 )  # fmt: skip  # of `explained.measure`
 STREAM = "stream"
-STREAM_FEATURES = ("frames_log_odds", "shared_misfit")  # of `tracking`: what frames say one by one, and together
+STREAM_FEATURES = ("frames_log_odds", "shared_misfit", "shared_smooth")  # of `tracking`: one by one, and together
 FEATURES_OF = {
     "network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES, STREAM: STREAM_FEATURES,
 }  # fmt: skip

@@ -3,7 +3,8 @@
 A sensor's noise is another one in every frame, and so is much of its bias. Another subject's ridges stay where they are
 on the bone. So the mean product of two residuals of different frames, whose foot points are near each other, is the
 variance of what stays there. Soft tissue stays as well, but is smooth: as in `roughness`, what points 14 to 22 mm apart
-have in common does not count. It grows clear with the frames: each adds pairs with all that are remembered.
+have in common is taken off, and is a number of its own. Both grow clear with the frames: each adds pairs with all that
+are remembered.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class SharedMisfit:
         self._frames: deque[tuple[Array, Array]] = deque(maxlen=FRAMES)
         self._total, self._count = np.zeros(len(LIMITS_MM)), np.zeros(len(LIMITS_MM))
 
-    def add(self, fit: Fit) -> float | None:
-        """Root of the covariance that this frame and those before share at short range only, mm.
+    def add(self, fit: Fit) -> tuple[float, float] | None:
+        """Roots of the covariances that this frame and those before share, mm: at short range only, and at long range.
 
         Negative where the covariance is; None while too few points of different frames are near each other.
         """
@@ -58,4 +59,4 @@ class SharedMisfit:
         if self._count.min() < FEWEST_PAIRS:
             return None
         near, far = self._total / (self._count + USUAL_PAIRS)
-        return signed_root(near, far)
+        return signed_root(near, far), signed_root(far, 0.0)

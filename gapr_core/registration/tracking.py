@@ -16,7 +16,7 @@ from gapr_core.geometry import se3
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.evidence import Evidence
-from gapr_core.registration.features import STREAM
+from gapr_core.registration.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.shared_misfit import SharedMisfit
@@ -199,14 +199,14 @@ class Tracker:
             self._shared_for_bone = False
             return assessment
         log_odds = float(np.clip(logit(assessment.probability), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS))
-        features = {"frames_log_odds": log_odds, "shared_misfit": shared_mm}
-        adds = self._stream.contributions(features)["shared_misfit"]
-        self._shared_for_bone = adds > 0.0
+        features = dict(zip(STREAM_FEATURES, (log_odds, *shared_mm), strict=True))
+        adds = {name: self._stream.contributions(features)[name] for name in STREAM_FEATURES[1:]}
+        self._shared_for_bone = sum(adds.values()) > 0.0
         return replace(
             assessment,
             probability=self._stream.probability(features),
             features={**assessment.features, **features},
-            contributions={**assessment.contributions, "shared_misfit": adds},
+            contributions={**assessment.contributions, **adds},
         )
 
     def _remember(self, result: RegistrationResult, source: Array, target: PreparedTarget) -> None:

@@ -26,18 +26,19 @@ def test_it_is_the_difference_of_the_mean_products_over_both_frames(every_pair_c
     shared = SharedMisfit(MEMORY)
     assert shared.add(frame(1.0, 2.0, 3.0, 4.0)) is None
     near, far = ((1 + 2) * (5 + 6) + (3 + 4) * (7 + 8)) / 8, ((1 + 2) * (7 + 8) + (3 + 4) * (5 + 6)) / 8
-    assert shared.add(frame(5.0, 6.0, 7.0, 8.0)) == pytest.approx(np.sqrt(near - far))
+    assert shared.add(frame(5.0, 6.0, 7.0, 8.0)) == pytest.approx((np.sqrt(near - far), np.sqrt(far)))
 
 
 def test_a_negative_covariance_keeps_its_sign(every_pair_counts):
     shared = SharedMisfit(MEMORY)
     shared.add(frame(1.0, 1.0, -1.0, -1.0))
-    assert shared.add(frame(-1.0, -1.0, 1.0, 1.0)) == pytest.approx(-np.sqrt(2.0))
+    assert shared.add(frame(-1.0, -1.0, 1.0, 1.0)) == pytest.approx((-np.sqrt(2.0), 1.0))
 
 
 def test_few_pairs_say_little_and_too_few_nothing(monkeypatch):
     first, second = frame(1.0, 1.0, -1.0, -1.0), frame(1.0, 1.0, -1.0, -1.0)
-    for fewest, usual, expected in ((9, 0, None), (8, 0, np.sqrt(2.0)), (8, 8, 1.0)):  # 8 near pairs, 8 far ones
+    both = np.array([np.sqrt(2.0), -1.0])
+    for fewest, usual, expected in ((9, 0, None), (8, 0, both), (8, 8, both / np.sqrt(2.0))):  # 8 near pairs, 8 far
         monkeypatch.setattr(shared_misfit, "FEWEST_PAIRS", fewest)
         monkeypatch.setattr(shared_misfit, "USUAL_PAIRS", usual)
         shared = SharedMisfit(MEMORY)
@@ -59,7 +60,7 @@ def stream_of(stays, each_frame, noise_mm=1.5, frames=5):
         seen = rng.permutation(len(feet))[:1000]
         signed = own[seen] + each_frame(feet[seen], rng) + rng.normal(0.0, noise_mm, len(seen))
         found = shared.add(plane_fit(signed, feet[seen]))
-    return found
+    return found[0]
 
 
 def nothing(feet, rng):
@@ -79,13 +80,20 @@ def test_what_stays_and_is_rough_shows_and_nothing_else_does():
     assert stream_of(rough, nothing) == pytest.approx(0.5 * np.sqrt(0.65), abs=0.08)
 
 
+def test_tissue_of_one_thickness_is_smooth_alone():
+    shared, rng, feet = SharedMisfit(MEMORY), np.random.default_rng(5), feet_of(3000)
+    for _ in range(3):
+        found = shared.add(plane_fit(0.8 + rng.normal(0.0, 1.0, len(feet)), feet))
+    assert abs(found[0]) < 0.25 and found[1] == pytest.approx(0.8, abs=0.05)
+
+
 def test_old_frames_are_forgotten(every_pair_counts):
     shared = SharedMisfit(2.0)
     signed = 1.0, 1.0, -1.0, -1.0
     for _ in range(2):
         shared.add(frame(*signed))
     elsewhere = frame(*signed, feet=FOUR + [200.0, 0.0, 0.0])
-    assert shared.add(elsewhere) == pytest.approx(np.sqrt(2.0))  # the mean of what there is
+    assert shared.add(elsewhere) == pytest.approx((np.sqrt(2.0), -1.0))  # the means of what there is
     assert shared._count == pytest.approx([4.0, 4.0])  # half of 8
     shared.forget()
     assert shared.add(frame(*signed)) is None
@@ -105,7 +113,8 @@ def test_outliers_take_no_part(every_pair_counts):
     for _ in range(2):
         shared.add(plane_fit(np.array([1.0, 50.0, -1.0, -1.0]), FOUR, weights))
     near, far = (1 + 4 * 1) / 5, -1.0  # (0, 0) alone, and the two others with each other
-    assert shared.add(plane_fit(np.zeros(0), np.zeros((0, 3)))) == pytest.approx(np.sqrt(near - far))
+    nobody = plane_fit(np.zeros(0), np.zeros((0, 3)))
+    assert shared.add(nobody) == pytest.approx((np.sqrt(near - far), far))
 
 
 def test_foot_points_decide_which_are_near(every_pair_counts):

@@ -44,6 +44,16 @@ def test_no_pose_of_another_subjects_stream_is_right(people, monkeypatch):
     assert what == "person" and len(names) == 2 and not any(frame.has_truth for frame in frames)
 
 
+def test_every_other_stream_is_of_look_alikes_in_turn_own_and_another_subjects():
+    tasks = streams.tasks("folder", "train", 3, 17)
+    usual, alike = tasks[:9], tasks[9:]
+    assert len(set(tasks)) == 17 and all(task.family == STREAM and task.seed == 3 for task in tasks)
+    assert [task.number for task in usual] == list(range(9)) and not any(task.what for task in usual)
+    found = [(pairs.BONES[task.number % len(pairs.BONES)], task.what) for task in alike]
+    assert found == [(bone, what) for what in ("own", "person") for bone in ("femur", "tibia")] * 2
+    assert len({collect._name(task) for task in tasks}) == 17
+
+
 def test_streams_have_targets_of_their_own(people, own):
     alone = pairs.setting_of("folder", "train", 0, TASK.number).cloud
     assert not np.array_equal(streams.draw(TASK)[-1][0].target, alone)
@@ -98,11 +108,11 @@ def test_every_frame_of_which_others_say_something_is_an_answer(monkeypatch, sta
     answers = answers_of([record], STREAM)
     assert len(answers) == 3 and answers.right.tolist() == [right] * 3
     assert answers.refused.tolist() == [refusal is not None] * 3
-    assert answers.features.tolist() == [[0.25, 0.25]] * 3 and answers.people == (("p0",),) * 3
+    assert answers.features.tolist() == [[0.25] * 3] * 3 and answers.people == (("p0",),) * 3
 
 
 def test_the_frames_count_one_by_one_whatever_they_share():
     tracker = streams.tracker_of_frames_alone()
     for shared in (-1.0, 0.0, 2.0):
-        features = dict(zip(STREAM_FEATURES, (1.5, shared), strict=True))
+        features = dict(zip(STREAM_FEATURES, (1.5, shared, -shared), strict=True))
         assert tracker._stream.model.value(features) == pytest.approx(1.5)

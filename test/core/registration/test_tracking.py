@@ -177,13 +177,14 @@ def test_what_a_stream_says_of_the_bone_decides_with_the_frame(tracker, frames, 
 
 
 class Scripted:
-    """Says of each frame what the frames share, and counts how often it is to forget."""
+    """Says of each frame what rough misfit the frames share, and counts how often it is to forget."""
 
     def __init__(self, *shared_mm):
         self.left, self.forgotten = list(shared_mm), 0
 
     def add(self, fit):
-        return self.left.pop(0)
+        shared_mm = self.left.pop(0)
+        return None if shared_mm is None else (shared_mm, 0.5)
 
     def forget(self):
         self.forgotten += 1
@@ -192,7 +193,8 @@ class Scripted:
 def stream_model():
     """Log odds of the frames as they are; 3 more without a shared misfit, 6 less where it is 1 mm."""
     curves = (Curve(STREAM_FEATURES[0], np.array([-9.0, 9.0]), np.array([-9.0, 9.0])),
-              Curve(STREAM_FEATURES[1], np.array([0.0, 1.0]), np.array([3.0, -6.0])))  # fmt: skip
+              Curve(STREAM_FEATURES[1], np.array([0.0, 1.0]), np.array([2.0, -7.0])),
+              Curve(STREAM_FEATURES[2], np.array([0.0, 1.0]), np.array([0.0, 2.0])))  # fmt: skip
     return Calibration(STREAM, Additive(0.0, curves), {})
 
 
@@ -219,7 +221,8 @@ def test_a_shared_misfit_alone_refuses_a_frame_that_fits(scripted, frames, prepa
     assert log_odds == pytest.approx(bad.features["frames_log_odds"])
     expected = [expit(min(log_odds + adds, LARGEST_LOG_ODDS)) for adds in (3.0, -6.0)]
     assert [good.confidence, bad.confidence] == pytest.approx(expected, rel=1e-6)
-    assert [r.contributions["shared_misfit"] for r in (good, bad)] == [3.0, -6.0]
+    assert [r.contributions["shared_misfit"] for r in (good, bad)] == [2.0, -7.0]
+    assert good.contributions["shared_smooth"] == bad.contributions["shared_smooth"] == 1.0
 
 
 def test_after_a_jump_what_the_frames_shared_counts_only_against_the_bone(scripted, frames, prepared):

@@ -55,8 +55,8 @@ def main() -> int:
         markdown.head(("family", "pairs", "within 4 mm and 5 deg, %", "median NEES / 5.35", "TRE, mm", "predicted, mm"))
     ]
     for family, pairs in (of_folder(args.pairs) if args.pairs else drawn(args)).items():
-        kind = family.replace("-", "_")
-        sensor = SensorConfig(kind if args.declared and kind in SENSOR_KINDS else "unknown")
+        kinds = [kind for kind in SENSOR_KINDS if family.replace("-", "_").startswith(kind)]
+        sensor = SensorConfig(kinds[0] if args.declared and kinds else "unknown")
         registrar = Registrar(RegistrarConfig(num_threads=1, sensor=sensor))
         found = [measure(registrar, pair(), args.full) for pair in tqdm(pairs, family, leave=False)]
         rows = np.array([row for row in found if row])

@@ -3,7 +3,8 @@
 paper, overlap-40/50/60/70 and incomplete follow section III and the experiments of the paper (arXiv 2606.13488);
 L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gives them, and L2-region and L3-region
 the same of about half the size; L2-wave and so on have another smooth bias; sweep is the band that a probe covers on
-its way; pointer, ultrasound, depth-camera and laser are simulated sensors; scene-C1 and so on are what a camera sees
+its way; pointer, ultrasound, depth-camera and laser are simulated sensors, pointer-50 and ultrasound-4 the same with 50
+dots and four slices; scene-C1 and so on are what a camera sees
 of a bone in a wound (see `scenes`); wrong and scene-wrong pairs have no pose.
 """
 
@@ -23,7 +24,7 @@ from gapr_core.data import degradation, views
 from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import derived
 from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
-from gapr_core.data.sensors import SENSORS
+from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import extent
@@ -138,7 +139,7 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
 def acquired(specimen: Specimen, rng: np.random.Generator, sensor: str) -> Pair:
     """What a simulated sensor of `data.sensors` measures of the bone; a camera's viewpoint is in the source's frame."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
-    found = SENSORS[sensor](specimen, rng)
+    found = (SENSORS | SPARSE)[sensor](specimen, rng)
     rotation = Rotation.random(random_state=rng).as_matrix()
     return place(specimen, rng.permutation(found.points), target, rotation, found.parameters, rng, found.viewpoint)
 
@@ -246,7 +247,7 @@ PROTOCOLS: dict[str, Callable[..., Pair]] = {
     **{f"overlap-{k}": partial(paper, share=(k / 100.0, k / 100.0)) for k in (40, 50, 60, 70)},
     "incomplete": incomplete,
     **{name: partial(one_sided, level=level) for name, level in LEVELS.items()},
-    **{name.replace("_", "-"): partial(acquired, sensor=name) for name in SENSORS},
+    **{name.replace("_", "-"): partial(acquired, sensor=name) for name in SENSORS | SPARSE},
     **{name: partial(scene, level=level) for name, level in SCENE_LEVELS.items()},
     **{name: partial(_derived, base=base, change=change) for name, (base, change) in DERIVED.items()},
     **STRANGERS,

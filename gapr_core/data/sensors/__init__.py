@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -13,11 +14,17 @@ from gapr_core.data.sensors.pointer import pointer
 from gapr_core.data.sensors.ultrasound import ultrasound
 from gapr_core.data.specimen import Specimen
 
-SENSORS: dict[str, Callable[[Specimen, np.random.Generator], Acquired]] = {
+Sensor = Callable[[Specimen, np.random.Generator], Acquired]
+SENSORS: dict[str, Sensor] = {
     "pointer": pointer,
     "ultrasound": ultrasound,
     "depth_camera": depth_camera,
     "laser": laser,
 }
+SPARSE: dict[str, Sensor] = {
+    "pointer_50": partial(pointer, points=(50, 50), only_dots=True),
+    "ultrasound_4": partial(ultrasound, count=(4, 4)),
+}
+"""The fewest points with which surgeons register: 50 dots, four slices."""
 
-__all__ = ["SENSORS", "Acquired"]
+__all__ = ["SENSORS", "SPARSE", "Acquired"]

@@ -21,26 +21,34 @@ BIAS_MM = 0.4  # largest smooth bias
 ON_TISSUE, TISSUE_MM = 0.06, (1.0, 4.0)  # largest share of points on soft tissue, and how high they lie
 
 
-def pointer(specimen: Specimen, rng: np.random.Generator) -> Acquired:
+def pointer(
+    specimen: Specimen, rng: np.random.Generator, points: tuple[int, int] = POINTS, only_dots: bool = False
+) -> Acquired:
     """12 to 200 points in dots and strokes with a constant stand-off, no full contact and a few points on tissue.
 
     Real digitisers lie .34 to .62 mm outside of the bone on average.
+
+    Args:
+        specimen: the bone.
+        rng: decides everything.
+        points: limits of their number.
+        only_dots: no strokes.
     """
     view = look(specimen, SHARE, "seen", 20_000, rng)
-    count = round(float(np.exp(rng.uniform(*np.log(POINTS)))))
-    in_dots = count if rng.random() < 0.4 else round(count * rng.uniform(0.0, 0.8))
+    count = round(float(np.exp(rng.uniform(*np.log(points)))))
+    in_dots = count if rng.random() < 0.4 or only_dots else round(count * rng.uniform(0.0, 0.8))
     touched = view.only(_touched(view, count, in_dots, rng))
     standoff_mm, contact_mm, noise_mm = rng.uniform(*STANDOFF_MM), rng.uniform(*CONTACT_MM), rng.uniform(*NOISE_MM)
     bias_mm, bias = smooth_offsets(touched.points, BIAS_MM, rng)
     height_mm = standoff_mm + contact_mm * np.abs(rng.normal(size=count)) + bias_mm
     on_tissue = some(rng.uniform(0.0, ON_TISSUE), count, rng)
     height_mm[on_tissue] += rng.uniform(*TISSUE_MM, len(on_tissue))
-    points = touched.points + height_mm[:, None] * touched.outward + rng.normal(0.0, noise_mm, (count, 3))
+    measured = touched.points + height_mm[:, None] * touched.outward + rng.normal(0.0, noise_mm, (count, 3))
     parameters = {
         **view.parameters, **bias, "family": "pointer", "noise_mm": noise_mm, "contact_mm": contact_mm, "scale": 1.0,
         "standoff_mm": standoff_mm + contact_mm * np.sqrt(2.0 / np.pi), "outlier_share": len(on_tissue) / count,
     }  # fmt: skip
-    return Acquired(points, parameters)
+    return Acquired(measured, parameters)
 
 
 def _touched(view: View, count: int, in_dots: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -27,10 +27,10 @@ BIAS_MM = 0.5
 OUTLIERS, OUTLIER_MM = 0.08, (2.0, 10.0)  # other interfaces, along the beam
 
 
-def ultrasound(specimen: Specimen, rng: np.random.Generator) -> Acquired:
-    """4 to 40 slices of 20 to 120 points, each with the errors of its own pose, beam and depth."""
+def ultrasound(specimen: Specimen, rng: np.random.Generator, count: tuple[int, int] = SLICES) -> Acquired:
+    """4 to 40 slices (`count`) of 20 to 120 points, each with the errors of its own pose, beam and depth."""
     view = look(specimen, SHARE, "band" if rng.random() < 0.7 else "seen", 60_000, rng)
-    slices = _slices(view, rng)
+    slices = _slices(view, count, rng)
     drawn = {
         "speed_of_sound": 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*SPEED_OF_SOUND),
         "thickness_mm": rng.uniform(-THICKNESS_MM, THICKNESS_MM),
@@ -55,10 +55,10 @@ def ultrasound(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     return Acquired(points, parameters)
 
 
-def _slices(view: View, rng: np.random.Generator) -> list[NDArray[np.intp]]:
+def _slices(view: View, limits: tuple[int, int], rng: np.random.Generator) -> list[NDArray[np.intp]]:
     """Indices of the points of each slice; slices lie across the way of the probe, tilted by hand."""
     along, across = tangents(view)
-    count = round(float(np.exp(rng.uniform(*np.log(SLICES)))))
+    count = round(float(np.exp(rng.uniform(*np.log(limits)))))
     most, width_mm = int(rng.integers(*SLICE_POINTS)), rng.uniform(*WIDTH_MM)
     low, high = np.quantile(view.points @ along, (0.03, 0.97))
     places = np.linspace(low, high, count) + rng.normal(0.0, 0.2, count) * (high - low) / count

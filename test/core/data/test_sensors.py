@@ -1,11 +1,14 @@
 """Each simulator on a ball, whose distances are known exactly."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from shapes import ball_specimen
 
 from gapr_core.data import protocols
-from gapr_core.data.sensors import SENSORS
+from gapr_core.data.sensors import SENSORS, SPARSE
+from gapr_core.data.sensors.pointer import pointer
 from gapr_core.geometry import se3
 
 RADIUS = 60.0
@@ -48,6 +51,16 @@ def test_a_pointer_gives_12_to_200_points_that_lie_outside_by_the_standoff(ball)
     off = np.array([np.median(heights(c)) - c.parameters["standoff_mm"] for c in clouds])
     assert abs(np.median(off)) < 0.1
     assert np.mean([c.parameters["standoff_mm"] for c in clouds]) > 0.3
+
+
+def test_the_sparse_ones_are_fifty_dots_and_four_slices(ball):
+    dots, strokes = (drawn(simulate, ball, 6) for simulate in (SPARSE["pointer_50"], partial(pointer, points=(50, 50))))
+    assert {len(cloud.points) for cloud in dots + strokes} == {50}
+    nearest = [[np.median(np.sort(np.linalg.norm(c.points[:, None] - c.points[None], axis=2), axis=1)[:, 1])
+                for c in clouds] for clouds in (dots, strokes)]  # fmt: skip
+    assert min(nearest[0]) > 3.0 and min(nearest[1]) < 1.5  # points of a stroke are in a row
+    slices = [cloud.parameters["slices"] for cloud in drawn(SPARSE["ultrasound_4"], ball, 8)]
+    assert max(slices) == np.median(slices) == 4  # one that misses the bone is left out
 
 
 def test_a_pointer_strokes_in_rows(ball):

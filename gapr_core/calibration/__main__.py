@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--look-alikes", type=int, default=0,
                         help="more femora and tibiae at L3, half of others (default: %(default)s)")  # fmt: skip
     parser.add_argument(
-        "--streams", type=int, default=0, help="streams of frames, half of look-alikes (default: %(default)s)"
+        "--streams", type=int, default=0, help="streams of frames, half of them of others (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")

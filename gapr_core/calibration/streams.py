@@ -36,13 +36,14 @@ STREAM_SEEDS = 900  # added to the seed: other targets than those of single pair
 
 
 def tasks(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Every other one as `pairs.WHAT` says; between them femora and tibiae, in turn own and another subject's."""
+    """Every other one as `pairs.WHAT` says; the others are of another subject's femur or tibia.
+
+    Most frames of other bones are refused by a rule and say nothing: with fewer, almost all that is left is right.
+    """
     bones = len(pairs.BONES)
-    long = (number for number in range(bones * count) if pairs.BONES[number % bones] in pairs.LOOK_ALIKES)
+    long = [number for number in range(bones * count) if pairs.BONES[number % bones] in pairs.LOOK_ALIKES]
     found = [Task(folder, split, seed, number, STREAM) for number in range((count + 1) // 2)]
-    what = ("own", "own", "person", "person")  # bones come in turn, too
-    found += [Task(folder, split, seed, next(long), STREAM, what[k % 4]) for k in range(count // 2)]
-    return found
+    return found + [Task(folder, split, seed, number, STREAM, "person") for number in long[: count // 2]]
 
 
 def record_of(task: Task) -> dict[str, Any]:

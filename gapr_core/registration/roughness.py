@@ -54,13 +54,17 @@ def products_mm2(points, residuals, others, other_residuals, limits_mm, own):  #
         itself and takes no part, -1 where none is.
     """
     total, count = np.zeros(len(limits_mm)), np.zeros(len(limits_mm))
+    squared = limits_mm**2
+    farthest = squared.max()
     for i in range(len(points)):
         for j in range(len(others)):
             apart = 0.0
             for axis in range(3):
                 apart += (points[i, axis] - others[j, axis]) ** 2
+            if apart >= farthest or j == own[i]:
+                continue
             for k in range(len(limits_mm)):
-                if j != own[i] and limits_mm[k, 0] ** 2 <= apart < limits_mm[k, 1] ** 2:
+                if squared[k, 0] <= apart < squared[k, 1]:
                     total[k] += residuals[i] * other_residuals[j]
                     count[k] += 1.0
     return total, count

@@ -175,7 +175,11 @@ class Tracker:
         return self.registrar.assess(source, target, self._memory.poses[0], viewpoint, clock)
 
     def _with_evidence(self, assessment: Assessment) -> Assessment:
-        """The probability in the light of the frames before; a frame that a safety rule refuses says nothing."""
+        """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.
+
+        What they say of the bone cannot make a pose right (see `evidence`). A frame that a safety rule refuses says
+        nothing.
+        """
         if assessment.refusal is not None:
             return assessment
         agrees = self._last is not None and _gap_mm(assessment, self._last) <= self._evidence.config.agree_mm
@@ -183,7 +187,7 @@ class Tracker:
         alone = assessment.probability
         one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))
         together = self._with_shared_misfit(one_by_one, agrees)
-        return together if agrees else together.limited(alone)
+        return together.limited(float(np.sqrt(alone)) if agrees else alone)
 
     def _with_shared_misfit(self, assessment: Assessment, agrees: bool) -> Assessment:
         """The probability in the light of what the residuals of the frames have in common.

@@ -1,5 +1,7 @@
 """A stream of sources: near the last pose first, in full if that is not sure."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import expit
@@ -219,10 +221,20 @@ def test_a_shared_misfit_alone_refuses_a_frame_that_fits(scripted, frames, prepa
     assert good.ok and bad.status is RegistrationStatus.LOW_CONFIDENCE
     log_odds = good.features["frames_log_odds"]
     assert log_odds == pytest.approx(bad.features["frames_log_odds"])
-    expected = [expit(min(log_odds + adds, LARGEST_LOG_ODDS)) for adds in (3.0, -6.0)]
-    assert [good.confidence, bad.confidence] == pytest.approx(expected, rel=1e-6)
+    assert bad.confidence == pytest.approx(expit(min(log_odds - 6.0, LARGEST_LOG_ODDS)), rel=1e-6)
     assert [r.contributions["shared_misfit"] for r in (good, bad)] == [2.0, -7.0]
     assert good.contributions["shared_smooth"] == bad.contributions["shared_smooth"] == 1.0
+
+
+def test_no_stream_makes_a_probability_larger_than_its_square_root(scripted, frames, prepared, monkeypatch):
+    """`rules.by_geometry` counts on it: what it does not look at must not be accepted."""
+    assess, alone = Registrar.assess, 0.2
+    tracker = scripted(None, 0.0)
+    tracker.register(frames[0].source, prepared)
+    monkeypatch.setattr(Registrar, "assess", lambda *a, **k: replace(assess(*a, **k), probability=alone))
+    result = tracker.register(frames[1].source, prepared)
+    assert result.features["shared_misfit"] == 0.0 and result.contributions["shared_misfit"] == 2.0
+    assert result.confidence == pytest.approx(np.sqrt(alone)) and not result.ok
 
 
 def test_after_a_jump_what_the_frames_shared_counts_only_against_the_bone(scripted, frames, prepared):

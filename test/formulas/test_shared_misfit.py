@@ -52,6 +52,12 @@ def test_frames_that_see_different_places_say_nothing():
     assert shared.add(plane_fit(np.ones(900), feet_of(900) + 500.0)) is None
 
 
+def test_a_patch_too_small_for_long_range_says_nothing(every_pair_counts):
+    shared, patch = SharedMisfit(MEMORY), feet_of(50) / 30.0  # 4 mm across
+    assert shared.add(plane_fit(np.ones(50), patch)) is None
+    assert shared.add(plane_fit(np.ones(50), patch)) is None
+
+
 def stream_of(stays, each_frame, noise_mm=1.5, frames=5):
     """The last answer for frames of 1000 of 4000 places: fields that stay and that do not, and noise."""
     shared, rng, feet = SharedMisfit(MEMORY), np.random.default_rng(4), feet_of(4000)

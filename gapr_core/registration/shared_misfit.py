@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from gapr_core.geometry import sampling
 from gapr_core.registration.refinement import Fit
-from gapr_core.registration.roughness import CENTRES, LIMITS_MM, on_the_bone, products_mm2, signed_root
+from gapr_core.registration.roughness import CENTRES, FAR_MM, NEAR_MM, on_the_bone, products_mm2, signed_root
 
 Array = NDArray[np.float64]
 
+LIMITS_MM = np.array([(1.0, NEAR_MM[1]), FAR_MM])  # a point that comes again, in a cloud that grows, has the same noise
 FRAMES, POINTS = 6, 500  # that are remembered, and of each of them
 FEWEST_PAIRS = 300  # with fewer near ones nothing is known
 USUAL_PAIRS = 1000  # with so many the covariance counts by half: the fewer, the more chance is in it

@@ -115,14 +115,19 @@ class Tracker:
         self._forget_track()
         self._bone: PreparedTarget | None = None
         self._evidence.reset()
-        self._shared_for_bone = False
-        if self._shared is not None:
-            self._shared.forget()
+        self._forget_shared()
 
     def share_points(self) -> None:
         """The sources of this stream share their points, as those of an `Accumulator` do: many count as one."""
         self._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
         self._shared = None  # the same points have the same noise
+
+    def _forget_shared(self) -> None:
+        self._shared_for_bone = False
+        self._shared_mm: tuple[float, float] | None = None
+        self._seen: Array = np.empty((0, 3))
+        if self._shared is not None:
+            self._shared.forget()
 
     def _forget_track(self) -> None:
         self._target: PreparedTarget | None = None
@@ -192,18 +197,21 @@ class Tracker:
     def _with_shared_misfit(self, assessment: Assessment, agrees: bool) -> Assessment:
         """The probability in the light of what the residuals of the frames have in common.
 
-        After a jump it may be another bone: what spoke for the last one is forgotten, what spoke against it is not.
+        After a jump it may be another bone: what spoke for the last one is forgotten, what spoke against it is not. A
+        source that is sent again has the same noise, and adds nothing.
         """
         if self._shared is None or not np.isfinite(assessment.probability):
             return assessment
         if not agrees and self._shared_for_bone:
-            self._shared.forget()
-        shared_mm = self._shared.add(assessment.fit)
-        if shared_mm is None:
+            self._forget_shared()
+        if not np.array_equal(assessment.source.points, self._seen):
+            self._seen = assessment.source.points
+            self._shared_mm = self._shared.add(assessment.fit)
+        if self._shared_mm is None:
             self._shared_for_bone = False
             return assessment
         log_odds = float(np.clip(logit(assessment.probability), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS))
-        features = dict(zip(STREAM_FEATURES, (log_odds, *shared_mm), strict=True))
+        features = dict(zip(STREAM_FEATURES, (log_odds, *self._shared_mm), strict=True))
         adds = {name: self._stream.contributions(features)[name] for name in STREAM_FEATURES[1:]}
         self._shared_for_bone = sum(adds.values()) > 0.0
         return replace(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_roughness import UP, feet_of, field, plane_fit
 
-from gapr_core.registration import shared_misfit
+from gapr_core.registration import roughness, shared_misfit
 from gapr_core.registration.shared_misfit import SharedMisfit
 
 FOUR = np.array([[0.0, 0, 0], [5.0, 0, 0], [0.0, 15.0, 0], [5.0, 15.0, 0]])
@@ -15,6 +15,7 @@ MEMORY = 1e9
 def every_pair_counts(monkeypatch):
     monkeypatch.setattr(shared_misfit, "FEWEST_PAIRS", 1)
     monkeypatch.setattr(shared_misfit, "USUAL_PAIRS", 0)
+    monkeypatch.setattr(shared_misfit, "LIMITS_MM", roughness.LIMITS_MM)  # from 0 mm: the same four places
 
 
 def frame(*signed, feet=FOUR):
@@ -35,7 +36,7 @@ def test_a_negative_covariance_keeps_its_sign(every_pair_counts):
     assert shared.add(frame(-1.0, -1.0, 1.0, 1.0)) == pytest.approx((-np.sqrt(2.0), 1.0))
 
 
-def test_few_pairs_say_little_and_too_few_nothing(monkeypatch):
+def test_few_pairs_say_little_and_too_few_nothing(every_pair_counts, monkeypatch):
     first, second = frame(1.0, 1.0, -1.0, -1.0), frame(1.0, 1.0, -1.0, -1.0)
     both = np.array([np.sqrt(2.0), -1.0])
     for fewest, usual, expected in ((9, 0, None), (8, 0, both), (8, 8, both / np.sqrt(2.0))):  # 8 near pairs, 8 far
@@ -44,6 +45,20 @@ def test_few_pairs_say_little_and_too_few_nothing(monkeypatch):
         shared = SharedMisfit(MEMORY)
         shared.add(first)
         assert shared.add(second) == (expected if expected is None else pytest.approx(expected))
+
+
+@pytest.mark.parametrize("moved_mm", [0.0, 0.3])
+def test_points_that_come_again_do_not_add_their_own_noise(moved_mm):
+    """In a cloud that grows, a point lies where it was, but for the pose: noise times itself is no covariance."""
+    rng, found, with_itself = np.random.default_rng(6), [], []
+    for _ in range(8):
+        shared, feet, noise = SharedMisfit(MEMORY), feet_of(500, int(rng.integers(99))), rng.normal(0.0, 3.0, 500)
+        for k in range(3):
+            last = shared.add(plane_fit(noise, feet + [k * moved_mm, 0.0, 0.0]))
+        found.append(np.sign(last[0]) * last[0] ** 2)
+        total, count = roughness.products_mm2(feet, noise, feet, noise, roughness.LIMITS_MM, np.full(500, -1))
+        with_itself.append(np.subtract(*(total / count)))
+    assert abs(np.mean(found)) < 0.5 < 1.0 < np.mean(with_itself)
 
 
 def test_frames_that_see_different_places_say_nothing():

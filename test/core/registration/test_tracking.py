@@ -251,6 +251,13 @@ def test_after_a_jump_what_the_frames_shared_counts_only_against_the_bone(script
         assert after.confidence <= alone + 1e-9
 
 
+def test_a_source_that_is_sent_again_adds_nothing_to_what_is_shared(scripted, frames, prepared):
+    tracker = scripted(None, 1.0, 0.0)
+    tracker.register(frames[0].source, prepared)
+    results = [tracker.register(frames[i].source, prepared) for i in (1, 1, 2)]
+    assert [r.features["shared_misfit"] for r in results] == [1.0, 1.0, 0.0] and not tracker._shared.left
+
+
 def test_sources_that_share_their_points_share_their_noise_as_well(scripted, frames, prepared):
     tracker = scripted(None, 1.0)
     tracker.share_points()

@@ -25,7 +25,6 @@ import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from harness import Client, NodeProcess, environment, wait_until
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -109,13 +108,6 @@ class Bench:
             return int(values["frames_received"]) - sum(int(values[key]) for key in NOT_NOW if key != "frames_lost")
 
         wait_until(lambda: rest() == 0, ANSWER_S, "the clouds on their way")
-
-    def change(self, transition: int) -> bool:
-        """A transition of the lifecycle."""
-        service = self.client.ready(ChangeState, "/register_node/change_state")
-        future = service.call_async(ChangeState.Request(transition=Transition(id=transition)))
-        wait_until(future.done, ANSWER_S)
-        return bool(future.result().success)
 
     def set(self, *messages: ParameterMessage) -> list[bool]:
         """Which of the parameters were taken."""
@@ -300,7 +292,7 @@ def the_lifecycle_goes_round_while_clouds_come(bench: Bench) -> None:
         for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP,
                            Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):  # fmt: skip
             bench.client.send(bench.cloud)
-            assert bench.change(transition)
+            assert bench.client.change_state(transition)
     wait_until(lambda: bench.client.points.get_subscription_count() == 1, 20.0)
 
 

@@ -24,6 +24,8 @@ import numpy as np
 import psutil
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -49,15 +51,18 @@ SIBLINGS_S = 5.0  # for the other messages about a cloud, once its diagnostics a
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
-    """The first true value of the condition; fails when there is none in time."""
+def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: Any = "") -> Any:
+    """The first true value of the condition; fails when there is none in time, and says what was waited for.
+
+    A callable is asked for what to say when the time is up.
+    """
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         value = condition()
         if value:
             return value
         time.sleep(0.005)
-    raise AssertionError(f"waited {timeout_s} s in vain for {what or condition}")
+    raise AssertionError(f"waited {timeout_s} s in vain for {what() if callable(what) else what or condition}")
 
 
 def context() -> Context:
@@ -218,6 +223,17 @@ class Client:
         future = client.call_async(request)
         wait_until(future.done, timeout_s, f"the answer of {name}")
         return future.result()
+
+    def ask_for(self, transition: int) -> Any:
+        """The future of a transition of the lifecycle (`lifecycle_msgs.msg.Transition`)."""
+        service = self.ready(ChangeState, f"{NODE}/change_state")
+        return service.call_async(ChangeState.Request(transition=Transition(id=transition)))
+
+    def change_state(self, transition: int) -> bool:
+        """Whether the node made a transition of the lifecycle."""
+        future = self.ask_for(transition)
+        wait_until(future.done, PATIENCE_S, "the transition")
+        return bool(future.result().success)
 
 
 def _answered(values: dict[str, str]) -> int:

@@ -11,7 +11,7 @@ import psutil
 import pytest
 from harness import PATIENCE_S, NodeProcess, StandIn, node_in_thread, wait_until
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import GetState
 from std_srvs.srv import Trigger
 
 LIMIT_S = 2.0  # of CPU time
@@ -40,11 +40,6 @@ def slow():
     return made
 
 
-def asked(client, transition):
-    service = client.ready(ChangeState, "/register_node/change_state")
-    return service.call_async(ChangeState.Request(transition=Transition(id=transition)))
-
-
 def state_of(client):
     future = client.ready(GetState, "/register_node/get_state").call_async(GetState.Request())
     wait_until(future.done)
@@ -54,14 +49,14 @@ def state_of(client):
 def test_while_it_configures_diagnostics_go_on_and_services_answer(blob_path, client, slow):
     with node_in_thread(slow, blob_path, autostart=False):
         wait_until(lambda: client.values().get("state") == "unconfigured")
-        configured = asked(client, Transition.TRANSITION_CONFIGURE)
+        configured = client.ask_for(Transition.TRANSITION_CONFIGURE)
         wait_until(lambda: "loading" in client.values()["message"])
         count = len(client.diagnostics)
         wait_until(lambda: len(client.diagnostics) > count + 5)
         assert state_of(client) == "unconfigured" and not configured.done()
         answer = client.call("reload_model")
         assert not answer.success and "configure it" in answer.message
-        second = asked(client, Transition.TRANSITION_CONFIGURE)
+        second = client.ask_for(Transition.TRANSITION_CONFIGURE)
         wait_until(second.done)
         assert not second.result().success, "one bone at a time"
         slow.gate.set()
@@ -73,14 +68,14 @@ def test_a_bone_that_cannot_be_prepared_fails_the_transition_with_its_reason(blo
     slow.error = RuntimeError("no such bone")
     with node_in_thread(slow, blob_path, autostart=False):
         wait_until(lambda: client.values().get("state") == "unconfigured")
-        configured = asked(client, Transition.TRANSITION_CONFIGURE)
+        configured = client.ask_for(Transition.TRANSITION_CONFIGURE)
         slow.gate.set()
         wait_until(configured.done)
         assert not configured.result().success
         wait_until(lambda: client.values()["level"] == 2)
         assert client.values()["message"].startswith("configure failed: RuntimeError: no such bone")
         slow.error = None
-        configured = asked(client, Transition.TRANSITION_CONFIGURE)
+        configured = client.ask_for(Transition.TRANSITION_CONFIGURE)
         wait_until(configured.done)
         assert configured.result().success
 
@@ -120,7 +115,7 @@ def test_a_transition_that_the_state_does_not_allow_is_refused_and_survived(blob
     with node_in_thread(method, blob_path):
         client.wait_for_state("active")
         for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE, 77):
-            refused = asked(client, transition)
+            refused = client.ask_for(transition)
             wait_until(refused.done)
             assert not refused.result().success
         assert client.ask(GOOD)["level"] == 0

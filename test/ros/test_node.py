@@ -12,7 +12,6 @@ from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from harness import Client, Collecting, accepted, node_in_thread, pose_mm, wait_until
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -292,7 +291,7 @@ def test_a_reload_that_a_cleanup_overtakes_is_answered(live):
     reload_model = client.ready(Trigger, "/register_node/reload_model").call_async(Trigger.Request())
     wait_until(lambda: node._loader.busy)
     for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
-        assert change_state(client, transition)
+        assert client.change_state(transition)
     method.gate.set()
     wait_until(reload_model.done, what="the answer of reload_model")
     assert not reload_model.result().success and "cleaned up" in reload_model.result().message
@@ -444,33 +443,26 @@ def test_a_model_that_cannot_be_used_fails_configure_with_its_reason_and_the_nod
         values = client.values()
         assert values["state"] == "unconfigured" and values["message"].startswith("configure failed: expected")
         node.set_parameters([Parameter("model_path", value=str(blob_path))])
-        assert change_state(client, Transition.TRANSITION_CONFIGURE)
-        assert change_state(client, Transition.TRANSITION_ACTIVATE)
+        assert client.change_state(Transition.TRANSITION_CONFIGURE)
+        assert client.change_state(Transition.TRANSITION_ACTIVATE)
         client.wait_for_state("active")
         assert client.ask(GOOD)["level"] == 0
-
-
-def change_state(client, transition):
-    service = client.ready(ChangeState, "/register_node/change_state")
-    future = service.call_async(ChangeState.Request(transition=Transition(id=transition)))
-    wait_until(future.done)
-    return future.result().success
 
 
 def test_the_lifecycle_goes_round_and_the_node_works_after_it(live):
     node, client, method = live
     client.ask(GOOD)
-    assert change_state(client, Transition.TRANSITION_DEACTIVATE)
+    assert client.change_state(Transition.TRANSITION_DEACTIVATE)
     wait_until(lambda: client.points.get_subscription_count() == 0)  # or the next cloud would go to the old one
     assert not client.call("register").success
-    assert change_state(client, Transition.TRANSITION_CLEANUP)
+    assert client.change_state(Transition.TRANSITION_CLEANUP)
     answer = client.call("reload_model")
     assert not answer.success and "unconfigured" in answer.message
-    assert change_state(client, Transition.TRANSITION_CONFIGURE)
-    assert change_state(client, Transition.TRANSITION_ACTIVATE)
+    assert client.change_state(Transition.TRANSITION_CONFIGURE)
+    assert client.change_state(Transition.TRANSITION_ACTIVATE)
     client.wait_for_state("active")
     assert client.ask(GOOD)["level"] == 0
-    assert change_state(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert client.change_state(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert node.state == "finalized"
 
 
@@ -482,7 +474,7 @@ def test_deactivating_tells_those_who_wait_and_sends_nothing_more(live):
     client.send(GOOD)
     wait_until(lambda: len(method.calls) > calls)
     poses = len(client.poses)
-    assert change_state(client, Transition.TRANSITION_DEACTIVATE)
+    assert client.change_state(Transition.TRANSITION_DEACTIVATE)
     method.gate.set()
     wait_until(lambda: client.values()["last_refusal"].startswith("superseded_by_reset"))
     assert len(client.poses) == poses

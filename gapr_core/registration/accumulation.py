@@ -60,7 +60,8 @@ class Accumulator:
         """Forget all sources, and the track of a `Tracker`."""
         self._kept: list[Array] = []  # looked at, or from before there was a pose
         self._new: list[Array] = []
-        self._off: list[Array] = []
+        self._off: list[Array] = []  # in a row, off the bone under an accepted pose
+        self._far = 0  # in a row, metres away from the others
         if isinstance(self.method, Tracker):
             self.method.reset()
 
@@ -75,20 +76,22 @@ class Accumulator:
         """
         points = finite_points(source)
         points = points[sampling.thin(points, self.config.accumulation.most_points)]
-        if not len(points) or _is_among(points, self._kept + self._new):
+        if not len(points):
             return
         if (extent_mm := Surface(points).extent_mm) > EXTENT_LIMITS_MM[1]:
             check_extent(extent_mm, "mm", "the source")
         apart_mm = Surface(np.concatenate([self.collected, points])).extent_mm
         if apart_mm > EXTENT_LIMITS_MM[1]:
-            self._leave_out(points, f"one that makes them {apart_mm:.0f} mm across")
-        self._new = [*self._new, points][-self.most :]
+            self._leave_out(f"one that makes them {apart_mm:.0f} mm across")
+        self._far = 0
+        if not _is_among(points, self._kept + self._new):
+            self._new = [*self._new, points][-self.most :]
 
-    def _leave_out(self, points: Array, given: str) -> None:
-        """Raises, but for the third in a row, before which the collection is forgotten."""
-        self._off = [*self._off, points]
+    def _leave_out(self, given: str) -> None:
+        """Raise for a source metres away from the others; with the last of `most_off` in a row, forget the others."""
+        self._far += 1
         most_off = self.config.accumulation.most_off
-        if len(self._off) < most_off:
+        if self._far < most_off:
             how = f"look at the transforms; {most_off} in a row restart the collection"
             raise InvalidPointCloudError("a source near the others, in one frame", given, how)
         log.warning("%d sources in a row are metres away from the others: the collection restarts", most_off)

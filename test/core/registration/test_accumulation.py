@@ -98,6 +98,29 @@ def test_a_single_source_that_is_metres_away_does_not_end_a_collection(registrar
     np.testing.assert_array_equal(accumulator.collected, own)
 
 
+def test_sources_that_are_metres_away_restart_a_collection_only_in_a_row(registrar, frames):
+    accumulator = Accumulator(registrar, most=5)
+    for pair in frames[:3]:
+        accumulator.collect(pair.source)
+        with pytest.raises(InvalidPointCloudError, match="near the others"):
+            accumulator.collect(pair.source + [0.0, 4e3, 0.0])
+    np.testing.assert_array_equal(accumulator.collected, np.concatenate([pair.source for pair in frames[:3]]))
+
+
+def test_a_source_that_is_metres_away_is_not_kept_with_those_that_have_left_the_bone(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=len(frames))
+    for pair in frames[:-1]:
+        accumulator.collect(pair.source)
+    assert accumulator.register(frames[-1].source, prepared).ok
+    with pytest.raises(InvalidPointCloudError, match="near the others"):
+        accumulator.register(frames[0].source + [0.0, 4e3, 0.0], prepared)
+    off = [pair.source + [0.0, 25.0, 10.0] for pair in frames[4:7]]
+    for source in off:
+        refused = accumulator.register(source, prepared)
+    assert "restarts" in refused.reason
+    np.testing.assert_array_equal(accumulator.collected, np.concatenate(off))
+
+
 def test_another_target_starts_a_new_collection(registrar, frames, prepared):
     accumulator = Accumulator(registrar, most=5)
     accumulator.register(frames[0].source, prepared)

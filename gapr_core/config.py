@@ -7,7 +7,9 @@ line: `--set refinement.iterations=5`. A value out of range raises `ConfigError`
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
+from gapr_core.errors import ConfigError
 from gapr_core.runtime.settings import Settings, setting
 
 TUKEY = "Tukey scale of the first and the last iteration, and the number of iterations"
@@ -115,6 +117,11 @@ class CovarianceConfig(Settings):
     smooth_neighbours: int = setting(30, "points of an average that shows the smooth misfit", low=2, high=1000)
     short_neighbours: int = setting(12, "the same at short range, for the confidence alone", low=2, high=1000)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.sizes_mm) < 2 or any(small >= large for small, large in pairwise(self.sizes_mm)):
+            raise ConfigError("two or more ascending sizes_mm", str(self.sizes_mm), "name the smallest size first")
+
 
 SENSOR_KINDS = ("unknown", "pointer", "ultrasound", "depth_camera", "laser")
 
@@ -213,7 +220,7 @@ class EvidenceConfig(Settings):
     """How the frames of a stream are combined (`gapr_core.registration.evidence`)."""
 
     correlation: float = setting(0.8, "of two frames: 0 independent, 1 the same again", low=0, high=1)
-    memory: float = setting(10.0, "frames after which a frame's weight has fallen to 1/e", low=0.1)
+    memory: float = setting(10.0, "frames after which a frame's weight has fallen to about 1/e", low=1)
     agree_mm: float = setting(15.0, "largest motion between frames (rms) that continues a track", low=0, unit="mm")
 
 
@@ -288,6 +295,12 @@ class ClutterConfig(Settings):
     levelled_by: int = setting(12, "neighbours over which the noise of a measured depth is averaged", low=1, high=200)
     markers: int = setting(16, "points by which two poses are compared", low=3, high=1000)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.seeds) != len(self.radii_mm):
+            given = f"{self.seeds} for {self.radii_mm}"
+            raise ConfigError("seeds for each of radii_mm", given, "name as many seeds as radii_mm")
 
 
 @dataclass(frozen=True)

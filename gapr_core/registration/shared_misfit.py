@@ -21,16 +21,16 @@ from gapr_core.registration.roughness import CENTRES, FAR_MM, NEAR_MM, on_the_bo
 Array = NDArray[np.float64]
 
 LIMITS_MM = np.array([(1.0, NEAR_MM[1]), FAR_MM])  # a point that comes again, in a cloud that grows, has the same noise
-FRAMES, POINTS = 6, 500  # that are remembered, and of each of them
+FRAMES, POINTS = 6, 500  # how many frames are remembered, and how many points of each
 FEWEST_PAIRS = 300  # with fewer near ones nothing is known
 USUAL_PAIRS = 1000  # with so many the covariance counts by half: the fewer, the more chance is in it
 
 
 class SharedMisfit:
-    """Of the frames of one stream on one target.
+    """What the residuals of frames have in common, of one stream on one target.
 
     Args:
-        memory: frames after which the weight of a pair has fallen to 1/e.
+        memory: frames after which the weight of a pair of points has fallen to about 1/e, at least 1.
     """
 
     def __init__(self, memory: float) -> None:
@@ -38,14 +38,16 @@ class SharedMisfit:
         self.forget()
 
     def forget(self) -> None:
-        """All frames."""
+        """Forget all frames."""
         self._frames: deque[tuple[Array, Array]] = deque(maxlen=FRAMES)
         self._total, self._count = np.zeros(len(LIMITS_MM)), np.zeros(len(LIMITS_MM))
 
     def add(self, fit: Fit) -> tuple[float, float] | None:
-        """Roots of the covariances that this frame and those before share, mm: at short range only, and at long range.
+        """Take in the next frame.
 
-        Negative where the covariance is; None while too few points of different frames are near each other.
+        Returns:
+            Roots, mm, of the covariance that the frames share at short range only, and of that at long range, negative
+            where the covariance is; None while too few points of different frames are near each other.
         """
         feet, signed = on_the_bone(fit)
         if self._frames and len(feet):

@@ -4,7 +4,14 @@ from dataclasses import dataclass, fields, is_dataclass
 
 import pytest
 
-from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig, VerificationConfig
+from gapr_core.config import (
+    ClutterConfig,
+    CovarianceConfig,
+    RefinementConfig,
+    RegistrarConfig,
+    SmoothBiasConfig,
+    VerificationConfig,
+)
 from gapr_core.errors import ConfigError
 from gapr_core.runtime import settings
 from gapr_core.runtime.settings import Settings, from_dict, setting
@@ -52,6 +59,7 @@ def test_what_is_no_mapping_is_refused(values):
 OUT_OF_RANGE = [
     {"min_confidence": 7.0}, {"min_confidence": -0.1}, {"min_confidence": float("nan")}, {"num_threads": -1},
     {"refinement": {"iterations": 0}}, {"smooth_bias": {"sizes_mm": [0.1, -1.0]}}, {"max_tre_mm": -1.0},
+    {"evidence": {"memory": 0.5}},
 ]  # fmt: skip
 
 
@@ -59,6 +67,18 @@ OUT_OF_RANGE = [
 def test_a_value_out_of_range_is_refused_with_the_range(values):
     with pytest.raises(ConfigError, match="at least|to"):
         from_dict(RegistrarConfig, values)
+
+
+@pytest.mark.parametrize("sizes_mm", [(), (0.1,), (0.1, 0.1), (0.5, 0.1, 0.2)])
+def test_sizes_of_the_bias_that_do_not_ascend_are_refused(sizes_mm):
+    with pytest.raises(ConfigError, match="ascending sizes_mm"):
+        CovarianceConfig(sizes_mm=sizes_mm)
+
+
+def test_radii_and_seeds_of_regions_go_in_pairs():
+    with pytest.raises(ConfigError, match="as many seeds as radii_mm"):
+        ClutterConfig(radii_mm=(30.0,))
+    assert ClutterConfig(radii_mm=(30.0,), seeds=(9,)).seeds == (9,)
 
 
 def test_ranges_hold_in_python_as_well_and_their_ends_are_inside():

@@ -51,8 +51,10 @@ class Precision:
             precision = Precision(from_dict(data), float(data["factor95"]), dict(data["card"]))
         except (ValueError, KeyError, TypeError) as error:
             raise WeightsError("a whole precision model", f"{path}: {error!r}", FIT_AGAIN) from error
-        if precision.model.features != PRECISION_FEATURES or not precision.factor95 > 0.0:
+        if precision.model.features != PRECISION_FEATURES:
             raise WeightsError(f"a model of {PRECISION_FEATURES}", f"{path}: {precision.model.features}", FIT_AGAIN)
+        if not 0.0 < precision.factor95 < np.inf:
+            raise WeightsError("a finite factor95 above 0", f"{path}: {precision.factor95}", FIT_AGAIN)
         return precision
 
     @staticmethod
@@ -61,10 +63,10 @@ class Precision:
         return Precision(Additive(0.0, ()), 1.0, {})
 
     def scale(self, features: Mapping[str, float], tre_mm: float) -> float:
-        """By how much a standard deviation of the covariance is to be enlarged.
+        """What a standard deviation of the covariance is to be multiplied by.
 
         Args:
-            features: of the answer (`gapr_core.registration.confidence.FEATURES`).
+            features: of the answer (`features.FEATURES` or `features.SCENE_FEATURES`).
             tre_mm: the whole-bone error that the covariance predicts, mm.
         """
         log_scale = self.model.value({**features, "log_tre": float(np.log(max(tre_mm, 1e-6)))})

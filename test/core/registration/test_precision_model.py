@@ -44,6 +44,9 @@ def test_a_model_reads_back_the_same_and_a_wrong_one_is_an_error(tmp_path):
         (tmp_path / "bad.json").write_text(json.dumps(data | damage))
         with pytest.raises(WeightsError, match="bad.json"):
             Precision.load(tmp_path / "bad.json")
+    (tmp_path / "bad.json").write_text(json.dumps(data | {"factor95": float("inf")}))
+    with pytest.raises(WeightsError, match="factor95 above 0; got .*inf"):
+        Precision.load(tmp_path / "bad.json")
 
 
 def test_what_ships_loads_and_makes_no_prediction_tiny():

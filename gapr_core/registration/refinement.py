@@ -1,7 +1,7 @@
 """Robust point-to-surface refinement: many poses coarsely, a few to the end.
 
 Point-to-plane (Chen and Medioni 1992) with second-order surface elements, Tukey's biweight at a scale that follows
-the residuals, and the offset that noise causes on curved surfaces taken away (see `refinement_kernels`). In the end
+the residuals, and the offset that noise causes on curved surfaces taken away (see `kernels`). In the end
 elements that fit their surroundings badly weigh less, and a patch of the source that is off as a whole weighs nothing.
 """
 

@@ -75,7 +75,7 @@ class Tracker:
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
-        recheck: at least every so many sources is registered in full, so that a wrong track cannot live for long.
+        recheck: of so many sources in a row at least one is registered in full: a wrong track does not live for long.
         calibration: the confidence model of tracked answers; the shipped one when not given.
         stream: the one of a source in the light of those before it; the shipped one when not given.
 
@@ -123,15 +123,15 @@ class Tracker:
         self._shared = None  # the same points have the same noise
 
     def _forget_shared(self) -> None:
-        self._shared_for_bone = False
-        self._shared_mm: tuple[float, float] | None = None
-        self._seen: Array = np.empty((0, 3))
+        self._shared_for_bone = False  # what the frames share speaks for the bone
+        self._shared_mm: tuple[float, float] | None = None  # what they share, as `SharedMisfit.add` said last
+        self._seen: Array = np.empty((0, 3))  # points of the last source that was added
         if self._shared is not None:
             self._shared.forget()
 
     def _forget_track(self) -> None:
-        self._target: PreparedTarget | None = None
-        self._last: Array | None = None
+        self._has_track = False
+        self._last: Array | None = None  # pose of the last source that no rule refused, (4, 4) T_target_source
         self._tracked = 0  # sources since the last full registration
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
@@ -161,7 +161,7 @@ class Tracker:
             assessment = self._with_evidence(assessment)
         result = self.registrar.conclude(assessment, clock)
         if isinstance(assessment, Assessment):
-            self._remember(result, assessment.source.points, target)
+            self._remember(result, assessment.source.points)
         return result
 
     def _assess(
@@ -173,7 +173,7 @@ class Tracker:
         clock: Clock,
     ) -> Assessment | Refusal:
         """Where the last pose was, or in full; a camera's cloud in full, with the last pose among the hypotheses."""
-        if self._target is None:
+        if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if viewpoint is None and self._tracked + 1 < self.recheck:
             return self._tracking.assess(source, target, clock=clock)
@@ -221,16 +221,19 @@ class Tracker:
             contributions={**assessment.contributions, **adds},
         )
 
-    def _remember(self, result: RegistrationResult, source: Array, target: PreparedTarget) -> None:
-        """A refusal changes no pose: the bone may be where it was."""
-        if result.T_target_source is None:  # after a full registration the next source gets one as well
+    def _remember(self, result: RegistrationResult, source: Array) -> None:
+        """Follow an accepted pose; a refusal changes nothing, since the bone may be where it was.
+
+        As it does not count either, a refused full registration is followed by another one.
+        """
+        if result.T_target_source is None:
             return
         followed = result.proposer == Memory.name
         self._tracked = self._tracked + 1 if followed else 0
         if followed:
             self._memory.follow(result.T_target_source, source)
         elif len(result.hypotheses) > 1:
-            self._target = target
+            self._has_track = True
             self._memory.keep([result.T_target_source, *(rival.T_target_source for rival in result.hypotheses[1:])])
         else:
             self._forget_track()  # no rival: the next answer could not be weighed against anything

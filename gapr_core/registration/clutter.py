@@ -24,7 +24,7 @@ from gapr_core.registration.proposals import regions
 from gapr_core.registration.proposals.regions import Region
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.registration.verification import Candidates
+from gapr_core.registration.verification import Candidates, markers, support
 from gapr_core.runtime.parallel import in_pieces, in_threads
 
 Array = NDArray[np.float64]
@@ -100,10 +100,8 @@ def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConf
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
     best = refine_on_all(best, scene, target, config, num_threads)
-    ends, others = (_moved_markers(of, scene, config.markers) for of in (best, crowd))
-    gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
-    support = (np.sqrt((gaps**2).mean(axis=2)) < config.same_pose_mm).mean(axis=1)
-    return Candidates(best.poses, 1.0 / np.maximum(best.scores, SMALLEST_SCORE), support)
+    shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
+    return Candidates(best.poses, 1.0 / np.maximum(best.scores, SMALLEST_SCORE), shares)
 
 
 def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Pool:
@@ -188,11 +186,5 @@ def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
 
 def _best_distinct(pool: Pool, scene: Scene, config: ClutterConfig, most: int) -> Pool:
     ranked = np.argsort(-pool.scores, kind="stable")
-    kept = distinct(_moved_markers(pool, scene, config.markers), ranked, config.same_pose_mm, most)
+    kept = distinct(markers(pool.poses, scene.source, config.markers), ranked, config.same_pose_mm, most)
     return Pool(pool.poses[kept], pool.region[kept], pool.scores[kept])
-
-
-def _moved_markers(pool: Pool, scene: Scene, count: int) -> Array:
-    """(K, count, 3) the same spread source points under every pose."""
-    markers = scene.source.subset(count)
-    return np.asarray(np.einsum("kij,nj->kni", pool.poses[:, :3, :3], markers) + pool.poses[:, None, :3, 3])

@@ -51,10 +51,14 @@ def verify(
     poses = _distinct(poses, scores, source, config, config.final_poses)[0]
     poses, scores = refine_many(poses, source.points, target, np.linspace(*config.final_limits_mm), num_threads)
     poses, scores = _distinct(poses, scores, source, config, config.final_poses)
-    ends, others = (_markers(T, source, config.markers) for T in (poses, crowd))
+    return Candidates(poses, scores, support(poses, crowd, source, config.markers, config.same_pose_mm))
+
+
+def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same_pose_mm: float) -> Array:
+    """(K,) share of the crowd (M, 4, 4) within `same_pose_mm` of each pose (K, 4, 4), over `count` markers."""
+    ends, others = (markers(T, source, count) for T in (poses, crowd))
     gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
-    support = (np.sqrt((gaps**2).mean(axis=2)) < config.same_pose_mm).mean(axis=1)
-    return Candidates(poses, scores, support)
+    return np.asarray((np.sqrt((gaps**2).mean(axis=2)) < same_pose_mm).mean(axis=1))
 
 
 def _distinct(
@@ -62,10 +66,10 @@ def _distinct(
 ) -> tuple[Array, Array]:
     """The best poses, none within `same_pose_mm` (root mean square over the markers) of a better one."""
     ranked = np.argsort(scores, kind="stable")
-    kept = distinct(_markers(poses, source, config.markers), ranked, config.same_pose_mm, most)
+    kept = distinct(markers(poses, source, config.markers), ranked, config.same_pose_mm, most)
     return poses[kept], scores[kept]
 
 
-def _markers(poses: Array, source: PreparedSource, count: int) -> Array:
-    """(K, count, 3) the same spread source points under every pose."""
-    return np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(count)) + poses[:, None, :3, 3]
+def markers(poses: Array, source: PreparedSource, count: int) -> Array:
+    """(K, min(count, N), 3) the same spread points of a source (N, 3) under poses (K, 4, 4), mm, target frame."""
+    return np.asarray(np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(count)) + poses[:, None, :3, 3])

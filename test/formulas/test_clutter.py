@@ -92,12 +92,6 @@ def test_the_best_of_each_group_are_kept_in_order(scene):
     assert places(apart.poses) == [1.9, 30.0, 0.0]
 
 
-def test_poses_are_compared_by_as_many_spread_points(scene):
-    T = se3.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-    found = clutter._moved_markers(Pool(np.array([T]), np.zeros(1, dtype=int), np.zeros(1)), scene, 5)
-    assert found[0] == pytest.approx(se3.apply(T, scene.source.points[scene.source.order[:5]]))
-
-
 def test_the_first_ranking_is_rough(scene, target, scored):
     found = clutter.rank_roughly(pool_of(0.0, 30.0, 9.0, 16.0), scene, target, CONFIG, 1)
     assert places(found.poses) == [9.0, 16.0, 0.0] and found.scores == pytest.approx([0.49, 0.44, 0.4])

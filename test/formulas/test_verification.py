@@ -107,7 +107,7 @@ def test_support_counts_the_poses_that_the_middle_stage_brought_within_the_dista
 
 def test_a_pose_is_compared_by_the_same_spread_points(source):
     T = se3.exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-    markers = verification._markers(np.array([np.eye(4), T]), source, 16)
+    markers = verification.markers(np.array([np.eye(4), T]), source, 16)
     some = source.subset(16)
     assert markers[0] == pytest.approx(some) and markers[1] == pytest.approx(se3.apply(T, some))
 

@@ -14,7 +14,7 @@ from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.clutter import Scene
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.features import of_another_bone
+from gapr_core.registration.features import of_the_fit
 from gapr_core.registration.free_space import Visible
 from gapr_core.registration.refinement import Fit, refine_fully
 from gapr_core.registration.source import PreparedSource
@@ -119,25 +119,11 @@ def measure(
     config: RegistrarConfig,
 ) -> dict[str, float]:
     """The features behind the confidence in a scene (`features.SCENE_FEATURES`); every one is finite."""
-    fit, part = explained.fit, explained.source
+    fit, noise_mm = explained.fit, scene.source.noise_mm
     seen = clutter.seen_of(fit.T[None], scene, target, config.clutter)
-    inlier = fit.weights > 0.0
-    agreement = np.abs(np.einsum("ni,ni->n", part.normals @ fit.T[:3, :3].T, fit.gradients))
-    reach_mm = np.linalg.norm(part.points - part.points.mean(axis=0), axis=1).max()
-    return _visible_features(seen, candidates, target) | {
-        "log_sigma": float(np.log(fit.sigma_mm)),
-        "log_excess": float(np.log(fit.sigma_mm / max(scene.source.noise_mm, 0.1))),
-        "smooth_misfit": uncertainty.smooth_mm,
-        "short_misfit": uncertainty.short_mm,
-        "inlier_ratio": explained.share,
-        "support": float(candidates.support[0]),
-        "log_shift_sd": float(np.log(uncertainty.largest_shift_mm)),
-        "log_turn_sd": float(np.log(uncertainty.largest_turn_deg)),
-        "normal_agreement": float(np.median(agreement[inlier])) if inlier.any() else 0.0,
-        "log_points": float(np.log(len(part.points))),
-        "extent": float(reach_mm / target.half_extent_mm),
-        **of_another_bone(fit, part, target, config),
-    }
+    visible = _visible_features(seen, candidates, target)
+    shared = of_the_fit(fit, candidates, uncertainty, explained.source, noise_mm, target, config)
+    return visible | shared | {"inlier_ratio": explained.share}
 
 
 def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:

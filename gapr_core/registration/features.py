@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
+from gapr_core.geometry.extent import half_extent_mm
 from gapr_core.registration import mirror, sensor
 from gapr_core.registration.bias_field import equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
@@ -38,6 +39,7 @@ SIGNS = {
     "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
     "frames_log_odds": 1, "shared_misfit": -1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
+LEAST_NOISE_MM = 0.1  # a source without roughness counts as so rough
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
 
 
@@ -60,24 +62,36 @@ def measure(
         config: how a mirrored source is refined, and how far a smooth bias reaches.
     """
     second = candidates.scores[1] if len(candidates.scores) > 1 else 2.0 * candidates.scores[0]
+    return of_the_fit(fit, candidates, uncertainty, source, source.noise_mm, target, config) | {
+        "inlier_ratio": float((fit.weights > 0.0).mean()),
+        "residual": float(np.sqrt(candidates.scores[0])),
+        "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
+    }
+
+
+def of_the_fit(
+    fit: Fit,
+    candidates: Candidates,
+    uncertainty: PoseUncertainty,
+    source: PreparedSource,
+    noise_mm: float,
+    target: PreparedTarget,
+    config: RegistrarConfig,
+) -> dict[str, float]:
+    """What `FEATURES` and `SCENE_FEATURES` share; `source` is what was fitted, `noise_mm` that of the whole cloud."""
     inlier = fit.weights > 0.0
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
     return {
         "log_sigma": float(np.log(fit.sigma_mm)),
-        "log_excess": float(np.log(fit.sigma_mm / max(source.noise_mm, 0.1))),
+        "log_excess": float(np.log(fit.sigma_mm / max(noise_mm, LEAST_NOISE_MM))),
         "smooth_misfit": uncertainty.smooth_mm,
         "short_misfit": uncertainty.short_mm,
-        "inlier_ratio": float(inlier.mean()),
-        "residual": float(np.sqrt(candidates.scores[0])),
-        "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
         "support": float(candidates.support[0]),
         "log_shift_sd": float(np.log(uncertainty.largest_shift_mm)),
         "log_turn_sd": float(np.log(uncertainty.largest_turn_deg)),
         "normal_agreement": float(np.median(agreement[inlier])) if inlier.any() else 0.0,
         "log_points": float(np.log(len(source.points))),
-        "extent": float(
-            np.linalg.norm(source.points - source.points.mean(axis=0), axis=1).max() / target.half_extent_mm
-        ),
+        "extent": half_extent_mm(source.points) / target.half_extent_mm,
         **of_another_bone(fit, source, target, config),
     }
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from gapr_core import clouds
 from gapr_core.config import TargetConfig
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.geometry import distance_field, quadrics, sampling, visibility
+from gapr_core.geometry import distance_field, extent, quadrics, sampling, visibility
 from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.surface import Surface
 
@@ -67,14 +67,9 @@ class PreparedTarget:
         return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
 
     @property
-    def centroid(self) -> Array:
-        """(3,) mean of the points, mm."""
-        return np.asarray(self.points.mean(axis=0))
-
-    @property
     def half_extent_mm(self) -> float:
-        """Largest distance of a point to the centroid: the one scale of a pair (method, section 2)."""
-        return float(np.linalg.norm(self.points - self.centroid, axis=1).max())
+        """Largest distance of a point to the centroid: the one scale of a pair."""
+        return extent.half_extent_mm(self.points)
 
 
 def prepare(

@@ -9,7 +9,7 @@ import tiny
 
 from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import explained
+from gapr_core.registration import explained, features
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.explained import Explained
@@ -199,7 +199,7 @@ def test_every_feature_of_a_scene_says_what_its_name_says(monkeypatch):
     scene, asked = SimpleNamespace(source=SimpleNamespace(noise_mm=0.3)), []
     seen = Visible(*(np.array([x]) for x in (0.2, 0.05, 0.4)), CONFIG.clutter.free_space)
     monkeypatch.setattr(explained.clutter, "seen_of", lambda *words: asked.append(words) or seen)
-    monkeypatch.setattr(explained, "of_another_bone", lambda *words: dict.fromkeys(OTHER_BONE, 0.125))
+    monkeypatch.setattr(features, "of_another_bone", lambda *words: dict.fromkeys(OTHER_BONE, 0.125))
     found = explained.measure(Explained(part, members, fit), candidates, known, scene, bone, CONFIG)
     assert set(found) == set(SCENE_FEATURES) and np.array_equal(asked[0][0], T[None])
     assert found["log_sigma"] == pytest.approx(np.log(0.5)) and found["log_excess"] == pytest.approx(np.log(0.5 / 0.3))

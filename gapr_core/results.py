@@ -125,7 +125,7 @@ class Guidance:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RegistrationResult:
     """The answer to one `register` call.
 

@@ -13,7 +13,7 @@ from gapr_core.errors import InvalidPointCloudError
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """A cloud or a triangle mesh in one frame.
 

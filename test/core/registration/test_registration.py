@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core import Registrar, RegistrarConfig, RegistrationResult, RegistrationStatus
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
@@ -159,9 +159,15 @@ def test_a_mesh_and_its_cloud_give_the_same_pose(registrar, femur, pairs):
     assert rmse(registrar.register(pair.source, registrar.prepare(shifted)).T_target_source, pair) < 0.5
 
 
-def test_a_refusal_carries_no_pose_and_a_pose_no_refusal():
-    from gapr_core import RegistrationResult
+@pytest.mark.parametrize(
+    "make", [lambda: RegistrationResult(RegistrationStatus.OK, np.eye(4)), lambda: Surface(np.eye(3))]
+)
+def test_results_and_surfaces_are_equal_to_themselves_alone(make):
+    one, other = make(), make()
+    assert one == one and one != other and len({one, other}) == 2
 
+
+def test_a_refusal_carries_no_pose_and_a_pose_no_refusal():
     with pytest.raises(ValueError, match="status OK"):
         RegistrationResult(RegistrationStatus.AMBIGUOUS, np.eye(4))
     with pytest.raises(ValueError, match="no pose to apply"):

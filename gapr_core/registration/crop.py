@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.clouds import finite_points
+from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
@@ -36,12 +37,12 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
 
     Raises:
         ConfigError: when a corner is not (3,) or `lowest` is not below `highest`.
-        InvalidPointCloudError: when the points are not (N, 3).
+        InvalidPointCloudError: when the points are not (N, 3) numbers.
     """
     low, high = np.asarray(lowest, dtype=np.float64), np.asarray(highest, dtype=np.float64)
     if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
         raise ConfigError("two corners x y z, the lowest first", f"{low} and {high}", "correct the box")
-    points = _cloud(points)
+    points = finite_points(points)
     placed = se3.apply(T_box_points, points)
     return np.asarray(points[((placed >= low) & (placed <= high)).all(axis=1)])
 
@@ -60,18 +61,10 @@ def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: Findable
 
     Raises:
         ConfigError: for a margin that is not positive.
-        InvalidPointCloudError: when the points are not (N, 3).
+        InvalidPointCloudError: when the points are not (N, 3) numbers.
     """
     if not margin_mm > 0.0:
         raise ConfigError("a positive margin in mm", f"{margin_mm:g}", "30 mm suits a bone that moves slowly")
-    cloud = _cloud(points)
-    cloud = cloud[np.isfinite(cloud).all(axis=1)]
-    gaps = target.tree.query(se3.apply(T_target_source, cloud), distance_upper_bound=margin_mm)[0]
-    return np.asarray(cloud[np.isfinite(gaps)])
-
-
-def _cloud(points: ArrayLike) -> Array:
-    cloud = np.asarray(points, dtype=np.float64)
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise InvalidPointCloudError("points (N, 3)", f"shape {cloud.shape}", "pass one x y z a row, in mm")
-    return cloud
+    points = finite_points(points)
+    gaps = target.tree.query(se3.apply(T_target_source, points), distance_upper_bound=margin_mm)[0]
+    return np.asarray(points[np.isfinite(gaps)])

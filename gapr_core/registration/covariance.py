@@ -180,14 +180,12 @@ def smooth_misfits_mm(
 
     Args:
         fit: the residuals.
-        neighbours: of how many points an average is taken; a figure for each count.
+        neighbours: of how many points an average is taken, one result for each; with as few inliers, `fit.sigma_mm`.
         around: (N, k) indices of each point's nearest ones, itself first, inliers or not, where they are known; a point
             that finds too few inliers among them is looked up.
     """
     inlier = fit.weights > 0.0
     points, signed = fit.moved[inlier], fit.signed_mm[inlier]
-    if len(points) <= min(neighbours):
-        return (fit.sigma_mm,) * len(neighbours)
     known = np.empty((len(inlier), 0), dtype=np.int64) if around is None else around
 
     def misfit_mm(count: int) -> float:

@@ -50,6 +50,10 @@ class Registrar:
         calibrations: the confidence model of each round; the shipped ones when not given.
         scene_calibration: the confidence model of a source with a viewpoint; the shipped one when not given.
         precision: what corrects the predicted errors; the shipped one when not given.
+
+    Raises:
+        ConfigError: no proposer, or not one calibration for each.
+        MethodUnavailableError: no confidence model ships for a proposer, and none was given.
     """
 
     name = "gapr"
@@ -72,7 +76,7 @@ class Registrar:
         self._scene_calibration = scene_calibration
         if len(self.calibrations) != len(self.proposers):
             given = f"{len(self.calibrations)} for {len(self.proposers)} proposers"
-            raise ConfigError("one confidence model for each proposer", given, "pass as many")
+            raise ConfigError("one confidence model for each proposer", given, "pass as many calibrations as proposers")
         self.precision = precision or Precision.load()
 
     @classmethod
@@ -100,7 +104,7 @@ class Registrar:
         """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
         prepared = targets.prepare(target, units, self.config.target, self.config.num_threads)
         for proposer in self.proposers:
-            proposer.prepare(prepared)  # and `both_cortices` when a source first follows both
+            proposer.prepare(prepared)  # `both_cortices` gets its share when a source first follows both
         return prepared
 
     def register(
@@ -119,7 +123,8 @@ class Registrar:
             viewpoint: (3,) mm, source frame: where the camera was, if there was one.
 
         Raises:
-            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm.
+            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; an
+                `initial` that is no rigid pose; a `viewpoint` that is no point, or lies in the cloud.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
@@ -152,7 +157,8 @@ class Registrar:
         if viewpoint is None:
             assessment = self._in_rounds(prepared, target, start, clock)
         else:
-            assessment = self._in_scene(prepared, target, start, _place(viewpoint), clock)
+            eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
+            assessment = self._in_scene(prepared, target, start, eye, clock)
         if assessment is None:
             return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no hypothesis was proposed")
         if viewpoint is None and target.both_cortices is not None and cortices.follows_both(assessment, self.config):
@@ -230,17 +236,21 @@ def _search(config: RegistrarConfig) -> NormalAlignedSearch:
     return NormalAlignedSearch(config.search, config.num_threads)
 
 
-def _place(viewpoint: ArrayLike) -> Array:
-    place = np.asarray(viewpoint, dtype=np.float64)
-    if place.shape != (3,) or not np.isfinite(place).all():
-        raise InvalidPointCloudError("a finite (3,) viewpoint", f"shape {place.shape}", "pass x, y, z in mm")
-    return place
+def _finite(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> Array:
+    """The values as an array of this shape.
+
+    Raises:
+        InvalidPointCloudError: another shape, or a value that is not finite.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        given = f"shape {array.shape}" if array.shape != shape else str(array.tolist())
+        raise InvalidPointCloudError(f"a finite {shape} {what}", given, how)
+    return array
 
 
 def _rigid(pose: ArrayLike) -> Array:
-    T = np.asarray(pose, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InvalidPointCloudError("a finite (4, 4) initial pose", f"shape {T.shape}", "pass T_target_source in mm")
+    T = _finite(pose, (4, 4), "initial pose", "pass T_target_source in mm")
     R = T[:3, :3]
     if np.abs(R.T @ R - np.eye(3)).max() > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
         given = f"a matrix whose rotation part has determinant {np.linalg.det(R):.3g}"

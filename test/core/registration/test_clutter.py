@@ -90,9 +90,9 @@ def test_a_refused_cloud_that_lies_on_the_bone_is_not_called_clutter(target, fem
     assert not result.ok and result.status is not RegistrationStatus.CLUTTER
 
 
-@pytest.mark.parametrize("viewpoint", [[0.0, 1.0], [np.nan, 0.0, 0.0]])
-def test_a_viewpoint_that_is_no_place_is_refused(method, target, scene, viewpoint):
-    with pytest.raises(InvalidPointCloudError, match="viewpoint"):
+@pytest.mark.parametrize(("viewpoint", "given"), [([0.0, 1.0], r"shape \(2,\)"), ([np.nan, 0.0, 0.0], "nan, 0.0, 0.0")])
+def test_a_viewpoint_that_is_no_place_is_refused(method, target, scene, viewpoint, given):
+    with pytest.raises(InvalidPointCloudError, match=f"viewpoint; got .*{given}"):
         method.register(scene[0], target, viewpoint=viewpoint)
 
 

@@ -149,7 +149,7 @@ class Registrar:
         """What `register` knows before `min_confidence` and `max_tre_mm` decide: for calibration and research."""
         clock = clock or Clock()
         target = offset_surface(target, self.config.sensor)
-        prepared = sources.prepare(source, self.config.source)
+        prepared = sources.prepare(source, self.config.source, self.config.num_threads)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
             return prepared

@@ -77,8 +77,8 @@ class PreparedSource:
         return self.points[self.order[:count]]
 
 
-def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSource | Refusal:
-    """Clean, thin and describe a source (N, 3), mm.
+def prepare(source: ArrayLike, config: SourceConfig | None = None, num_threads: int = 1) -> PreparedSource | Refusal:
+    """Clean, thin and describe a source (N, 3), mm, in so many threads; 0 for all cores.
 
     Returns:
         The prepared source, or why there is too little of it.
@@ -90,7 +90,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
     points = clouds.finite_points(source)
     if len(points) > config.most_raw_points:
         points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
-    points, found = _looked_up(sampling.distinct(points), config)
+    points, found = _looked_up(sampling.distinct(points), config, num_threads)
     if len(points) < config.fewest_points:
         return Refusal(
             RegistrationStatus.TOO_FEW_POINTS,
@@ -104,7 +104,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None) -> PreparedSo
         return Refusal(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
     if found is None:
         points = points[sampling.thin(points, config.most_points)]
-    return describe(points, config, found)
+    return describe(points, config, found, num_threads)
 
 
 def without_isolated(points: Array, config: SourceConfig) -> Array:
@@ -125,7 +125,7 @@ def _has_companions(gaps: Array, config: SourceConfig) -> NDArray[np.bool_]:
     return gaps <= max(config.isolated_mm, config.isolated_gaps * float(np.median(gaps)))
 
 
-def _looked_up(points: Array, config: SourceConfig) -> tuple[Array, Found | None]:
+def _looked_up(points: Array, config: SourceConfig, num_threads: int) -> tuple[Array, Found | None]:
     """`without_isolated`, and the neighbours of what stays where one look-up gives both; else None.
 
     A point whose neighbours all stay keeps them.
@@ -135,28 +135,29 @@ def _looked_up(points: Array, config: SourceConfig) -> tuple[Array, Found | None
         return without_isolated(points, config), None
     if config.companions >= count:
         return without_isolated(points, config), None
-    gaps, around = cKDTree(points).query(points, k=count)
+    gaps, around = quadrics.nearest(points, count, num_threads=num_threads)
     stays = _has_companions(gaps[:, config.companions], config)
     if stays.all():
         return points, (gaps, around)
     if _around_count(int(stays.sum()), config) != count:
         return points[stays], None
     points, number = points[stays], np.cumsum(stays) - 1
-    lost = ~stays[around].all(axis=1)[stays]
+    lost = ~np.asarray(stays[around].all(axis=1))[stays]
     gaps, around = gaps[stays], number[around[stays]]
     gaps[lost], around[lost] = cKDTree(points).query(points[lost], k=count)
     return points, (gaps, around)
 
 
-def describe(points: Array, config: SourceConfig, found: Found | None = None) -> PreparedSource:
+def describe(points: Array, config: SourceConfig, found: Found | None = None, num_threads: int = 1) -> PreparedSource:
     """Normals, neighbours and order of points (N, 3), mm, that are clean and thin already.
 
     Args:
         points: (N, 3), mm.
         config: how many neighbours give a normal.
         found: distances and indices of the neighbours, where they are known.
+        num_threads: that look them up; 0 for all cores.
     """
-    gaps, around = found or cKDTree(points).query(points, k=_around_count(len(points), config))
+    gaps, around = found or quadrics.nearest(points, _around_count(len(points), config), num_threads=num_threads)
     patches = np.ascontiguousarray(around[:, : _neighbour_count(len(points), config)])
     normals, flatness_mm, means = fit_planes(points, patches)
     isolation = np.linalg.norm(points - means, axis=1) / np.maximum(gaps[:, patches.shape[1] - 1], 1e-9)

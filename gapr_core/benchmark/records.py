@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -55,7 +55,8 @@ def append(path: Path, record: Record) -> None:
 
 def write(path: Path, records: Iterable[Record]) -> None:
     """Write all lines as one whole file."""
-    files.write_text(path, "".join(json.dumps(record.to_json(), allow_nan=False) + "\n" for record in records))
+    with files.replacing(path) as scratch, scratch.open("w", encoding="utf-8") as file:
+        file.writelines(json.dumps(record.to_json(), allow_nan=False) + "\n" for record in records)
 
 
 def read(path: Path) -> list[Record]:
@@ -69,9 +70,13 @@ def read(path: Path) -> list[Record]:
 
 def discard_cut_line(path: Path) -> None:
     """Take a last line that was cut off out of the file, so that the next record begins a line."""
-    whole = "".join(f"{line}\n" for line in _whole_lines(path))
-    if path.is_file() and len(whole.encode()) < path.stat().st_size:
-        files.write_text(path, whole)
+    if not path.is_file():
+        return
+    try:
+        with path.open("r+b") as file:
+            file.truncate(sum(len(line) for line in file if line.endswith(b"\n")))
+    except OSError as error:
+        raise files.unwritable(path, error) from error
 
 
 def done(records: Iterable[Record], hashes: dict[str, str], settings: dict[str, str]) -> set[tuple[str, str]]:
@@ -127,11 +132,11 @@ def read_plan(folder: Path) -> Plan:
         raise ConfigError("a plan of gapr benchmark", f"{path} ({error})", "run the benchmark again") from error
 
 
-def _whole_lines(path: Path) -> list[str]:
-    if not path.is_file():
-        return []
-    text = path.read_text(encoding="utf-8", errors="replace")
-    return text[: text.rfind("\n") + 1].splitlines()
+def _whole_lines(path: Path) -> Iterator[str]:
+    """One line at a time: the text of a long run is as large as its records."""
+    if path.is_file():
+        with path.open(encoding="utf-8", errors="replace") as file:
+            yield from (line[:-1] for line in file if line.endswith("\n"))
 
 
 def _record(line: str, number: int, path: Path) -> Record:

@@ -6,6 +6,7 @@ import logging
 import multiprocessing
 import os
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -45,13 +46,13 @@ def run(tasks: Sequence[Task], jobs: int = 1, threads: int = 1) -> Iterator[Reco
     When one dies (a crash inside a library), what was under way is tried again, each task alone; one that dies then
     as well is recorded as a failure.
     """
-    waiting = list(tasks)
+    waiting = deque(tasks)
     while waiting:
         lost: list[Task] = []
         yield from _run_pool(waiting, jobs, threads, lost)
         for task in lost:
             deadly: list[Task] = []
-            yield from _run_pool([task], 1, threads, deadly)
+            yield from _run_pool(deque([task]), 1, threads, deadly)
             if deadly:
                 yield _failure(task, load_pair(task.path), "the process died")
 
@@ -70,7 +71,7 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Iterator[Record]:
             raise outcome
 
 
-def _run_pool(waiting: list[Task], jobs: int, threads: int, lost: list[Task]) -> Iterator[Record]:
+def _run_pool(waiting: deque[Task], jobs: int, threads: int, lost: list[Task]) -> Iterator[Record]:
     """Take tasks off `waiting` until it is empty or the pool breaks; what was under way then goes to `lost`."""
     context = multiprocessing.get_context("spawn")
     under_way: dict[Future[Record], Task] = {}
@@ -79,7 +80,7 @@ def _run_pool(waiting: list[Task], jobs: int, threads: int, lost: list[Task]) ->
             while waiting or under_way:
                 while waiting and len(under_way) < jobs:
                     under_way[pool.submit(run_task, waiting[0])] = waiting[0]
-                    waiting.pop(0)  # only now: a pool that is broken takes no task
+                    waiting.popleft()  # only now: a pool that is broken takes no task
                 for future in wait(under_way, return_when=FIRST_COMPLETED).done:
                     yield future.result()
                     del under_way[future]

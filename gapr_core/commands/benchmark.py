@@ -108,12 +108,7 @@ def benchmark(
     config = config or RegistrarConfig()
     if config != RegistrarConfig() and not any(name in known_methods.OWN for name in methods):
         raise ConfigError(f"settings with one of {', '.join(known_methods.OWN)}", ", ".join(methods), "leave them out")
-    known = records.read(out / records.FILE)
-    all_methods = list(dict.fromkeys([*(record.method for record in records.sort(known, methods)), *methods]))
-    plan = _plan(pairs, paths, all_methods, threads, ours)
-    done = records.done(known, plan.pairs, {name: known_methods.settings_of(name, config) for name in methods})
-    records.write_plan(out, plan)
-    records.discard_cut_line(out / records.FILE)
+    plan, done = _begin(pairs, paths, methods, out, threads, ours, config)
     chosen = [path.resolve() for path in paths[shard[0] - 1 :: shard[1]]]
     tasks = [runner.Task(path, method, config) for path in chosen for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
@@ -126,12 +121,32 @@ def benchmark(
     return write(out, plan)
 
 
+def _begin(
+    pairs: Path, paths: Sequence[Path], methods: Sequence[str], out: Path, threads: int, ours: str | None,
+    config: RegistrarConfig,
+) -> tuple[Plan, set[tuple[str, str]]]:  # fmt: skip
+    """Write the plan; hand it back with what an earlier run has done. Its records do not stay in memory."""
+    known = records.read(out / records.FILE)
+    all_methods = list(dict.fromkeys([*(record.method for record in records.sort(known, methods)), *methods]))
+    plan = _plan(pairs, paths, all_methods, threads, ours)
+    done = records.done(known, plan.pairs, {name: known_methods.settings_of(name, config) for name in methods})
+    records.write_plan(out, plan)
+    records.discard_cut_line(out / records.FILE)
+    return plan, done
+
+
 def merge(folders: Sequence[Path], out: Path) -> list[Row]:
     """Join the results of shards of one run.
 
     Raises:
         ConfigError: a folder that is no output of a benchmark, or shards of different pairs or settings.
     """
+    _join(folders, out)
+    return write(out, records.read_plan(out))
+
+
+def _join(folders: Sequence[Path], out: Path) -> None:
+    """The records and the plan of all shards in `out`."""
     plans = [records.read_plan(folder) for folder in folders]
     pairs: dict[str, str] = {}
     for folder, plan in zip(folders, plans, strict=True):
@@ -144,7 +159,6 @@ def merge(folders: Sequence[Path], out: Path) -> list[Row]:
     records.done(joined, pairs, {record.method: record.settings for record in reversed(joined)})
     records.write(out / records.FILE, records.sort(joined, methods))
     records.write_plan(out, replace(plans[0], pairs=pairs, methods=methods, command=_command()))
-    return write(out, records.read_plan(out))
 
 
 def write(out: Path, plan: Plan) -> list[Row]:

@@ -101,8 +101,7 @@ def write_pairs(
     out = Path(out)
     begin(recipe, out)
     plan = list(_plan(recipe, bones))
-    others = [specimen for found in bones.values() for specimen in found]
-    shared = others, out.resolve()
+    shared = bones, out.resolve()  # goes to each worker once; a job names its specimen
     here = (_pair_entry(job, shared) for job in plan)
     entries = cluster.results(dask, _pair_entry, plan, shared) if dask else here
     found = {e["name"]: e for e in tqdm(entries, desc="pairs", unit="pair", total=len(plan), disable=None)}
@@ -139,9 +138,12 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Job:
+    """One pair to draw: of specimen `number` of the bone's; `turn` counts the pairs of a bone and protocol."""
+
     name: str
     protocol: str
-    specimen: Specimen
+    bone: str
+    number: int
     seed: int
     turn: int
 
@@ -157,16 +159,16 @@ def _plan(recipe: Recipe, bones: dict[str, list[Specimen]]) -> Iterator[_Job]:
             if not bones[bone]:
                 raise ConfigError(f"somebody's {bone} in split {recipe.split}", "nobody's", "choose another split")
             for index in range(recipe.count):
-                specimen = bones[bone][index % len(bones[bone])]
-                name = f"{protocol}_{bone}_{index:04d}"
-                yield _Job(name, protocol, specimen, 1_000_000 * recipe.seed + index, index)
+                name, number = f"{protocol}_{bone}_{index:04d}", index % len(bones[bone])
+                yield _Job(name, protocol, bone, number, 1_000_000 * recipe.seed + index, index)
 
 
-def _pair_entry(job: _Job, shared: tuple[list[Specimen], Path]) -> dict[str, Any]:
-    others, out = shared
+def _pair_entry(job: _Job, shared: tuple[dict[str, list[Specimen]], Path]) -> dict[str, Any]:
+    bones, out = shared
     path = out / f"{job.name}.npz"
     if not path.is_file():
-        save_pair(path, make_pair(job.protocol, job.specimen, job.seed, others, job.turn))
+        others = [specimen for found in bones.values() for specimen in found]
+        save_pair(path, make_pair(job.protocol, bones[job.bone][job.number], job.seed, others, job.turn))
     pair = load_pair(path)
     entry = {"name": job.name, "bone": pair.bone, "person": pair.person, "protocol": pair.protocol}
     return {**entry, "cohort": pair.metadata.get("cohort", ""), "sha256": pair_hash(pair)}

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[Any]
+DRAWN_AT_ONCE = 4_000_000  # labels, 32 MB
 
 
 def interval(
@@ -36,17 +37,22 @@ def interval(
     if values.size == 0:
         return float("nan"), float("nan")
     labels = np.arange(len(values)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
-    draws = np.random.default_rng(seed).integers(labels.max() + 1, size=(resamples, labels.max() + 1))
-    estimates = _means(values, labels, draws) if statistic is None else _each(values, labels, draws, statistic)
+    estimate = _mean(values, labels) if statistic is None else _each(values, labels, statistic)
+    rng, count = np.random.default_rng(seed), int(labels.max()) + 1
+    rows = max(1, DRAWN_AT_ONCE // count)  # the numbers are those drawn all at once, which takes GB for many groups
+    pieces = [min(rows, resamples - first) for first in range(0, resamples, rows)]
+    estimates = np.concatenate([estimate(rng.integers(count, size=(piece, count))) for piece in pieces])
     low, high = np.percentile(estimates, [50 * (1 - level), 50 * (1 + level)])
     return float(low), float(high)
 
 
-def _means(values: Array, labels: Array, draws: Array) -> Array:
+def _mean(values: Array, labels: Array) -> Callable[[Array], Array]:
+    """(resamples,) means of (resamples, groups) labels."""
     sums, counts = np.bincount(labels, weights=values), np.bincount(labels)
-    return np.asarray(sums[draws].sum(axis=1) / counts[draws].sum(axis=1))
+    return lambda draws: np.asarray(sums[draws].sum(axis=1) / counts[draws].sum(axis=1))
 
 
-def _each(values: Array, labels: Array, draws: Array, statistic: Callable[[Array], float]) -> Array:
-    members = [values[labels == label] for label in range(labels.max() + 1)]
-    return np.array([statistic(np.concatenate([members[k] for k in draw])) for draw in draws])
+def _each(values: Array, labels: Array, statistic: Callable[[Array], float]) -> Callable[[Array], Array]:
+    """The same of another statistic."""
+    members = np.split(values[np.argsort(labels, kind="stable")], np.cumsum(np.bincount(labels))[:-1])
+    return lambda draws: np.array([statistic(np.concatenate([members[k] for k in draw])) for draw in draws])

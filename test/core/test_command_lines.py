@@ -142,7 +142,7 @@ def test_a_full_disk_is_one_line(folder, capsys, monkeypatch):
     from gapr_core.benchmark import runner
 
     monkeypatch.setattr(runner, "_methods", {})
-    monkeypatch.setattr(runner, "_run_pool", lambda tasks, *_: (runner.run_task(tasks.pop(0)) for _ in list(tasks)))
+    monkeypatch.setattr(runner, "_run_pool", lambda tasks, *_: (runner.run_task(tasks.popleft()) for _ in list(tasks)))
     assert run("benchmark --methods icp --pairs pairs --out full") == 1
     assert "No space left" in capsys.readouterr().err
 

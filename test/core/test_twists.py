@@ -1,5 +1,7 @@
 """Twists, NEES and the Cramer-Rao bound against simulation."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,7 +9,7 @@ from scipy.stats import chi2
 
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist, motion_jacobians, nees, predicted_rmse_mm
-from gapr_core.metrics import cramer_rao
+from gapr_core.metrics import bootstrap, cramer_rao
 from gapr_core.metrics.bootstrap import interval
 
 
@@ -172,6 +174,24 @@ def test_bootstrap_of_a_mean_has_the_width_of_the_normal_approximation():
     people = np.arange(400) // 4
     assert interval(values, people, np.mean) == pytest.approx(interval(values, people))
     assert interval(values, statistic=np.median) != (low, high)
+
+
+@pytest.mark.parametrize("statistic", [None, np.median])
+@pytest.mark.parametrize("groups", [None, np.arange(90) % 7])
+def test_an_interval_does_not_depend_on_how_many_resamples_are_drawn_at_once(monkeypatch, statistic, groups):
+    values = np.random.default_rng(11).normal(size=90)
+    whole = interval(values, groups, statistic, resamples=301)
+    monkeypatch.setattr(bootstrap, "DRAWN_AT_ONCE", 1000)
+    assert interval(values, groups, statistic, resamples=301) == whole
+
+
+def test_an_interval_of_many_values_needs_little_memory():
+    """All resamples at once are 2000 x 20 000 labels, and as many values: 960 MB."""
+    tracemalloc.start()
+    interval(np.arange(20_000) % 3)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 200e6
 
 
 def test_the_interval_of_two_values_follows_from_the_four_resamples():

@@ -45,4 +45,4 @@ def no_report(monkeypatch):
 def in_process(monkeypatch, no_report):
     """No worker processes, which cost seconds each; the tests about processes do without this."""
     monkeypatch.setattr(runner, "_methods", {})
-    monkeypatch.setattr(runner, "_run_pool", lambda tasks, *_: (runner.run_task(tasks.pop(0)) for _ in list(tasks)))
+    monkeypatch.setattr(runner, "_run_pool", lambda tasks, *_: (runner.run_task(tasks.popleft()) for _ in list(tasks)))

@@ -4,10 +4,13 @@ import argparse
 import importlib
 import json
 import shutil
+import tracemalloc
+import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmark_cases import make_pair
+from benchmark_cases import make_pair, ok, record
 
 from gapr_core.benchmark import methods as known_methods
 from gapr_core.benchmark import records, runner
@@ -166,6 +169,44 @@ def test_a_damaged_line_in_the_middle_is_no_silent_loss(tmp_path):
     (tmp_path / records.FILE).write_text('{"a": 1}\n{"a": \n{"a": 3}\n')
     with pytest.raises(ConfigError, match="damaged"):
         records.read(tmp_path / records.FILE)
+
+
+def test_reading_and_writing_records_needs_no_more_memory_than_they_do(tmp_path):
+    each = record(make_pair(0), ok(np.eye(4)))
+    records.write(tmp_path / records.FILE, (replace(each, reason=f"{number:09d}" * 1000) for number in range(300)))
+    tracemalloc.start()
+    found = records.read(tmp_path / records.FILE)
+    kept, most = tracemalloc.get_traced_memory()
+    tracemalloc.reset_peak()
+    records.write(tmp_path / records.FILE, found)
+    wrote = tracemalloc.get_traced_memory()[1] - kept
+    tracemalloc.stop()
+    assert most < 1.3 * kept and wrote < 0.3 * kept
+
+
+def test_records_of_earlier_runs_do_not_stay_in_memory(pairs, fakes, tmp_path, in_process, monkeypatch):
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "a")
+    read, run, known, alive = records.read, runner.run, [], []
+
+    def noted(path):
+        found = read(path)
+        known.extend(map(weakref.ref, found))
+        return found
+
+    def looking(call):
+        def look(*arguments):
+            alive.append(sum(each() is not None for each in known))
+            known.clear()
+            return call(*arguments)
+
+        return look
+
+    monkeypatch.setattr(records, "read", noted)
+    monkeypatch.setattr(runner, "run", looking(run))
+    monkeypatch.setattr(benchmark, "write", looking(benchmark.write))
+    benchmark.benchmark(pairs, fakes("turned"), tmp_path / "a")
+    benchmark.merge([tmp_path / "a"], tmp_path / "b")
+    assert alive == [0, 0, 0]
 
 
 @pytest.fixture

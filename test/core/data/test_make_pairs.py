@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from argparse import ArgumentParser
 
 import numpy as np
@@ -71,6 +72,20 @@ def test_the_same_seed_gives_the_same_hash_and_another_seed_another_one(tmp_path
 def test_pairs_drawn_on_a_cluster_have_the_same_hash(tmp_path, dask_address):
     one = write_pairs(RECIPE, BONES, tmp_path / "one")
     assert write_pairs(RECIPE, BONES, tmp_path / "many", dask=dask_address) == one
+
+
+def test_what_is_sent_for_a_pair_holds_no_mesh(tmp_path, monkeypatch):
+    """The meshes go to each worker once, however many pairs are drawn of them."""
+    sent = []
+
+    def results(address, call, tasks, shared):
+        for task in tasks:
+            sent.append(len(pickle.dumps(task)))
+            yield call(task, shared)
+
+    monkeypatch.setattr(make_pairs.cluster, "results", results)
+    write_pairs(RECIPE, BONES, tmp_path, dask="somewhere")
+    assert len(sent) == 12 and max(sent) < 500 < min(len(pickle.dumps(s)) for found in BONES.values() for s in found)
 
 
 @pytest.mark.parametrize("protocol", ["paper", "L2"])

@@ -16,6 +16,7 @@ from gapr_core.surface import Array, Surface, as_points
 log = logging.getLogger(__name__)
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
+BEYOND = 1e12  # no coordinate, whatever its unit, but bytes that were read as one; its square may be infinite
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
 
 
@@ -51,9 +52,9 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
 
 
 def finite_points(array: ArrayLike) -> Array:
-    """The rows of an (N, 3) array that are finite; may be empty."""
+    """The rows of an (N, 3) array that can be points: finite, and none beyond 1e12; may be empty."""
     points = as_points(array)
-    return points[np.isfinite(points).all(axis=1)]
+    return points[(np.abs(points) < BEYOND).all(axis=1)]
 
 
 def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
-from gapr_core.clouds import EXTENT_LIMITS_MM
+from gapr_core.clouds import EXTENT_LIMITS_MM, finite_points
 from gapr_core.surface import Surface
 from gapr_ros.node import wire
 from gapr_ros.node.refusal import Reason, RefusedError
@@ -19,7 +19,6 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import INPUTS, InvalidMessageError
 
 Array = NDArray[np.float64]
-BEYOND = 1e12  # no coordinate, whatever its unit, but bytes that were read as one
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
 
 
@@ -142,8 +141,7 @@ def thin(points: Array, most: int, seed: int) -> Array:
 def _finite_points(cloud: Any, cloud_type: str) -> Array:
     count = INPUTS[cloud_type].count(cloud)
     try:
-        points = INPUTS[cloud_type].points(cloud)
-        points = points[(np.abs(points) < BEYOND).all(axis=1)]
+        points = finite_points(INPUTS[cloud_type].points(cloud))
     except InvalidMessageError as error:
         raise RefusedError(Reason.BAD_FIELDS, str(error)) from error
     if count == 0:

@@ -86,7 +86,7 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceCo
     T = _looking_at(eye, points)
     seen = se3.apply(T, points)
     in_view = seen[:, 2] > config.widest_cos * np.linalg.norm(seen, axis=1)
-    if in_view.sum() < quadrics.FEWEST_NEIGHBOURS:
+    if in_view.sum() < min(quadrics.FEWEST_NEIGHBOURS, len(points)):
         raise InvalidPointCloudError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
     seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
     turned = quadrics.orient(turned, -seen)

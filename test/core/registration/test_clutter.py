@@ -96,6 +96,11 @@ def test_a_viewpoint_that_is_no_place_is_refused(method, target, scene, viewpoin
         method.register(scene[0], target, viewpoint=viewpoint)
 
 
+def test_a_few_points_in_view_of_their_camera_are_refused_without_an_error(method, target, scene):
+    result = method.register(scene[0][:9], target, viewpoint=scene[1])
+    assert not result.ok and "no hypothesis" in result.reason
+
+
 def test_normals_of_a_camera_point_to_it(scene):
     points, viewpoint, _ = scene
     facing = prepare(points).facing(viewpoint)

@@ -123,8 +123,9 @@ class Registrar:
             viewpoint: (3,) mm, source frame: where the camera was, if there was one.
 
         Raises:
-            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; an
-                `initial` that is no rigid pose; a `viewpoint` that is no point, or lies in the cloud.
+            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; a target
+                that is not prepared; an `initial` that is no rigid pose; a `viewpoint` that is no point, or lies in the
+                cloud.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
@@ -148,6 +149,9 @@ class Registrar:
     ) -> Assessment | Refusal:
         """What `register` knows before `min_confidence` and `max_tre_mm` decide: for calibration and research."""
         clock = clock or Clock()
+        if not isinstance(target, PreparedTarget):
+            how = "pass what `prepare` returns for it"
+            raise InvalidPointCloudError("a prepared target", type(target).__name__, how)
         target = offset_surface(target, self.config.sensor)
         prepared = sources.prepare(source, self.config.source, self.config.num_threads)
         clock.lap("prepare")
@@ -240,13 +244,13 @@ def _finite(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> A
     """The values as an array of this shape.
 
     Raises:
-        InvalidPointCloudError: another shape, or a value that is not finite.
+        InvalidPointCloudError: another shape, or a value that is no finite number.
     """
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
+    array = np.asarray(values)
+    if array.shape != shape or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         given = f"shape {array.shape}" if array.shape != shape else str(array.tolist())
         raise InvalidPointCloudError(f"a finite {shape} {what}", given, how)
-    return array
+    return array.astype(np.float64)
 
 
 def _rigid(pose: ArrayLike) -> Array:

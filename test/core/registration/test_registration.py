@@ -72,9 +72,21 @@ def test_a_good_start_does_no_harm_and_a_bad_one_neither(registrar, pairs):
         assert rmse(registrar.register(pair.source, target, initial=start).T_target_source, pair) < 0.5
 
 
-def test_a_start_that_is_no_pose_is_refused_with_a_sentence(registrar, pairs, target):
+@pytest.mark.parametrize("start", [np.full((4, 4), np.nan), np.eye(3), "start.tfm"])
+def test_a_start_that_is_no_pose_is_refused_with_a_sentence(registrar, pairs, target, start):
     with pytest.raises(InvalidPointCloudError, match=r"\(4, 4\)"):
-        registrar.register(pairs["L1"].source, target, initial=np.full((4, 4), np.nan))
+        registrar.register(pairs["L1"].source, target, initial=start)
+
+
+def test_a_target_that_was_not_prepared_is_refused_with_a_sentence(registrar, pairs):
+    with pytest.raises(InvalidPointCloudError, match="a prepared target; got ndarray"):
+        registrar.register(pairs["L1"].source, pairs["L1"].target)
+
+
+def test_a_coordinate_that_is_none_is_dropped(registrar, pairs, target):
+    source = pairs["L1"].source
+    plain, damaged = (registrar.register(points, target) for points in (source, np.vstack([source, [[1e300] * 3]])))
+    assert plain.ok and np.array_equal(plain.T_target_source, damaged.T_target_source)
 
 
 @pytest.mark.parametrize("protocol", ["paper", "L1", "L2"])

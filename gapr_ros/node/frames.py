@@ -62,13 +62,14 @@ class Frames:
         """
         if parent == child:
             return np.eye(4)
-        if self._tf2 is None or self._buffer is None:
+        buffer = self._buffer  # `close` may take it away meanwhile
+        if self._tf2 is None or buffer is None:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {MISSING}")
         deadline = time.monotonic() + timeout_s  # tf2's own wait never ends while simulated time stands still
-        while not self._buffer.can_transform(parent, child, stamp) and time.monotonic() < deadline:
+        while not buffer.can_transform(parent, child, stamp) and time.monotonic() < deadline:
             time.sleep(POLL_S)
         try:
-            return transform_to_matrix(self._buffer.lookup_transform(parent, child, stamp))
+            return transform_to_matrix(buffer.lookup_transform(parent, child, stamp))
         except (self._tf2.TransformException, InvalidMessageError) as error:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {error}") from error
 

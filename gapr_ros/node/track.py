@@ -15,13 +15,17 @@ Array = NDArray[np.float64]
 
 
 class Track:
-    """The poses of one bone over time, in one frame. Used by one thread only."""
+    """The poses of one bone over time, in one frame. Used by one thread only, but for `place`, which any may read.
+
+    Attributes:
+        place: where the bone was with the last cloud; None when that was refused.
+    """
 
     def __init__(self) -> None:
-        self._frame = ""
+        self.place: Place | None = None
+        self._frame, self._streak = "", 0
         self._candidate: Array | None = None
         self._accepted: Array | None = None
-        self._streak, self._sure = 0, False
 
     def clear(self) -> None:
         """Forget everything."""
@@ -47,16 +51,11 @@ class Track:
         if self._streak < parameters.require_consecutive:
             text = f"{self._streak} of {parameters.require_consecutive} good poses in a row (require_consecutive)"
             raise RefusedError(Reason.LOW_CONFIDENCE, text)
-        self._accepted, self._sure = T_frame_model, True
+        self._accepted, self.place = T_frame_model, Place(T_frame_model, frame)
 
     def miss(self) -> None:
         """A cloud was refused: the row of good poses ends, and the bone may be elsewhere."""
-        self._streak, self._candidate, self._sure = 0, None, False
-
-    @property
-    def place(self) -> Place | None:
-        """Where the bone was with the last cloud; None when that was refused."""
-        return Place(self._accepted, self._frame) if self._accepted is not None and self._sure else None
+        self._streak, self._candidate, self.place = 0, None, None
 
     def _check_jump(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
         if self._accepted is None:

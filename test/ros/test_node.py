@@ -575,6 +575,15 @@ def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands
     assert 0.1 <= time.monotonic() - start < 30.0
 
 
+def test_a_look_up_that_has_begun_goes_on_while_the_node_ends(monkeypatch):
+    tf2 = FakeTf2(np.eye(4))
+    monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
+    looked_up = frames.Frames(None, publish=False, listen=True)
+    buffer, known = looked_up._buffer, looked_up._buffer.can_transform
+    buffer.can_transform = lambda *names: looked_up.close() or known(*names)
+    np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", None, 1.0), np.eye(4))
+
+
 def test_the_model_is_scaled_turned_and_converted_before_it_is_prepared(tmp_path, client, method):
     points_m = np.random.default_rng(2).normal(size=(400, 3)) * [0.06, 0.02, 0.015]
     np.save(tmp_path / "metres.npy", points_m)

@@ -34,13 +34,6 @@ class DistanceField:
     distance: NDArray[np.uint8]
     reach_mm: float
 
-    def lookup(self, points: Array) -> NDArray[np.int32]:
-        """Index of the target point near each of (N, 3) points, `FAR` where there is none within the reach."""
-        cell = np.rint((points - self.origin) / self.cell_mm).astype(np.int64)
-        inside = ((cell >= 0) & (cell < self.nearest.shape)).all(axis=1)
-        cell[~inside] = 0
-        return np.where(inside, self.nearest[tuple(cell.T)], FAR).astype(np.int32)
-
 
 def build(
     points: Array,

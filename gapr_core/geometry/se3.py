@@ -97,6 +97,12 @@ def exp(twist: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     return from_rotation_translation(rotation, twist[:3] + centre - rotation @ centre)
 
 
+def rms_apart_mm(T: ArrayLike, T_other: ArrayLike, points: ArrayLike) -> float:
+    """sqrt(mean_i |T p_i - T_other p_i|^2) over points (N, 3), mm: how far apart two poses (4, 4) put them."""
+    shift = apply(T, points) - apply(T_other, points)
+    return float(np.sqrt((shift**2).sum(axis=1).mean()))
+
+
 def pose_error(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> PoseError:
     """RTE at the centroid of `source` (N, 3) and RRE of T_estimate against T_true, both T_target_source (4, 4)."""
     centroid = np.asarray(source, dtype=np.float64).mean(axis=0, keepdims=True)

@@ -19,8 +19,7 @@ STRICT_LIMITS = ((1.0, 1.0), (2.0, 2.0), (RIGHT_MM, RIGHT_DEG))  # mm at the sou
 
 def rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> float:
     """sqrt(mean_i |T_estimate p_i - T_true p_i|^2) over the source (N, 3): the paper's RMSE of one pair."""
-    shift = se3.apply(T_estimate, source) - se3.apply(T_true, source)
-    return float(np.sqrt((shift**2).sum(axis=1).mean()))
+    return se3.rms_apart_mm(T_estimate, T_true, source)
 
 
 def whole_bone_rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, target: ArrayLike) -> float:

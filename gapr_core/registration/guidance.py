@@ -121,9 +121,8 @@ def _bounds_mm(assessment: Assessment, patches: Patches, config: GuidanceConfig)
 
 def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> float:
     """Root-mean-square distance over the bone between where two hypotheses put it."""
-    points = target.points[target.anchors]
-    gap = points - se3.apply(best.T_target_source @ se3.inverse(rival.T_target_source), points)
-    return float(np.sqrt((gap**2).sum(axis=1).mean()))
+    motion = best.T_target_source @ se3.inverse(rival.T_target_source)
+    return se3.rms_apart_mm(np.eye(4), motion, target.points[target.anchors])
 
 
 def _excluded(

@@ -106,7 +106,7 @@ def can_be_pushed(
     centre = fit.moved.mean(axis=0)
     poses = np.array([fit.T, *(se3.exp(sign * push, centre) @ fit.T for push in pushes for sign in (1.0, -1.0))])
     rested, scores = refine_many(poses, some, target, np.linspace(*config.final_limits_mm), num_threads)
-    apart = np.array([_rms_mm(se3.apply(T, some) - se3.apply(rested[0], some)) for T in rested])
+    apart = np.array([se3.rms_apart_mm(T, rested[0], some) for T in rested])
     elsewhere = apart >= config.same_pose_mm
     return bool((scores[elsewhere] < _as_good(scores[0], rules)).any())
 

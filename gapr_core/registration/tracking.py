@@ -54,9 +54,9 @@ class Memory:
         self.poses = np.stack(poses)
 
     def follow(self, pose: Array, source: Array) -> None:
-        """The source (N, 3), mm, has moved from the remembered pose T_k nearest to `pose`: all others move with it.
+        """The source (N, 3), mm, has moved from the remembered pose nearest to `pose`, T_before to T_now.
 
-        R_k becomes R_k inv(T_k) T_now, and the nearest pose comes first.
+        All others move with it, R to R inv(T_before) T_now; the nearest one comes first.
         """
         gaps = [np.linalg.norm(se3.apply(each, source) - se3.apply(pose, source)) for each in self.poses]
         nearest = int(np.argmin(gaps))
@@ -187,8 +187,9 @@ class Tracker:
         """
         if assessment.refusal is not None:
             return assessment
-        agrees = self._last is not None and _gap_mm(assessment, self._last) <= self._evidence.config.agree_mm
-        self._last = assessment.fit.T
+        T, agree_mm = assessment.fit.T, self._evidence.config.agree_mm
+        agrees = self._last is not None and se3.rms_apart_mm(T, self._last, assessment.source.points) <= agree_mm
+        self._last = T
         alone = assessment.probability
         one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))
         together = self._with_shared_misfit(one_by_one, agrees)
@@ -237,9 +238,3 @@ class Tracker:
             self._memory.keep([result.T_target_source, *(rival.T_target_source for rival in result.hypotheses[1:])])
         else:
             self._forget_track()  # no rival: the next answer could not be weighed against anything
-
-
-def _gap_mm(assessment: Assessment, T: Array) -> float:
-    """Root-mean-square distance over the source between the assessed pose and another one."""
-    gap = assessment.fit.moved - se3.apply(T, assessment.source.points)
-    return float(np.sqrt((gap**2).sum(axis=1).mean()))

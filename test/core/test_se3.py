@@ -81,3 +81,9 @@ def test_the_nearest_rigid_motion_has_a_proper_rotation():
     R = se3.nearest_rigid(bent)[:3, :3]
     assert np.array_equal(se3.nearest_rigid(bent)[:, 3], [*bent[:3, 3], 1.0])
     assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_poses_are_as_far_apart_as_they_put_points_on_average():
+    quarter = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2.0])
+    points = [[3.0, 0.0, 0.0], [0.0, 0.0, 5.0]]  # moved by 3 sqrt(2) and by nothing: root of (18 + 0) / 2
+    assert se3.rms_apart_mm(T @ quarter, T, points) == pytest.approx(3.0)

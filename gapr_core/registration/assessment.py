@@ -102,7 +102,7 @@ class Assessment:
         return self.refusal is None and self.probability >= limit
 
     def corrected(self, learned: Precision) -> Assessment:
-        """The same with the covariance, and the bound, as errors of known size say that they have to be."""
+        """The same with the covariance and the bound scaled by what was learned from errors of known size."""
         variance_scale = learned.scale(self.features, self.tre_mm) ** 2
         covariance = variance_scale * self.uncertainty.covariance
         return replace(self, uncertainty=replace(self.uncertainty, covariance=covariance), factor95=learned.factor95)

@@ -43,7 +43,7 @@ class Explained:
 
     @property
     def share(self) -> float:
-        """Of the scene's points that count for the pose, 0 to 1."""
+        """Share of the scene's points that count for the pose, 0 to 1."""
         return float((self.fit.weights > 0.0).sum() / len(self.members))
 
 

@@ -126,8 +126,8 @@ def compare(
     points: Array,
     normals: Array,
     image: DepthImage,
-    on_mm: float = 3.0,
-    front_mm: float = 4.0,
+    on_mm: float,
+    front_mm: float,
     num_threads: int = 0,
 ) -> Visible:
     """Compare a target under many poses with an image.

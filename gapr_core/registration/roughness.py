@@ -1,6 +1,6 @@
 """The misfit that changes within centimetres: a sign of another bone, or of a wrong pose.
 
-What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wrong for all of it: residuals 15 to 20 mm
+What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wrong for all of it: residuals 14 to 22 mm
 apart are nearly as alike as those of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the
 covariance of the residuals at short range, less that at longer range, tells the two apart (an empirical covariogram;
 Matheron 1963). Noise takes no part: it is independent from point to point.
@@ -23,9 +23,9 @@ CENTRES = 300  # inliers, evenly spread, of which each is compared with all
 
 
 def rough_misfit_mm(fit: Fit) -> float:
-    """Root of the residuals' covariance over at most 8 mm less that over 14 to 22 mm; negative where that is.
+    """Root, mm, of the residuals' covariance over less than 8 mm, minus that over 14 to 22 mm; with their sign.
 
-    0 where no two inliers are as near, or none as far.
+    0 where no two inliers are so near, or none so far apart.
     """
     feet, signed = on_the_bone(fit)
     chosen = sampling.thin(feet, CENTRES)
@@ -41,7 +41,7 @@ def on_the_bone(fit: Fit) -> tuple[Array, Array]:
 
 
 def signed_root(near_mm2: float, far_mm2: float) -> float:
-    """Root of the difference of two covariances, with its sign, mm."""
+    """Root, mm, of the difference of two covariances; its sign is that of the difference."""
     return float(np.sign(near_mm2 - far_mm2) * np.sqrt(abs(near_mm2 - far_mm2)))
 
 

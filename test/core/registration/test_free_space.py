@@ -31,8 +31,8 @@ def image():
     return see(points, -normals, EYE)
 
 
-def seen(image, pose, cloud=None, **limits):
-    found = compare(pose[None], *(cloud or wall()), image, num_threads=1, **limits)
+def seen(image, pose, cloud=None, on_mm=3.0, front_mm=4.0):
+    found = compare(pose[None], *(cloud or wall()), image, on_mm, front_mm, num_threads=1)
     return float(found.explained[0]), float(found.violating[0]), float(found.compared[0])
 
 

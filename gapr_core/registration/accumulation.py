@@ -32,7 +32,7 @@ class Accumulator:
     is the newest. After three of them in a row the bone or its reference has moved, and only these three are kept.
 
     Args:
-        method: registers what is collected.
+        method: registers what is collected. The sources of a `Tracker` then count as one (`Tracker.share_points`).
         most: how many sources are kept, the newest among them.
 
     Raises:

@@ -60,7 +60,8 @@ def single_threaded_libraries(call: Callable[Given, Result]) -> Callable[Given, 
 
     The matrices of a registration are small. Several threads gain little with them, and wait for each other busily: as
     soon as something else wants a core, a registration with two of them takes nine times as long. Threads of our own
-    loops are not affected, nor is OpenMP in other threads of the process; linear algebra is, everywhere.
+    loops are not affected, nor is OpenMP in other threads of the process; linear algebra is, everywhere, and may keep
+    one thread after calls that overlapped in two threads: each gives back what it found.
     """
 
     @wraps(call)

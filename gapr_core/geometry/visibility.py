@@ -168,6 +168,7 @@ def _views(
 ) -> NDArray[np.bool_]:
     """(D, N) which points each of the directions (D, 3) sees."""
     pixel_mm = max(1.5 * spacing_mm, float(np.linalg.norm(np.ptp(points, axis=0))) / MOST_PIXELS)
+    normals = np.ascontiguousarray(normals)  # rows of frames are not: they would be compiled for as well
 
     def view(direction: Array) -> NDArray[np.bool_]:
         return seen_from(direction, points, normals, pixel_mm)

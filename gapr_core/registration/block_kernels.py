@@ -44,13 +44,13 @@ def mean_square(T, points, trust, elements, nearest, origin, per_cell, spacing, 
     return total / len(points)
 
 
-@numba.njit(inline="always", **FAST)
+@numba.njit(**FAST)
 def gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, block):
     """Lay side by side each moved point, its offset from the element near it, this element, and the point's trust.
 
     Points with none near are left out; returns how many there are.
     """
-    count = 0
+    count = np.int64(0)  # of a plain 0 Numba would compile what it is given to once more
     for p in range(start, stop):
         x, y, z = moved(T, points[p])
         q = element_near(x, y, z, nearest, origin, per_cell)

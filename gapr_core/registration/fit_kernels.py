@@ -1,4 +1,4 @@
-"""Compiled loops over the residuals of a pose: their scale, the weights that follow, and the means of patches.
+"""Compiled loops over the residuals of a pose: the weights that follow from them, and the means of patches.
 
 No fast mathematics here: where no surface is near a residual is NaN, and counts as infinitely large.
 """
@@ -10,15 +10,6 @@ import numba
 import numpy as np
 
 EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
-
-
-@numba.njit(**EXACT)
-def median_size(residuals):
-    """Median of the absolute values of (N,) residuals."""
-    sizes = np.empty(len(residuals))
-    for p in range(len(residuals)):
-        sizes[p] = np.inf if np.isnan(residuals[p]) else abs(residuals[p])
-    return np.median(sizes)
 
 
 @numba.njit(**EXACT)

@@ -137,14 +137,19 @@ def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfi
     """
     means = fit_kernels.patch_means(fit.signed_mm, fit.weights, neighbours)
     by_noise = fit.sigma_mm / np.sqrt(neighbours.shape[1])
-    limit_mm = config.patch_scale * max(1.4826 * fit_kernels.median_size(means), by_noise)
+    limit_mm = config.patch_scale * max(1.4826 * _median_size(means), by_noise)
     return np.clip(1.0 - (means / limit_mm) ** 2, 0.0, 1.0) ** 2
 
 
 def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
     """1.4826 x median absolute residual, those without a surface near counted as large; within the limits set."""
-    spread = 1.4826 * fit_kernels.median_size(signed)
+    spread = 1.4826 * _median_size(signed)
     return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
+
+
+def _median_size(residuals: Array) -> float:
+    """Median of the absolute values of (N,) residuals; NaN, where no surface is near, counts as infinitely large."""
+    return float(np.median(np.nan_to_num(np.abs(residuals), nan=np.inf, posinf=np.inf)))
 
 
 def _tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:

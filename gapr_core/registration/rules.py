@@ -77,7 +77,10 @@ def by_threshold(probability: float, tre95_mm: float, config: RegistrarConfig) -
 
 
 def is_matched(candidates: Candidates, rules: RulesConfig = DEFAULT) -> bool:
-    """True when a distinct pose explains the source as well as the best one."""
+    """True when a distinct pose explains the source as well as the best one.
+
+    The limits are those of mean squares in mm^2; the scores of a camera's cloud, which are none, are held to them too.
+    """
     scores = candidates.scores
     return len(scores) > 1 and bool(scores[1] < _as_good(scores[0], rules))
 

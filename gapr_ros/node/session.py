@@ -120,7 +120,7 @@ class Session:
         except InvalidMessageError as error:
             self._host.ros.get_logger().warning(f"initialpose is ignored: {error}")
             return
-        self._begin_anew()
+        self._begin_again()
         self._seed = Seed(T_frame_model, intake.plain_frame(message.header.frame_id))
         if message.header.frame_id:
             self._frames.listen()
@@ -206,7 +206,7 @@ class Session:
         self._clear()
 
     def _clear(self) -> None:
-        self._begin_anew()
+        self._begin_again()
         self.worker.outdate(self._epoch)
         self._publishers.withdraw_pose()
         self._frames.forget()
@@ -236,7 +236,7 @@ class Session:
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self._ready = ready
-        self._begin_anew()
+        self._begin_again()
         self._publishers.withdraw_pose()
         self.send_model()
 
@@ -246,7 +246,7 @@ class Session:
 
     def stop_waiting(self, why: str) -> None:
         """Drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way."""
-        self._begin_anew()
+        self._begin_again()
         waiting = self.worker.clear()
         if waiting is not None:
             self._host.counters.dropped += 1
@@ -254,7 +254,7 @@ class Session:
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.tell()
 
-    def _begin_anew(self) -> None:
+    def _begin_again(self) -> None:
         """Forget track, seed and collected clouds; clouds on their way will be refused."""
         self._epoch += 1
         self.worker.run(self._forget_clouds)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import time
-import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from itertools import cycle, pairwise
 from pathlib import Path
@@ -35,6 +34,7 @@ from gapr_core.pages import markdown
 from gapr_core.registration import source as sources
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime.console import say
+from gapr_core.runtime.memory import allocated_mb
 
 Case = Callable[[], object]
 TRIANGLES = 200_000
@@ -142,15 +142,6 @@ def fine_mesh(bone: Specimen, folder: Path) -> Path:
     path = folder / "bone.ply"
     o3d.io.write_triangle_mesh(str(path), mesh.simplify_quadric_decimation(TRIANGLES))
     return path
-
-
-def allocated_mb(case: Case) -> float:
-    """The largest size of what a call allocates."""
-    tracemalloc.start()
-    case()
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return most / 2**20
 
 
 def parts(stages: dict[str, list[dict[str, float]]]) -> str:

@@ -139,6 +139,9 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
     if parameters.viewpoint != "none" and parameters.accumulate > 1:
         sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
+    low, high = parameters.crop_min, parameters.crop_max
+    if low != high and any(least >= most for least, most in zip(low, high, strict=True)):
+        sentences.append(f"crop_min {low} is not below crop_max {high}: every cloud is refused until it is")
     return sentences
 
 

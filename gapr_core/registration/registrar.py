@@ -164,7 +164,7 @@ class Registrar:
             eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
             assessment = self._in_scene(prepared, target, start, eye, clock)
         if assessment is None:
-            return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no hypothesis was proposed")
+            return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
         if viewpoint is None and target.both_cortices is not None and cortices.follows_both(assessment, self.config):
             again = self._in_rounds(prepared, target.both_cortices, assessment.fit.T[None], clock)
             assessment = (again or assessment).limited(self.config.cortices.largest_confidence)

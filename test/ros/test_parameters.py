@@ -149,3 +149,18 @@ def test_slices_and_touched_points_are_registered_together_where_the_bone_rests_
     assert sentence in " ".join(parameters.remarks(node.parameters))
     assert bool(sentence) == bool(parameters.remarks(node.parameters))
     node.close()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), False),
+        ((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), False),
+        ((-0.1, 0.1, -0.1), (0.1, -0.1, 0.1), True),
+        ((-0.1, 0.0, -0.1), (0.1, 0.0, 0.1), True),
+    ],
+    ids=["no box", "a box", "a corner above the other", "a box without a volume"],
+)
+def test_a_box_that_no_point_can_be_in_is_said_when_it_is_configured(low, high, said):
+    remarks = parameters.remarks(parameters.NodeParameters(crop_min=low, crop_max=high))
+    assert ["crop_min" in remark for remark in remarks] == [True] * said

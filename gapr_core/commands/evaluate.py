@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from argparse import ArgumentParser, Namespace
+from collections import Counter
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavaila
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime import files, origin
 from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.console import say
 
 log = logging.getLogger(__name__)
 Answer = dict[str, Any]
@@ -51,7 +53,16 @@ def run(args: Namespace) -> int:
     for path in tqdm(waiting, unit="pair", disable=None):
         answers[path.stem] = _answer(path, method) | made_of[path]
         files.write_json(args.out, answers)
+    _say_counts(args.out, [answers[path.stem] for path in paths])
     return 0
+
+
+def _say_counts(path: Path, answers: list[Answer]) -> None:
+    """How many pairs had which status; the first pair that cannot be read says why."""
+    counts = Counter(str(answer["status"]) for answer in answers)
+    say(f"{path}: {len(answers)} pairs" + "".join(f", {count} {status}" for status, count in counts.most_common()))
+    if reason := next((answer["reason"] for answer in answers if answer["status"] == INVALID_INPUT), None):
+        log.warning("the first of %d pairs that cannot be read: %s", counts[INVALID_INPUT], reason)
 
 
 def _digest(path: Path) -> str:

@@ -84,7 +84,12 @@ def run(args: Namespace) -> int:
     method = methods.make(args.method, config)
     plan = _plan(args)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
-    source = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds).points
+    whole = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds)
+    if whole.faces is not None and target.faces is None:
+        log.warning(
+            "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
+        )
+    source = whole.points
     result = method.register(source, method.prepare(target), **_hints(args, method))  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
@@ -107,14 +112,12 @@ def run(args: Namespace) -> int:
 
 def _check_outputs(args: Namespace) -> None:
     """Before the work, what cannot be written, and what does not go together."""
-    from gapr_core.formats import plugins, transforms
+    from gapr_core.formats import transforms
 
     if args.out:
         transforms.check(args.out)
         if args.axes == "lps_to_ras":
             raise ConfigError("--axes lps or ras with --out, which is LPS", "lps_to_ras", "say what the mesh is in")
-    if args.topic and plugins.of(args.source) is None:
-        raise ConfigError("a bag as the source of --topic", args.source.name, "give a bag, or leave --topic out")
     if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
         raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
     if args.rerun:

@@ -52,6 +52,8 @@ def load(path: Path) -> Markups:
     Raises:
         InvalidPointCloudError: not there, damaged, empty, or without its coordinate system.
     """
+    if not path.exists():
+        raise InvalidPointCloudError("a file that exists", str(path), "check the path")
     if not path.is_file() or not path.name.lower().endswith((".mrk.json", ".fcsv")):
         raise InvalidPointCloudError("markups: a .mrk.json or .fcsv file", str(path), "save the points from 3D Slicer")
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import text, tracker
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
@@ -25,7 +26,8 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
     """Columns named x y z (any case), or the first three; of a recording of a tracked tool, where its tip was.
 
     Raises:
-        InvalidPointCloudError: a recording of a tracked tool without the tip, or of several tools and none chosen.
+        InvalidPointCloudError: a recording of a tracked tool without the tip, or of several tools and none chosen; or
+            a tip or a tool for a file that is no such recording.
     """
     data = options.limits.read(path)
     header = next(text.lines(data), "")
@@ -34,6 +36,11 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
         return Surface(tracker.tips(tracker.read_poses(path, options.limits, options.tool), options.tip_mm))
     if "q0" in names and "tx" in names:
         raise tracker.needs_tip(path)
+    if options.tip_mm is not None or options.tool is not None:
+        given = f"{path.name} without columns q0 and tx"
+        raise InvalidPointCloudError(
+            "a recording by NDI Track for --tip and --tool", given, "leave both out for points"
+        )
     return _surface(data, [names.index(axis) for axis in "xyz"] if set("xyz") <= set(names) else None)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.formats import axes, plugins
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
@@ -23,15 +23,18 @@ class Format:
         in_patient: whether the file says its own axes and is in mm: it comes out in LPS mm, and units do not apply.
         with_options: whether the reader of another file takes all options.
         unit: of its numbers, where the user names none.
+        uses: the choices (`CHOICES`) that its reader takes; another one is an error and not ignored.
     """
 
     reader: str
     in_patient: bool = False
     with_options: bool = False
     unit: str = "mm"
+    uses: tuple[str, ...] = ()
 
     def read(self, path: Path, options: ReadOptions) -> Surface:
         """The surface, in LPS mm for patient data, otherwise in the file's unit with its axes turned as asked."""
+        self._check(path, options)
         module, function = self.reader.split(":")
         reader: Callable[[Path, FileLimits | ReadOptions], Surface]
         reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
@@ -39,8 +42,22 @@ class Format:
             return axes.of_patient(reader(path, options), path, options.axes)
         return axes.turned(reader(path, options if self.with_options else options.limits), path, options.axes)
 
+    def _check(self, path: Path, options: ReadOptions) -> None:
+        """A choice that this kind of file cannot follow means that it is the wrong file, or the wrong choice."""
+        nothing = ReadOptions(limits=options.limits)
+        for name, (files, option) in CHOICES.items():
+            if name not in self.uses and getattr(options, name) != getattr(nothing, name):
+                raise ConfigError(f"{files} for {option}", path.name, f"give one, or leave {option} out")
 
-LABEL_MAP = Format("volumes.label_map:read", in_patient=True)
+
+CHOICES = {  # choice of `ReadOptions` -> the files that have it, and how a user names it
+    "labels": ("a label map", "--label (model_label of the node)"),
+    "tip_mm": ("a recording of a tracked tool", "--tip"),
+    "tool": ("a recording of a tracked tool", "--tool"),
+    "topic": ("a bag", "--topic"),
+    "clouds": ("a bag", "--clouds"),
+}
+LABEL_MAP = Format("volumes.label_map:read", in_patient=True, uses=("labels",))
 FORMATS = {
     ".ply": Format("meshes.ply:read"),
     ".pcd": Format("meshes.pcd:read"),
@@ -57,12 +74,12 @@ FORMATS = {
     ".dcm": LABEL_MAP,
     ".mrk.json": Format("markups:read", in_patient=True),
     ".fcsv": Format("markups:read", in_patient=True),
-    ".csv": Format("points_text:read_csv", with_options=True),
+    ".csv": Format("points_text:read_csv", with_options=True, uses=("tip_mm", "tool")),
     ".txt": Format("points_text:read"),
     ".xyz": Format("points_text:read"),
-    ".igs.mha": Format("sweeps:read_igs", in_patient=True),
+    ".igs.mha": Format("sweeps:read_igs", in_patient=True, uses=("tip_mm", "tool")),
 }
-FOLDER = Format("sweeps:read_folder", in_patient=True)
+FOLDER = Format("sweeps:read_folder", in_patient=True, uses=("tip_mm", "tool"))
 LONGEST_REASON = 160
 
 
@@ -71,6 +88,7 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
 
     Raises:
         InvalidPointCloudError: an unknown format, a missing, damaged, cut or empty file, or one beyond the limits.
+        ConfigError: a choice that this kind of file has not, such as a label of a mesh.
         MethodUnavailableError: a library that the format needs is not installed.
     """
     options = options or ReadOptions()

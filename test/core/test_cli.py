@@ -46,7 +46,7 @@ def test_bad_input_exits_with_1_and_one_line(tmp_path, files, capsys):
     assert captured.out == "" and captured.err.count("\n") == 1 and "text.ply" in captured.err
 
 
-def test_evaluate_answers_every_pair_without_the_truth(tmp_path, pair):
+def test_evaluate_answers_every_pair_without_the_truth(tmp_path, pair, capsys, caplog):
     folder = tmp_path / "pairs"
     folder.mkdir()
     np.savez(folder / "a.npz", source=pair.source, target=pair.target)  # no transform to look at
@@ -58,6 +58,8 @@ def test_evaluate_answers_every_pair_without_the_truth(tmp_path, pair):
     assert poses["a"]["seconds"] > 0 and poses["a"]["prepare_seconds"] > 0
     assert poses["b"] | {"transform": None, "status": "TOO_FEW_POINTS"} == poses["b"]
     assert poses["c"]["status"] == "INVALID_INPUT" and poses["c"]["confidence"] == 0.0
+    assert "3 pairs, 1 OK, 1 TOO_FEW_POINTS, 1 INVALID_INPUT" in capsys.readouterr().out
+    assert "cannot be read: expected" in caplog.text and "c.npz" in caplog.text
 
 
 def test_evaluate_goes_on_where_it_stopped(tmp_path, pair):

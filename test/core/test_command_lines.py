@@ -17,6 +17,7 @@ def folder(tmp_path, monkeypatch):
     """The files that the command lines below name, as the working folder."""
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", CLOUD)
+    np.savetxt("points.csv", CLOUD, delimiter=",")
     for name in ("pairs", "bad", "flat", "text", "empty", "run", "torn", "other", "full"):
         (tmp_path / name).mkdir()
     np.savez("pairs/a.npz", source=CLOUD[:100], target=CLOUD, transform=np.eye(4))
@@ -42,6 +43,13 @@ register --source cloud.npy
 REGISTER --units inch
 register --source none.ply --target cloud.npy
 register --source cloud.npy --target empty
+REGISTER --label Femur
+REGISTER --tip 1,2,3
+REGISTER --tool 1
+REGISTER --topic /points
+REGISTER --clouds 0:1
+register --source points.csv --target cloud.npy --tip 1,2,3
+REGISTER --targets none.fcsv
 REGISTER --method gpr
 REGISTER --method os:system
 REGISTER --method os:nothing
@@ -178,3 +186,23 @@ def test_json_of_a_refusal_holds_no_error_of_a_pose(folder):
     if (folder / "out.json").exists():
         answer = json.loads((folder / "out.json").read_text())
         assert answer["tre_mm"] is None and answer["tre95_mm"] is None and answer["covariance"] is None
+
+
+@pytest.mark.parametrize(("choice", "expected"), [
+    ("--label Femur", "a label map for --label (model_label of the node); got cloud.npy"),
+    ("--tip 1,2,3", "a recording of a tracked tool for --tip; got cloud.npy"),
+    ("--clouds 0:1", "a bag for --clouds; got cloud.npy"),
+    ("--targets none.fcsv", "a file that exists; got none.fcsv"),
+])  # fmt: skip
+def test_an_option_that_a_file_cannot_follow_is_said_and_not_ignored(folder, capsys, choice, expected):
+    assert run(f"{REGISTER} {choice}") == 1
+    assert expected in capsys.readouterr().err
+
+
+def test_a_source_that_looks_like_the_target_is_said(folder, caplog):
+    np.savez("bone.npz", points=CLOUD, faces=[[0, 1, 2], [3, 4, 5]])
+    run("register --source bone.npz --target cloud.npy --method icp")
+    assert "exchange them if bone.npz is the whole bone" in caplog.text
+    caplog.clear()
+    run("register --source cloud.npy --target bone.npz --method icp")
+    assert "exchange" not in caplog.text

@@ -49,12 +49,19 @@ class Warnings(logging.Handler):
         return " with a warning" if self._count else ""
 
 
+def tip_of(path):
+    """A tip for recordings of tracked tools; other files refuse one."""
+    if path.is_dir() or "tip_mm" not in getattr(reading.format_of(path), "uses", ()):
+        return None
+    return TIP_MM if path.name.endswith(".igs.mha") or b"q0" in path.read_bytes()[:1000].lower() else None
+
+
 def verdict(path):
     """`read` with its counts, `refused`, or what should not have happened."""
     start = time.process_time()
     try:
         with Warnings() as warnings:
-            surface = clouds.load(path, reading.format_of(path).unit, ReadOptions(tip_mm=TIP_MM))
+            surface = clouds.load(path, reading.format_of(path).unit, ReadOptions(tip_mm=tip_of(path)))
         answer = f"read {len(surface.points)} {0 if surface.faces is None else len(surface.faces)}{warnings}"
     except InvalidPointCloudError as error:
         answer = "refused" if "\n" not in str(error) and len(str(error)) < 600 else f"long message {str(error)[:80]!r}"

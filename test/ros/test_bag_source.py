@@ -137,7 +137,7 @@ def test_a_topic_of_something_that_is_no_bag_is_refused(tmp_path, capsys):
     np.save(tmp_path / "bone.npy", 1000.0 * PIECES[0])
     named = ["--source", str(tmp_path / "bone.npy"), "--target", str(tmp_path / "bone.npy")]
     assert main(["register", *named, "--topic", "/points"]) == 1
-    assert "a bag as the source of --topic" in capsys.readouterr().err
+    assert "a bag for --topic; got bone.npy" in capsys.readouterr().err
 
 
 def test_a_registration_from_a_bag_finds_the_bone(tmp_path):

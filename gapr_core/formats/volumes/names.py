@@ -71,12 +71,12 @@ def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tup
     for label in wanted:
         segment = _by_number(int(label), named, present) if label.isdigit() else _by_name(label, named, present)
         if segment.value not in present.get(segment.layer, ()):
-            raise InvalidPointCloudError(
-                f"voxels of {label}", f"none, but {_present(named, present)}", "choose one of these"
-            )
+            there = _present(named, present)
+            how = "choose one of these" if there else "check the segmentation"
+            raise InvalidPointCloudError(f"voxels of {label}", f"none, but {there or 'zeros only'}", how)
         chosen.append(segment)
         if label.isdigit():
-            notes.append(f"label {label} is {_meaning(segment)}")
+            notes.append(f"label {label} {_meaning(segment)}")
     return chosen, notes
 
 
@@ -97,7 +97,7 @@ def _segments(named: list[Segment], present: Present) -> list[Segment]:
 
 def _present(named: list[Segment], present: Present) -> str:
     """What the file has voxels of, by name where it has one."""
-    return _listed([s.name or str(s.value) for s in _segments(named, present)]) or "zeros only"
+    return _listed([s.name or str(s.value) for s in _segments(named, present)])
 
 
 def _by_number(value: int, named: list[Segment], present: Present) -> Segment:
@@ -138,10 +138,10 @@ def _nameless(label: str, present: Present) -> InvalidPointCloudError:
 
 def _meaning(segment: Segment) -> str:
     if segment.name:
-        return f"{segment.name}, says the file"
+        return f"is {segment.name}, says the file"
     tables = [(version, table) for version, table in TOTALSEGMENTATOR.items() if segment.value in table]
     names = [f"{table[segment.value]} in {version}" for version, table in tables]
-    return "without a name in the file" + (f": {', '.join(names)}" if names else "")
+    return "has no name in the file" + (f"; it would be {', '.join(names)}" if names else "")
 
 
 def _key(name: str) -> str:

@@ -263,6 +263,8 @@ def test_images_and_empty_and_cut_label_maps_are_refused_in_one_line(tmp_path, c
         clouds.load(tmp_path / "ct.nii.gz")
     with pytest.raises(InvalidPointCloudError, match="a segment; got empty.nrrd: zeros only"):
         clouds.load(write(tmp_path / "empty.nrrd", np.zeros((9, 9, 9)), affine))
+    with pytest.raises(InvalidPointCloudError, match="voxels of 7; got empty.nrrd: none, but zeros only; check the"):
+        clouds.load(tmp_path / "empty.nrrd", options=options("7"))
     for ending in ("nii", "nii.gz", "nrrd", "mha"):
         whole = write(tmp_path / f"whole.{ending}", voxels_of(affine, size), affine).read_bytes()
         cut = tmp_path / f"cut.{ending}"

@@ -20,7 +20,7 @@ class PaperPipeline(Baseline):
     """Section IV of the paper from end to end, with the weights of a run.
 
     Args:
-        weights: safetensors file; the shipped network without one (it was not trained in the paper's regime).
+        weights: safetensors file; the shipped network without one (which was not trained in the paper's regime).
 
     Raises:
         WeightsError: the file is missing, damaged or of another format.

@@ -14,7 +14,7 @@ from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.clutter import Scene
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.features import of_the_fit
+from gapr_core.registration.features import SCENE_FEATURES, of_the_fit
 from gapr_core.registration.free_space import Visible
 from gapr_core.registration.refinement import Fit, refine_fully
 from gapr_core.registration.source import PreparedSource
@@ -123,7 +123,8 @@ def measure(
     seen = clutter.seen_of(fit.T[None], scene, target, config.clutter)
     visible = _visible_features(seen, candidates, target)
     shared = of_the_fit(fit, candidates, uncertainty, explained.source, noise_mm, target, config)
-    return visible | shared | {"inlier_ratio": explained.share}
+    values = visible | shared | {"inlier_ratio": explained.share}
+    return {name: values[name] for name in SCENE_FEATURES}
 
 
 def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:

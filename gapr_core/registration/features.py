@@ -62,11 +62,12 @@ def measure(
         config: how a mirrored source is refined, and how far a smooth bias reaches.
     """
     second = candidates.scores[1] if len(candidates.scores) > 1 else 2.0 * candidates.scores[0]
-    return of_the_fit(fit, candidates, uncertainty, source, source.noise_mm, target, config) | {
+    values = of_the_fit(fit, candidates, uncertainty, source, source.noise_mm, target, config) | {
         "inlier_ratio": float((fit.weights > 0.0).mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
         "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
     }
+    return {name: values[name] for name in FEATURES}
 
 
 def of_the_fit(

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gapr_core.errors import GaprError
+from gapr_ros.demo import interrupt
 from gapr_ros.demo.act import DemoError, camera_round, probe_sweep, write_bag
 
 FRAMES = {"sweep": 24, "scene": 12, "guided": 12}
@@ -54,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     args.frames = FRAMES[args.act] if args.frames is None else args.frames
     try:
         args.out.mkdir(parents=True, exist_ok=True)
-        return _guided(args, console) if args.act == "guided" else _from_bag(args, console)
+        with interrupt.heeded():
+            return _guided(args, console) if args.act == "guided" else _from_bag(args, console)
     except (DemoError, GaprError, OSError) as error:
         console.print(f"[red]error:[/red] {error}", highlight=False)
         return 1

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_ros.demo import interrupt
 from gapr_ros.demo.act import Act, DemoError
 from gapr_ros.demo.children import child, last_lines
 
@@ -91,11 +92,13 @@ class RunningNode:
         observer.complete()
 
     def check(self) -> None:
-        """It is still there.
+        """It is still there, and nobody pressed Ctrl-C.
 
         Raises:
             DemoError: it ended with an error.
+            KeyboardInterrupt: Ctrl-C was pressed.
         """
+        interrupt.check()
         if self._process.poll() not in (None, 0):
             raise DemoError(f"{self._log.stem} ended with {self._process.returncode}:\n{last_lines(self._log)}")
 

@@ -1,12 +1,12 @@
 """`gapr demo`, from the command line to the report, and what it does when things go wrong."""
 
 import argparse
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +22,7 @@ from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.scenes.stream import SceneMotion, simulate
 from gapr_core.geometry import se3
 from gapr_ros.demo import cli as demo
-from gapr_ros.demo import guided
+from gapr_ros.demo import guided, interrupt
 from gapr_ros.demo import report as demo_report
 from gapr_ros.demo.act import Act, DemoError, act_of_pairs, write_bag
 from gapr_ros.demo.children import child
@@ -85,6 +85,19 @@ def test_ctrl_c_ends_the_demo_and_its_node(tmp_path):
     assert process.returncode == 130, output
     assert "Traceback" not in output
     assert not own_nodes(tmp_path)
+
+
+def test_ctrl_c_that_a_library_swallows_is_raised_again():
+    interrupt.check()
+    before = signal.getsignal(signal.SIGINT)
+    with interrupt.heeded():
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            interrupt.check()
+    assert signal.getsignal(signal.SIGINT) is before
+    with interrupt.heeded():
+        interrupt.check()
 
 
 def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkeypatch):
@@ -328,13 +341,15 @@ def follow_scripted(monkeypatch, folder, script, most=5):
             answer, said.advice = next(self.left)
             return answer
 
-    @contextmanager
+    @contextlib.contextmanager
     def running(observer, where, parameters):
         yield SimpleNamespace(wait_until_ready=lambda: None)
 
     monkeypatch.setattr(guided, "running", running)
     monkeypatch.setattr(guided, "Sender", Scripted)
-    console = SimpleNamespace(print=lambda *_, **__: None, status=lambda _: contextmanager(lambda: iter([0]))())
+    console = SimpleNamespace(
+        print=lambda *_, **__: None, status=lambda _: contextlib.contextmanager(lambda: iter([0]))()
+    )
     probe = guided.make_probe("tibia", 2)
     return probe, guided.follow(probe, said, most, folder, console)
 

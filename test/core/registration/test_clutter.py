@@ -98,7 +98,7 @@ def test_a_viewpoint_that_is_no_place_is_refused(method, target, scene, viewpoin
 
 def test_a_few_points_in_view_of_their_camera_are_refused_without_an_error(method, target, scene):
     result = method.register(scene[0][:9], target, viewpoint=scene[1])
-    assert not result.ok and "no hypothesis" in result.reason
+    assert not result.ok and "no pose" in result.reason
 
 
 def test_normals_of_a_camera_point_to_it(scene):

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -191,10 +192,15 @@ def draw(measured: Sequence[Growth]) -> Figure:
         beside = axes.twinx()
         beside.plot(each.x, each.memory_mb, color=palette.SECOND, marker="s", ms=3, ls="--")
         beside.set_ylabel("allocated, MB", color=palette.SECOND)
-        for scale in (axes, beside):
+        for scale, cost in ((axes, 1e3 * each.wall_s), (beside, each.memory_mb)):
             scale.set_yscale("log")
+            scale.set_ylim(10.0 ** np.floor(np.log10(cost.min())), 10.0 ** np.ceil(np.log10(cost.max())))
         if not each.is_share:
             axes.set_xscale("log")
+        for axis in (axes.xaxis, axes.yaxis, beside.yaxis):
+            axis.set_minor_formatter(NullFormatter())
+        if len(each.x) <= len(BONES):
+            axes.set_xticks(each.x, [f"{x:.0f}" for x in each.x])
         axes.grid(alpha=0.25)
     for axes in figure.axes:
         axes.set_visible(axes.has_data())

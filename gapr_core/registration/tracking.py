@@ -58,8 +58,7 @@ class Memory:
 
         All others move with it, R to R inv(T_before) T_now; the nearest one comes first.
         """
-        gaps = [np.linalg.norm(se3.apply(each, source) - se3.apply(pose, source)) for each in self.poses]
-        nearest = int(np.argmin(gaps))
+        nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in self.poses]))
         moved = self.poses @ (se3.inverse(self.poses[nearest]) @ pose)
         self.poses = np.concatenate([moved[nearest : nearest + 1], np.delete(moved, nearest, axis=0)])
 

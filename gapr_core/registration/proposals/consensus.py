@@ -98,12 +98,11 @@ def distinct(
     kept: list[int] = []
     left = np.arange(len(order))
     while len(left) and len(kept) < count:
-        best = left[0]
+        best, left = left[0], left[1:]
         kept.append(best)
         shift = np.linalg.norm(places[left] - places[best], axis=1)
         trace = np.einsum("kij,ij->k", rotations[left], rotations[best])
-        left = left[(shift >= apart_mm) | (trace <= trace_limit)]
-        left = left[left != best]
+        left = left[~((shift < apart_mm) & (trace > trace_limit))]
     return order[kept]
 
 

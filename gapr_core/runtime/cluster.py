@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -11,7 +13,9 @@ from gapr_core.errors import ConfigError, MethodUnavailableError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 PATIENCE_S = 20.0  # for the scheduler to answer
-WAITING = 3  # tasks that wait for each worker: memory stays flat however long the list is
+WAITING = 3  # turns that wait for each worker: memory stays flat however long the list is
+TURN_S = 0.5  # work of one message to a worker: the scheduler's share of short tasks stays small
+MOST = 64  # tasks of one turn, however short they are
 ARGUMENT = "address of a Dask scheduler, such as tcp://host:8786: run on its workers, which share the folders"
 
 
@@ -32,8 +36,9 @@ def outcomes(
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Every task with what its call returned or raised, in the order in which they finish.
 
-    A task whose worker dies goes to another one. When three workers have died of it, its outcome is a
-    `WorkersDiedError`.
+    A worker gets several short tasks at a time, and hands back what it does not begin within `TURN_S`. When three
+    workers have died of such a turn, each of its tasks is tried alone; when three have died of one task, its outcome
+    is a `WorkersDiedError`.
 
     Args:
         address: of the scheduler.
@@ -57,20 +62,49 @@ def outcomes(
             given = f"{len(workers)} workers, threads {sorted(set(workers.values()))}"
             raise ConfigError("workers of one thread each", given, "start them with `--nthreads 1`, one for each core")
         more = () if shared is None else (client.scatter(shared, broadcast=True),)
-        left, under_way = iter(tasks), {}
+        left, size = iter(tasks), 1
+        again, alone = deque[Task](), deque[Task]()  # handed back; to be tried without others
+        under_way: dict[Any, list[Task]] = {}
 
-        def submit(count: int) -> list[Any]:
-            new = {client.submit(call, task, *more, pure=False): task for task in islice(left, count)}
-            under_way.update(new)
-            return list(new)
+        def submit() -> list[Any]:
+            new = []
+            while len(under_way) < WAITING * len(workers):
+                turn = [alone.popleft()] if alone else [again.popleft() for _ in range(min(size, len(again)))]
+                turn = turn or list(islice(left, size))
+                if not turn:
+                    break
+                new.append(client.submit(_turn, call, turn, *more, pure=False))
+                under_way[new[-1]] = turn
+            return new
 
-        finished = distributed.as_completed(submit(WAITING * len(workers)))
+        finished = distributed.as_completed(submit())
         for future in finished:
-            raised = future.exception()
-            if isinstance(raised, distributed.KilledWorker):
-                raised = WorkersDiedError(str(raised))
-            yield under_way.pop(future), raised or future.result()
-            finished.update(submit(1))
+            turn, raised = under_way.pop(future), future.exception()
+            if raised is None:
+                done, seconds = future.result()
+                again.extend(turn[len(done) :])
+                size = max(1, min(MOST, 2 * size, int(len(done) * TURN_S / max(seconds, 1e-9))))
+                yield from zip(turn, done, strict=False)
+            elif len(turn) > 1:
+                alone.extend(turn)
+            else:
+                has_died = isinstance(raised, distributed.KilledWorker)
+                yield turn[0], WorkersDiedError(str(raised)) if has_died else raised
+            finished.update(submit())
+
+
+def _turn(call: Callable[..., Result], tasks: Sequence[Task], *shared: Any) -> tuple[list[Result | Exception], float]:
+    """On a worker: what `call` makes of as many tasks as fit into a turn, at least one, and the seconds it took."""
+    found: list[Result | Exception] = []
+    begun = time.monotonic()
+    for task in tasks:
+        try:
+            found.append(call(task, *shared))
+        except Exception as error:
+            found.append(error)
+        if time.monotonic() - begun > TURN_S:
+            break
+    return found, time.monotonic() - begun
 
 
 def _library() -> Any:

@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 import time
+from itertools import islice
 
 import pytest
 
@@ -35,19 +36,41 @@ def test_every_pair_of_the_calibration_gives_one_record(tmp_path, dask_address, 
     assert sorted(record["name"] for record in found) == sorted(map(collect._name, tasks))
 
 
-def test_no_more_than_a_few_tasks_wait_at_a_time(dask_address):
+def test_no_more_than_a_few_tasks_wait_at_a_time(dask_address, monkeypatch):
+    monkeypatch.setattr(cluster, "MOST", 2)
     begun, done = [], []
 
     def tasks():
         for number in range(40):
             begun.append(number)
-            assert len(begun) <= len(done) + cluster.WAITING + 1
+            assert len(begun) <= len(done) + 2 * (cluster.WAITING + 1)
             yield number
 
     for task, outcome in cluster.outcomes(dask_address, abs, tasks()):
         done.append(task)
         assert outcome == task
     assert sorted(done) == list(range(40))
+
+
+def test_short_tasks_share_a_message(dask_address, monkeypatch):
+    import distributed
+
+    turns, submit = [], distributed.Client.submit
+
+    def submitted(client, turn, call, tasks, **how):
+        turns.append(len(tasks))
+        return submit(client, turn, call, tasks, **how)
+
+    monkeypatch.setattr(distributed.Client, "submit", submitted)
+    assert sorted(task for task, _ in cluster.outcomes(dask_address, abs, range(100))) == list(range(100))
+    assert turns[:3] == [1, 1, 1] and 1 < max(turns) <= cluster.MOST and sum(turns) == 100
+
+
+def test_what_does_not_fit_into_a_turn_is_done_in_another(dask_address, monkeypatch):
+    outcomes = cluster.outcomes(dask_address, abs, range(100))
+    seen = dict(islice(outcomes, 50))
+    monkeypatch.setattr(cluster, "TURN_S", -1.0)
+    assert seen | dict(outcomes) == {number: number for number in range(100)}
 
 
 def test_what_a_task_raises_is_its_outcome(dask_address):

@@ -16,6 +16,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import Point, Pose, TransformStamped
 from rclpy.executors import ExternalShutdownException
+from rclpy.signals import uninstall_signal_handlers
 from rclpy.utilities import remove_ros_args
 from shape_msgs.msg import Mesh, MeshTriangle
 from trusted_pose import TrustedPose
@@ -83,6 +84,7 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     rclpy.try_shutdown()
+    uninstall_signal_handlers()  # ends the thread that handles signals, before the interpreter ends
 
 
 if __name__ == "__main__":

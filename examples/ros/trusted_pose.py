@@ -17,6 +17,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import uninstall_signal_handlers
 from rclpy.time import Time
 
 WAIT_S = 0.5  # a status and its transform are sent together; more than this apart, one of them was lost
@@ -113,6 +114,7 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     rclpy.try_shutdown()
+    uninstall_signal_handlers()  # ends the thread that handles signals, before the interpreter ends
 
 
 if __name__ == "__main__":

@@ -8,9 +8,14 @@ from functools import partial
 import numpy as np
 
 from gapr_core.data.sensors.acquired import Acquired
+from gapr_core.data.sensors.covered import covered
 from gapr_core.data.sensors.depth_camera import depth_camera
 from gapr_core.data.sensors.laser import laser
+from gapr_core.data.sensors.moving import moving
+from gapr_core.data.sensors.photogrammetry import photogrammetry
 from gapr_core.data.sensors.pointer import pointer
+from gapr_core.data.sensors.stereo import stereo
+from gapr_core.data.sensors.structured_light import structured_light
 from gapr_core.data.sensors.ultrasound import ultrasound
 from gapr_core.data.specimen import Specimen
 
@@ -20,7 +25,13 @@ SENSORS: dict[str, Sensor] = {
     "ultrasound": ultrasound,
     "depth_camera": depth_camera,
     "laser": laser,
+    "structured_light": structured_light,
+    "stereo": stereo,
+    "photogrammetry": photogrammetry,
+    "covered": covered,
+    "moving": moving,
 }
+"""What measures, and in the last two what it meets: bone that is covered, bone that moves."""
 SPARSE: dict[str, Sensor] = {
     "pointer_50": partial(pointer, points=(50, 50), only_dots=True),
     "ultrasound_4": partial(ultrasound, count=(4, 4)),

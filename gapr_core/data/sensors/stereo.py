@@ -8,13 +8,14 @@ from scipy.spatial import cKDTree
 
 from gapr_core.data.sensors.acquired import Acquired, look, smooth_offsets, tangents
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry import sampling
 
 Array = NDArray[np.float64]
 
 SHARE = (0.08, 0.35)
 POINTS = (400, 5000)
 WINDOW_MM = (1.0, 4.0)  # standard deviation of the Gaussian window over which depth is matched
-IN_WINDOW, MOST_STEP_MM = 64, 8.0  # points of a window, and the step of depth that ends it
+IN_WINDOW, MOST_STEP_MM = 80, 8.0  # points that a window looks at, and the step of depth that ends it
 NOISE_MM = (0.2, 1.0)  # along the look, alike within a window
 WHITE = 0.3  # standard deviation of what differs from point to point, in those of the noise
 HOLES, HOLE_MM = (0, 6), (3.0, 10.0)  # without texture nothing is matched: how many, and their radius
@@ -26,7 +27,9 @@ def stereo(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     view = look(specimen, SHARE, "seen", 30_000, rng)
     window_mm, noise_mm = rng.uniform(*WINDOW_MM), rng.uniform(*NOISE_MM)
     depth_mm, across = view.points @ view.towards, view.points @ np.stack(tangents(view), axis=1)
-    apart, near = cKDTree(across).query(across, k=min(IN_WINDOW, len(across)))
+    some = sampling.voxel_indices(view.points, 0.5 * window_mm)
+    apart, near = cKDTree(across[some]).query(across, k=min(IN_WINDOW, len(some)))
+    near = some[near]
     weights = np.exp(-0.5 * (apart / window_mm) ** 2) * (np.abs(depth_mm[near] - depth_mm[:, None]) < MOST_STEP_MM)
     weights /= weights.sum(axis=1, keepdims=True)
     patchy = np.einsum("nk,nk->n", weights, rng.normal(size=len(depth_mm))[near])

@@ -35,8 +35,8 @@ def structured_light(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     count = int(rng.integers(VIEWS[0], VIEWS[1] + 1))
     each = round(float(np.exp(rng.uniform(*np.log(POINTS))))) // count
     parts = [_one_view(specimen, view, bias_mm, drawn, each, rng) for _ in range(count)]
-    parameters = {**view.parameters, **bias, **drawn, "family": "structured_light", "scale": 1.0, "standoff_mm": 0.0,
-                  "outlier_share": 0.0}  # fmt: skip
+    parameters = {**view.parameters, **bias, **drawn, "family": "structured_light", "views": count, "scale": 1.0,
+                  "standoff_mm": 0.0, "outlier_share": 0.0}  # fmt: skip
     return Acquired(np.concatenate(parts), parameters)
 
 

@@ -1,6 +1,7 @@
 """Each simulator on a ball, whose distances are known exactly."""
 
 from functools import partial
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ from shapes import ball_specimen
 
 from gapr_core.data import protocols
 from gapr_core.data.sensors import SENSORS, SPARSE
+from gapr_core.data.sensors.acquired import look
 from gapr_core.data.sensors.pointer import pointer
+from gapr_core.data.sensors.structured_light import _one_view
 from gapr_core.geometry import se3
 
 RADIUS = 60.0
@@ -20,8 +23,8 @@ def ball():
     return ball_specimen(RADIUS)
 
 
-def heights(acquired):
-    return np.linalg.norm(acquired.points - CENTRE, axis=1) - RADIUS
+def heights(acquired, radius=RADIUS):
+    return np.linalg.norm(acquired.points - CENTRE, axis=1) - radius
 
 
 def drawn(simulate, ball, count=12):
@@ -128,3 +131,84 @@ def test_the_viewpoint_of_a_pair_is_in_the_frame_of_its_source(name, ball):
     assert np.linalg.norm(away) > RADIUS + 50.0
     assert away @ pair.metadata["view_direction"] > 0.95 * np.linalg.norm(away)
     assert "viewpoint" not in protocols.make_pair("pointer", ball, 3).metadata
+
+
+def test_structured_light_is_accurate_but_its_views_are_not_laid_on_each_other_exactly(ball):
+    clouds = drawn(SENSORS["structured_light"], ball, 24)
+    off = np.array([np.median(np.abs(heights(c))) for c in clouds])
+    allowed = [sum(c.parameters[k] for k in ("noise_mm", "row_mm", "step_mm", "view_mm", "bias_mm")) for c in clouds]
+    assert (off < np.array(allowed) + 0.1).all()
+    several = np.array([c.parameters["views"] > 1 for c in clouds])
+    apart = np.array([c.parameters["view_mm"] + c.parameters["view_deg"] for c in clouds])
+    far, near = several & (apart > 0.5), several & (apart < 0.35)
+    assert off[far].mean() > 1.3 * off[near].mean()
+
+
+def test_the_depth_of_structured_light_comes_in_steps(ball):
+    exact = {"row_mm": 0.0, "row_height_mm": 1.0, "noise_mm": 0.0, "step_mm": 2.0, "view_mm": 0.0, "view_deg": 0.0}
+    view, rng = look(ball, (0.1, 0.1), "seen", 20_000, np.random.default_rng(0)), np.random.default_rng(1)
+    points = _one_view(ball, view, np.zeros(len(view.points)), exact, 2000, rng)
+    assert off_whole_steps(points, view.towards) < 0.02 < off_whole_steps(view.points[:2000], view.towards)
+
+
+def off_whole_steps(points, towards):
+    """0 where depths along some direction near this one lie at whole steps of 2 mm, 1 where they lie anywhere."""
+    rng = np.random.default_rng(2)
+    for spread in (0.3, 0.1, 0.03, 0.01, 0.003):
+        tried = np.vstack([towards, towards + spread * rng.normal(size=(3000, 3))])
+        tried /= np.linalg.norm(tried, axis=1, keepdims=True)
+        together = np.abs(np.exp(1j * np.pi * (points @ tried.T)).mean(axis=0))
+        towards = tried[together.argmax()]
+    return 1.0 - together.max()
+
+
+def test_stereo_makes_a_ridge_round(monkeypatch):
+    module = import_module("gapr_core.data.sensors.stereo")
+    for name, limits in {"NOISE_MM": (1e-9, 1e-9), "BIAS_MM": 0.0, "HOLES": (0, 0), "WINDOW_MM": (2.0, 2.0)}.items():
+        monkeypatch.setattr(module, name, limits)
+    for cloud in drawn(module.stereo, ball_specimen(20.0), 6):
+        from_middle = (cloud.points - CENTRE) @ cloud.parameters["view_direction"]
+        top = heights(cloud, 20.0)[from_middle > 0.95 * from_middle.max()]
+        assert np.median(top) == pytest.approx(-(2.0**2) / 20.0, rel=0.3)  # the mean of a paraboloid over the window
+
+
+def test_the_noise_of_stereo_is_that_of_patches(ball):
+    clouds = [c for c in drawn(SENSORS["stereo"], ball, 24) if len(c.points) > 2500]
+    cloud = next(c for c in clouds if c.parameters["window_mm"] > 2.5 and c.parameters["bias_mm"] < 0.4)
+    off = heights(cloud) - np.median(heights(cloud))
+    nearest = np.linalg.norm(cloud.points[:, None] - cloud.points[None], axis=2) + 1e3 * np.eye(len(off))
+    assert np.corrcoef(off, off[nearest.argmin(axis=1)])[0, 1] > 0.5
+
+
+def test_photogrammetry_is_not_of_the_right_size(ball):
+    for cloud in drawn(SENSORS["photogrammetry"], ball, 12):
+        p = cloud.parameters
+        most = abs(p["scale"] - 1.0) * RADIUS + p["bent_mm"] + p["bias_mm"] + 2.0 * p["noise_mm"] + 0.2
+        assert np.median(np.abs(heights(cloud))) < most
+    assert np.std([c.parameters["scale"] for c in drawn(SENSORS["photogrammetry"], ball, 30)]) > 0.004
+
+
+def test_what_covers_a_bone_lies_above_it(ball):
+    for cloud in drawn(SENSORS["covered"], ball, 12):
+        p, off = cloud.parameters, heights(cloud)
+        assert np.quantile(off, 0.02) > -(2.5 * p["noise_mm"] + p["bias_mm"] + 0.1)
+        assert off.mean() == pytest.approx(p["standoff_mm"], abs=p["bias_mm"] + 0.15)
+        assert off.max() < 4.0 + p["bias_mm"] + 5.0 * p["noise_mm"] + 0.1
+    shares = [c.parameters["covered_share"] for c in drawn(SENSORS["covered"], ball, 24)]
+    assert min(shares) < 0.3 and max(shares) > 0.7
+
+
+def test_a_bone_that_moves_is_seen_at_its_mean_place(ball, monkeypatch):
+    module = import_module("gapr_core.data.sensors.moving")
+    for name, limits in {"NOISE_MM": (0.0, 0.0), "TURN_DEG": (0.0, 0.0), "BIAS_MM": 0.0, "CYCLES": (1.0, 1.0)}.items():
+        monkeypatch.setattr(module, name, limits)
+    monkeypatch.setattr(module, "SHIFT_MM", (0.0, 0.0))
+    still = drawn(module.moving, ball, 8)
+    monkeypatch.setattr(module, "SHIFT_MM", (5.0, 5.0))
+    moved = drawn(module.moving, ball, 8)
+    for before, after in zip(still, moved, strict=True):
+        each = after.points - before.points
+        assert np.abs(each.mean(axis=0)).max() < 1e-9
+        assert np.linalg.norm(each, axis=1).max() == pytest.approx(5.0)
+        assert np.linalg.matrix_rank(each, tol=1e-6) == 1
+    assert max(np.abs(heights(each)).max() for each in still) < 0.3

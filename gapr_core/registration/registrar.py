@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, cortices, explained
+from gapr_core.registration import clutter, cortices, explained, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess
@@ -156,7 +157,7 @@ class Registrar:
         prepared = sources.prepare(source, self.config.source, self.config.num_threads)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
-            return prepared
+            return rules.asking_the_unit(prepared, finite_points(source), target.points)
         start = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
         if viewpoint is None:
             assessment = self._in_rounds(prepared, target, start, clock)
@@ -171,7 +172,10 @@ class Registrar:
         if assessment.is_sure(self.config.min_confidence**2):  # as in `rules.by_geometry`
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
-        return explained.named_clutter(assessment, self.config).corrected(self.precision)
+        judged = explained.named_clutter(assessment, self.config).corrected(self.precision)
+        if judged.refusal is None or judged.seen is not None:  # a part that was found in a scene has no size of its own
+            return judged
+        return replace(judged, refusal=rules.asking_the_unit(judged.refusal, prepared.points, target.points))
 
     def _in_rounds(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock

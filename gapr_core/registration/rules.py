@@ -19,10 +19,13 @@ from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
 from gapr_core.results import Refusal, RegistrationStatus
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
 DEFAULT = RulesConfig()
+OTHER_UNITS = {"cm": 10.0, "m": 1000.0}  # mm in each that is taken for mm by mistake
+PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 
 
 def by_geometry(
@@ -50,6 +53,27 @@ def by_geometry(
             "a pose a few mm away fits as well: the observed surface is flat or straight",
         )
     return None
+
+
+def asking_the_unit(refusal: Refusal, source: Array, target: Array) -> Refusal:
+    """The refusal; of a cloud that shows too little, and would have the bone's size in another unit, it asks for that.
+
+    A short scan of a long bone is as small as a whole one in cm that is taken for mm: no rule can tell them apart.
+
+    Args:
+        refusal: any; only DEGENERATE gets the question.
+        source, target: (N, 3) and (M, 3), mm, as they are read now.
+    """
+    if refusal.status is not RegistrationStatus.DEGENERATE:
+        return refusal
+    low, high = PLAUSIBLE
+    extent_mm, target_extent_mm = Surface(source).extent_mm, Surface(target).extent_mm
+    shares = {unit: extent_mm * mm / target_extent_mm for unit, mm in OTHER_UNITS.items()}
+    unit = next((unit for unit, share in shares.items() if low <= share <= high), None)
+    if unit is None:
+        return refusal
+    sizes = f"the cloud is {extent_mm:.3g} mm across, the bone {target_extent_mm:.3g} mm"
+    return Refusal(refusal.status, f"{refusal.reason}; {sizes}: is the cloud in {unit}?")
 
 
 def by_size(features: Mapping[str, float], rules: RulesConfig = DEFAULT) -> Refusal | None:

@@ -31,6 +31,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
             Files in patient coordinates (label maps, markups) are in mm, whatever is named here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
 
+    A mesh file of several separate long bones is read as one body, with a warning.
+
     Raises:
         InvalidPointCloudError: unreadable file, unknown format, wrong shape, nothing finite, or an extent that
             cannot be a bone in the unit named.
@@ -48,7 +50,10 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         check_extent(surface.extent_mm, "mm", name, "in its header")
         return surface
     scale = _mm_per_unit(surface, units, name)
-    return Surface(surface.points * scale, surface.faces, surface.normals)
+    surface = Surface(surface.points * scale, surface.faces, surface.normals)
+    if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
+        _warn_of_several_bones(surface, name)
+    return surface
 
 
 def finite_points(array: ArrayLike) -> Array:
@@ -103,6 +108,20 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
         raise InvalidPointCloudError("finite vertices", f"{(~finite).sum()} that are not in {name}", "repair the mesh")
     normals = None if surface.normals is None else surface.normals[finite]
     return Surface(surface.points[finite], None, normals)
+
+
+def _warn_of_several_bones(surface: Surface, name: str) -> None:
+    """A rigid pose of two bones that move against each other is that of neither."""
+    from gapr_core.geometry.bones import separate_long_bones
+
+    lengths = separate_long_bones(surface.points, surface.triangles, surface.face_areas_mm2)
+    if lengths:
+        sizes = " and ".join(f"{length:.0f} mm" for length in sorted(lengths, reverse=True))
+        log.warning(
+            "%s holds %d separate long parts, of %s: they are registered as one rigid body; "
+            "for one bone, save it to a file of its own, or take it from the label map with --label (model_label)",
+            name, len(lengths), sizes,
+        )  # fmt: skip
 
 
 def _check_faces(surface: Surface, name: str) -> None:

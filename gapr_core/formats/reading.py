@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
-from gapr_core.formats import axes, plugins
+from gapr_core.formats import axes, kinds, plugins
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
@@ -128,11 +128,20 @@ def format_of(path: Path) -> Format | plugins.Plugin:
 
 def unreadable(path: Path, why: str) -> InvalidPointCloudError:
     """The error for a file that cannot be read, in one line."""
-    kind, reason = f"{_ending(path).lstrip('.').upper()} file", " ".join(why.split())
-    short = reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
-    return InvalidPointCloudError(
-        f"a readable {'folder' if path.is_dir() else kind}", f"{path.name} ({short})", "export it again"
-    )
+    if path.is_dir():
+        return InvalidPointCloudError("a readable folder", f"{path.name} ({_short(why)})", "name a file in it")
+    ending = _ending(path)
+    if path.is_file() and path.stat().st_size == 0:
+        why = "0 bytes, an empty file"
+    other, how = kinds.ending_of(path), "export it again"
+    if other and other != ending:
+        how = f"it looks like {other}: rename it, if that is what it is"
+    return InvalidPointCloudError(f"a readable {ending.lstrip('.').upper()} file", f"{path.name} ({_short(why)})", how)
+
+
+def _short(why: str) -> str:
+    reason = " ".join(why.split())
+    return reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
 
 
 def _ending(path: Path) -> str:

@@ -86,7 +86,7 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
     """
     files = sorted(f for f in path.iterdir() if f.suffix.lower() in SLICE_ENDINGS and f.stem != "poses")
     if not files:
-        raise ValueError(f"no slices ({' '.join(SLICE_ENDINGS)}) in the folder")
+        raise ValueError(f"no slices ({' '.join(SLICE_ENDINGS)}) in it")
     from gapr_core.formats.reading import read
 
     slices = [read(file, options).points for file in files]

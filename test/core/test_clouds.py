@@ -130,6 +130,42 @@ def test_an_unreadable_file_is_named_in_one_sentence(tmp_path, name, content):
         clouds.load(tmp_path / name)
 
 
+@pytest.mark.parametrize("name", ["bone.ply", "bone.vtp", "bone.npz", "bone.csv", "bone.obj"])
+def test_a_binary_stl_file_under_another_ending_is_refused_with_its_own(tmp_path, name):
+    write_with_open3d(tmp_path / "bone.stl", mesh=True)
+    (tmp_path / "bone.stl").rename(tmp_path / name)
+    with pytest.raises(InvalidPointCloudError, match=rf"{name} .*looks like \.stl: rename it"):
+        clouds.load(tmp_path / name)
+
+
+def test_an_array_file_under_the_ending_of_a_mesh_is_refused_with_its_own(tmp_path):
+    for save, kind in ((np.save, "npy"), (lambda file, points: np.savez(file, points=points), "npz")):
+        with (tmp_path / "bone.stl").open("wb") as file:
+            save(file, VERTICES)
+        with pytest.raises(InvalidPointCloudError, match=rf"looks like \.{kind}: rename it"):
+            clouds.load(tmp_path / "bone.stl")
+
+
+def test_a_cut_file_under_its_own_ending_is_to_be_exported_again(tmp_path):
+    write_with_open3d(tmp_path / "bone.ply", mesh=True)
+    (tmp_path / "bone.ply").write_bytes((tmp_path / "bone.ply").read_bytes()[:-9])
+    with pytest.raises(InvalidPointCloudError, match="bone.ply .*export it again"):
+        clouds.load(tmp_path / "bone.ply")
+
+
+@pytest.mark.parametrize("ending", ["ply", "stl", "obj", "vtk", "vtp", "pcd", "npy", "npz", "csv", "txt", "xyz"])
+def test_an_empty_file_is_called_empty(tmp_path, ending):
+    (tmp_path / f"bone.{ending}").touch()
+    with pytest.raises(InvalidPointCloudError, match=rf"bone\.{ending} \(0 bytes, an empty file\)"):
+        clouds.load(tmp_path / f"bone.{ending}")
+
+
+def test_a_folder_of_meshes_is_no_cloud_and_a_file_in_it_is_asked_for(tmp_path):
+    write_with_open3d(tmp_path / "bone.stl", mesh=True)
+    with pytest.raises(InvalidPointCloudError, match=r"no slices .*; name a file in it"):
+        clouds.load(tmp_path)
+
+
 def test_a_missing_file_and_an_unknown_format_are_distinguished(tmp_path):
     with pytest.raises(InvalidPointCloudError, match="a file that exists"):
         clouds.load(tmp_path / "none.ply")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
-        scratch.unlink(missing_ok=True)
+        with suppress(OSError):  # no such folder: the error above says more
+            scratch.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -66,4 +67,6 @@ def read_json(path: str | Path, what: str) -> Any:
 def unwritable(path: str | Path, error: OSError) -> ConfigError:
     """What to say of a path that cannot be written."""
     why = error.strerror or str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        why = "what should be its folder is a file"
     return ConfigError("a path that can be written", f"{path} ({why})", "choose another path, or free some space")

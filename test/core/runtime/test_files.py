@@ -29,6 +29,14 @@ def test_a_full_disk_is_one_sentence_that_names_the_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_path_through_a_file_is_one_sentence_that_names_what_was_asked_for(tmp_path):
+    (tmp_path / "a.txt").write_text("old")
+    for path in (tmp_path / "a.txt" / "b.json", tmp_path / "a.txt" / "c" / "b.json"):
+        with pytest.raises(ConfigError, match=r"b\.json \(what should be its folder is a file\)"):
+            files.write_text(path, "new")
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
 @pytest.mark.parametrize("content", [None, b"{", b"\xff\xfe\x00"])
 def test_what_is_no_json_is_one_sentence_that_names_the_file(tmp_path, content):
     if content is not None:

@@ -229,6 +229,8 @@ def _is_triple(value: Any) -> bool:
 def _example(default: Any, value: Any) -> str:
     if isinstance(default, float) and type(value) is int:
         return f"{value}.0"
+    if isinstance(default, float) and not default:
+        return "1.0"  # 0.0 switches a limit off
     if isinstance(default, str):
         return f'"{value}"' if isinstance(value, int | float) else f'"{default}"'
     return _yaml(default)

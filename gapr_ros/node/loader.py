@@ -44,7 +44,8 @@ class Loader:
         self._path, self._since = parameters.model_path or "no model_path", time.monotonic()
         self._thread = threading.Thread(target=self._run, args=(parameters, done), name="loading", daemon=True)
         self._thread.start()
-        self._host.ros.get_logger().info(f"loading {self._path}")
+        if parameters.model_path:
+            self._host.ros.get_logger().info(f"loading {self._path}")
         self._host.report()  # that it loads: with a short file nobody would see it otherwise
         return done
 

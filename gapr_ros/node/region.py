@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gapr_core import crop_box, crop_to_pose
 from gapr_ros.node import wire
 from gapr_ros.node.model import Model
+from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
 
 Array = NDArray[np.float64]
@@ -37,7 +38,15 @@ def box(parameters: NodeParameters, T_crop_cloud: Array) -> Crop:
     Args:
         parameters: the corners, m, in `crop_frame`.
         T_crop_cloud: (4, 4), metres.
+
+    Raises:
+        RefusedError: too_few_points, for a box that no point fits in.
     """
+    if not all(low < high for low, high in zip(parameters.crop_min, parameters.crop_max, strict=True)):
+        corners = (
+            f"crop_min {list(parameters.crop_min)} is not below crop_max {list(parameters.crop_max)} along every axis"
+        )
+        raise RefusedError(Reason.TOO_FEW_POINTS, f"the box is empty: {corners}; correct them")
     low, high = (wire.to_mm(np.asarray(corner), "m") for corner in (parameters.crop_min, parameters.crop_max))
     return partial(crop_box, T_box_points=wire.in_mm(T_crop_cloud), lowest=low, highest=high)
 

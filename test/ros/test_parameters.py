@@ -46,6 +46,7 @@ def ros():
     [
         ("min_confidence", 1, "'min_confidence' must be of type double, got 1: write 1.0"),
         ("max_rate", 10, "write 10.0"),
+        ("max_tre", "two", "write 1.0"),
         ("min_points", 3.5, "must be of type integer, got 3.5"),
         ("model_path", 5, 'write "5"'),
         ("continuous", "yes", "write true"),

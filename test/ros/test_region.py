@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import frames, region
+from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import matrix_to_transform
 
@@ -52,6 +53,15 @@ def test_the_box_keeps_what_is_inside_it_in_its_own_frame():
     points_mm = se3.apply(se3.inverse(T_BOX_PROBE), there_m) * 1000.0
     kept = region.box(parameters, T_BOX_PROBE)(points_mm)
     np.testing.assert_allclose(kept, points_mm[[0, 4]], atol=1e-9)
+
+
+@pytest.mark.parametrize("highest", [(0.1, 0.3, 0.2), (0.1, 0.0, 0.4)])
+def test_a_box_that_no_point_fits_in_names_its_corners_in_metres(highest):
+    parameters = NodeParameters(crop_min=(0.0, 0.1, 0.2), crop_max=highest)
+    with pytest.raises(RefusedError) as refused:
+        region.box(parameters, np.eye(4))
+    assert refused.value.reason is Reason.TOO_FEW_POINTS
+    assert f"crop_min [0.0, 0.1, 0.2] is not below crop_max {list(highest)}" in refused.value.text
 
 
 def test_the_neighbourhood_of_the_bone_is_where_its_last_pose_puts_it():

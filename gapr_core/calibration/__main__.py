@@ -22,7 +22,7 @@ from gapr_core.calibration.card import as_markdown
 from gapr_core.calibration.collect import collect
 from gapr_core.calibration.fit import ACCEPTED, by_group, fit, of_unseen_families, of_unseen_people
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, GaprError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
 from gapr_core.registration.precision_model import PRECISION_FEATURES
@@ -131,4 +131,7 @@ def _write(path: Path, kind: str, model: Additive, more: dict[str, Any], card: d
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except GaprError as error:
+        raise SystemExit(f"python -m gapr_core.calibration: {error}") from None

@@ -20,6 +20,7 @@ from gapr_core.calibration.shapes import SHAPES
 from gapr_core.config import SENSOR_KINDS
 from gapr_core.data import anatomy, protocols, scans
 from gapr_core.data import pool as bone_pool
+from gapr_core.data.parametric import BONES as PARAMETRIC
 from gapr_core.data.specimen import Specimen
 from gapr_core.training.dataset import People
 
@@ -274,7 +275,8 @@ def keep(folder: str, split: str, bones: Bones) -> None:
 def _made(bone: str, folder: str, split: str) -> list[Specimen]:
     drawn = People(bone, Path(folder), split)
     new = [drawn.draw(number, 1.0, DRAWN_SEED) for number in range(DRAWN_PEOPLE[bool(drawn.real)])]
-    return anatomy.surfaces(folder, bone, split) + bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE) + new
+    parametric = bone_pool.specimens(bone, split, PARAMETRIC_PEOPLE) if bone in PARAMETRIC else []
+    return anatomy.surfaces(folder, bone, split) + parametric + new
 
 
 VIEWS: dict[str, Callable[[Specimen, np.random.Generator], protocols.Pair]] = {

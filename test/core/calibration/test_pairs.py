@@ -1,5 +1,8 @@
 """What the models learn from."""
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -162,3 +165,25 @@ class _NoView:
     def __init__(self, seen_as):
         self.seen_as, self.whole, self.specimen, self.person = seen_as, self, self, "nobody"
         self.bone, self.end = "femur", None
+
+
+def test_another_bone_needs_its_name_and_meshes_only(tmp_path, monkeypatch):
+    """It has no parametric subjects."""
+    tibia = parametric_specimen("tibia", 0).surface
+    people = [f"subject_{number}" for number in range(4)]
+    points = np.stack([tibia.points * size for size in (1.0, 1.02, 0.98, 1.05)])
+    np.savez(tmp_path / "fibula_mine.npz", points=points, faces=tibia.faces, person=people)
+    (tmp_path / "splits.json").write_text(json.dumps({"train": people, "val": [], "test": []}))
+    monkeypatch.setattr(pairs, "BONES", ("fibula",))
+    monkeypatch.setattr(pairs, "DRAWN_PEOPLE", dict.fromkeys(pairs.DRAWN_PEOPLE, 2))
+    monkeypatch.setattr(pairs, "_KEPT", {})
+    found = pairs.bones_of(str(tmp_path), "train")["fibula"]
+    assert [each.cohort for each in found] == ["mine"] * 4 + ["drawn"] * 2
+
+
+def test_a_folder_that_is_none_is_one_line(tmp_path):
+    command = [sys.executable, "-m", "gapr_core.calibration", "--anatomy", "nowhere", "--out", "out", "--count", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("python -m gapr_core.calibration: expected a folder with anatomy; got nowhere")
+    assert done.stderr.count("\n") == 1

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Point32, Polygon
 
 from gapr_core import baselines
 from gapr_core.benchmark import methods
@@ -154,7 +153,8 @@ def test_the_recipes_of_contributing_work(here, monkeypatch):
         result = method.register(pair.source, method.prepare(pair.target))
         assert result.ok or result.reason
     assert result.proposer == "centroids"
-    message = names["INPUT"].message(polygon=Polygon(points=[Point32(x=1.0), Point32(y=2.0)]))
+    message = names["polygon"]([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    assert message.header.frame_id
     assert names["INPUT"].points(message).tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
     assert names["INPUT"].count(message) == 2
 

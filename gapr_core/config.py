@@ -182,6 +182,12 @@ class RulesConfig(Settings):
     largest_scale_z: float = setting(
         3.0, "standard deviations by which the size of a source may be off; more is another bone", low=0
     )
+    mirrored_better: float = setting(
+        0.2, "log of mean squares by which the mirrored source may fit better; more is another side", low=0
+    )
+    mirrored_points: int = setting(
+        400, "a source of at most so many points is registered mirrored as well", low=0, high=1_000_000
+    )
     push: float = setting(1.5, "how far a pose is pushed, in units of verification.same_pose_mm", low=1, high=100)
     pushed_motions: int = setting(
         3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6

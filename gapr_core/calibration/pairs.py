@@ -48,11 +48,6 @@ SEEN_AS = {
     "ultrasound": {"ultrasound": 6.0},
     "depth-camera": {"depth-camera": 6.0},
     "laser": {"laser": 5.0},
-    "structured-light": {"structured-light": 4.0},
-    "stereo": {"stereo": 4.0},
-    "photogrammetry": {"photogrammetry": 4.0},
-    "covered": {"covered": 4.0},
-    "moving": {"moving": 4.0},
     "scene": {"scene-C1": 2.0, "scene-C2": 2.0, "scene-C3": 2.0},
 }  # family: how a bone is seen, and how often
 HELD_OUT = "laser"  # the family that no model is fitted on, only judged

@@ -107,6 +107,12 @@ class Assessment:
         covariance = variance_scale * self.uncertainty.covariance
         return replace(self, uncertainty=replace(self.uncertainty, covariance=covariance), factor95=learned.factor95)
 
+    def refused(self, refusal: Refusal | None, config: RulesConfig) -> Assessment:
+        """The same with what a rule says against it, if it says anything, and the probability that is left then."""
+        if refusal is None:
+            return self
+        return replace(self, refusal=refusal, probability=min(self.probability, config.ruled_out))
+
     def limited(self, most: float) -> Assessment:
         """The same with a probability of at most `most`."""
         return replace(self, probability=min(self.probability, most))
@@ -140,20 +146,19 @@ def judge(
     probability = calibration.probability(features)
     refusal = rules.by_geometry(fit, candidates, uncertainty, probability, source, target, config)
     refusal = refusal or rules.by_size(features, config.rules)
-    if refusal is not None:
-        probability = min(probability, config.rules.ruled_out)
-    return Assessment(
+    assessment = Assessment(
         fit,
         candidates,
         uncertainty,
         features,
         probability,
-        refusal,
+        None,
         source,
         target,
         contributions=calibration.contributions(features),
         independent_points=config.rules.independent_points,
     )
+    return assessment.refused(refusal, config.rules)
 
 
 def shared_probability(best: float, scores: Array, independent_points: float) -> tuple[float, ...]:

@@ -2,7 +2,8 @@
 
 The bone of the other side of the body is the mirror image of this one. Where a patch is nearly its own mirror image no
 residual tells the two apart; where it is not, the mirrored source fits badly. A bone that is its own mirror image as a
-whole (a pelvis, a rib cage) has no other side: those images are not counted.
+whole (a pelvis, a rib cage) has no other side: those images are not counted in `margin`. Yet it is never quite its own
+image, and `image_margin` tells a scan that was flipped from one that was not.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ LIMITS = (-1.5, 4.0)  # of the margin: what is clearer decides nothing more
 PLANES = 6  # through the bone's long axis, evenly turned
 OWN_IMAGE_SHARE = 0.02  # of the half extent: a bone whose image lies so near, as a median, is its own mirror image
 POINTS = 400  # of the bone, for that
+LEAST_MM = 0.1
 FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
@@ -48,6 +50,44 @@ def margin(
         if not _is_own_image(poses[number] @ FLIP @ se3.inverse(T), target):
             return float(np.clip(np.log(scores[number] / own), *LIMITS))
     return LIMITS[1]
+
+
+def image_margin(
+    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+) -> float:
+    """As `margin`, for the image of a bone that is nearly its own mirror image; 4 for any other bone.
+
+    Args:
+        T: (4, 4) T_target_source of the pose, mm.
+        source: what was registered.
+        target: the bone; its image is found once, and kept with it.
+        config: how hypotheses are refined.
+        num_threads: 0 for all cores.
+    """
+    if "own image" not in target.cache:
+        target.cache["own image"] = _own_image(target, config, num_threads)
+    image = target.cache["own image"]
+    if image is None:
+        return LIMITS[1]
+    some, limits_mm = source.subset(config.middle_points), np.linspace(*config.middle_limits_mm)
+    own = refine_many(T[None], some, target, limits_mm, num_threads)[1][0]
+    flipped = refine_many((image @ T @ FLIP)[None], some * FLIP.diagonal()[:3], target, limits_mm, num_threads)[1][0]
+    return log_ratio(flipped, own)
+
+
+def log_ratio(mirrored_mm2: float, own_mm2: float) -> float:
+    """Log of one mean square residual over another; below .1 mm neither says anything of left and right."""
+    return float(np.clip(np.log((mirrored_mm2 + LEAST_MM**2) / (own_mm2 + LEAST_MM**2)), *LIMITS))
+
+
+def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: int) -> Array | None:
+    """(4, 4) motion with a reflection that lays the bone on itself, target frame; None where there is none."""
+    some = target.points[:: max(1, len(target.points) // POINTS)]
+    centre, limits_mm = target.points.mean(axis=0), np.linspace(*config.middle_limits_mm)
+    planes = np.array([_reflection(normal, centre) for normal in _axes(target.points)])
+    poses, scores = refine_many(planes @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
+    images = [poses[number] @ FLIP for number in np.argsort(scores)]
+    return next((image for image in images if _is_own_image(image, target)), None)
 
 
 def _reflections(T: Array, points: Array, target: PreparedTarget) -> list[Array]:

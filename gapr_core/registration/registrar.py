@@ -14,7 +14,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, cortices, explained, rules
+from gapr_core.registration import clutter, cortices, explained, mirror, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess
@@ -36,6 +36,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+NO_POSES = np.empty((0, 4, 4))
 FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity: poses are often written with few digits
 
 
@@ -158,7 +159,7 @@ class Registrar:
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
-        start = np.empty((0, 4, 4)) if initial is None else _rigid(initial)[None]
+        start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
             assessment = self._in_rounds(prepared, target, start, clock)
         else:
@@ -170,12 +171,29 @@ class Registrar:
             again = self._in_rounds(prepared, target.both_cortices, assessment.fit.T[None], clock)
             assessment = (again or assessment).limited(self.config.cortices.largest_confidence)
         if assessment.is_sure(self.config.min_confidence**2):  # as in `rules.by_geometry`
+            assessment = self._unless_mirrored(assessment, clock)
+        if assessment.is_sure(self.config.min_confidence**2):
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
         judged = explained.named_clutter(assessment, self.config).corrected(self.precision)
         if judged.refusal is None or judged.seen is not None:  # a part that was found in a scene has no size of its own
             return judged
         return replace(judged, refusal=rules.asking_the_unit(judged.refusal, prepared.points, target.points))
+
+    def _unless_mirrored(self, assessment: Assessment, clock: Clock) -> Assessment:
+        """The same; refused where the mirror image of the source fits better.
+
+        A few points leave much to chance, wherever on the bone: their mirror image is registered in full.
+        """
+        a, config = assessment, self.config
+        found = mirror.image_margin(a.fit.T, a.source, a.target, config.verification, config.num_threads)
+        if a.seen is None and len(a.source.points) <= config.rules.mirrored_points:
+            flipped = sources.prepare(a.source.points * [1.0, 1.0, -1.0], config.source, config.num_threads)
+            image = None if isinstance(flipped, Refusal) else self._in_rounds(flipped, a.target, NO_POSES, clock)
+            if image is not None:
+                found = min(found, mirror.log_ratio(image.candidates.scores[0], a.candidates.scores[0]))
+        clock.lap("assess")
+        return a.refused(rules.by_mirror(found, config.rules), config.rules)
 
     def _in_rounds(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock

@@ -1,7 +1,8 @@
 """The safety rules: what refuses a pose, whatever its probability. Each rule refuses alone.
 
-Four rules never look at the probability: a motion that is not observed, a pose that can be pushed aside, a rival that
-is as good, a source of another size. Two are the user's thresholds: `min_confidence` and `max_tre_mm`.
+Five rules never look at the probability: a motion that is not observed, a pose that can be pushed aside, a rival that
+is as good, a source of another size, a source whose mirror image fits better. Two are the user's thresholds:
+`min_confidence` and `max_tre_mm`.
 """
 
 from __future__ import annotations
@@ -87,6 +88,20 @@ def by_size(features: Mapping[str, float], rules: RulesConfig = DEFAULT) -> Refu
         return None
     reason = f"the source fits best in another size ({features['scale_z']:.1f} standard deviations off)"
     return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: is it of this bone, and is its scale right?")
+
+
+def by_mirror(log_ratio: float, rules: RulesConfig = DEFAULT) -> Refusal | None:
+    """Why the source is of the other side of the body, or flipped; None where its mirror image fits no better.
+
+    Args:
+        log_ratio: log of the mean square residual of the mirrored source over that of the source (`mirror`).
+        rules: how much better a mirrored source may fit.
+    """
+    if not log_ratio < -rules.mirrored_better:
+        return None
+    reason = "the mirror image of the source fits the bone better"
+    question = "is it of the other side of the body, or was a scan flipped from left to right?"
+    return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {question}")
 
 
 def by_threshold(probability: float, tre95_mm: float, config: RegistrarConfig) -> Refusal | None:

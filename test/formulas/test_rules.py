@@ -10,7 +10,7 @@ import tiny
 
 from gapr_core.config import RegistrarConfig, SourceConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import refinement, rules
+from gapr_core.registration import mirror, refinement, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration.assessment import shared_probability
 from gapr_core.registration.covariance import PoseUncertainty
@@ -103,6 +103,21 @@ def test_a_source_of_another_size_refuses_alone(scale_z, refused):
     if refusal:
         assert refusal.status is RegistrationStatus.LOW_CONFIDENCE
         assert f"{scale_z:.1f} standard deviations" in refusal.reason and "scale" in refusal.reason
+
+
+@pytest.mark.parametrize(("log_ratio", "refused"), [(-0.21, True), (-0.2, False), (-0.19, False), (1.0, False)])
+def test_a_source_whose_mirror_image_fits_better_refuses_alone(log_ratio, refused):
+    refusal = rules.by_mirror(log_ratio)
+    assert (refusal is not None) is refused
+    if refusal:
+        assert refusal.status is RegistrationStatus.LOW_CONFIDENCE
+        assert "other side" in refusal.reason and "flipped" in refusal.reason
+
+
+def test_the_ratio_of_a_mirrored_source_is_that_of_mean_squares_above_a_tenth_of_a_millimetre():
+    assert mirror.log_ratio(0.03, 0.09) == pytest.approx(np.log(0.04 / 0.10))
+    assert mirror.log_ratio(1e-9, 1e-12) == pytest.approx(0.0, abs=1e-6)  # both exact: no sign of either
+    assert (mirror.log_ratio(0.0, 1e3), mirror.log_ratio(1e3, 0.0)) == (-1.5, 4.0)
 
 
 def test_a_pose_that_can_be_pushed_refuses_alone_where_it_would_be_accepted(egg, monkeypatch):

@@ -168,7 +168,7 @@ def test_a_signal_ends_the_node_within_two_seconds_while_nothing_happens(client,
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_ends_the_node_within_two_seconds_while_it_registers(client, tmp_path, number):
-    """400 000 points, none of them left out, take nearly two seconds of CPU time."""
+    """400 000 points, none of them left out, take most of a second of CPU time and more."""
     bone = bones.bone()
     model = bones.save(bone, tmp_path / "bone.npz")
     node = started(client, tmp_path, model, max_points=0, track=False, timeout=600.0)
@@ -176,7 +176,7 @@ def test_a_signal_ends_the_node_within_two_seconds_while_it_registers(client, tm
     before = client.values()
     begun_s = cpu_s(node)
     client.send(bones.partial(bone, np.eye(4), count=400_000))
-    wait_until(lambda: cpu_s(node) >= begun_s + 0.5, PATIENCE_S, "half a second of work")
+    wait_until(lambda: cpu_s(node) >= begun_s + 0.2, PATIENCE_S, "a fifth of a second of work")
     assert client.values()["frames_accepted"] == before["frames_accepted"] == "0", "it was ready before the signal"
     assert node.stop_cpu_s(number) < LIMIT_S
     assert "Traceback" not in node.log

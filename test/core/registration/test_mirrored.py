@@ -1,0 +1,83 @@
+"""A source whose mirror image fits better is refused: a flipped scan, or a bone of the other side."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig
+from gapr_core.data.parametric import make_bone
+from gapr_core.registration import mirror
+from gapr_core.results import RegistrationStatus
+
+CONFIG = RegistrarConfig(num_threads=1)
+FLIP = np.array([-1.0, 1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def pelvis():
+    return make_bone("pelvis", 900_001)
+
+
+@pytest.fixture(scope="module")
+def registrar():
+    return Registrar(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def target(registrar, pelvis):
+    return registrar.prepare(pelvis)
+
+
+def seen(bone, count=1500, noise_mm=0.4):
+    rng = np.random.default_rng(5)
+    points = bone.sample(20_000, rng)[0]
+    points = points[points[:, 1] > np.median(points[:, 1])]
+    return points[rng.permutation(len(points))[:count]] + rng.normal(0.0, noise_mm, (count, 3))
+
+
+def test_a_pelvis_is_accepted_and_a_flipped_one_is_not(registrar, target, pelvis):
+    own, flipped = (registrar.register(seen(pelvis) * flip, target) for flip in (1.0, FLIP))
+    assert own.ok and own.confidence > 0.9
+    assert flipped.status is RegistrationStatus.LOW_CONFIDENCE and "flipped" in flipped.reason
+    assert flipped.T_target_source is None and flipped.confidence <= CONFIG.rules.ruled_out
+
+
+def test_nothing_but_this_rule_refuses_the_flipped_pelvis(target, pelvis):
+    without = replace(CONFIG, rules=replace(CONFIG.rules, mirrored_better=10.0))
+    assert Registrar(without).register(seen(pelvis) * FLIP, target).ok
+
+
+def test_the_image_of_a_bone_is_a_reflection_and_found_once(registrar, target, monkeypatch):
+    image = mirror._own_image(target, CONFIG.verification, 1)
+    assert np.linalg.det(image[:3, :3]) == pytest.approx(-1.0)
+    monkeypatch.setattr(mirror, "_own_image", None)  # is not called again
+    np.testing.assert_array_equal(target.cache["own image"], image)
+    assert registrar.register(seen(make_bone("pelvis", 900_001)), target).ok
+
+
+def test_a_bone_without_an_image_has_the_largest_margin(target):
+    unlike = replace(target, cache={"own image": None})
+    assert mirror.image_margin(np.eye(4), None, unlike, CONFIG.verification, 1) == mirror.LIMITS[1]
+
+
+@pytest.mark.parametrize(("count", "better", "refused"), [(400, 1.5, True), (400, 1.0, False), (401, 1.5, False)])
+def test_few_points_are_registered_mirrored_as_well(monkeypatch, count, better, refused):
+    registrar, femur = Registrar(CONFIG), make_bone("femur", 900_001)
+    in_rounds, asked, own = Registrar._in_rounds, [], []
+
+    def rounds(self, source, target, poses, clock):
+        asked.append(source.points)
+        if len(asked) == 1:
+            own.append(in_rounds(self, source, target, poses, clock))
+            return own[0]
+        return SimpleNamespace(candidates=SimpleNamespace(scores=own[0].candidates.scores / better))
+
+    monkeypatch.setattr(Registrar, "_in_rounds", rounds)
+    result = registrar.register(seen(femur, count), registrar.prepare(femur))
+    assert (not result.ok and "mirror image" in result.reason) is refused
+    assert len(asked) == (2 if count <= 400 else 1)
+    if len(asked) == 2:
+        gaps = np.sort(asked[0] * [1.0, 1.0, -1.0], axis=0) - np.sort(asked[1], axis=0)
+        np.testing.assert_allclose(gaps, 0.0, atol=1e-9)

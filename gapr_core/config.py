@@ -123,7 +123,7 @@ class CovarianceConfig(Settings):
             raise ConfigError("two or more ascending sizes_mm", str(self.sizes_mm), "name the smallest size first")
 
 
-SENSOR_KINDS = ("unknown", "pointer", "ultrasound", "depth_camera", "laser")
+SENSOR_KINDS = ("unknown", "pointer", "ultrasound", "depth_camera", "laser", "structured_light")
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,12 @@ class SensorConfig(Settings):
     noise_mm: float | None = setting(None, "standard deviation of a point", low=1e-3, high=10, unit="mm")
     bias_mm: float | None = setting(None, "standard deviation of the smooth bias", low=1e-3, high=10, unit="mm")
     scale: float | None = setting(None, "standard deviation of the relative error of size", low=0, high=0.2)
+    tracking_mm: float | None = setting(
+        None, "standard deviation of an error of the whole cloud's place", low=0, high=10, unit="mm"
+    )
+    tracking_deg: float | None = setting(
+        None, "the same of its attitude, about its centroid", low=0, high=10, unit="deg"
+    )
     sparse_points: int = setting(400, "with more points the stand-off of an unknown sensor falls as 1 / N", low=1)
     known_standoff_mm: float = setting(
         0.15, "standard deviation of a stand-off that is stated: contact is never full", low=1e-3, high=10, unit="mm"

@@ -20,7 +20,14 @@ from gapr_core.calibration import conformal, streams
 from gapr_core.calibration.answers import Answers, answers_of, together
 from gapr_core.calibration.card import as_markdown
 from gapr_core.calibration.collect import collect
-from gapr_core.calibration.fit import ACCEPTED, by_group, fit, of_unseen_families, of_unseen_people
+from gapr_core.calibration.fit import (
+    ACCEPTED,
+    by_group,
+    fit,
+    known_families,
+    of_unseen_families,
+    of_unseen_people,
+)
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
@@ -61,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commits = sorted({str(record.get("commit")) for record in records})
     made = {"commit": origin.commit(), "commits_of_pairs": commits,
             "command": " ".join(["python -m gapr_core.calibration", *given]),
-            "seed": args.seed, "split": args.split, "held_out_family": HELD_OUT}  # fmt: skip
+            "seed": args.seed, "split": args.split, "held_out_families": list(HELD_OUT)}  # fmt: skip
     cards = write_models(records, args.out, made)
     write_text(args.out / "confidence.md", as_markdown(cards, made))
     say(f"{len(records)} pairs; models and confidence.md are in {args.out}")
@@ -75,7 +82,7 @@ def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str
         answers = answers_of(records, name)
         if not len(answers):
             continue
-        known = answers.of(answers.family != HELD_OUT)
+        known = answers.of(known_families(answers))
         cards[name] = made | confidence_card(answers)
         if set(SHARED) <= set(answers.feature_names):
             rounds[name] = answers
@@ -112,8 +119,8 @@ def fit_precision(rounds: Sequence[Answers]) -> tuple[Additive, float, dict[str,
     if not found:
         raise ConfigError("accepted answers with a truth", "none", "collect more pairs (--count)")
     answers = together(found)
-    known = answers.family != HELD_OUT
-    new_sensor, new_subject = conformal.of_unseen(answers), conformal.of_unseen_people(answers, known)
+    known = known_families(answers)
+    new_sensor, new_subject = conformal.of_unseen(answers, known), conformal.of_unseen_people(answers, known)
     scores = [answers.true_mm / (scale * answers.tre95_mm) for scale in (new_sensor, new_subject)]
     factor = max(
         conformal.factor_overall(scores[0][known]),

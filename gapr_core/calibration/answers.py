@@ -137,13 +137,13 @@ def of_models_that_saw_no_subject(
 
 
 def of_models_that_saw_neither(
-    answers: Answers, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
+    answers: Answers, known: Mask, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
 ) -> Array:
-    """(N,) predictions, each by a model that was fitted without the pair's subject and without its sensor family."""
+    """(N,) predictions, each by a model of the known answers (N,) without the pair's subject and its sensor family."""
     found = np.full(len(answers), np.nan)
     for family in np.unique(answers.family):
         of_it: Mask = answers.family == family
         for fitted, judged in answers.people_folds():
             if (judged & of_it).any():
-                found[judged & of_it] = predict(fit(answers.of(fitted & ~of_it)), answers.of(judged & of_it))
+                found[judged & of_it] = predict(fit(answers.of(fitted & known & ~of_it)), answers.of(judged & of_it))
     return found

@@ -26,8 +26,9 @@ def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
         "# Confidence and precision: card",
         f"Made by `{made['command']}` at commit {made['commit']}, seed {made['seed']}, {made['split']} subjects; "
         f"the pairs were registered by the code of {', '.join(made['commits_of_pairs'])}.",
-        f"The family {made['held_out_family']} is in no fit, only judged. New bones are drawn from shape models of all "
-        "subjects, and the network learned from the same subjects: who is unseen here is unseen by the confidence.",
+        f"The families {' and '.join(made['held_out_families'])} are in no fit, only judged. "
+        "New bones are drawn from shape models of all subjects, and the network learned from the same subjects: who is "
+        "unseen here is unseen by the confidence.",
         f"How a bone is seen: {_shares(views)}.",
         f"Whose bone it is: {_shares(WHAT)}. {100 * SHAPE_SHARE:.0f} % are shapes without a knowable pose.",
         "AUROC and ECE (10 equal-width bins) are of all pairs; wrong and right count what a confidence of .5 or .9 "

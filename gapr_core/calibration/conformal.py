@@ -43,9 +43,9 @@ def precision_table(answers: Answers) -> Array:
     return np.column_stack([columns[name] for name in PRECISION_FEATURES])
 
 
-def of_unseen(answers: Answers) -> Array:
-    """(N,) scales by models that have seen neither the subject nor the sensor family."""
-    return of_models_that_saw_neither(answers, fit_scale, scales)
+def of_unseen(answers: Answers, known: NDArray[np.bool_]) -> Array:
+    """(N,) scales by models of the known families that have seen neither the subject nor the sensor family."""
+    return of_models_that_saw_neither(answers, known, fit_scale, scales)
 
 
 def of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array:

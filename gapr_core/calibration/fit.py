@@ -20,6 +20,11 @@ Array = NDArray[np.float64]
 ACCEPTED = 0.5  # default of `min_confidence`
 
 
+def known_families(answers: Answers) -> NDArray[np.bool_]:
+    """(N,) mask of the answers that models are fitted to."""
+    return ~np.isin(answers.family, HELD_OUT)
+
+
 def fit(answers: Answers) -> Additive:
     """The log odds that an answer is right; every record counts once."""
     return fit_log_odds(answers.features, answers.right, answers.feature_names, SIGNS)
@@ -31,13 +36,13 @@ def probability(model: Additive, answers: Answers) -> Array:
 
 
 def of_unseen_people(answers: Answers) -> Array:
-    """(N,) probabilities, each by a model fitted without the pair's subject and the held-out family."""
-    return of_models_that_saw_no_subject(answers, answers.family != HELD_OUT, fit, probability)
+    """(N,) probabilities, each by a model fitted without the pair's subject and the held-out families."""
+    return of_models_that_saw_no_subject(answers, known_families(answers), fit, probability)
 
 
 def of_unseen_families(answers: Answers) -> Array:
     """(N,) probabilities, each by a model that has seen neither the subject nor the sensor family."""
-    return of_models_that_saw_neither(answers, fit, probability)
+    return of_models_that_saw_neither(answers, known_families(answers), fit, probability)
 
 
 def judged(answers: Answers, confidence: Array) -> dict[str, Any]:

@@ -6,7 +6,8 @@ relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K +
 Censi 2007 for the noise alone). A Hessian alone is over-confident. The size of the bias comes from the residuals
 (`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone hardly moves the
 pose, and one seen from one side does. Of an image, depths are wrong: both act along the beam. Slices of a tracked probe
-share an error each: another K, of short reach. A weak prior keeps a motion of which nothing was observed uncertain, but
+share an error each: another K, of short reach. An error of the place of the whole cloud, a tracked scanner's, is one of
+the pose as it is. A weak prior keeps a motion of which nothing was observed uncertain, but
 finite.
 """
 
@@ -109,10 +110,10 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
 
 
 def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
-    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + the prior's share.
+    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + T + the prior's share.
 
     G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`), e the
-    local error with fields E, o the stand-off and q the scale (see `directions`).
+    local error with fields E, o the stand-off and q the scale (see `directions`). T is that of the whole cloud's place.
     """
     inlier = fit.weights > 0.0
     gain, prior = gain_of(fit, fields, errors.noise_mm)
@@ -126,7 +127,8 @@ def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) 
             errors.scale * gain @ growth,
         ]
     )
-    return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + prior)
+    place = np.diag(np.repeat(np.square([errors.tracking_mm, np.radians(errors.tracking_deg)]), 3))
+    return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + place + prior)
 
 
 def directions(fit: Fit, along_beam: bool, one_sided: float) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ def test_a_known_sensor_has_its_usual_errors_however_many_points_come(kind):
         assert sensor.errors(SensorConfig(kind), points) == sensor.KINDS[kind]
 
 
-@pytest.mark.parametrize("name", ["noise_mm", "bias_mm", "scale"])
+@pytest.mark.parametrize("name", ["noise_mm", "bias_mm", "scale", "tracking_mm", "tracking_deg"])
 def test_each_stated_error_replaces_the_usual_one_alone(name):
     usual, stated = sensor.KINDS["laser"], sensor.errors(SensorConfig("laser", **{name: 0.123}), 10)
     assert {key for key in vars(usual) if getattr(usual, key) != getattr(stated, key)} == {name}

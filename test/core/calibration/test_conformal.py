@@ -39,7 +39,7 @@ def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_famil
         return np.exp(0.7 * np.abs(features[:, FEATURES.index("smooth_misfit")]))
 
     answers = made_answers(3000, error_scale=doubled_where_smooth)
-    scale = conformal.of_unseen(answers)
+    scale = conformal.of_unseen(answers, np.full(len(answers), True))
     factor = conformal.factor_overall(answers.true_mm / (scale * answers.tre95_mm))
     rows = conformal.coverage(answers, scale, factor)
     assert 0.945 < rows["all"]["covered"] < 0.975
@@ -71,15 +71,17 @@ def test_a_family_of_a_few_answers_does_not_decide_for_all():
 
 def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):
     answers, seen = made_answers(300), []
+    held_out = answers.family[0]
 
-    def fit_nothing(known):
-        seen.append(set(known.family))
+    def fit_nothing(fitted):
+        seen.append(set(fitted.family))
         return len(seen)
 
     monkeypatch.setattr(conformal, "fit_scale", fit_nothing)
     monkeypatch.setattr(conformal, "scales", lambda model, judged: np.full(len(judged), float(model)))
-    for family, model in zip(answers.family, conformal.of_unseen(answers).astype(int), strict=True):
-        assert family not in seen[model - 1]
+    models = conformal.of_unseen(answers, answers.family != held_out).astype(int)
+    for family, model in zip(answers.family, models, strict=True):
+        assert seen[model - 1] == set(answers.family) - {family, held_out}
 
 
 def test_no_scale_of_an_unseen_subject_is_from_a_model_that_has_seen_him_or_an_unknown_family(monkeypatch):

@@ -50,7 +50,7 @@ def test_the_family_that_is_held_out_is_in_no_fit(answers, monkeypatch):
     monkeypatch.setattr(fits, "fit", lambda known: seen.update(known.family) or Additive(0.0, ()))
     monkeypatch.setattr(fits, "probability", lambda model, judged: np.zeros(len(judged)))
     fits.of_unseen_people(answers)
-    assert seen == set(answers.family) - {HELD_OUT}
+    assert seen == set(answers.family) - set(HELD_OUT)
 
 
 def test_the_rounds_together_keep_what_each_record_is(answers):

@@ -133,6 +133,14 @@ def test_a_standoff_does_not_move_a_pose_that_is_held_from_all_sides():
     assert shifts[0] < 0.01 < 0.4 < shifts[1]
 
 
+def test_an_error_of_the_whole_clouds_place_is_one_of_the_pose():
+    """Sizes other than 1, and not alike: mm for deg, or deg for rad, fails; so does a size for its square."""
+    fit, fields = curved_fit(), np.zeros((300, 1))
+    errors = replace(NOTHING, tracking_mm=0.3, tracking_deg=0.7)
+    added = covariance.sandwich(fit, fields, errors, CONFIG) - covariance.sandwich(fit, fields, NOTHING, CONFIG)
+    np.testing.assert_allclose(added, np.diag([0.09] * 3 + [np.radians(0.7) ** 2] * 3), atol=1e-9)
+
+
 def test_depths_that_are_wrong_move_the_pose_along_the_beam_and_nowhere_else():
     """The noise of 1e-6 mm aside: variance of the stand-off along the mean normal, none across it, none of a turn."""
     fit, errors = curved_fit(), replace(NOTHING, standoff_mm=0.6, along_beam=True)

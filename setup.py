@@ -1,9 +1,13 @@
 """The metadata of the package: for pip and, through ament_python, for colcon."""
 
+import os
+import subprocess
+import sys
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 
 PACKAGE = "gapr_ros"
 
@@ -50,6 +54,26 @@ def files(folder, *patterns):
     return f"share/{PACKAGE}/{folder}", found
 
 
+class BuildCompiled(build_py):
+    """Copy the modules, then compile their loops, so that the first registration after an installation need not wait.
+
+    Without the libraries that this takes, and on another processor later, loops are compiled when they first run.
+    """
+
+    def run(self):
+        super().run()
+        if self.editable_mode:
+            return
+        folder = str(Path(self.build_lib).resolve())
+        kept_there = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+        environment = kept_there | {"PYTHONPATH": os.pathsep.join([folder, *sys.path]), "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, "-m", "gapr_core.cli", "compile"]
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+        if done.returncode:
+            why = done.stderr.strip().splitlines()[-1:]
+            self.warn(f"the loops are not compiled, so the first registration takes half a minute: {why}")
+
+
 setup(
     name=PACKAGE,
     version="0.2.0",
@@ -61,6 +85,7 @@ setup(
     maintainer_email="maintainers@gapr.invalid",
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=["gapr_core*", "msg_adapters*", "gapr_ros*"]),
+    cmdclass={"build_py": BuildCompiled},
     package_data={"gapr_core": ["weights/*.safetensors", "weights/*.json", "weights/*.md", "pages/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

@@ -25,6 +25,7 @@ COMMANDS = {
     "evaluate": "gapr_core.commands.evaluate",
     "settings": "gapr_core.commands.settings",
     "pivot": "gapr_core.commands.pivot",
+    "compile": "gapr_core.commands.compile",
     "benchmark": "gapr_core.commands.benchmark",
     "make-pairs": "gapr_core.data.make_pairs",
     "train": "gapr_core.training.cli",

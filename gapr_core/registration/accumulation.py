@@ -167,7 +167,7 @@ class Accumulator:
         limits, refinement = self.config.accumulation, self.config.refinement
         if len(source) < limits.fewest_points:
             return False
-        some = points[:: 1 + len(points) // limits.most_points]
+        some = np.ascontiguousarray(points[:: 1 + len(points) // limits.most_points])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
         return own > limits.off * max(of_all, refinement.smallest_sigma_mm)
 

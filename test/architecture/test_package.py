@@ -85,6 +85,45 @@ def test_everything_that_the_code_reads_is_installed_with_it(workspace):
     assert not [str(path) for path in files if not (site / path).is_file()]
 
 
+REGISTER = """
+import numpy as np
+from gapr_core import Accumulator, Registrar, Tracker
+from gapr_core.data.parametric import make_bone
+
+rng, bone = np.random.default_rng(1), make_bone("tibia", 1)
+points, normals = bone.sample(6000, rng)
+seen, registrar = points[normals[:, 1] < -0.2], Registrar.from_pretrained()
+print(registrar.__class__.register.__globals__["__file__"])
+for method in (registrar, Registrar(), Tracker(registrar), Accumulator(Tracker(registrar), 3)):
+    target = method.prepare(bone)
+    for number in range(3):
+        method.register(seen[number:], target)
+registrar.register(np.concatenate([seen, seen + 50.0]), registrar.prepare(points), viewpoint=[0.0, -500.0, 0.0])
+"""
+
+
+def test_no_registration_of_an_installed_package_waits_for_a_compiler(workspace):
+    (site,) = (workspace / "install/gapr_ros/lib").glob("python*/site-packages")
+    before = {path: path.stat().st_mtime_ns for path in site.rglob("*.nb[ic]")}
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    run = subprocess.run(
+        [sys.executable, "-c", REGISTER], cwd=workspace, env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 0 and str(site) in run.stdout, run.stdout + run.stderr
+    assert len(before) > 40
+    assert {path: path.stat().st_mtime_ns for path in site.rglob("*.nb[ic]")} == before
+
+
+def test_a_build_without_a_compiler_is_whole_and_says_what_it_lacks(tmp_path):
+    (tmp_path / "numba.py").write_text("raise ImportError('no compiler here')")
+    command = [sys.executable, "setup.py", "build_py", "--build-lib", str(tmp_path / "built")]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0 and "the loops are not compiled" in run.stdout + run.stderr
+    assert (tmp_path / "built/gapr_core/registration/kernels.py").is_file()
+    assert not list((tmp_path / "built").rglob("*.nbc"))
+
+
 def test_the_node_that_colcon_built_starts_and_uses_the_installed_code(workspace):
     node = workspace / "install/gapr_ros/lib/gapr_ros/register_node"
     where = "python3 -c 'import gapr_ros; print(gapr_ros.__file__)'"

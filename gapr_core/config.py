@@ -104,10 +104,13 @@ class CovarianceConfig(Settings):
         "standard deviations of the bias to choose from", low=1e-3, high=100, unit="mm",
     )  # fmt: skip
     smallest_share: float = setting(0.03, "least information of a usable field, over the largest", low=0, high=1)
-    bias_gain: float = setting(2.5, "bias over what the residuals of a robust fit show of it", low=0, high=100)
+    bias_gain: float = setting(2.1, "bias over what the residuals of a robust fit show of it", low=0, high=100)
     no_bias_mm: float = setting(0.035, "bias that residuals without any show on average", low=0, high=10, unit="mm")
     bias_spread: float = setting(1.5, "log standard deviation of the bias before the residuals", low=0.01, high=10)
     long_share: float = setting(0.5, "of the bias that all points share, over its size", low=0, high=10)
+    linear_share: float = setting(
+        0.6, "the same of the part that strains the source, at the root mean square distance", low=0, high=10
+    )
     local_correlation_mm: float = setting(
         8.0, "the same l of an error that near points share, such as that of a slice", low=0.1, high=1000, unit="mm"
     )

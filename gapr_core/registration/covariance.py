@@ -5,10 +5,11 @@ smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), a stand-off of va
 relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
 Censi 2007 for the noise alone). A Hessian alone is over-confident. The size of the bias comes from the residuals
 (`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone hardly moves the
-pose, and one seen from one side does. Of an image, depths are wrong: both act along the beam. Slices of a tracked probe
-share an error each: another K, of short reach. An error of the place of the whole cloud, a tracked scanner's, is one of
-the pose as it is. A weak prior keeps a motion of which nothing was observed uncertain, but
-finite.
+pose, and one seen from one side does. What varies more slowly than the correlation is constant or linear in place: in
+proportion to the bias, all points share an offset and the source is strained. Of an image, depths are wrong: stand-off
+and scale act along the beam. Slices of a tracked probe share an error each: another K, of short reach. An error of the
+place of the whole cloud, a tracked scanner's, is one of the pose as it is. A weak prior keeps a motion of which nothing
+was observed uncertain, but finite.
 """
 
 from __future__ import annotations
@@ -110,10 +111,11 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
 
 
 def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
-    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + T + the prior's share.
+    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T + c^2 S S^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + T + P.
 
-    G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`), e the
-    local error with fields E, o the stand-off and q the scale (see `directions`). T is that of the whole cloud's place.
+    G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`) and c
+    strains the source (`linear_share`, `strains`), e the local error with fields E, o the stand-off and q the scale
+    (see `directions`), T what the place of the whole cloud adds and P the prior.
     """
     inlier = fit.weights > 0.0
     gain, prior = gain_of(fit, fields, errors.noise_mm)
@@ -122,6 +124,7 @@ def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) 
         [
             errors.bias_mm * gain @ fields[inlier],
             config.long_share * errors.bias_mm * gain.sum(axis=1),
+            config.linear_share * errors.bias_mm * gain @ strains(fit),
             errors.local_mm * gain @ _local_fields(fit, errors, config)[inlier],
             errors.standoff_mm * gain @ shift,
             errors.scale * gain @ growth,
@@ -148,6 +151,22 @@ def directions(fit: Fit, along_beam: bool, one_sided: float) -> tuple[Array, Arr
         return np.ones(len(normals)), np.einsum("ni,ni->n", away, normals)
     beam = mean / length
     return normals @ beam, (normals @ beam) * (away @ beam)
+
+
+def strains(fit: Fit) -> Array:
+    """(n, 6) how the residuals of the inliers change by independent strains of the source about their centroid.
+
+    A symmetric matrix E moves a point p by E (p - c), and its residual by n . E (p - c). The six are orthogonal, and
+    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid.
+    """
+    inlier = fit.weights > 0.0
+    if not inlier.any():
+        return np.zeros((0, 6))
+    away, normals = fit.moved[inlier] - fit.moved[inlier].mean(axis=0), fit.gradients[inlier]
+    size_mm = max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
+    products = np.einsum("ni,nj->nij", normals, away / size_mm)
+    i, j = np.triu_indices(3)
+    return np.asarray((products[:, i, j] + products[:, j, i]) / np.where(i == j, 2.0, np.sqrt(2.0)))
 
 
 def _local_fields(fit: Fit, errors: Errors, config: CovarianceConfig) -> Array:

@@ -12,7 +12,7 @@ from gapr_core.registration import bias_field, covariance, refinement
 from gapr_core.registration.sensor import Errors
 
 CONFIG = CovarianceConfig()
-NO_COMMON_BIAS = replace(CONFIG, long_share=0.0)
+NO_COMMON_BIAS = replace(CONFIG, long_share=0.0, linear_share=0.0)
 NOTHING = Errors(offset_mm=0.0, standoff_mm=0.0, noise_mm=1e-6, bias_mm=0.0, scale=0.0)
 
 
@@ -163,9 +163,29 @@ def test_a_view_from_several_sides_has_no_beam():
 
 def test_what_the_bias_has_in_common_is_a_standoff_of_its_own():
     fit, fields = curved_fit(), np.zeros((300, 1))
-    shared = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), CONFIG)
+    shared = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), replace(CONFIG, linear_share=0.0))
     standoff = covariance.sandwich(fit, fields, replace(NOTHING, standoff_mm=0.8 * CONFIG.long_share), CONFIG)
     np.testing.assert_allclose(shared, standoff, rtol=1e-9, atol=1e-15)
+
+
+def test_what_the_bias_has_in_common_also_strains_the_source():
+    """Errors of 0.8 mm x 0.7: symmetric matrices whose entries vary by 1 on the diagonal, by sqrt(1/2) beside it."""
+    fit, fields, rng = curved_fit(), np.zeros((300, 1)), np.random.default_rng(2)
+    inlier = fit.weights > 0.0
+    away = fit.moved - fit.moved[inlier].mean(axis=0)
+    size_mm = np.sqrt((away[inlier] ** 2).sum(axis=1).mean())
+    entries = rng.normal(size=(4000, 3, 3))
+    matrices = (entries + entries.transpose(0, 2, 1)) / 2.0  # off the diagonal the variance halves
+    errors_mm = 0.56 * np.einsum("ni,kij,nj->kn", fit.gradients, matrices, away / size_mm)
+    twists = solved(fit, errors_mm, 1e-6, fields) * arms(fit)
+    only_strain = replace(CONFIG, long_share=0.0, linear_share=0.7)
+    predicted = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), only_strain)
+    predicted = predicted * np.outer(arms(fit), arms(fit))
+    sampled = twists.T @ twists / len(twists)
+    assert np.abs(sampled - predicted).max() < 0.08 * np.abs(predicted).max()
+    assert np.trace(sampled) == pytest.approx(np.trace(predicted), rel=0.08)
+    nothing_seen = replace(fit, weights=np.zeros(300))
+    assert covariance.strains(nothing_seen).shape == (0, 6)
 
 
 def test_the_noise_of_few_points_is_larger_than_their_residuals_say():

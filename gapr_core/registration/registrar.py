@@ -183,11 +183,13 @@ class Registrar:
     def _unless_mirrored(self, assessment: Assessment, clock: Clock) -> Assessment:
         """The same; refused where the mirror image of the source fits better.
 
-        A few points leave much to chance, wherever on the bone: their mirror image is registered in full.
+        A few points leave much to chance, wherever on the bone, and so does an answer that is not sure: the mirror
+        image of such a source is registered in full.
         """
         a, config = assessment, self.config
         found = mirror.image_margin(a.fit.T, a.source, a.target, config.verification, config.num_threads)
-        if a.seen is None and len(a.source.points) <= config.rules.mirrored_points:
+        by_chance = len(a.source.points) <= config.rules.mirrored_points or not a.is_sure(config.rules.mirrored_below)
+        if a.seen is None and by_chance:
             flipped = sources.prepare(a.source.points * [1.0, 1.0, -1.0], config.source, config.num_threads)
             image = None if isinstance(flipped, Refusal) else self._in_rounds(flipped, a.target, NO_POSES, clock)
             if image is not None:

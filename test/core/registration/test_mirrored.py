@@ -62,9 +62,19 @@ def test_a_bone_without_an_image_has_the_largest_margin(target):
     assert mirror.image_margin(np.eye(4), None, unlike, CONFIG.verification, 1) == mirror.LIMITS[1]
 
 
-@pytest.mark.parametrize(("count", "better", "refused"), [(400, 1.5, True), (400, 1.0, False), (401, 1.5, False)])
-def test_few_points_are_registered_mirrored_as_well(monkeypatch, count, better, refused):
-    registrar, femur = Registrar(CONFIG), make_bone("femur", 900_001)
+@pytest.mark.parametrize(
+    ("count", "below", "better", "refused"),
+    [
+        (400, 0.0, 1.5, True),
+        (400, 0.0, 1.0, False),
+        (401, 0.0, 1.5, False),
+        (401, 1.0, 1.5, True),
+        (401, 1.0, 1.0, False),
+    ],
+)
+def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(monkeypatch, count, below, better, refused):
+    config = replace(CONFIG, rules=replace(CONFIG.rules, mirrored_below=below))
+    registrar, femur = Registrar(config), make_bone("femur", 900_001)
     in_rounds, asked, own = Registrar._in_rounds, [], []
 
     def rounds(self, source, target, poses, clock):
@@ -77,7 +87,7 @@ def test_few_points_are_registered_mirrored_as_well(monkeypatch, count, better, 
     monkeypatch.setattr(Registrar, "_in_rounds", rounds)
     result = registrar.register(seen(femur, count), registrar.prepare(femur))
     assert (not result.ok and "mirror image" in result.reason) is refused
-    assert len(asked) == (2 if count <= 400 else 1)
+    assert len(asked) == (2 if count <= 400 or below else 1)
     if len(asked) == 2:
         gaps = np.sort(asked[0] * [1.0, 1.0, -1.0], axis=0) - np.sort(asked[1], axis=0)
         np.testing.assert_allclose(gaps, 0.0, atol=1e-9)

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import tarfile
 import xml.etree.ElementTree as ElementTree
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -112,6 +113,15 @@ def test_no_registration_of_an_installed_package_waits_for_a_compiler(workspace)
     assert run.returncode == 0 and str(site) in run.stdout, run.stdout + run.stderr
     assert len(before) > 40
     assert {path: path.stat().st_mtime_ns for path in site.rglob("*.nb[ic]")} == before
+
+
+def test_a_source_archive_holds_what_builds_it(tmp_path):
+    command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path), "sdist", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, capture_output=True, check=True)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as packed:
+        names = {Path(*Path(name).parts[1:]).as_posix() for name in packed.getnames()}
+    assert {"setup.py", "pyproject.toml", "scripts/build_backend.py", "config/register_node.yaml"} <= names
 
 
 def test_a_build_without_a_compiler_is_whole_and_says_what_it_lacks(tmp_path):

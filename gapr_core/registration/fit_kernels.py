@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
+from gapr_core.geometry.quadric_kernels import EXACT
 
 
 @numba.njit(**EXACT)

@@ -47,11 +47,11 @@ KINDS = {
     "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.0),
     "laser": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.15, bias_mm=0.15, scale=0.002),
     "structured_light": Errors(
-        offset_mm=0.0, standoff_mm=0.1, noise_mm=0.2, bias_mm=0.15, scale=0.001, tracking_mm=0.25, tracking_deg=0.25
+        offset_mm=0.0, standoff_mm=0.1, noise_mm=0.2, bias_mm=0.15, scale=0.001, tracking_mm=0.2, tracking_deg=0.2
     ),
 }
 """What is usual: a real pointer lies .34 to .62 mm outside, sound is 1 to 3 % faster or slower than assumed, a tracked
-slice lies .1 to .5 mm off, light enters wet bone before it comes back, a tracked scanner is placed to a quarter of a
+slice lies .1 to .5 mm off, light enters wet bone before it comes back, a tracked scanner is placed to a fifth of a
 millimetre, pictures of unknown making are wrong by .3 % of their size."""
 
 

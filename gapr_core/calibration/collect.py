@@ -23,7 +23,7 @@ from gapr_core import metrics
 from gapr_core.calibration import pairs, streams
 from gapr_core.calibration.answers import round_of
 from gapr_core.calibration.pairs import Drawn, Task
-from gapr_core.config import ClutterConfig, RegistrarConfig, SensorConfig
+from gapr_core.config import ClutterConfig, RegistrarConfig, RulesConfig, SensorConfig
 from gapr_core.data import degradation, protocols
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -53,6 +53,7 @@ FOLLOWED = 0.5  # share of the pairs that become a stream
 LOOKED_AT = 3  # of the clean clouds with a viewpoint every third is registered as a scene as well: that takes seconds
 ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
+UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
 ACCEPTED = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
 
@@ -207,7 +208,9 @@ def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: Clutte
     """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     calibrations = [Calibration(proposer.name, ACCEPTED, {}) for proposer in proposers]
     sensor_config = SensorConfig(kind=sensor)
-    config = RegistrarConfig(num_threads=1, sensor=sensor_config, clutter=clutter_config or ClutterConfig())
+    config = RegistrarConfig(
+        num_threads=1, sensor=sensor_config, clutter=clutter_config or ClutterConfig(), rules=UNCHECKED
+    )
     of_scenes = Calibration(clutter.NAME, ACCEPTED, {})
     return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
 

@@ -195,7 +195,7 @@ class Scripted:
 def stream_model():
     """Log odds of the frames as they are; 3 more without a shared misfit, 6 less where it is 1 mm."""
     curves = (Curve(STREAM_FEATURES[0], np.array([-9.0, 9.0]), np.array([-9.0, 9.0])),
-              Curve(STREAM_FEATURES[1], np.array([0.0, 1.0]), np.array([2.0, -7.0])),
+              Curve(STREAM_FEATURES[1], np.array([0.0, 1.0]), np.array([2.0, -12.0])),
               Curve(STREAM_FEATURES[2], np.array([0.0, 1.0]), np.array([0.0, 2.0])))  # fmt: skip
     return Calibration(STREAM, Additive(0.0, curves), {})
 
@@ -221,8 +221,8 @@ def test_a_shared_misfit_alone_refuses_a_frame_that_fits(scripted, frames, prepa
     assert good.ok and bad.status is RegistrationStatus.LOW_CONFIDENCE
     log_odds = good.features["frames_log_odds"]
     assert log_odds == pytest.approx(bad.features["frames_log_odds"])
-    assert bad.confidence == pytest.approx(expit(min(log_odds - 6.0, LARGEST_LOG_ODDS)), rel=1e-6)
-    assert [r.contributions["shared_misfit"] for r in (good, bad)] == [2.0, -7.0]
+    assert bad.confidence == pytest.approx(expit(min(log_odds - 11.0, LARGEST_LOG_ODDS)), rel=1e-6)
+    assert [r.contributions["shared_misfit"] for r in (good, bad)] == [2.0, -12.0]
     assert good.contributions["shared_smooth"] == bad.contributions["shared_smooth"] == 1.0
 
 

@@ -192,7 +192,7 @@ class RulesConfig(Settings):
         3.0, "standard deviations by which the size of a source may be off; more is another bone", low=0
     )
     mirrored_better: float = setting(
-        0.2, "log of mean squares by which the mirrored source may fit better; more is another side", low=0
+        0.01, "log of mean squares by which the mirrored source may fit better; more is another side", low=0
     )
     mirrored_points: int = setting(
         400, "a source of at most so many points is registered mirrored as well", low=0, high=1_000_000

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,9 +42,10 @@ TRIANGLES = 200_000
 STREAM = Motion(frames=8, points=4000, step_mm=2.0, step_deg=1.0)
 GICP_VOXEL_MM = 2.0
 TARGET, OPEN3D = "prepare a target of 200 000 triangles", "Open3D: read it, and its normals"
-FULL, KISS = "register, one round (paper)", "KISS-Matcher and refinement, of that pair"
+FULL = {protocol: f"register ({protocol})" for protocol in ("paper", "L1", "L2")}
+KISS = {protocol: f"KISS-Matcher and refinement, of that pair ({protocol})" for protocol in FULL}
 TRACK, GICP = "track a frame of 4000 points", "small_gicp: thin and align that frame"
-STAGED = FULL, TRACK  # whose stages are printed too
+STAGED = FULL["paper"], TRACK  # whose stages are printed too
 
 
 def main() -> int:
@@ -88,20 +90,21 @@ def report(cases: dict[str, Case], repeats: int) -> None:
 
 def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -> dict[str, Case]:
     """What is timed, by name; `folder` is for a mesh."""
-    clean, biased, scene = (make_pair(protocol, bone, 5) for protocol in ("paper", "L2", "scene-C2"))
-    target, of_scene = registrar.prepare(clean.target), registrar.prepare(scene.target)
+    pairs, scene = {protocol: make_pair(protocol, bone, 5) for protocol in FULL}, make_pair("scene-C2", bone, 5)
+    clean, target, of_scene = pairs["paper"], registrar.prepare(pairs["paper"].target), registrar.prepare(scene.target)
     twice = Registrar.from_pretrained(RegistrarConfig(num_threads=threads, sure=2.0))
     kiss = make("kiss_matcher+point_to_plane")
-    of_kiss, file = kiss.prepare(clean.target, "mm"), fine_mesh(bone, folder)
-    frames = simulate(bone, 3, STREAM)
+    targets = {protocol: (registrar.prepare(pair.target), kiss.prepare(pair.target, "mm"))
+               for protocol, pair in pairs.items()}  # fmt: skip
+    file, frames = fine_mesh(bone, folder), simulate(bone, 3, STREAM)
+    full = {FULL[name]: partial(registrar.register, pair.source, targets[name][0]) for name, pair in pairs.items()}
+    of_kiss = {KISS[name]: partial(kiss.register, pair.source, targets[name][1]) for name, pair in pairs.items()}
     return {
         TARGET: lambda: registrar.prepare(file),
         OPEN3D: lambda: o3d.io.read_triangle_mesh(str(file)).compute_vertex_normals(),
         "prepare a source (5000 points)": lambda: sources.prepare(clean.source, SourceConfig()),
-        FULL: lambda: registrar.register(clean.source, target),
-        KISS: lambda: kiss.register(clean.source, of_kiss),
+        **{name: case for both in zip(full.items(), of_kiss.items(), strict=True) for name, case in both},
         "register, both rounds (paper)": lambda: twice.register(clean.source, target),
-        "register, one round (L2)": lambda: registrar.register(biased.source, target),
         "register a scene (C2)": lambda: registrar.register(scene.source, of_scene, viewpoint=scene.viewpoint),
         TRACK: tracked(frames, registrar),
         GICP: aligned(frames, threads),
@@ -154,7 +157,7 @@ def parts(stages: dict[str, list[dict[str, float]]]) -> str:
 
 def ratios(wall: dict[str, np.ndarray]) -> str:
     """Our times over those of others, repetition by repetition."""
-    pairs = ((TRACK, GICP), (FULL, KISS), (TARGET, OPEN3D))
+    pairs = ((TRACK, GICP), *((FULL[name], KISS[name]) for name in FULL), (TARGET, OPEN3D))
     rows = [markdown.row((ours, other, f"{np.median(wall[ours] / wall[other]):.2f}")) for ours, other in pairs]
     return "\n".join([markdown.head(("ours", "over", "median ratio of wall times")), *rows])
 

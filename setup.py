@@ -64,12 +64,17 @@ class BuildCompiled(build_py):
         super().run()
         if self.editable_mode:
             return
-        folder = str(Path(self.build_lib).resolve())
-        kept_there = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-        environment = kept_there | {"PYTHONPATH": os.pathsep.join([folder, *sys.path]), "PYTHONDONTWRITEBYTECODE": "1"}
+        folder = Path(self.build_lib).resolve()
+        for old in folder.rglob("*.nb[ic]"):
+            old.unlink()  # of a build before: Numba does not see that a loop in another file has changed
+        kept_there = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+        environment = kept_there | {
+            "PYTHONPATH": os.pathsep.join([str(folder), *sys.path]),
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
         command = [sys.executable, "-m", "gapr_core.cli", "compile"]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-        if done.returncode:
+        if done.returncode or not list(folder.rglob("*.nbc")):
             why = done.stderr.strip().splitlines()[-1:]
             self.warn(f"the loops are not compiled, so the first registration takes half a minute: {why}")
 

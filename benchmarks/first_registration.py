@@ -36,7 +36,9 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as empty:
             for name, cache in (("as installed", {}), ("nothing compiled", {"NUMBA_CACHE_DIR": empty})):
                 command = [sys.executable, str(Path(__file__).resolve()), "--one", method]
-                run = subprocess.run(command, cwd=empty, env=os.environ | cache, capture_output=True, text=True)
+                run = subprocess.run(
+                    command, cwd=empty, env=os.environ | cache, stdout=subprocess.PIPE, text=True, check=True
+                )
                 lines.append(markdown.row((f"{method}, {name}", *run.stdout.split())))
     say("\n".join(lines))
     return 0

@@ -109,7 +109,7 @@ class CovarianceConfig(Settings):
     bias_spread: float = setting(1.5, "log standard deviation of the bias before the residuals", low=0.01, high=10)
     long_share: float = setting(0.5, "of the bias that all points share, over its size", low=0, high=10)
     linear_share: float = setting(
-        0.6, "the same of the part that strains the source, at the root mean square distance", low=0, high=10
+        0.6, "relative strain of the source times its root mean square radius, over the bias", low=0, high=10
     )
     local_correlation_mm: float = setting(
         8.0, "the same l of an error that near points share, such as that of a slice", low=0.1, high=1000, unit="mm"
@@ -197,7 +197,9 @@ class RulesConfig(Settings):
     mirrored_points: int = setting(
         400, "a source of at most so many points is registered mirrored as well", low=0, high=1_000_000
     )
-    mirrored_below: float = setting(0.95, "so is one whose answer is less sure than this", low=0, high=1)
+    mirrored_below: float = setting(
+        0.95, "so is one without a viewpoint whose answer is less sure than this", low=0, high=1
+    )
     push: float = setting(1.5, "how far a pose is pushed, in units of verification.same_pose_mm", low=1, high=100)
     pushed_motions: int = setting(
         3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6

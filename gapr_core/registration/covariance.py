@@ -111,9 +111,9 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
 
 
 def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
-    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T + c^2 S S^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + T + P.
+    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T + h^2 S S^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + T + P.
 
-    G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`) and c
+    G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`) and h
     strains the source (`linear_share`, `strains`), e the local error with fields E, o the stand-off and q the scale
     (see `directions`), T what the place of the whole cloud adds and P the prior.
     """

@@ -106,13 +106,24 @@ registrar.register(np.concatenate([seen, seen + 50.0]), registrar.prepare(points
 def test_no_registration_of_an_installed_package_waits_for_a_compiler(workspace):
     (site,) = (workspace / "install/gapr_ros/lib").glob("python*/site-packages")
     before = {path: path.stat().st_mtime_ns for path in site.rglob("*.nb[ic]")}
-    environment = os.environ | {"PYTHONPATH": str(site)}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    environment |= {"PYTHONPATH": str(site)}
     run = subprocess.run(
         [sys.executable, "-c", REGISTER], cwd=workspace, env=environment, capture_output=True, text=True
     )
     assert run.returncode == 0 and str(site) in run.stdout, run.stdout + run.stderr
     assert len(before) > 40
     assert {path: path.stat().st_mtime_ns for path in site.rglob("*.nb[ic]")} == before
+
+
+def test_what_an_earlier_build_compiled_is_thrown_away(tmp_path):
+    stale = tmp_path / "built/gapr_core/registration/__pycache__/kernels.step-1.py311.1.nbc"
+    stale.parent.mkdir(parents=True)
+    stale.touch()
+    (tmp_path / "numba.py").write_text("raise ImportError('no compiler here')")
+    command = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", str(tmp_path / "built")]
+    subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, check=True)
+    assert not stale.exists()
 
 
 def test_a_source_archive_holds_what_builds_it(tmp_path):

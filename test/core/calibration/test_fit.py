@@ -45,12 +45,14 @@ def test_nobody_is_judged_by_a_model_that_learned_from_a_twin(answers):
         assert not (judged & set(twins) and known & set(twins))
 
 
-def test_the_family_that_is_held_out_is_in_no_fit(answers, monkeypatch):
-    seen = set()
+@pytest.mark.parametrize("judged_by", [fits.of_unseen_people, fits.of_unseen_families])
+def test_the_families_that_are_held_out_are_in_no_fit(answers, monkeypatch, judged_by):
+    seen, every_fifth = set(), np.arange(len(answers)) % 5 == 0
+    answers = replace(answers, family=np.where(every_fifth, "structured-light", answers.family))
     monkeypatch.setattr(fits, "fit", lambda known: seen.update(known.family) or Additive(0.0, ()))
     monkeypatch.setattr(fits, "probability", lambda model, judged: np.zeros(len(judged)))
-    fits.of_unseen_people(answers)
-    assert seen == set(answers.family) - set(HELD_OUT)
+    judged_by(answers)
+    assert set(HELD_OUT) <= set(answers.family) and seen == set(answers.family) - set(HELD_OUT)
 
 
 def test_the_rounds_together_keep_what_each_record_is(answers):

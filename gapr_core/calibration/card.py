@@ -32,7 +32,8 @@ def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
         f"How a bone is seen: {_shares(views)}.",
         f"Whose bone it is: {_shares(WHAT)}. {100 * SHAPE_SHARE:.0f} % are shapes without a knowable pose.",
         "AUROC and ECE (10 equal-width bins) are of all pairs; wrong and right count what a confidence of .5 or .9 "
-        "and the safety rules accept.",
+        "and the safety rules accept. One of these is left out: sources of many points were not registered mirrored "
+        "(`mirrored_below`).",
     ]
     for name, card in cards.items():
         if name == "precision":

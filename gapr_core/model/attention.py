@@ -39,6 +39,18 @@ class VanillaEncoder(nn.Module):
         return PairEncoding()
 
 
+class FusedEncoder(nn.Module):
+    """An encoder whose attention has a shorter way than by the four hooks, where it fits; both say the same."""
+
+    def fits(self, pairs: Pairs, x: Tensor) -> bool:
+        """Whether there is such a way for these pairs and features."""
+        raise NotImplementedError
+
+    def attend(self, q: Tensor, k: Tensor, v: Tensor, pairs: Pairs, heads: int) -> Tensor:
+        """What attention sees of projected queries, keys and values; all in the layout of `pairs`."""
+        raise NotImplementedError
+
+
 class Attention(nn.Module):
     """Multi-head attention over pairs, eq. (1) to (5), Fig. 4.
 
@@ -60,6 +72,8 @@ class Attention(nn.Module):
 
     def forward(self, x_q: Tensor, x_s: Tensor, pairs: Pairs) -> Tensor:
         """Queries of x_q look at keys and values of x_s; both in the layout of `pairs`."""
+        if isinstance(self.encoder, FusedEncoder) and self.encoder.fits(pairs, x_q):
+            return self.encoder.attend(self.query(x_q), self.key(x_s), self.value(x_s), pairs, self.heads)
         encoding = self.encoder(pairs)
         q = encoding.query(pairs.queries(self.query(x_q)))
         k, v = pairs.keys(torch.cat([self.key(x_s), self.value(x_s)], dim=-1)).split(self.dim, dim=-1)

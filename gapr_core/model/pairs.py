@@ -61,6 +61,10 @@ class Pairs:
         columns = self.distance.topk(min(count + skipped, keys), largest=False).indices
         return columns[..., skipped:] if keys > skipped else columns
 
+    def table(self) -> tuple[Tensor, Tensor]:
+        """Rows of the keys (B n, m) that every query looks at, of all (B m, C) or (M, C) of them; bool, which exist."""
+        raise NotImplementedError
+
     def queries(self, x: Tensor) -> Tensor:
         """Features of the query points, in the layout of the pairs, as (B, n, C)."""
         raise NotImplementedError
@@ -95,6 +99,9 @@ class LocalPairs(Pairs):
     def n_j(self) -> Tensor:  # type: ignore[override]
         """(N, 1, K, 3)."""
         return self.keys(self.support.normals)[:, None]
+
+    def table(self) -> tuple[Tensor, Tensor]:
+        return self.index, self.valid[:, 0]
 
     def queries(self, x: Tensor) -> Tensor:
         return x[:, None]
@@ -147,6 +154,12 @@ class DensePairs(Pairs):
         self.c_h, self.c_k = c_h[:, :, None], c_k[:, :, None]
         self.valid, self.reach = valid_j[:, None], reach[:, None, None]
         self.radius = torch.ones_like(self.reach)
+
+    def table(self) -> tuple[Tensor, Tensor]:
+        batch, _, keys = self.valid.shape
+        rows = torch.arange(batch * keys, device=self.valid.device).view(batch, 1, keys)
+        each = batch, self.p_i.shape[1], keys
+        return rows.expand(each).flatten(0, 1), self.valid.expand(each).flatten(0, 1)
 
     def queries(self, x: Tensor) -> Tensor:
         return x

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from torch import nn
+from torch import Tensor, nn
 
-from gapr_core.model.attention import PairEncoding, TransformerLayer
+from gapr_core.model import fused
+from gapr_core.model.attention import FusedEncoder, PairEncoding, TransformerLayer
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.encoding.relative import RelativeEncoder
 from gapr_core.model.pairs import Pairs
 from gapr_core.model.pgf import EMBEDDED
 
 
-class PGAEncoder(nn.Module):
+class PGAEncoder(FusedEncoder):
     """l_ij -> MLP -> r_ij; local, global and cross alike, since `Pairs` brings the right ball centroids."""
 
     def __init__(self, dim: int, hidden: int, in_values: bool) -> None:
@@ -21,6 +22,17 @@ class PGAEncoder(nn.Module):
 
     def forward(self, pairs: Pairs) -> PairEncoding:
         return self.relative(self.first(pairs.pgf))
+
+    def fits(self, pairs: Pairs, x: Tensor) -> bool:
+        return fused.fits(pairs, x)
+
+    def attend(self, q: Tensor, k: Tensor, v: Tensor, pairs: Pairs, heads: int) -> Tensor:
+        by_head = [x.reshape(-1, heads, x.shape[-1] // heads) for x in (q, k, v)]
+        out, mixed = fused.attend(
+            *by_head, self.relative.folded(by_head[0]), self.first[0].weight.T, self.first[0].bias, pairs,
+            by_head[0].shape[2] ** -0.5,
+        )  # fmt: skip
+        return self.relative.valued(out, mixed).reshape(q.shape)
 
 
 def layer(dim: int, config: ModelConfig) -> nn.Module:

@@ -37,3 +37,15 @@ class RelativeEncoder(nn.Module):
 
     def forward(self, hidden: Tensor) -> PairEncoding:
         return RelativeEncoding(hidden, self.to_key.weight @ self.second.weight, self.to_value)
+
+    def folded(self, q: Tensor) -> Tensor:
+        """(N, H, hidden), what multiplies the hidden layer in the logits, from queries (N, H, D)."""
+        key_map = (self.to_key.weight @ self.second.weight).view(*q.shape[1:], -1)
+        return (q.transpose(0, 1) @ key_map).transpose(0, 1)
+
+    def valued(self, out: Tensor, mixed: Tensor) -> Tensor:
+        """Sums of values (N, H, D) with the geometry's share, from sums of the hidden layer (N, H, hidden)."""
+        if self.to_value is None:
+            return out
+        weight, bias = self.to_value.weight.view(*out.shape[1:], -1), self.to_value.bias.view(*out.shape[1:])
+        return out + (mixed.transpose(0, 1) @ weight.transpose(1, 2)).transpose(0, 1) + bias

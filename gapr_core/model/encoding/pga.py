@@ -27,11 +27,9 @@ class PGAEncoder(FusedEncoder):
         return fused.fits(pairs, x)
 
     def attend(self, q: Tensor, k: Tensor, v: Tensor, pairs: Pairs, heads: int) -> Tensor:
-        by_head = [x.reshape(-1, heads, x.shape[-1] // heads) for x in (q, k, v)]
-        out, mixed = fused.attend(
-            *by_head, self.relative.folded(by_head[0]), self.first[0].weight.T, self.first[0].bias, pairs,
-            by_head[0].shape[2] ** -0.5,
-        )  # fmt: skip
+        hq, hk, hv = (x.reshape(-1, heads, x.shape[-1] // heads) for x in (q, k, v))
+        folded, first, scale = self.relative.folded(hq), dict(self.first[0].named_parameters()), hq.shape[2] ** -0.5
+        out, mixed = fused.attend(hq, hk, hv, folded, first["weight"].T, first["bias"], pairs, scale)
         return self.relative.valued(out, mixed).reshape(q.shape)
 
 

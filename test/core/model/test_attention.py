@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import pytest
 import torch
 from torch.nn.functional import scaled_dot_product_attention
 
+from gapr_core.model import fused
 from gapr_core.model.attention import Attention, VanillaEncoder
 from gapr_core.model.encoding import TRANSFORMERS, make_transformer
 from gapr_core.model.encoding.gcn import EdgeConv
@@ -49,6 +51,28 @@ def test_local_vanilla_attention_equals_attention_over_each_neighbourhood_alone(
         q, k, v = heads(layer.query(x[i : i + 1])), heads(layer.key(near)), heads(layer.value(near))
         expected = scaled_dot_product_attention(q, k, v).transpose(0, 1).flatten()
         torch.testing.assert_close(found[i], expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("in_values", [True, False])
+@pytest.mark.parametrize("kind", ["local", "dense"])
+def test_the_compiled_loops_of_pga_and_their_gradients_equal_the_hooks(clouds, monkeypatch, kind, in_values):
+    valid = torch.ones(2, 9, dtype=torch.bool)
+    valid[1, 6:] = False
+    pairs = local(clouds[0]) if kind == "local" else dense(valid=valid)
+    shape = (len(pairs.index),) if kind == "local" else (2, 9)
+    torch.manual_seed(5)
+    layer, x, up = Attention(DIM, HEADS, PGAEncoder(DIM, 16, in_values)), torch.randn(*shape, DIM), torch.randn(DIM)
+    found = {}
+    for way, fits in (("loops", True), ("hooks", False)):
+        monkeypatch.setattr(fused, "fits", lambda *given, fits=fits: fits)
+        source = x.clone().requires_grad_()
+        layer.zero_grad()
+        out = layer(source, source.roll(1, -2), pairs)
+        (out.tanh() @ up).sum().backward()
+        found[way] = [out, source.grad, *(each.grad for each in layer.parameters() if each.grad is not None)]
+    assert len(found["loops"]) == len(found["hooks"]) >= 8
+    for one, other in zip(found["loops"], found["hooks"], strict=True):
+        torch.testing.assert_close(one, other, atol=2e-4, rtol=2e-4)
 
 
 def test_pga_equals_its_equation_written_out_pair_by_pair():

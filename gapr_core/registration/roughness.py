@@ -1,9 +1,10 @@
 """The misfit that changes within centimetres: a sign of another bone, or of a wrong pose.
 
-What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wrong for all of it: residuals 14 to 22 mm
+What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wrong for all of it: residuals 12 to 16 mm
 apart are nearly as alike as those of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the
 covariance of the residuals at short range, less that at longer range, tells the two apart (an empirical covariogram;
-Matheron 1963). Noise takes no part: it is independent from point to point.
+Matheron 1963). Noise takes no part: it is independent from point to point. Large residuals are damped: a few of them
+would decide.
 """
 
 from __future__ import annotations
@@ -17,27 +18,32 @@ from gapr_core.registration.refinement import Fit
 
 Array = NDArray[np.float64]
 
-NEAR_MM, FAR_MM = (0.0, 8.0), (14.0, 22.0)  # between foot points on the bone
+NEAR_MM, FAR_MM = (0.0, 6.0), (12.0, 16.0)  # between foot points on the bone; how they were chosen: docs/log.md
 LIMITS_MM = np.array([NEAR_MM, FAR_MM])
-CENTRES = 300  # inliers, evenly spread, of which each is compared with all
+CENTRES = 600  # inliers, evenly spread, of which each is compared with all
+LARGEST_SIGMAS = 4.0  # a residual of so many standard deviations counts as none
 
 
 def rough_misfit_mm(fit: Fit) -> float:
-    """Root, mm, of the residuals' covariance over less than 8 mm, minus that over 14 to 22 mm; with their sign.
+    """Root, mm, of the residuals' covariance over less than 6 mm, minus that over 12 to 16 mm; with their sign.
 
     0 where no two inliers are so near, or none so far apart.
     """
-    feet, signed = on_the_bone(fit)
+    feet, damped = on_the_bone(fit)
     chosen = sampling.thin(feet, CENTRES)
-    total, count = products_mm2(feet[chosen], signed[chosen], feet, signed, LIMITS_MM, chosen)
+    total, count = products_mm2(feet[chosen], damped[chosen], feet, damped, LIMITS_MM, chosen)
     return signed_root(*(total / count)) if count.all() else 0.0
 
 
 def on_the_bone(fit: Fit) -> tuple[Array, Array]:
-    """(M, 3) foot points of the inliers and their (M,) residuals: noise must not decide which points are near."""
+    """(M, 3) foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm.
+
+    Foot points: noise must not decide which points are near.
+    """
     inlier = fit.weights > 0.0
-    signed = np.ascontiguousarray(fit.signed_mm[inlier])
-    return fit.moved[inlier] - signed[:, None] * fit.gradients[inlier], signed
+    signed = fit.signed_mm[inlier]
+    damped = signed * np.maximum(1.0 - (signed / (LARGEST_SIGMAS * fit.sigma_mm)) ** 2, 0.0)
+    return fit.moved[inlier] - signed[:, None] * fit.gradients[inlier], damped
 
 
 def signed_root(near_mm2: float, far_mm2: float) -> float:

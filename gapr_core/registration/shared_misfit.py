@@ -2,7 +2,7 @@
 
 A sensor's noise is another one in every frame, and so is much of its bias. Another subject's ridges stay where they are
 on the bone. So the mean product of two residuals of different frames, whose foot points are near each other, is the
-variance of what stays there. Soft tissue stays as well, but is smooth: as in `roughness`, what points 14 to 22 mm apart
+variance of what stays there. Soft tissue stays as well, but is smooth: as in `roughness`, what points 12 to 16 mm apart
 have in common is taken off, and is a number of its own. Both grow clear with the frames: each adds pairs with all that
 are remembered.
 """
@@ -49,16 +49,16 @@ class SharedMisfit:
             Roots, mm, of the covariance that the frames share at short range only, and of that at long range, negative
             where the covariance is; None while too few points of different frames are near each other.
         """
-        feet, signed = on_the_bone(fit)
+        feet, damped = on_the_bone(fit)
         if self._frames and len(feet):
             chosen = sampling.thin(feet, CENTRES)
-            others, other_signed = (np.concatenate(each) for each in zip(*self._frames, strict=True))
+            others, other_damped = (np.concatenate(each) for each in zip(*self._frames, strict=True))
             nobody = np.full(len(chosen), -1)
-            total, count = products_mm2(feet[chosen], signed[chosen], others, other_signed, LIMITS_MM, nobody)
+            total, count = products_mm2(feet[chosen], damped[chosen], others, other_damped, LIMITS_MM, nobody)
             self._total = self._kept_share * self._total + total
             self._count = self._kept_share * self._count + count
         few = sampling.thin(feet, POINTS)
-        self._frames.append((feet[few], signed[few]))
+        self._frames.append((feet[few], damped[few]))
         if self._count.min() < FEWEST_PAIRS:
             return None
         near, far = self._total / (self._count + USUAL_PAIRS)

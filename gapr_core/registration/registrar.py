@@ -189,7 +189,7 @@ class Registrar:
         a, config = assessment, self.config
         found = mirror.image_margin(a.fit.T, a.source, a.target, config.verification, config.num_threads)
         by_chance = len(a.source.points) <= config.rules.mirrored_points or not a.is_sure(config.rules.mirrored_below)
-        if a.seen is None and by_chance:
+        if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
             flipped = sources.prepare(a.source.points * [1.0, 1.0, -1.0], config.source, config.num_threads)
             image = None if isinstance(flipped, Refusal) else self._in_rounds(flipped, a.target, NO_POSES, clock)
             if image is not None:

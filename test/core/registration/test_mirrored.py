@@ -91,3 +91,17 @@ def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(monkeypat
     if len(asked) == 2:
         gaps = np.sort(asked[0] * [1.0, 1.0, -1.0], axis=0) - np.sort(asked[1], axis=0)
         np.testing.assert_allclose(gaps, 0.0, atol=1e-9)
+
+
+def test_nothing_is_registered_mirrored_where_the_image_on_the_bone_fits_better_already(monkeypatch):
+    registrar, femur = Registrar(CONFIG), make_bone("femur", 900_001)
+    in_rounds, asked = Registrar._in_rounds, []
+
+    def rounds(self, source, *rest):
+        asked.append(source)
+        return in_rounds(self, source, *rest)
+
+    monkeypatch.setattr(Registrar, "_in_rounds", rounds)
+    monkeypatch.setattr(mirror, "image_margin", lambda *given: -1.0)
+    result = registrar.register(seen(femur, 400), registrar.prepare(femur))
+    assert "mirror image" in result.reason and len(asked) == 1

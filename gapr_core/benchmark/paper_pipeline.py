@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from gapr_core.baselines.base import Baseline, BaselineTarget, NoPose
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.registration.proposals.network import SHIPPED, consensus, correspondences_mm
+from gapr_core.registration.proposals.consensus import ransac, sharpened
+from gapr_core.registration.proposals.network import SHIPPED, correspondences_mm
 
 Array = NDArray[np.float64]
 AGREES = 1.5  # matching radii within which a correspondence agrees with a pose
@@ -56,7 +57,7 @@ class PaperPipeline(Baseline):
             output = self.network(moving, cloud, features)
         found = correspondences_mm(output.matches, moving, cloud)
         radius_mm = AGREES * matching_radius(frame) * frame.scale_mm
-        poses, _ = consensus("ransac", found, radius_mm, np.random.default_rng(0))
+        poses, _ = ransac(found, radius_mm, np.random.default_rng(0))
         if not len(poses):
             raise NoPose(f"no pose that three of {len(found.score)} correspondences agree on")
-        return poses[0]
+        return sharpened(poses[0], found, radius_mm / AGREES)

@@ -13,6 +13,9 @@ from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 
+SHRINKING = (2.0, 1.5, 1.0, 0.7)  # radii, one after the other, within which a correspondence counts in `sharpened`
+ROUNDS = 5  # fits with each of them
+
 
 @dataclass(frozen=True)
 class Correspondences:
@@ -66,6 +69,20 @@ def ransac(
     sides_p, sides_q = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
     rigid = (np.abs(sides_p - sides_q) < 2.0 * radius_mm).all(axis=1) & (sides_p > 2.0 * radius_mm).all(axis=1)
     return _converge(se3.kabsch(p[rigid], q[rigid]), found, radius_mm, count)
+
+
+def sharpened(pose: Array, found: Correspondences, radius_mm: float) -> Array:
+    """The pose (4, 4) fitted to the correspondences near it by Tukey's weights, within a radius that shrinks.
+
+    A correspondence within `radius_mm` can be that far off. Those of a pose that is nearly right agree better.
+    """
+    for within_mm in radius_mm * np.repeat(SHRINKING, ROUNDS):
+        squared = ((se3.apply(pose, found.source) - found.target) ** 2).sum(axis=1)
+        weights = found.score * np.maximum(1.0 - squared / within_mm**2, 0.0) ** 2
+        if np.count_nonzero(weights) < 3:
+            break
+        pose = _batched_kabsch(found, weights[None])[0]
+    return pose
 
 
 def _converge(

@@ -37,6 +37,7 @@ from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.registration import target
+from gapr_core.registration.proposals.consensus import sharpened
 from gapr_core.registration.proposals.network import METHODS, consensus, correspondences_mm
 from gapr_core.registration.refinement import refine_fully
 from gapr_core.runtime import files
@@ -211,11 +212,13 @@ def examine(network: GAPRNet, pair: Pair, pose: str = METHODS[0]) -> Record:
     output = network(source, full)
     record["coarse"], record["fine"] = inlier_ratios(output, source, truth)
     radius_mm = float(truth.radius[0]) * float(source.scale_mm[0])
-    poses, _ = consensus(pose, correspondences_mm(output.matches, source, full), 1.5 * radius_mm)
+    found = correspondences_mm(output.matches, source, full)
+    poses, _ = consensus(pose, found, 1.5 * radius_mm)
     if not len(poses):
         return record | dict.fromkeys([name for name in FIGURES if "rr_" in name], 0.0)
-    refined = refine_fully(poses[0], pair.source, target.prepare(pair.target), RefinementConfig()).T
-    return record | _recalled(pair, poses[0], "") | _recalled(pair, refined, "refined_")
+    best = sharpened(poses[0], found, radius_mm) if pose == "ransac" else poses[0]
+    refined = refine_fully(best, pair.source, target.prepare(pair.target), RefinementConfig()).T
+    return record | _recalled(pair, best, "") | _recalled(pair, refined, "refined_")
 
 
 def _recalled(pair: Pair, T: Any, prefix: str) -> Record:

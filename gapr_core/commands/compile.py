@@ -40,7 +40,7 @@ def run(args: Namespace) -> int:
 
 
 def all_ways() -> Iterator[Callable[[], Any]]:
-    """Calls that together run every compiled loop, in their order."""
+    """Calls that together run every compiled loop of a registration, in their order; training compiles its own."""
     registrar = Registrar.from_pretrained() if find_spec("torch") and find_spec("safetensors") else Registrar()
     tracker, bone = Tracker(registrar), made_up_bone()
     shell = Surface(np.concatenate([bone.points, 0.8 * bone.points]))

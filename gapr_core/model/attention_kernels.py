@@ -20,11 +20,10 @@ ZERO, LOWEST = np.float32(0.0), np.float32(-3e38)  # fast mathematics knows no i
 
 
 @numba.njit(**FAST)
-def forward(rows, q, k, v, folded, first, bias, index, valid, geometry, scale, out, mixed, weights):
-    """Fill the rows from `rows[0]` up to `rows[1]` of out (N, H, D), mixed (N, H, E) and weights (N, H, K), all zero.
+def forward(q, k, v, folded, first, bias, index, valid, geometry, scale, out, mixed, weights):
+    """Fill out (N, H, D), mixed (N, H, E) and weights (N, H, K), all zero before.
 
     Args:
-        rows: which of the N queries.
         q: (N, H, D). k, v: (M, H, D). folded: (N, H, E), what multiplies the hidden layer in the logits.
         first, bias: (G, E), (E,) of the hidden layer.
         index, valid: (N, K) rows of the keys, and bool, which exist. geometry: (N, K, G).
@@ -32,7 +31,7 @@ def forward(rows, q, k, v, folded, first, bias, index, valid, geometry, scale, o
     """
     hidden = np.empty((index.shape[1], len(bias)), np.float32)
     columns = np.empty(index.shape[1], np.int64)
-    for n in range(rows[0], rows[1]):
+    for n in range(len(index)):
         count = existing(valid, n, columns)
         for j in range(count):
             column = columns[j]
@@ -53,15 +52,15 @@ def forward(rows, q, k, v, folded, first, bias, index, valid, geometry, scale, o
 
 @numba.njit(**FAST)
 def backward(
-    rows, q, k, v, folded, first, bias, index, valid, geometry, scale, weights, g_out, g_mixed,
+    q, k, v, folded, first, bias, index, valid, geometry, scale, weights, g_out, g_mixed,
     g_q, g_k, g_v, g_folded, g_first, g_bias,
 ):  # fmt: skip
-    """Add to the gradients `g_*`, shaped like what they belong to, what `g_out` and `g_mixed` of some rows say."""
+    """Add to the gradients `g_*`, shaped like what they belong to, what `g_out` and `g_mixed` say."""
     hidden = np.empty((index.shape[1], len(bias)), np.float32)
     g_logit = np.empty((index.shape[1], q.shape[1]), np.float32)
     g_hidden = np.empty(len(bias), np.float32)
     columns = np.empty(index.shape[1], np.int64)
-    for n in range(rows[0], rows[1]):
+    for n in range(len(index)):
         count = existing(valid, n, columns)
         for j in range(count):
             m = index[n, columns[j]]

@@ -51,7 +51,7 @@ class _Attend(torch.autograd.Function):
         weights = q.new_zeros(len(q), q.shape[1], valid.shape[1])
         ctx.scale = scale = np.float32(scale)  # a float would make all of it float64
         ctx.save_for_backward(*tensors, weights)
-        attention_kernels.forward((0, len(q)), *_arrays(tensors), scale, *_arrays([out, mixed, weights]))
+        attention_kernels.forward(*_arrays(tensors), scale, *_arrays([out, mixed, weights]))
         return out, mixed
 
     @staticmethod
@@ -60,7 +60,7 @@ class _Attend(torch.autograd.Function):
         *tensors, weights = ctx.saved_tensors
         made = [torch.zeros_like(tensor) for tensor in tensors[:6]]
         came = _arrays([weights, *(one.contiguous() for one in g)])
-        attention_kernels.backward((0, len(weights)), *_arrays(tensors), ctx.scale, *came, *_arrays(made))
+        attention_kernels.backward(*_arrays(tensors), ctx.scale, *came, *_arrays(made))
         return (*made, None, None, None, None)
 
 

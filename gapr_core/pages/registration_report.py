@@ -46,6 +46,7 @@ WORDS = {
     "scale_z": "evidence that another size fits better",
     "scale_off": "size with which the source fits best",
     "log_scale_sd": "uncertainty of that size",
+    "size_margin": "fit of a source of another size",
     "mirror_margin": "fit of the mirrored source",
     "rough_misfit": "misfit that changes within centimetres",
     "shared_misfit": "the same, shared by the sources of a stream",

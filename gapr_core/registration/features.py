@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
 from gapr_core.geometry.extent import half_extent_mm
-from gapr_core.registration import mirror, sensor
+from gapr_core.registration import mirror, other_size, sensor
 from gapr_core.registration.bias_field import equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
@@ -18,7 +18,7 @@ from gapr_core.registration.verification import Candidates
 
 Array = NDArray[np.float64]
 
-OTHER_BONE = ("scale_z", "scale_off", "log_scale_sd", "mirror_margin", "rough_misfit")
+OTHER_BONE = ("scale_z", "scale_off", "log_scale_sd", "size_margin", "mirror_margin", "rough_misfit")
 FEATURES = (
     "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "residual", "margin", "support",
     "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
@@ -35,7 +35,8 @@ FEATURES_OF = {
 }  # fmt: skip
 SIGNS = {
     "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1, "log_shift_sd": -1,
-    "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "mirror_margin": 1, "rough_misfit": -1,
+    "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1, "mirror_margin": 1,
+    "rough_misfit": -1,
     "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
     "frames_log_odds": 1, "shared_misfit": -1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
@@ -107,6 +108,7 @@ def of_another_bone(
         "scale_z": min(abs(scale) / float(np.hypot(scale_sd, usual)), LARGEST_SCALE_Z),
         "scale_off": abs(scale) * known.usual**2 / (known.usual**2 + scale_sd**2),
         "log_scale_sd": float(np.log(scale_sd)),
+        "size_margin": other_size.margin(fit.T, source, target, config.verification, config.num_threads),
         "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),
         "rough_misfit": rough_misfit_mm(fit),
     }

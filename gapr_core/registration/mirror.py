@@ -75,9 +75,9 @@ def image_margin(
     return log_ratio(flipped, own)
 
 
-def log_ratio(mirrored_mm2: float, own_mm2: float) -> float:
-    """Log of one mean square residual over another; below .1 mm neither says anything of left and right."""
-    return float(np.clip(np.log((mirrored_mm2 + LEAST_MM**2) / (own_mm2 + LEAST_MM**2)), *LIMITS))
+def log_ratio(changed_mm2: float, own_mm2: float) -> float:
+    """Log of one mean square residual over another; below .1 mm neither says anything of left and right, or of size."""
+    return float(np.clip(np.log((changed_mm2 + LEAST_MM**2) / (own_mm2 + LEAST_MM**2)), *LIMITS))
 
 
 def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: int) -> Array | None:

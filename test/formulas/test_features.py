@@ -37,6 +37,7 @@ def fit_of(points, signed=None, weights=None, sigma_mm=0.5):
 def other_bone(monkeypatch):
     """Replaces size and mirror image."""
     monkeypatch.setattr(features.mirror, "margin", lambda *_: 1.25)
+    monkeypatch.setattr(features.other_size, "margin", lambda *_: 0.75)
     known = SimpleNamespace(scale=(-0.03, 0.04))
     monkeypatch.setattr(features, "scale_of", lambda *_: known.scale)
     return known
@@ -66,6 +67,7 @@ def test_every_feature_says_what_its_name_says(points, other_bone):
     assert found["log_points"] == pytest.approx(np.log(COUNT))
     reach = max(np.linalg.norm(p - points.mean(axis=0)) for p in points)
     assert found["extent"] == pytest.approx(reach / 50.0) and found["mirror_margin"] == 1.25
+    assert found["size_margin"] == 0.75
 
 
 @pytest.mark.parametrize(("scores", "ratio"), [((0.25,), 2.0), ((0.25, 0.2), 1.0), ((0.25, 1.0), 4.0)])

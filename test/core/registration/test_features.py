@@ -8,7 +8,7 @@ import pytest
 
 from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import mirror
+from gapr_core.registration import mirror, other_size
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.features import FEATURES_OF, SIGNS, of_another_bone, scale_of
@@ -70,6 +70,36 @@ def test_a_size_within_the_sensors_own_error_speaks_less_against_the_bone(bone, 
 def test_without_inliers_nothing_is_known_of_the_scale():
     nothing = SimpleNamespace(weights=np.zeros(9))
     assert scale_of(nothing, CONFIG.covariance, CONFIG.scale) == (0.0, 1.0)
+
+
+def grown(points, size):
+    centre = points.mean(axis=0)
+    return centre + size * (points - centre)
+
+
+@pytest.mark.parametrize("size", [0.94, 1.06])
+def test_a_source_of_the_wrong_size_fits_better_in_another_one_and_the_right_one_worse(bone, end, size):
+    def margin(points):
+        return other_size.margin(fit_of(points, bone).T, sources.prepare(points), bone, CONFIG.verification, 1)
+
+    assert margin(end) > 0.3 and margin(grown(end, size)) < -0.3
+
+
+def test_the_margin_of_the_size_is_that_of_the_mean_squares_each_in_its_own_size(bone, end, monkeypatch):
+    """By hand: 0.36 mm^2 of the source, 1.2 and 0.9 mm^2 of the smaller and the larger one."""
+    given, squares = [], {1.0: 0.36, 0.945: 1.2, 1.055: 0.9}
+
+    def refined(poses, points, *rest):
+        given.append(points)
+        return poses, np.array([squares[(1.0, *other_size.SIZES)[len(given) - 1]]])
+
+    monkeypatch.setattr(other_size, "refine_many", refined)
+    source = sources.prepare(end)
+    found = other_size.margin(np.eye(4), source, bone, CONFIG.verification, 1)
+    assert found == pytest.approx(np.log((0.9 / 1.055**2 + 0.01) / (0.36 + 0.01)))
+    some = source.subset(CONFIG.verification.middle_points)
+    for points, size in zip(given, (1.0, 0.945, 1.055), strict=True):
+        np.testing.assert_allclose(points, grown(some, size), atol=1e-9)
 
 
 def test_the_mirrored_source_of_a_whole_end_fits_badly(bone, end):

@@ -31,6 +31,7 @@ _KEPT: dict[tuple[str, str], Bones] = {}
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 LOOK_ALIKES = ("femur", "tibia")  # of which a patch of one subject is much like that of another
 LOOK_ALIKE_SEEDS = 500  # added to the seed, so that no pair of the long list comes twice
+MADE = ("drawn", "parametric")  # cohorts of bones that are nobody's, and told apart more easily than subjects' bones
 SYMMETRIC = ("pelvis",)  # a mirrored one is the other side of the same: judged against that side's pose
 PARAMETRIC_PEOPLE = 9  # for each bone, besides the subjects of the folder
 DRAWN_PEOPLE, DRAWN_SEED = {True: 40, False: 8}, 9  # new ones: of shape models, or parametric where there is none
@@ -70,7 +71,8 @@ SCALES = (0.04, 0.07)  # by which a bone of a wrong scale is larger or smaller
 class Task:
     """Which pair: number `number` of the list that folder, split and seed define; or of a list of one family only.
 
-    With `what` (a key of `WHAT`) the source is of that bone, whatever the shares say.
+    With `what` (a key of `WHAT`) the source is of that bone, whatever the shares say; with `real` both bones are of
+    subjects of the folder, where it has any.
     """
 
     folder: str
@@ -79,6 +81,7 @@ class Task:
     number: int
     family: str = ""
     what: str = ""
+    real: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +125,12 @@ class Drawn:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Femora and tibiae at L3, every other one of another subject: which bone it is is hardest to see there."""
+    """Subjects' femora and tibiae at L3, every other one of another subject: hardest to tell apart."""
     row, turn = IN_A_ROW, IN_A_ROW * len(BONES)
     numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
     own_list = seed + LOOK_ALIKE_SEEDS
-    return [Task(folder, split, own_list, number, "L3", ("own", "person")[number % 2]) for number in numbers[:count]]
+    whats = ("own", "person")
+    return [Task(folder, split, own_list, number, "L3", whats[number % 2], True) for number in numbers[:count]]
 
 
 def draw(task: Task) -> Drawn:
@@ -135,7 +139,7 @@ def draw(task: Task) -> Drawn:
     if rng.random() < SHAPE_SHARE and not task.family:
         shape = sorted(SHAPES)[int(rng.integers(len(SHAPES)))]
         return Drawn(SHAPES[shape](int(rng.integers(2**31))), "shape", shape, "shape", ())
-    setting = setting_of(task.folder, task.split, task.seed, task.number // IN_A_ROW)
+    setting = setting_of(task.folder, task.split, task.seed, task.number // IN_A_ROW, task.real)
     family, seen_as = _choose_view(rng, task.family)
     what, stranger = source_of(task, setting, rng)
     seed = int(rng.integers(2**31))
@@ -148,10 +152,11 @@ def draw(task: Task) -> Drawn:
 
 
 @lru_cache(maxsize=2)
-def setting_of(folder: str, split: str, seed: int, number: int) -> Setting:
+def setting_of(folder: str, split: str, seed: int, number: int, real: bool = False) -> Setting:
     """Target `number` of the list; bones come in turn, so that each has its share."""
     rng = np.random.default_rng([seed, number, 61])
-    whole = _one_of(bones_of(folder, split)[BONES[number % len(BONES)]], rng)
+    bones = bones_of(folder, split)[BONES[number % len(BONES)]]
+    whole = _one_of(of_subjects(bones) if real else bones, rng)
     kind = _choose(TARGETS, rng)
     end = (rng.uniform(*SHORTEST), bool(rng.random() < 0.5)) if kind == "short" else None
     specimen = whole.end(*end) if end else whole
@@ -166,10 +171,16 @@ def source_of(task: Task, setting: Setting, rng: np.random.Generator) -> tuple[s
     what = task.what or _choose(WHAT, rng)
     if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
         what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
-    bones = bones_of(task.folder, task.split)
-    others = without_twins(setting.whole, [each for group in bones.values() for each in group])
+    bones = bones_of(task.folder, task.split).values()
+    everybody = [each for group in bones for each in (of_subjects(group) if task.real else group)]
+    others = without_twins(setting.whole, everybody)
     stranger = STRANGERS[what](setting.specimen, others, rng)
     return what, stranger.end(*setting.end) if setting.end and what in ("person", "bone") else stranger
+
+
+def of_subjects(bones: Sequence[Specimen]) -> Sequence[Specimen]:
+    """Those of subjects; all where there are none."""
+    return [each for each in bones if each.cohort not in MADE] or bones
 
 
 def without_twins(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:

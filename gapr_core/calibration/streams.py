@@ -36,14 +36,14 @@ STREAM_SEEDS = 900  # added to the seed: other targets than those of single pair
 
 
 def tasks(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Every other one as `pairs.WHAT` says; the others are of another subject's femur or tibia.
+    """Every other one as `pairs.WHAT` says; the others are of a subject's femur or tibia on that of another subject.
 
     Most frames of other bones are refused by a rule and say nothing: with fewer, almost all that is left is right.
     """
     bones = len(pairs.BONES)
     long = [number for number in range(bones * count) if pairs.BONES[number % bones] in pairs.LOOK_ALIKES]
     found = [Task(folder, split, seed, number, STREAM) for number in range((count + 1) // 2)]
-    return found + [Task(folder, split, seed, number, STREAM, "person") for number in long[: count // 2]]
+    return found + [Task(folder, split, seed, number, STREAM, "person", True) for number in long[: count // 2]]
 
 
 def record_of(task: Task) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def record_of(task: Task) -> dict[str, Any]:
 def draw(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
     """(family of the bias, key of `pairs.WHAT`, everybody whose bone it is, frames on one target); always the same."""
     rng = np.random.default_rng([task.seed, task.number, 63, len(task.what)])
-    setting = pairs.setting_of(task.folder, task.split, task.seed + STREAM_SEEDS, task.number)
+    setting = pairs.setting_of(task.folder, task.split, task.seed + STREAM_SEEDS, task.number, task.real)
     what, source = pairs.source_of(task, setting, rng)
     family = str(rng.choice(sorted(BIASES)))
     kind = str(rng.choice(sorted(BIASES[family])))

@@ -161,6 +161,21 @@ def test_look_alikes_are_long_bones_at_l3_and_every_other_one_is_of_another_subj
     assert collect._name(tasks[1]) == "503-L3-person-1"
 
 
+def test_look_alikes_are_of_subjects_where_there_are_any(monkeypatch):
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
+    cohorts = ("ct", "drawn", "ct", "parametric", "ct")
+    bones = {bone: [replace(parametric_specimen(bone, number), cohort=cohort) for number, cohort in enumerate(cohorts)]
+             for bone in ("femur", "tibia")}  # fmt: skip
+    monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
+    pairs.setting_of.cache_clear()
+    subjects = {f"parametric_{number}" for number in (0, 2, 4)}
+    alike = [pairs.draw(task).people for task in pairs.look_alikes(FOLDER, "train", 3, 40)]
+    assert {person for people in alike for person in people} == subjects
+    any_bone = [pairs.draw(Task(FOLDER, "train", 3, number, "L3", "person")).people for number in range(8)]
+    assert {person for people in any_bone for person in people} > subjects
+
+
 class _NoView:
     def __init__(self, seen_as):
         self.seen_as, self.whole, self.specimen, self.person = seen_as, self, self, "nobody"

@@ -31,7 +31,7 @@ _KEPT: dict[tuple[str, str], Bones] = {}
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 LOOK_ALIKES = ("femur", "tibia")  # of which a patch of one subject is much like that of another
 LOOK_ALIKE_SEEDS = 500  # added to the seed, so that no pair of the long list comes twice
-MADE = ("drawn", "parametric")  # cohorts of bones that are nobody's, and told apart more easily than subjects' bones
+MADE = ("drawn", "parametric")  # cohorts of bones that are nobody's, and easier to distinguish than subjects' bones
 SYMMETRIC = ("pelvis",)  # a mirrored one is the other side of the same: judged against that side's pose
 PARAMETRIC_PEOPLE = 9  # for each bone, besides the subjects of the folder
 DRAWN_PEOPLE, DRAWN_SEED = {True: 40, False: 8}, 9  # new ones: of shape models, or parametric where there is none
@@ -125,7 +125,7 @@ class Drawn:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Subjects' femora and tibiae at L3, every other one of another subject: hardest to tell apart."""
+    """Subjects' femora and tibiae at L3, every other one of another subject: hardest to distinguish."""
     row, turn = IN_A_ROW, IN_A_ROW * len(BONES)
     numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
     own_list = seed + LOOK_ALIKE_SEEDS

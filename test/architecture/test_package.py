@@ -14,6 +14,8 @@ import pytest
 
 import gapr_core
 
+pytestmark = pytest.mark.timeout(600)  # building compiles all loops: minutes on a machine that is busy
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gapr_core", "msg_adapters", "gapr_ros")
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()

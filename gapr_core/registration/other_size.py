@@ -29,12 +29,7 @@ def margin(
     The source grows about its centroid and is refined from the pose. Its residuals grow with it, so that they count in
     its own size: a mean square over s^2.
 
-    Args:
-        T: (4, 4) T_target_source of the pose, mm.
-        source: what was registered.
-        target: the bone.
-        config: how hypotheses are refined.
-        num_threads: 0 for all cores.
+    Args: as `mirror.margin`.
 
     Returns:
         Below 0 where another size fits better, above where it fits worse, within `mirror.LIMITS`.

@@ -25,12 +25,13 @@ def thread_count(requested: int) -> int:
 
 
 def in_threads(work: Callable[..., Result], *columns: Iterable[Any], num_threads: int = 0) -> list[Result]:
-    """`list(map(work, *columns))`, in that many threads; 0 means every core. One thread is the caller's own."""
-    threads = thread_count(num_threads)
-    if threads == 1:
-        return list(map(work, *columns))
+    """`list(map(work, *columns))`, in at most that many threads; 0 means every core. One call needs no other thread."""
+    calls = list(zip(*columns, strict=True))
+    threads = min(thread_count(num_threads), len(calls))
+    if threads <= 1:
+        return [work(*call) for call in calls]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, *columns))
+        return list(pool.map(lambda call: work(*call), calls))
 
 
 def in_pieces(work: Callable[[NDArray[Any]], Result], rows: NDArray[Any], num_threads: int = 0) -> list[Result]:

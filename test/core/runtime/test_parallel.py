@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -55,6 +56,13 @@ def test_pieces_are_consecutive_and_four_for_each_thread(rows, num_threads):
     pieces = in_pieces(lambda piece: piece, np.arange(rows), num_threads)
     assert len(pieces) == min(4 * num_threads, rows) or (rows == 0 and len(pieces) == 1)
     assert list(np.concatenate(pieces)) == list(range(rows))
+
+
+@pytest.mark.parametrize(("rows", "num_threads", "own"), [(1, 2, True), (8, 1, True), (8, 2, False)])
+def test_a_single_piece_starts_no_thread(rows, num_threads, own):
+    """A thread for the refinement of one pose costs ten times as much as the refinement."""
+    ran_in = set(in_pieces(lambda piece: threading.get_ident(), np.arange(rows), num_threads))
+    assert (ran_in == {threading.get_ident()}) is own
 
 
 def test_torch_that_is_loaded_after_the_first_registration_has_one_thread_too():

@@ -56,8 +56,8 @@ class PaperPipeline(Baseline):
         with torch.inference_mode():
             output = self.network(moving, cloud, features)
         found = correspondences_mm(output.matches, moving, cloud)
-        radius_mm = AGREES * matching_radius(frame) * frame.scale_mm
-        poses, _ = ransac(found, radius_mm, np.random.default_rng(0))
+        radius_mm = matching_radius(frame) * frame.scale_mm
+        poses, _ = ransac(found, AGREES * radius_mm, np.random.default_rng(0))
         if not len(poses):
             raise NoPose(f"no pose that three of {len(found.score)} correspondences agree on")
-        return sharpened(poses[0], found, radius_mm / AGREES)
+        return sharpened(poses[0], found, radius_mm)

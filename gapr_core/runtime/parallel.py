@@ -24,14 +24,14 @@ def thread_count(requested: int) -> int:
     return requested or len(os.sched_getaffinity(0))
 
 
-def in_threads(work: Callable[..., Result], *columns: Iterable[Any], num_threads: int = 0) -> list[Result]:
-    """`list(map(work, *columns))`, in at most that many threads; 0 means every core. One call needs no other thread."""
-    calls = list(zip(*columns, strict=True))
-    threads = min(thread_count(num_threads), len(calls))
+def in_threads(work: Callable[[Any], Result], items: Iterable[Any], num_threads: int = 0) -> list[Result]:
+    """`list(map(work, items))`, in at most that many threads; 0 means every core. One item needs no other thread."""
+    items = list(items)
+    threads = min(thread_count(num_threads), len(items))
     if threads <= 1:
-        return [work(*call) for call in calls]
+        return list(map(work, items))
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(lambda call: work(*call), calls))
+        return list(pool.map(work, items))
 
 
 def in_pieces(work: Callable[[NDArray[Any]], Result], rows: NDArray[Any], num_threads: int = 0) -> list[Result]:

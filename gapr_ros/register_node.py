@@ -84,8 +84,8 @@ def _run(node: RegisterNode, executor: Executor) -> int:
         ended = node.close(PATIENCE_S)
     except KeyboardInterrupt:
         pass
+    uninstall_signal_handlers()  # first: their thread shuts down as well, and uses the executor's guard condition
     rclpy.try_shutdown()
-    uninstall_signal_handlers()  # joins rclpy's thread for signals, which may be using the executor's guard condition
     executor.shutdown(timeout_sec=0.0)
     if not ended:  # a thread in native code does not survive the end of the interpreter: leave it no time to crash
         sys.stdout.flush()

@@ -113,8 +113,8 @@ def main() -> None:
         rclpy.spin(TrustedPose())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    uninstall_signal_handlers()  # ends rclpy's thread for signals first: it shuts down too, and twice is an error
     rclpy.try_shutdown()
-    uninstall_signal_handlers()  # ends the thread that handles signals, before the interpreter ends
 
 
 if __name__ == "__main__":

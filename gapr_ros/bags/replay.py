@@ -18,6 +18,7 @@ import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import uninstall_signal_handlers
 from rclpy.time import Time
 from rclpy.utilities import remove_ros_args
 from rosbags.interfaces import Connection
@@ -202,6 +203,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     finally:
         bag.reader.close()
+        uninstall_signal_handlers()  # ends rclpy's thread for signals first: it shuts down too, and twice is an error
         rclpy.try_shutdown()
 
 

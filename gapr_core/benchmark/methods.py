@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -60,16 +61,29 @@ def _paper_pipeline(weights: str | None) -> RegistrationMethod:
     return PaperPipeline(weights) if weights else PaperPipeline()
 
 
-def _paper_pipeline_refined(weights: str | None) -> RegistrationMethod:
-    coarse = _paper_pipeline(weights)
+def _geotransformer(weights: str | None, pose: str = "local_to_global") -> RegistrationMethod:
+    from gapr_core.benchmark.geotransformer import GeoTransformer
+
+    if weights is None:
+        raise ConfigError(
+            "geotransformer@WEIGHTS", "no weights", "train them with python -m gapr_core.training.geotransformer"
+        )
+    return GeoTransformer(weights, pose)
+
+
+def _refined(make_coarse: Trained, weights: str | None) -> RegistrationMethod:
+    coarse = make_coarse(weights)
     return baselines.Refined(coarse, baselines.PointToPlane(), f"{coarse.name}{REFINED}")
 
 
 REFINED = "+point_to_plane"
-TRAINED: dict[str, Callable[[str | None], RegistrationMethod]] = {  # NAME, or NAME@WEIGHTS
+Trained = Callable[[str | None], RegistrationMethod]
+RAW: dict[str, Trained] = {
     "gapr_paper": _paper_pipeline,
-    f"gapr_paper{REFINED}": _paper_pipeline_refined,
+    "geotransformer": _geotransformer,
+    "geotransformer_ransac": partial(_geotransformer, pose="ransac"),
 }
+TRAINED = RAW | {name + REFINED: partial(_refined, maker) for name, maker in RAW.items()}  # NAME, or NAME@WEIGHTS
 
 
 def _with_weights(name: str) -> tuple[str, str | None]:
@@ -98,8 +112,9 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
     Args:
         name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
             proposers alone), "gapr_tracker", "gapr_paper" (the paper's pipeline; "gapr_paper@WEIGHTS" with those of a
-            run), a baseline of `gapr_core.baselines.REGISTRY`, or "package.module:factory"
-            for a callable without arguments that returns a `RegistrationMethod`.
+            run), "geotransformer@WEIGHTS" (its authors' code, see `geotransformer`), a baseline of
+            `gapr_core.baselines.REGISTRY`, or "package.module:factory" for a callable without arguments that returns a
+            `RegistrationMethod`.
         config: settings of our own methods.
 
     Raises:

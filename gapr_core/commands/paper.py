@@ -37,6 +37,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--table", type=int, required=True, choices=(*PROTOCOLS, *TRAINED), help="of the paper")
     parser.add_argument("--out", type=Path, required=True, help="folder of the table; an interrupted one goes on")
     parser.add_argument("--weights", type=Path, help="of the network in tables 1 to 3 (gapr train wrote them)")
+    parser.add_argument("--also", default="", help="more methods in tables 1 to 3, with commas: geotransformer@WEIGHTS")
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--split", default="test", choices=[s for s in anatomy.SPLITS if s != "train"], help="(test)")
     parser.add_argument("--bones", default=",".join(anatomy.BONES), help="with commas; the paper's four")
@@ -68,7 +69,8 @@ def compared_table(args: Namespace, recipe: Recipe) -> int:
     people = {bone: specimens(bone, recipe.split, recipe.people, args.anatomy) for bone in recipe.bones}
     write_pairs(recipe, people, pairs)
     ours = f"gapr_paper@{args.weights}"
-    benchmark(pairs, [ours, ours + REFINED, "icp"], args.out, jobs=args.jobs, ours=ours)
+    methods = [ours, ours + REFINED, *filter(None, args.also.split(",")), "icp"]
+    benchmark(pairs, methods, args.out, jobs=args.jobs, ours=ours)
     return 0
 
 

@@ -6,7 +6,7 @@ GEOTRANSFORMER=GeoTransformer gapr benchmark --methods geotransformer@runs/peer/
 
 Its network, losses and registration run as they are, with the settings of its 3DMatch experiment, but at the sizes of a
 network of ours (channels, superpoints, patches, Sinkhorn steps). Three things are ours: the two operators of its C++
-extension (voxels, balls) are NumPy and k-d trees, `.cuda()` does nothing where there is no GPU, and its unit is 40
+extension (voxels, balls) are NumPy and k-d trees, tensors stay on the CPU where there is no GPU, and its unit is 40
 first voxels of a pair's target, because its settings are made for voxels of 0.025.
 """
 
@@ -146,7 +146,7 @@ def thinning(sizes: ModelConfig) -> ModelConfig:
 
 @contextmanager
 def without_cuda() -> Iterator[None]:
-    """`.cuda()` leaves tensors where they are, on a machine without a GPU."""
+    """Tensors stay where they are, on a machine without a GPU, though its code moves them."""
     if torch.cuda.is_available():
         yield
         return

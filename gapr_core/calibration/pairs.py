@@ -125,12 +125,18 @@ class Drawn:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Subjects' femora and tibiae at L3, every other one of another subject: hardest to distinguish."""
+    """Subjects' femora and tibiae, every other one of another subject, twice as many as `count`.
+
+    The first half is seen as at L3, where they are hardest to distinguish, the second by all other families in turn.
+    """
     row, turn = IN_A_ROW, IN_A_ROW * len(BONES)
-    numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
+    numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES][:count]
     own_list = seed + LOOK_ALIKE_SEEDS
     whats = ("own", "person")
-    return [Task(folder, split, own_list, number, "L3", whats[number % 2], True) for number in numbers[:count]]
+    others = [family for family in SEEN_AS if family not in ("L3", "scene", *HELD_OUT)]
+    families = ["L3"] * count + [others[number // len(whats) % len(others)] for number in range(count)]
+    return [Task(folder, split, own_list, number, family, whats[number % len(whats)], True)
+            for number, family in zip(2 * numbers, families, strict=True)]  # fmt: skip
 
 
 def draw(task: Task) -> Drawn:

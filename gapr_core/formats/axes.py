@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError
+from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.meshes import vtp
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -23,7 +25,6 @@ LPS_RAS = np.array([-1.0, -1.0, 1.0])  # the same both ways
 FACTORS = {"lps": np.ones(3), "as_is": np.ones(3), "ras": LPS_RAS, "lps_to_ras": LPS_RAS}
 CHOICES = ("auto", *FACTORS)
 COMMENT = re.compile(rb"SPACE=(LPS|RAS)\b")
-CODES = re.compile(rb'<Array[^>]*Name="SPACE"[^>]*format="ascii"[^>]*>([\d\s]+)</')  # VTP: letters by their codes
 COMMENT_BYTES = 8192
 
 
@@ -84,9 +85,9 @@ def stated(path: Path) -> str | None:
         head = file.read(COMMENT_BYTES)
     if found := COMMENT.search(head):
         return found[1].decode().lower()
-    if found := CODES.search(head):
-        text = "".join(chr(int(code)) for code in found[1].split()[:9] if 0 < int(code) < 128).lower()
-        return text if text in FACTORS else None
+    if path.suffix.lower() == ".vtp":
+        text = vtp.space(path, FileLimits.from_environment()).lower()
+        return text if text in ("lps", "ras") else None
     return None
 
 

@@ -24,6 +24,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 
 NUMBERED = {"0": "ras", "1": "lps", "ras": "ras", "lps": "lps"}  # Slicer before 4.11 wrote a number
+STATUS, PLACED = 14, "2"  # the column after those with a name; undefined 0, preview 1, missing 3
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001}
 SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
 
@@ -97,6 +98,8 @@ def _of_json(content: Any) -> Markups:
         positions = np.array([p["position"] for p in placed], dtype=np.float64).reshape(-1, 3)
         points.append(axes.to_lps(positions * mm, space))
         labels += [str(p.get("label", "")) for p in placed]
+    if not points:
+        raise ValueError("no markups in it")
     return Markups(np.vstack(points), tuple(labels))
 
 
@@ -107,7 +110,10 @@ def _of_fcsv(data: bytes) -> Markups:
     space = _space(found[1] if found else None)
     columns = re.search(r"^#\s*columns\s*=\s*(.+)$", text, re.MULTILINE)
     names = [name.strip() for name in (columns[1] if columns else "id,x,y,z").split(",")]
-    rows = [row for row in csv.reader(text.splitlines()) if row and not row[0].startswith("#")]
+    lines = re.sub(r"\r+(?=,)", "", text).splitlines()  # some versions keep a CR within the row
+    rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
+    if len(names) == STATUS:  # some versions add two columns without a name: status of the position, type of the point
+        rows = [row for row in rows if len(row) <= STATUS or row[STATUS].strip() in ("", PLACED)]
     at = [names.index(axis) for axis in "xyz"]
     points = np.array([[float(row[i]) for i in at] for row in rows]).reshape(-1, 3)
     label = names.index("label") if "label" in names else 0

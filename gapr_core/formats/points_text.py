@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +48,17 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
 def _surface(data: bytes, columns: list[int] | None = None) -> Surface:
     rows = [line for line in text.lines(data) if line.strip() and not line.lstrip().startswith(("#", "//"))]
     delimiter = next((d for d in DELIMITERS if rows and d in rows[0]), None)
+    names: list[str] = []
     if rows and not _is_numbers(rows[0], delimiter):
+        names = [re.sub(r"[\s(\[].*", "", name.strip(' "\ufeff').lower()) for name in rows[0].split(delimiter)]
         rows = rows[1:]
     values = text.table(rows, delimiter=delimiter)
     if values.shape[1] < 3:
         raise ValueError(f"{values.shape[1]} columns, not x y z")
+    if columns is None and len(names) == values.shape[1] and names[:3] != list("xyz"):
+        if not set("xyz") <= set(names):
+            raise ValueError(f"columns {' '.join(names)}: name them x y z, or leave that line out")
+        columns = [names.index(axis) for axis in "xyz"]
     points = values[:, columns or [0, 1, 2]]
     has_normals = columns is None and values.shape[1] == 6 and _are_units(values[:, 3:])
     return Surface(points, None, values[:, 3:] if has_normals else None)

@@ -42,6 +42,15 @@ def read(path: Path, limits: FileLimits) -> Surface:
     return Surface(np.concatenate(points), joined if len(joined) else None)
 
 
+def space(path: Path, limits: FileLimits) -> str:
+    """The text of the field array SPACE, in which 3D Slicer writes the axes; empty without one of three letters.
+
+    Raises:
+        ValueError, ElementTree.ParseError: a damaged file.
+    """
+    return _File(limits.read(path), limits).text("SPACE", letters=3)
+
+
 class _File:
     def __init__(self, data: bytes, limits: FileLimits) -> None:
         if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
@@ -82,6 +91,21 @@ class _File:
         if len(values) != count:
             raise ValueError(f"{len(values)} numbers where {count} are announced")
         return values
+
+    def text(self, name: str, letters: int) -> str:
+        """The first string of a field array, of so many letters; VTK ends each with a zero."""
+        element = self._root.find(f"PolyData/FieldData/Array[@Name='{name}']")
+        if element is None:
+            return ""
+        if element.get("format") == "ascii":
+            data = bytes(int(code) for code in (element.text or "").split()[: letters + 1])
+        else:
+            stream, compressor = self._stream(element), self._root.get("compressor")
+            try:
+                data = stream.block() if compressor is None else self._blocks(stream, compressor, letters + 1)
+            except ValueError:  # of another length
+                return ""
+        return data.rstrip(b"\0").decode("ascii") if len(data) <= letters + 1 else ""
 
     def _values(self, element: ElementTree.Element, count: int) -> Array:
         if element.get("format") == "ascii":

@@ -33,6 +33,19 @@ def test_old_fcsv_files_write_their_axes_as_a_number_and_0_is_ras(tmp_path, said
     np.testing.assert_allclose(clouds.load(tmp_path / "a.fcsv", units="m").points, POINTS * factors)
 
 
+def test_points_of_an_fcsv_file_that_were_never_placed_stay_behind(tmp_path):
+    """3D Slicer 5 ends a row with two columns without a name, the status of the position first, and may keep a CR."""
+    path = fcsv(tmp_path / "a.fcsv", "# CoordinateSystem = LPS\n")
+    head, *rows = path.read_text().split("associatedNodeID\n")
+    rows = rows[0].splitlines()
+    assert len(rows) == 3
+    rows = [f"{rows[0]}\r,2,0", f"{rows[1]},0,0", f"{rows[2]},2,0"]
+    path.write_bytes(f"{head}associatedNodeID\n".encode() + "".join(f"{row}\n" for row in rows).encode())
+    read = markups.load(path)
+    np.testing.assert_allclose(read.points, POINTS[[0, 2]])
+    assert read.labels == ("F-0", "F-2")
+
+
 @pytest.mark.parametrize("said", ["", "# CoordinateSystem = 2\n"])
 def test_axes_of_markups_are_never_guessed(tmp_path, said):
     with pytest.raises(InvalidPointCloudError, match="neither LPS nor RAS"):
@@ -237,6 +250,58 @@ MESH = (
 def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title, axes, factors):
     (tmp_path / "a.vtk").write_text(MESH.format(title))
     np.testing.assert_allclose(reading.read(tmp_path / "a.vtk", ReadOptions(axes=axes)).points, POINTS * factors)
+
+
+@pytest.mark.parametrize("compressor", ["None", "ZLib"])
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
+@pytest.mark.parametrize(("said", "factors"), [
+    ("LPS", [1, 1, 1]), ("RAS", LPS_RAS), ("SCANNER", [1, 1, 1]), (None, [1, 1, 1]),
+])  # fmt: skip
+def test_axes_of_a_vtp_file_come_from_its_array_space_however_it_is_written(tmp_path, mode, compressor, said, factors):
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    corners, faces, poly, writer = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkXMLPolyDataWriter()
+    corners.SetData(numpy_to_vtk(POINTS, deep=True))
+    faces.InsertNextCell(3, [0, 1, 2])
+    poly.SetPoints(corners)
+    poly.SetPolys(faces)
+    if said:
+        space = vtkStringArray()
+        space.SetName("SPACE")
+        space.InsertNextValue(said)
+        poly.GetFieldData().AddArray(space)
+    writer.SetFileName(str(tmp_path / "a.vtp"))
+    getattr(writer, f"SetDataModeTo{mode}")()
+    getattr(writer, f"SetCompressorTypeTo{compressor}")()
+    writer.SetInputData(poly)
+    assert writer.Write()
+    np.testing.assert_allclose(reading.read(tmp_path / "a.vtp").points, POINTS * factors)
+
+
+TABLES = {
+    "a.txt": "z y x\n30 20 10\n60 5 -40\n90 -8 7\n",
+    "b.xyz": "id x y z\n0 10 20 30\n1 -40 5 60\n2 7 -8 90\n",
+    "c.csv": "\ufeffZ (mm),Y (mm),X (mm)\n30,20,10\n60,5,-40\n90,-8,7\n",
+    "d.csv": '"X","Y","Z"\n10,20,30\n-40,5,60\n7,-8,90\n',
+    "e.xyz": "a cloud\n10 20 30\n-40 5 60\n7 -8 90\n",
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_line_of_names_says_which_column_is_which(tmp_path, name):
+    (tmp_path / name).write_text(TABLES[name], encoding="utf-8")
+    np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
+
+
+@pytest.mark.parametrize("names", ["r,a,s", "id,px,py,pz"])
+def test_names_that_say_something_else_are_refused(tmp_path, names):
+    numbers = ",".join("123456"[: names.count(",") + 1])
+    (tmp_path / "a.csv").write_text(f"{names}\n{numbers}\n")
+    with pytest.raises(InvalidPointCloudError, match="name them x y z, or leave that line out"):
+        reading.read(tmp_path / "a.csv")
 
 
 def test_a_contradiction_of_axes_is_said(tmp_path, caplog):

@@ -39,7 +39,7 @@ lint: $(DEV)  ## ruff, mypy and the import contracts, on every file
 	PATH="$(CURDIR)/$(BIN):$$PATH" pre-commit run --all-files
 
 docs: $(DEV)  ## the site in build/site; fails on a warning
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 format: $(DEV)  ## let ruff format the code
 	$(BIN)/ruff check --fix . ; $(BIN)/ruff format .

@@ -64,7 +64,8 @@ def link(found: re.Match[str], here: str, folder: str, files: Files) -> str:
     path = normpath(join(here, found[2]))
     pages = {where: page for page, where in ELSEWHERE.items()}
     page = pages.get(path, path.removeprefix("docs/"))
-    if files.get_file_from_path(page) is None and (ROOT / path).exists():
+    file = files.get_file_from_path(page)
+    if (file is None or file.inclusion.is_excluded()) and (ROOT / path).exists():
         return f"{found[1]} (`{path}`)"
     return f"[{found[1]}]({relpath(page, folder or '.')}{found[3] or ''})"
 
@@ -84,7 +85,7 @@ def settings_of_the_library() -> str:
 
 def help_of_commands() -> str:
     """What `gapr` and each of its commands says with --help."""
-    env = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
+    env = {**os.environ, "COLUMNS": "84", "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
     parts = ["# Command line"]
     for command in ("", *modules()):
         run = [sys.executable, "-m", "gapr_core.cli", *command.split(), "--help"]

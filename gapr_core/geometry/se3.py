@@ -65,7 +65,8 @@ def kabsch(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = Non
     """Rigid T (..., 4, 4) minimising sum_i w_i |T source_i - target_i|^2 (Kabsch 1976, Arun 1987).
 
     Args:
-        source, target: (..., N, 3), N >= 3.
+        source: (..., N, 3), N >= 3.
+        target: (..., N, 3), the same number of points.
         weights: (..., N), not negative; all equal when None.
     """
     source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
@@ -81,7 +82,8 @@ def fitting(covariance: Array, source_mean: Array, target_mean: Array) -> Array:
 
     Args:
         covariance: (..., 3, 3) sum of w_i (source_i - mean) (target_i - mean)^T.
-        source_mean, target_mean: (..., 3) weighted means.
+        source_mean: (..., 3) weighted mean.
+        target_mean: (..., 3) weighted mean.
     """
     u, _, vt = np.linalg.svd(covariance)
     v = vt.swapaxes(-1, -2).copy()

@@ -30,7 +30,8 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
     Args:
         points: (N, 3), mm, in their own frame.
         T_box_points: (4, 4) pose of that frame in the box's frame, mm.
-        lowest, highest: (3,) two opposite corners, mm, box frame; both belong to the box.
+        lowest: (3,) corner of the box, mm, box frame; it belongs to the box.
+        highest: (3,) the opposite corner.
 
     Returns:
         (K, 3) in the points' own frame; none of those that are not finite.

@@ -137,6 +137,8 @@ def remarks(parameters: NodeParameters) -> list[str]:
     elif sensor in TOGETHER and not parameters.output_frame:
         why = "output_frame is empty: name the frame of the reference that is fixed to the bone"
         sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
+    if parameters.accumulate > 1 and not parameters.output_frame:
+        sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
     if parameters.viewpoint != "none" and parameters.accumulate > 1:
         sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
     low, high = parameters.crop_min, parameters.crop_max

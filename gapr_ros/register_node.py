@@ -39,12 +39,16 @@ def main(args: list[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         return _fail(f"{error}: source a ROS 2, or install the wheels with pip install '.[ros]'")
     from rclpy.executors import SingleThreadedExecutor
+    from rclpy.utilities import remove_ros_args
 
     from gapr_ros.node.guard import describe
     from gapr_ros.node.lifecycle import RegisterNode
     from gapr_ros.parameters import ParameterError
 
     try:
+        unused = remove_ros_args(sys.argv if args is None else ["register_node", *args])[1:]
+        if unused:
+            return _fail(f"{' '.join(unused)} is not used: write --ros-args before -p, -r and --params-file")
         rclpy.init(args=args)
         node = RegisterNode()
         executor = SingleThreadedExecutor()

@@ -33,12 +33,16 @@ def bones(path: str) -> list[str]:
     """
     if not Path(path).is_file():
         raise ValueError(f"params_file: expected a parameter file with one entry a bone, got {path!r}; {EXAMPLE}")
-    entries = yaml.safe_load(Path(path).read_text())
+    try:
+        entries = yaml.safe_load(Path(path).read_text())
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: not a parameter file: {error}; {EXAMPLE}") from error
     if not isinstance(entries, dict):
         raise ValueError(
             f"{path}: expected entries such as /femur/{EXECUTABLE}, got {type(entries).__name__}; {EXAMPLE}"
         )
-    names = [key.rsplit("/", 1)[0] for key in map(str, entries) if key.endswith(ENDING) and key != ENDING]
+    keys = [key for key in map(str, entries) if "*" not in key]  # what a pattern names is for all
+    names = [key.rsplit("/", 1)[0] for key in keys if key.endswith(ENDING) and key != ENDING]
     if not names:
         raise ValueError(f"{path}: no entry such as /femur/{EXECUTABLE}, got {', '.join(map(str, entries))}; {EXAMPLE}")
     frames = [_parameters(entries[f"{name}/{EXECUTABLE}"]).get("model_frame") for name in names]

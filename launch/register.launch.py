@@ -4,6 +4,7 @@ ros2 launch gapr_ros register.launch.py model_path:=/path/to/bone.stl points:=/c
 """
 # ruff: noqa: I001  (this folder is not the package launch)
 
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -43,16 +44,27 @@ def _value(name: str, text: str) -> Any:
     default = FIELDS[name].default
     if isinstance(default, str):
         return text
-    value = yaml.safe_load(text)
-    if isinstance(default, tuple):
-        return [float(number) for number in value]
-    return float(value) if isinstance(default, float) else value
+    try:
+        value = yaml.safe_load(text)
+        if isinstance(default, tuple):
+            return [float(number) for number in value]
+        return float(value) if isinstance(default, float) else value
+    except (TypeError, ValueError, yaml.YAMLError):
+        return text  # the node says what it wants instead
+
+
+def _shown(chosen: dict[str, str]) -> dict[str, str]:
+    """Where the topics of register.rviz are, by their names there."""
+    own = {f"register_node/{name}": f"register_node/{name}" for name in ("aligned", "model", "pose")}
+    return {"points": chosen["points"], "initialpose": chosen["initialpose"]} | own
 
 
 def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
     """The node and RViz, once the arguments are known."""
     parameters = given(context)
     chosen = context.launch_configurations
+    if not Path(chosen["params_file"]).is_file():  # launch only warns, and the node would run with other limits
+        raise ValueError(f"params_file: expected a parameter file, got {chosen['params_file']!r}")
     register = Node(
         package="gapr_ros",
         executable="register_node",
@@ -67,11 +79,13 @@ def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
     rviz = Node(
         package="rviz2",
         executable="rviz2",
+        namespace=chosen["namespace"],
+        remappings=[(f"/{name}", target) for name, target in _shown(chosen).items()],
         arguments=["-d", PathJoinSubstitution([share, "rviz", "register.rviz"])],
         parameters=[{"use_sim_time": parameters.get("use_sim_time", False)}],
         condition=IfCondition(chosen["rviz"]),
     )
-    return [register, rviz]
+    return [rviz, register]  # RViz first: where it is not installed, launch stops before it has started a node
 
 
 def generate_launch_description() -> LaunchDescription:

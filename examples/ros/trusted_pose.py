@@ -10,17 +10,18 @@ never used: it may be that of another cloud.
 from __future__ import annotations
 
 import sys
+import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
-from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import uninstall_signal_handlers
 from rclpy.time import Time
 
-WAIT_S = 0.5  # a status and its transform are sent together; more than this apart, one of them was lost
+WAIT_S = 0.5  # for tf2 to know the frames at the stamp of a pose; /tf may come after ~/transform
+POLL_S = 0.05
 
 
 class TrustedPose(Node):
@@ -36,6 +37,7 @@ class TrustedPose(Node):
         source = declare("register_node", "register_node").value
         self.waiting: dict[tuple[int, int], dict[str, str]] = {}
         self.transforms: dict[tuple[int, int], TransformStamped] = {}
+        self.since: dict[tuple[int, int], float] = {}
         self.buffer = self._listen_to_tf2()
         self.create_subscription(DiagnosticStatus, f"{source}/status", self._on_status, 10)
         self.create_subscription(TransformStamped, f"{source}/transform", self._on_transform, 10)
@@ -77,18 +79,32 @@ class TrustedPose(Node):
     def _meet(self) -> None:
         """Act on every stamp of which both messages are here, and forget what is older."""
         for key in sorted(set(self.waiting) & set(self.transforms)):
-            self.act(self._at(self.transforms[key]), self.waiting[key])
-            self.waiting = {k: v for k, v in self.waiting.items() if k > key}
-            self.transforms = {k: v for k, v in self.transforms.items() if k > key}
+            since = self.since.setdefault(key, time.monotonic())
+            why = self._not_yet(self.transforms[key])
+            if why and time.monotonic() - since < WAIT_S:
+                return
+            values, transform = self.waiting[key], self.transforms[key]
+            for kept in (self.waiting, self.transforms, self.since):
+                for old in [k for k in kept if k <= key]:
+                    del kept[old]
+            if why:
+                self.hold(why)
+            else:
+                self.act(self._at(transform), values)
+
+    def _not_yet(self, transform: TransformStamped) -> str:
+        """Why the pose cannot be had in the frame that was asked for; empty when it can."""
+        if self.buffer is None or self.frame == transform.header.frame_id:
+            return ""
+        stamp = Time.from_msg(transform.header.stamp)
+        there, why = self.buffer.can_transform(self.frame, self.bone, stamp, return_debug_tuple=True)
+        return "" if there else f"no transform {self.frame} <- {self.bone}: {why}"
 
     def _at(self, transform: TransformStamped) -> TransformStamped:
         """The pose in the frame that was asked for, at the stamp of the cloud."""
-        if not self.frame or self.frame == transform.header.frame_id:
+        if self.buffer is None or self.frame == transform.header.frame_id:
             return transform
-        if self.buffer is None:
-            raise RuntimeError(f"frame {self.frame} needs tf2_ros, which is part of a ROS installation")
-        stamp = Time.from_msg(transform.header.stamp)
-        return self.buffer.lookup_transform(self.frame, self.bone, stamp, Duration(seconds=WAIT_S))
+        return self.buffer.lookup_transform(self.frame, self.bone, Time.from_msg(transform.header.stamp))
 
     def _listen_to_tf2(self) -> object | None:
         if not self.frame:
@@ -96,7 +112,8 @@ class TrustedPose(Node):
         import tf2_ros
 
         buffer = tf2_ros.Buffer(node=self)
-        self.listener = tf2_ros.TransformListener(buffer, self, spin_thread=True)
+        self.listener = tf2_ros.TransformListener(buffer, self)  # no thread: it would not end with the program
+        self.create_timer(POLL_S, self._meet)
         return buffer
 
 

@@ -50,6 +50,8 @@ class Frames:
 
     def listen(self) -> None:
         """Start filling the buffer, if tf2 is there and it has not been started; call it from the executor."""
+        if self._tf2 is None:  # neither `publish` nor `listen` asked for it
+            self._tf2 = _import_tf2()
         if self._tf2 is not None and self._buffer is None:
             self._buffer = self._tf2.Buffer(node=self._node)
             self._listener = self._tf2.TransformListener(self._buffer, self._node)
@@ -91,6 +93,9 @@ class Frames:
         """Give back what was subscribed and advertised."""
         if self._listener is not None:
             self._listener.unregister()
+        if self._buffer is not None:  # it offers a service and watches the clock for as long as the node lives
+            self._node.destroy_service(self._buffer.srv)
+            self._buffer.jump_handle.unregister()
         if self._broadcaster is not None:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
         self._listener = self._buffer = self._broadcaster = None

@@ -63,4 +63,5 @@ class RosLogHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """One record, at its own level."""
         write = self._logger.error if record.levelno >= logging.ERROR else self._logger.warning
-        write(record.getMessage())
+        error = record.exc_info[1] if record.exc_info else None
+        write(f"{record.getMessage()}: {describe(error)}" if error else record.getMessage())

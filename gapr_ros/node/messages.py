@@ -19,6 +19,7 @@ from gapr_ros.node.outcome import Outcome
 from msg_adapters import matrix_to_pose, xyz_to_cloud
 
 Array = NDArray[np.float64]
+NEARLY_UP = 0.999  # cosine beyond which a direction has no side that is up
 
 
 def status(outcome: Outcome, name: str, hardware_id: str) -> DiagnosticStatus:
@@ -112,9 +113,9 @@ def _metres(length_mm: float | None) -> float | None:
 
 
 def _with_x(direction: Array) -> Array:
-    """(3, 3) rotation whose x axis is a unit vector; its z axis is as far up as can be."""
+    """(3, 3) rotation whose x axis is along a direction; its z axis is as far up as can be."""
     x = direction / np.linalg.norm(direction)
-    side = np.eye(3)[int(np.argmin(np.abs(x)))]
-    y = np.cross(side, x)
+    up = np.array([0.0, 0.0, 1.0] if abs(x[2]) < NEARLY_UP else [1.0, 0.0, 0.0])
+    y = np.cross(up, x)
     y /= np.linalg.norm(y)
     return np.column_stack([x, y, np.cross(x, y)])

@@ -65,7 +65,7 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     surface = clouds.load(parameters.model_path, units=parameters.model_unit, options=options)
     surface = Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
     target = method.prepare(surface, units="mm")
-    points_mm = _for_display(surface.points)
+    points_mm = _for_display(surface)
     return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm))
 
 
@@ -76,10 +76,11 @@ def labels_of(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Ready:
-    """A registration method with the bone that it has prepared: what a session works with."""
+    """A registration method with the bone that it has prepared, and the parameters that both were made from."""
 
     method: Any
     model: Model
+    parameters: NodeParameters
 
 
 def make_ready(method_factory: Callable[[NodeParameters], Any], parameters: NodeParameters) -> Ready:
@@ -91,7 +92,7 @@ def make_ready(method_factory: Callable[[NodeParameters], Any], parameters: Node
     method = method_factory(parameters)
     model = load_model(method, parameters)
     warm_up(method, model)
-    return Ready(method, model)
+    return Ready(method, model, parameters)
 
 
 def warm_up(method: Any, model: Model) -> None:
@@ -101,6 +102,8 @@ def warm_up(method: Any, model: Model) -> None:
         method.reset()
 
 
-def _for_display(points_mm: Array) -> Array:
-    step = max(1, len(points_mm) // DISPLAY_POINTS)
-    return points_mm[::step]
+def _for_display(surface: Surface) -> Array:
+    """(N, 3) mm, spread over the surface: the corners of a coarse mesh can be centimetres apart."""
+    if surface.faces is not None:
+        return surface.sample(DISPLAY_POINTS, np.random.default_rng(0))[0]
+    return surface.points[:: max(1, len(surface.points) // DISPLAY_POINTS)]

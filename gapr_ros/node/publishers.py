@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from rclpy.lifecycle import LifecyclePublisher
@@ -45,7 +46,8 @@ class Publishers:
 
     def send_model(self, model: Model) -> None:
         """The bone, latched, in its own frame."""
-        self._topics["model"].publish(xyz_to_cloud(wire.to_metres(model.points_mm).astype("f4"), self._of_model()))
+        header = self._of_model(Time())  # stamp 0: wherever the frame is now; tf2 has forgotten the start after 10 s
+        self._topics["model"].publish(xyz_to_cloud(wire.to_metres(model.points_mm).astype("f4"), header))
 
     def send(self, outcome: Outcome, model: Model) -> None:
         """What became of a cloud, then its pose where it has one, then what there is to look at."""
@@ -75,8 +77,7 @@ class Publishers:
     def _advertise_pose(self) -> LifecyclePublisher:
         return self._host.ros.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED)
 
-    def _of_model(self) -> Header:
-        stamp = self._host.ros.get_clock().now().to_msg()
+    def _of_model(self, stamp: Time) -> Header:
         return Header(frame_id=self._host.parameters.model_frame, stamp=stamp)
 
     def _is_heard(self, name: str) -> bool:
@@ -107,5 +108,6 @@ class Publishers:
         if residuals is not None and self._is_heard("residuals"):
             self._topics["residuals"].publish(messages.residuals(residuals, outcome.header))
         if guidance is not None and guidance.patches:
-            self._topics["guidance"].publish(messages.guidance(guidance, self._of_model()))
-            self._topics["next_view"].publish(messages.next_view(guidance, self._of_model()))
+            header = self._of_model(outcome.header.stamp)  # tf2 has the bone at the stamp of the cloud, not later
+            self._topics["guidance"].publish(messages.guidance(guidance, header))
+            self._topics["next_view"].publish(messages.next_view(guidance, header))

@@ -43,7 +43,7 @@ class Session:
 
     def __init__(self, host: Host, ready: Ready, method_factory: Callable[[NodeParameters], Any]) -> None:
         self._host, self._ready, self._method_factory = host, ready, method_factory
-        self._limits, self._reading = _limits(host.parameters), _reading(host.parameters)
+        self._limits, self._reading = _limits(ready.parameters), _reading(host.parameters)
         self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
         self.conflicts = Conflicts(host.ros.get_logger().warning)
@@ -56,6 +56,7 @@ class Session:
         self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation)
         self.worker = Worker(self._work, self._held, self._period_s)
+        self.parameters_changed()  # a limit may have been set while the bone was read
 
     @property
     def model(self) -> Model:
@@ -235,8 +236,9 @@ class Session:
 
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
-        self._ready = ready
+        self._ready, self._limits = ready, _limits(ready.parameters)
         self._begin_again()
+        self.parameters_changed()
         self._publishers.withdraw_pose()
         self.send_model()
 

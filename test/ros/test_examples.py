@@ -169,7 +169,7 @@ def graph(blob_path):
 def test_the_security_policy_allows_what_the_node_does_and_names_nothing_else(graph):
     (profile,) = ElementTree.parse(ROOT / "deploy" / "sros2_policy.xml").getroot().iter("profile")
     optional = {"/tf", "/tf_static", "/clock", "/register_node/detection", "/diagnostics", "/parameter_events",
-                "/register_node/get_type_description"}  # fmt: skip
+                "/register_node/get_type_description", "/tf2_frames"}  # fmt: skip
     for kind, does in graph.items():
         allowed = {
             entry.text.replace("~", "/register_node") if entry.text.startswith("~") else f"/{entry.text}"

@@ -13,6 +13,7 @@ import yaml
 from gapr_ros.parameters import FIELDS, problem
 
 ROOT = Path(__file__).parents[2]
+DEFAULTS = str(ROOT / "config" / "register_node.yaml")
 
 
 class Recorded:
@@ -53,7 +54,7 @@ def started(module, **arguments):
     *declared, opaque = module.generate_launch_description().given[0]
     values = {argument.given[0]: argument.named["default_value"] for argument in declared}
     assert set(arguments) <= set(values), "an argument that is not declared"
-    values = {name: value if isinstance(value, str) else "share/register_node.yaml" for name, value in values.items()}
+    values = {name: value if isinstance(value, str) else DEFAULTS for name, value in values.items()}
     context = types.SimpleNamespace(launch_configurations=values | arguments)
     return opaque.named["function"](context, *opaque.named.get("args", []))
 
@@ -62,14 +63,14 @@ def test_every_parameter_of_the_node_is_an_argument_and_none_is_given_unasked(lo
     module = load("register.launch.py")
     declared = {argument.given[0] for argument in module.generate_launch_description().given[0][:-1]}
     assert set(FIELDS) <= declared
-    register, _ = started(module)
-    assert register.named["parameters"] == ["share/register_node.yaml", {}]
+    _, register = started(module)
+    assert register.named["parameters"] == [DEFAULTS, {}]
 
 
 def test_arguments_become_parameters_of_the_type_that_the_node_wants(load):
     arguments = {"min_confidence": "1", "accumulate": "50", "model_path": "007", "guide": "true", "max_tre": "0.002",
                  "crop_min": "[0, 0, -1]", "use_sim_time": "true"}  # fmt: skip
-    register, rviz = started(load("register.launch.py"), points="/camera/points", namespace="/left", **arguments)
+    rviz, register = started(load("register.launch.py"), points="/camera/points", namespace="/left", **arguments)
     given = register.named["parameters"][1]
     wanted = {"min_confidence": 1.0, "accumulate": 50, "model_path": "007", "guide": True, "use_sim_time": True,
               "crop_min": [0.0, 0.0, -1.0], "max_tre": 0.002}  # fmt: skip
@@ -77,6 +78,26 @@ def test_arguments_become_parameters_of_the_type_that_the_node_wants(load):
     assert [problem(FIELDS[name], value) for name, value in given.items() if name in FIELDS] == [""] * 6
     assert ("points", "/camera/points") in register.named["remappings"] and register.named["namespace"] == "/left"
     assert rviz.named["parameters"] == [{"use_sim_time": True}]
+
+
+def test_a_parameter_file_that_does_not_exist_is_refused(load):
+    with pytest.raises(ValueError, match="expected a parameter file, got '/no/such.yaml'"):
+        started(load("register.launch.py"), params_file="/no/such.yaml")
+
+
+@pytest.mark.parametrize(("name", "text"), [("min_confidence", "high"), ("crop_min", "1"), ("crop_min", "[1")])
+def test_what_is_no_value_of_a_parameter_goes_to_the_node_which_says_what_it_wants(load, name, text):
+    _, register = started(load("register.launch.py"), **{name: text})
+    assert f"parameter '{name}' must be" in problem(FIELDS[name], register.named["parameters"][1][name])
+
+
+def test_rviz_shows_what_the_node_hears_and_says(load):
+    rviz, register = started(load("register.launch.py"), points="/camera/points", namespace="left")
+    assert rviz.named["namespace"] == register.named["namespace"] == "left"
+    displays = yaml.safe_load((ROOT / "rviz" / "register.rviz").read_text())["Visualization Manager"]["Displays"]
+    shown = {display["Topic"]["Value"] for display in displays if "Topic" in display}
+    assert shown <= {name for name, _ in rviz.named["remappings"]}
+    assert ("/points", "/camera/points") in rviz.named["remappings"]
 
 
 def test_a_use_sim_time_that_is_neither_true_nor_false_is_refused(load):
@@ -99,6 +120,8 @@ def test_the_shipped_file_of_two_bones_starts_two_nodes_that_hear_one_topic(load
     ("text", "hint"),
     [
         (None, "expected a parameter file with one entry a bone, got .*copy share/gapr_ros/config/two_bones.yaml"),
+        ("\0", "not a parameter file"),
+        ("a: {", "bones.yaml: not a parameter file"),
         ("", "got NoneType"),
         ("- femur", "got list"),
         ("/**: {ros__parameters: {}}", "no entry such as /femur/register_node"),

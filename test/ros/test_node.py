@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -516,17 +517,19 @@ class FakeTf2:
 
         return Broadcaster()
 
-    def TransformListener(self, buffer, node):
-        class Listener:
-            def unregister(self):
-                pass
+    class Listener:
+        def unregister(self):
+            pass
 
-        return Listener()
+    def TransformListener(self, buffer, node):
+        return self.Listener()
 
     def Buffer(self, node):
         fake = self
 
         class Buffer:
+            srv, jump_handle = None, fake.Listener()
+
             def can_transform(self, parent, child, stamp):
                 return child == "probe" and next(fake.delay) > 3
 
@@ -578,7 +581,8 @@ def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands
 def test_a_look_up_that_has_begun_goes_on_while_the_node_ends(monkeypatch):
     tf2 = FakeTf2(np.eye(4))
     monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
-    looked_up = frames.Frames(None, publish=False, listen=True)
+    node = SimpleNamespace(destroy_service=lambda service: None)
+    looked_up = frames.Frames(node, publish=False, listen=True)
     buffer, known = looked_up._buffer, looked_up._buffer.can_transform
     buffer.can_transform = lambda *names: looked_up.close() or known(*names)
     np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", None, 1.0), np.eye(4))
@@ -637,3 +641,10 @@ def test_no_exception_of_a_callback_ends_the_node(live):
     wait_until(lambda: client.values()["frames_accepted"] == "1")
     node.session._publishers.send = send
     assert client.ask(GOOD)["level"] == 0
+
+
+def test_a_seed_in_another_frame_is_looked_up_though_nothing_goes_to_tf(monkeypatch):
+    monkeypatch.setattr(frames, "_import_tf2", lambda: FakeTf2(np.eye(4)))
+    looked_up = frames.Frames(None, publish=False, listen=False)
+    looked_up.listen()
+    np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", None, 1.0), np.eye(4))

@@ -29,6 +29,12 @@ class Tf2:
     class TransformException(Exception):
         pass
 
+    srv = None
+
+    @property
+    def jump_handle(self):
+        return self
+
     def TransformListener(self, buffer, node):
         return self
 

@@ -6,8 +6,8 @@ GEOTRANSFORMER=GeoTransformer gapr benchmark --methods geotransformer@runs/peer/
 
 Its network, losses and registration run as they are, with the settings of its 3DMatch experiment, but at the sizes of a
 network of ours (channels, superpoints, patches, Sinkhorn steps). Three things are ours: the two operators of its C++
-extension (voxels, balls) are NumPy and k-d trees, tensors stay on the CPU where there is no GPU, and its unit is 40
-first voxels of a pair's target, because its settings are made for voxels of 0.025.
+extension (voxels, balls) are NumPy and k-d trees, its tensors stay on the CPU, and its unit is 40 first voxels of a
+pair's target, because its settings are made for voxels of 0.025.
 """
 
 from __future__ import annotations
@@ -31,22 +31,23 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from gapr_core.baselines.base import Baseline, BaselineTarget, NoPose
-from gapr_core.errors import InvalidPointCloudError, MethodUnavailableError, WeightsError
+from gapr_core.benchmark.paper_pipeline import ransac_pose
+from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
-from gapr_core.model.pyramid import build_cloud, matching_radius, target_frame, voxel_means
+from gapr_core.model.pyramid import build_cloud, target_frame, voxel_means
 from gapr_core.model.types import Cloud
-from gapr_core.registration.proposals.consensus import Correspondences, ransac, sharpened
+from gapr_core.registration.proposals.consensus import Correspondences
 
 Array = NDArray[np.float64]
 CHECKOUT = "GEOTRANSFORMER"  # environment variable: where the checkout is
 FORMAT = "geotransformer/1"
 EXPERIMENT = "geotransformer.3dmatch.stage4.gse.k3.max.oacl.stage2.sinkhorn"
 SCRIPTS = ("config", "backbone", "model", "loss")  # top-level modules of an experiment's folder
+PYRAMID = ("points", "neighbors", "subsampling", "upsampling")  # lists of tensors, one for each stage
 VOXEL = 0.025  # its first voxel, in its unit
 NEIGHBORS = [38, 36, 36, 38]  # of a point, as in its demo for 3DMatch
 MOST_NEIGHBORS = 64  # that the stand-in for its extension looks for: more than it ever keeps
-AGREES = 1.5  # matching radii within which a correspondence agrees with a pose, as in `paper_pipeline`
 
 
 @dataclass(frozen=True)
@@ -114,13 +115,19 @@ class Checkout:
         """Its coarse and fine losses: called with the output and the input of the network."""
         return self.loss.OverallLoss(self.settings(sizes))
 
-    def batch(self, source: Cloud, target: Cloud, voxel: float, T: Tensor | None = None) -> dict[str, Any]:
+    def batch(
+        self, source: Cloud, target: Cloud, voxel: float, patch_size: int, T: Tensor | None = None
+    ) -> dict[str, Any]:
         """The input of the network.
 
         Args:
             source, target: of which the finest points are used.
             voxel: the first voxel in the clouds' units.
+            patch_size: points of a patch; its network cannot do with fewer in a whole cloud.
             T: (3, 4) true T_target_source in the clouds' units; the network wants one, and registration ignores it.
+
+        Raises:
+            InvalidPointCloudError: a cloud of fewer points than a patch has, after the first thinning.
         """
         scale, motion = VOXEL / voxel, torch.eye(4)
         if T is not None:
@@ -136,20 +143,20 @@ class Checkout:
         backbone = self.config.make_cfg().backbone
         balls = backbone.num_stages, backbone.init_voxel_size, backbone.init_radius, NEIGHBORS
         made = self.collate([pair | {"transform": motion}], *balls)
-        return {name: [t.contiguous() for t in v] if isinstance(v, list) else v for name, v in made.items()}
+        fewest = int(made["lengths"][1].min())
+        if fewest < patch_size:
+            raise InvalidPointCloudError(f"at least {patch_size} voxels", f"{fewest}", "a larger cloud")
+        return {name: [t.contiguous() for t in v] if name in PYRAMID else v for name, v in made.items()}
 
 
 def thinning(sizes: ModelConfig) -> ModelConfig:
-    """How clouds come to their first voxels: voxels double at each stage, and our network's superpoints are left."""
+    """The settings for the first voxels: each stage doubles them, all else is as in our network."""
     return replace(sizes, voxel_growth=2.0)
 
 
 @contextmanager
 def without_cuda() -> Iterator[None]:
-    """Tensors stay where they are, on a machine without a GPU, though its code moves them."""
-    if torch.cuda.is_available():
-        yield
-        return
+    """Tensors stay on the CPU, though its code would move them."""
     with patch.object(Tensor, "cuda", lambda tensor, *_, **__: tensor):
         yield
 
@@ -170,7 +177,7 @@ class GeoTransformer(Baseline):
     def __init__(self, weights: str | Path, pose: str = "local_to_global", checkout: str | Path | None = None) -> None:
         self.code, self.pose = Checkout.at(checkout), pose
         self.network, sizes = load(self.code, weights)
-        self.thinning = thinning(sizes)
+        self.thinning, self.patch_size = thinning(sizes), sizes.patch_size
         self.name = f"geotransformer{'' if pose == 'local_to_global' else f'_{pose}'}@{weights}"
 
     def _prepare(self, points: Array, normals: Array | None) -> Any:
@@ -181,19 +188,16 @@ class GeoTransformer(Baseline):
         frame, cloud = target.static
         try:
             moving = build_cloud(source, frame, self.thinning)
+            batch = self.code.batch(moving, cloud, frame.voxel, self.patch_size)
         except InvalidPointCloudError as error:
             raise NoPose(str(error)) from error
         with torch.inference_mode(), without_cuda():
-            output = self.network(self.code.batch(moving, cloud, frame.voxel))
+            output = self.network(batch)
         unit_mm = frame.scale_mm * frame.voxel / VOXEL
         if self.pose == "local_to_global":
             return to_mm(output["estimated_transform"].double().numpy(), moving, cloud, unit_mm)
         found = correspondences_mm(output, moving, cloud, unit_mm)
-        radius_mm = matching_radius(frame) * frame.scale_mm
-        poses, _ = ransac(found, AGREES * radius_mm, np.random.default_rng(0))
-        if not len(poses):
-            raise NoPose(f"no pose that three of {len(found.score)} correspondences agree on")
-        return sharpened(poses[0], found, radius_mm)
+        return ransac_pose(found, frame)
 
 
 def save(network: nn.Module, sizes: ModelConfig, path: Path, card: dict[str, Any]) -> None:
@@ -220,7 +224,7 @@ def load(code: Checkout, path: str | Path) -> tuple[nn.Module, ModelConfig]:
         sizes = ModelConfig.from_dict(json.loads(header["sizes"]))
         network = code.network(sizes)
         network.load_state_dict(tensors)
-    except (OSError, SafetensorError, RuntimeError) as error:
+    except (OSError, SafetensorError, RuntimeError, ConfigError, KeyError, TypeError, ValueError) as error:
         raise WeightsError("weights of GeoTransformer", f"{path}: {error}", "train them first") from error
     return network.eval(), sizes
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.baselines.base import Baseline, BaselineTarget, NoPose
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.registration.proposals.consensus import ransac, sharpened
+from gapr_core.registration.proposals.consensus import Correspondences, ransac, sharpened
 from gapr_core.registration.proposals.network import SHIPPED, correspondences_mm
+
+if TYPE_CHECKING:
+    from gapr_core.model.pyramid import Frame
 
 Array = NDArray[np.float64]
 AGREES = 1.5  # matching radii within which a correspondence agrees with a pose
@@ -46,7 +49,7 @@ class PaperPipeline(Baseline):
     def _align(self, source: Array, target: BaselineTarget, seed: Array) -> Array:
         import torch
 
-        from gapr_core.model.pyramid import build_cloud, matching_radius
+        from gapr_core.model.pyramid import build_cloud
 
         frame, cloud, features = target.static
         try:
@@ -56,8 +59,19 @@ class PaperPipeline(Baseline):
         with torch.inference_mode():
             output = self.network(moving, cloud, features)
         found = correspondences_mm(output.matches, moving, cloud)
-        radius_mm = matching_radius(frame) * frame.scale_mm
-        poses, _ = ransac(found, AGREES * radius_mm, np.random.default_rng(0))
-        if not len(poses):
-            raise NoPose(f"no pose that three of {len(found.score)} correspondences agree on")
-        return sharpened(poses[0], found, radius_mm)
+        return ransac_pose(found, frame)
+
+
+def ransac_pose(found: Correspondences, frame: Frame) -> Array:
+    """(4, 4) T_target_source, mm, that most correspondences agree with, fitted to them.
+
+    Raises:
+        NoPose: three never agree.
+    """
+    from gapr_core.model.pyramid import matching_radius
+
+    radius_mm = matching_radius(frame) * frame.scale_mm
+    poses, _ = ransac(found, AGREES * radius_mm, np.random.default_rng(0))
+    if not len(poses):
+        raise NoPose(f"no pose that three of {len(found.score)} correspondences agree on")
+    return sharpened(poses[0], found, radius_mm)

@@ -8,7 +8,7 @@ those of our networks. Call the same line again to go on after a stop; a checkpo
 
 from __future__ import annotations
 
-import csv
+import sys
 import time
 from argparse import ArgumentParser
 from dataclasses import replace
@@ -23,6 +23,8 @@ from tqdm import tqdm
 from gapr_core.benchmark import geotransformer
 from gapr_core.benchmark.geotransformer import Checkout, without_cuda
 from gapr_core.data.protocols import Pair
+from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.runtime import files
 from gapr_core.training.bone_cache import PooledBone
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs
@@ -30,6 +32,7 @@ from gapr_core.training.targets import TrainingPair
 from gapr_core.training.trainer import learning_rate
 
 SAVE_S = 120.0
+LOSSES = ("loss", "c_loss", "f_loss")  # by their names in its code: all, coarse, fine
 
 
 class WithVoxel(TrainingPairs):
@@ -42,8 +45,8 @@ class WithVoxel(TrainingPairs):
         return super()._prepare(made, bone)
 
 
-def main() -> None:
-    """Train, or go on."""
+def main() -> int:
+    """Train, or go on; 1 for what cannot be trained with."""
     parser = ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkout", type=Path, required=True, help="folder of the authors' code")
     parser.add_argument(
@@ -53,78 +56,116 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, required=True, help="budget")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run")
     args = parser.parse_args()
-    config = replace(TrainConfig.from_yaml(args.config), pairs=args.pairs)
-    args.out.mkdir(parents=True, exist_ok=True)
-    train(Checkout.at(args.checkout), config, args.anatomy, args.out)
+    try:
+        config = replace(TrainConfig.from_yaml(args.config), pairs=args.pairs)
+        args.out.mkdir(parents=True, exist_ok=True)
+        train(Checkout.at(args.checkout), config, args.anatomy, args.out)
+    except GaprError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
 
 
 def train(code: Checkout, config: TrainConfig, anatomy: Path | None, folder: Path) -> None:
     """Run until the schedule ends; `folder` gets checkpoint.pt, log.csv and weights.safetensors."""
     torch.manual_seed(config.seed)
     np.random.seed(config.seed)  # its kernels are turned at random
-    sizes = config.network()
-    network, losses = code.network(sizes), code.losses(sizes)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
-    )
-    checkpoint, first, left_out = folder / "checkpoint.pt", 0, 0
+    learner = Learner(code, config, anatomy)
+    checkpoint = folder / "checkpoint.pt"
     if checkpoint.exists():
-        state = torch.load(checkpoint, weights_only=True)
-        network.load_state_dict(state["network"])
-        optimizer.load_state_dict(state["optimizer"])
-        first, left_out = state["step"], state["left_out"]
-    drawn = WithVoxel(config, geotransformer.thinning(sizes), anatomy)
+        learner.go_on(torch.load(checkpoint, weights_only=True))
     steps, saved = config.pairs // config.batch, time.monotonic()
-    progress = tqdm(range(first, steps), initial=first, total=steps, unit="step")
+    progress = tqdm(range(learner.steps_done, steps), initial=learner.steps_done, total=steps, unit="step")
     for step in progress:
-        for parameters in optimizer.param_groups:
-            parameters["lr"] = learning_rate(config, step / steps)
-        found = [
-            learn(code, network, losses, drawn, step * config.batch + i, config.batch) for i in range(config.batch)
-        ]
-        used = [losses_of_pair for losses_of_pair in found if losses_of_pair]
-        left_out += len(found) - len(used)
-        norm = nn.utils.clip_grad_norm_(network.parameters(), config.clip)
-        if torch.isfinite(norm):
-            optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-        row = {key: round(float(np.mean([losses_of[key] for losses_of in used])), 4) for key in used[0]} if used else {}
-        progress.set_postfix(row)
-        write_row(
-            folder / "log.csv", {"step": step + 1, "pairs": (step + 1) * config.batch, "left_out": left_out, **row}
-        )
+        progress.set_postfix(learner.step(learning_rate(config, step / steps)))
         if time.monotonic() - saved > SAVE_S or step + 1 == steps:
             saved = time.monotonic()
-            state = {"network": network.state_dict(), "optimizer": optimizer.state_dict()}
-            torch.save(state | {"step": step + 1, "left_out": left_out}, checkpoint)
-            card = {"pairs": (step + 1) * config.batch, "left_out": left_out, "run": config.to_dict()}
-            geotransformer.save(network, sizes, folder / "weights.safetensors", card)
+            with files.replacing(checkpoint) as new:
+                torch.save(learner.state(), new)
+            with files.replacing(folder / "weights.safetensors") as new:
+                geotransformer.save(learner.network, learner.sizes, new, learner.card())
+            files.write_text(folder / "log.csv", learner.log())
 
 
-def learn(
-    code: Checkout, network: nn.Module, losses: nn.Module, drawn: WithVoxel, number: int, share: int
-) -> dict[str, float]:
-    """Add the gradient of one pair, a `share`-th of a step; its losses, none where the network sees no overlap."""
-    pair = drawn.pair(number)
-    batch = code.batch(pair.source, pair.target, drawn.voxel, pair.T[0])
-    with without_cuda():
-        output: dict[str, Any] = network(batch)
-        if not len(output["gt_node_corr_indices"]):
-            return {}
-        found = losses(output, batch)
-        (found["loss"] / share).backward()
-    return {name: float(value.detach()) for name, value in found.items()}
+class Learner:
+    """The network, what it learns from, and how far it has come.
 
+    Args:
+        code: the authors'.
+        config: of the pairs, the schedule and the sizes.
+        anatomy: real bones; None for parametric ones.
+    """
 
-def write_row(path: Path, row: dict[str, Any]) -> None:
-    """Append to a table, with its header where it is new."""
-    is_new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if is_new:
-            writer.writerow(row)
-        writer.writerow(row.values())
+    def __init__(self, code: Checkout, config: TrainConfig, anatomy: Path | None) -> None:
+        self.code, self.config, self.sizes = code, config, config.network()
+        self.network, self._losses = code.network(self.sizes), code.losses(self.sizes)
+        self._optimizer = torch.optim.AdamW(
+            self.network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
+        )
+        self._drawn = WithVoxel(config, geotransformer.thinning(self.sizes), anatomy)
+        self._rows: list[list[float]] = []  # of the log
+        self.left_out = 0  # pairs in which the network sees no overlap, or too few points
+
+    @property
+    def steps_done(self) -> int:
+        """Of the schedule."""
+        return len(self._rows)
+
+    def step(self, rate: float) -> dict[str, float]:
+        """Learn from the next pairs; the mean of their losses."""
+        for parameters in self._optimizer.param_groups:
+            parameters["lr"] = rate
+        first = self.steps_done * self.config.batch
+        found = [self._learn(first + number) for number in range(self.config.batch)]
+        used = [losses for losses in found if losses is not None]
+        self.left_out += len(found) - len(used)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        if torch.isfinite(norm):
+            self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+        means = np.mean(used, axis=0).tolist() if used else [np.nan] * len(LOSSES)
+        self._rows.append([self.left_out, *means])
+        return dict(zip(LOSSES, means, strict=True))
+
+    def _learn(self, number: int) -> list[float] | None:
+        """Add the gradient of a pair, and return its losses."""
+        pair = self._drawn.pair(number)
+        try:
+            batch = self.code.batch(pair.source, pair.target, self._drawn.voxel, self.sizes.patch_size, pair.T[0])
+        except InvalidPointCloudError:
+            return None
+        with without_cuda():
+            output: dict[str, Any] = self.network(batch)
+            if not len(output["gt_node_corr_indices"]):
+                return None
+            found = self._losses(output, batch)
+            (found["loss"] / self.config.batch).backward()
+        return [float(found[name].detach()) for name in LOSSES]
+
+    def state(self) -> dict[str, Any]:
+        """What `go_on` needs."""
+        parts = {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
+        return parts | {"rows": self._rows, "left_out": self.left_out}
+
+    def go_on(self, state: dict[str, Any]) -> None:
+        """From where a run stopped."""
+        self.network.load_state_dict(state["network"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._rows, self.left_out = state["rows"], state["left_out"]
+
+    def card(self) -> dict[str, Any]:
+        """What the weights were trained on."""
+        pairs = self.steps_done * self.config.batch
+        return {"pairs": pairs, "left_out": self.left_out, "run": self.config.to_dict()}
+
+    def log(self) -> str:
+        """One line a step, as CSV."""
+        lines = (
+            ",".join(f"{value:.5g}" for value in (step, step * self.config.batch, *row))
+            for step, row in enumerate(self._rows, 1)
+        )
+        return "\n".join([",".join(("step", "pairs", "left_out", *LOSSES)), *lines, ""])
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

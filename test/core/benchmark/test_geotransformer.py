@@ -12,7 +12,7 @@ import torch
 from gapr_core.benchmark import geotransformer, methods
 from gapr_core.benchmark.geotransformer import CHECKOUT, VOXEL, Checkout, GeoTransformer
 from gapr_core.data.parametric import make_bone
-from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
+from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import build_cloud, target_frame
@@ -82,7 +82,7 @@ def test_its_pose_comes_back_in_mm(monkeypatch, pose):
     source = se3.apply(se3.inverse(T), target[target[:, 2] < np.median(target[:, 2])])
     sizes = ModelConfig(superpoints=(50, 75))
 
-    def batch(source, target, voxel):
+    def batch(source, target, voxel, patch_size):
         return source, target, float(target.scale_mm[0]) * voxel / VOXEL
 
     monkeypatch.setattr(Checkout, "at", lambda folder: SimpleNamespace(batch=batch))
@@ -102,9 +102,11 @@ def test_a_unit_is_forty_first_voxels_and_the_motion_is_in_it_too():
     cloud = build_cloud(points, frame, sizes)
     settings = SimpleNamespace(num_stages=4, init_voxel_size=VOXEL, init_radius=2.5 * VOXEL)
     config = SimpleNamespace(make_cfg=lambda: SimpleNamespace(backbone=settings))
-    code = Checkout(config, None, None, lambda pairs, *balls: pairs[0] | {"balls": [torch.ones(2)]})
+    code = Checkout(config, None, None, lambda pairs, *balls: pairs[0] | {"lengths": [None, torch.tensor([40, 32])]})
     T = torch.cat([torch.eye(3), torch.tensor([[0.5], [0.0], [-0.25]])], dim=1)
-    batch = code.batch(cloud, cloud, frame.voxel, T)
+    with pytest.raises(InvalidPointCloudError, match="at least 33 voxels; got 32"):
+        code.batch(cloud, cloud, frame.voxel, 33)
+    batch = code.batch(cloud, cloud, frame.voxel, 32, T)
     scale = VOXEL / frame.voxel
     torch.testing.assert_close(batch["ref_points"], cloud.levels[0].points * scale)
     assert batch["transform"][:3, 3].tolist() == pytest.approx([0.5 * scale, 0.0, -0.25 * scale])

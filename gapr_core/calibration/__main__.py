@@ -49,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
     parser.add_argument("--scenes", type=int, default=0, help="more pairs that are scenes (default: %(default)s)")
     parser.add_argument("--look-alikes", type=int, default=0,
-                        help="more of subjects' femora and tibiae at L3, half of them against another subject's, and as many seen by "
-                        "all other families (default: %(default)s)")  # fmt: skip
+                        help="more of subjects' femora and tibiae at L3, half of them against another subject's, and "
+                        "as many seen by all other families (default: %(default)s)")  # fmt: skip
     parser.add_argument(
         "--streams", type=int, default=0, help="streams of frames, half of them of others (default: %(default)s)"
     )

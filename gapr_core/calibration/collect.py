@@ -191,17 +191,18 @@ class AskedOnce:
 
     def __post_init__(self) -> None:
         self.name = self.proposer.name
-        self._last: tuple[Array, Proposals] | None = None
+        self._last: tuple[Array, Array, Proposals] | None = None
 
     def prepare(self, target: PreparedTarget) -> None:
         """As the proposer."""
         self.proposer.prepare(target)
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """As the proposer, or what it said of the same points before."""
-        if self._last is None or not np.array_equal(self._last[0], source.points):
-            self._last = source.points, self.proposer.propose(source, target, rng)
-        return self._last[1]
+        """As the proposer, or what it said of the same points and target before."""
+        last = self._last
+        if last is None or last[1] is not target.points or not np.array_equal(last[0], source.points):
+            self._last = last = source.points, target.points, self.proposer.propose(source, target, rng)
+        return last[2]
 
 
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig | None = None) -> Registrar:

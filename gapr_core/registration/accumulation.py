@@ -139,11 +139,11 @@ class Accumulator:
 
     def _look_at_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
         """Keep the new sources that lie on the bone under the pose; without a pose, all."""
-        off: list[Array] = []
-        newest = self._new[-1:]
-        if result.T_target_source is not None:
-            everything = _together(self._last())
-            off = [source for source in self._new if self._lies_off(source, everything, result.T_target_source, target)]
+        if result.T_target_source is None:  # it says nothing of any source, nor of a row of those off the bone
+            self._kept, self._new = self._last(), []
+            return result
+        newest, everything = self._new[-1:], _together(self._last())
+        off = [source for source in self._new if self._lies_off(source, everything, result.T_target_source, target)]
         newly_off = [source for source in off if not _is_among(source, self._off)]
         self._off = [*self._off, *newly_off] if off and len(off) == len(self._new) else newly_off
         self._kept = [s for s in self._kept + self._new if not _is_among(s, off)][-self.most :]

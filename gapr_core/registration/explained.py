@@ -85,23 +85,31 @@ def assess(
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
-    if judged.probability < config.min_confidence and explained.share < config.part.mostly_clutter:
-        judged = replace(judged, refusal=_clutter(explained.share, judged.refusal))
     return replace(judged, seen=scene.source, members=explained.members)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
-    """The same; a refusal of a dense cloud of no known viewpoint says so where most of the cloud lies off the bone."""
-    source, judged = assessment.source, assessment.seen is not None
-    if judged or assessment.is_sure(config.min_confidence) or len(source.points) < config.source.dense_points:
+    """The same; a refusal says so where most of the cloud is not this bone.
+
+    With a viewpoint, by what the pose explains; of another dense cloud, by what lies on the bone. This is no safety
+    rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed.
+    """
+    in_scene, source = assessment.seen is not None, assessment.source
+    if assessment.is_sure(config.min_confidence):
         return assessment
-    share = _on_surface(assessment.fit.T, source, assessment.target, config).mean()
-    if share >= config.part.mostly_off:
+    if in_scene:
+        share, limit = assessment.features["inlier_ratio"], config.part.mostly_clutter
+        is_named = assessment.probability < config.min_confidence and share < limit
+    else:
+        share = _on_surface(assessment.fit.T, source, assessment.target, config).mean()
+        is_named = len(source.points) >= config.source.dense_points and share < config.part.mostly_off
+    if not is_named:
         return assessment
-    return replace(assessment, refusal=_clutter(float(share), assessment.refusal, "say where the camera was, "))
+    more = "" if in_scene else "say where the camera was, "
+    return replace(assessment, refusal=_clutter(float(share), assessment.refusal, more))
 
 
-def _clutter(share: float, other: Refusal | None, more: str = "") -> Refusal:
+def _clutter(share: float, other: Refusal | None, more: str) -> Refusal:
     why = "no pose of it is certain" if other is None else other.reason
     return Refusal(
         RegistrationStatus.CLUTTER,

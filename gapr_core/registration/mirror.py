@@ -48,7 +48,7 @@ def margin(
     poses, scores = refine_many(reflections @ T @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
     for number in np.argsort(scores):
         if not _is_own_image(poses[number] @ FLIP @ se3.inverse(T), target):
-            return float(np.clip(np.log(scores[number] / own), *LIMITS))
+            return log_ratio(scores[number], own)
     return LIMITS[1]
 
 

@@ -138,7 +138,8 @@ class Registrar:
         if isinstance(assessment, Refusal):
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
-        return replace(answer(assessment, self.config), guidance=guidance, stage_ms=clock.stages)
+        named = explained.named_clutter(assessment, self.config)
+        return replace(answer(named, self.config), guidance=guidance, stage_ms=clock.stages)
 
     @single_threaded_libraries
     def assess(
@@ -175,7 +176,7 @@ class Registrar:
         if assessment.is_sure(self.config.min_confidence**2):
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
-        judged = explained.named_clutter(assessment, self.config).corrected(self.precision)
+        judged = assessment.corrected(self.precision)
         if judged.refusal is None or judged.seen is not None:  # a part that was found in a scene has no size of its own
             return judged
         return replace(judged, refusal=rules.asking_the_unit(judged.refusal, prepared.points, target.points))

@@ -1,8 +1,8 @@
 """The safety rules: what refuses a pose, whatever its probability. Each rule refuses alone.
 
-Five rules never look at the probability: a motion that is not observed, a pose that can be pushed aside, a rival that
-is as good, a source of another size, a source whose mirror image fits better. Two are the user's thresholds:
-`min_confidence` and `max_tre_mm`.
+Five rules do not weigh the probability: a motion that is not observed, a pose that can be pushed aside, a rival that is
+as good, a source of another size, a source whose mirror image fits better. Pushing and mirroring cost time: they are
+done only where the pose may still be accepted. Two are the user's thresholds: `min_confidence` and `max_tre_mm`.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def by_threshold(probability: float, tre95_mm: float, config: RegistrarConfig) -
     """Why the pose does not meet what the user asks for; None when it does. A probability of NaN does not."""
     if not probability >= config.min_confidence:
         reason = f"the best pose is right with a probability of only {probability:.2f}"
-        return Refusal(RegistrationStatus.LOW_CONFIDENCE, reason)
+        return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}, {config.min_confidence:g} is asked for")
     if config.max_tre_mm > 0.0 and not tre95_mm <= config.max_tre_mm:
         reason = f"the error over the bone is below {tre95_mm:.1f} mm (95 %), allowed are {config.max_tre_mm:g} mm"
         return Refusal(RegistrationStatus.IMPRECISE, reason)

@@ -99,7 +99,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None, num_threads: 
     extent_mm = float(np.linalg.norm(np.ptp(points, axis=0)))
     if extent_mm > clouds.EXTENT_LIMITS_MM[1] or extent_mm < 1.0:
         clouds.check_extent(extent_mm, "mm", "the source")
-    width_mm = float(np.sqrt(np.linalg.eigvalsh(np.cov(points.T))[1]))
+    width_mm = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(points.T))[1], 0.0)))  # of a line -1e-13 or so
     if width_mm < config.smallest_width_mm:
         return Refusal(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
     if found is None:

@@ -143,7 +143,7 @@ def _check_is_a_body(points: Array, config: TargetConfig) -> None:
     if len(points) < config.fewest_points:
         given = f"{len(points)} distinct points"
         raise InvalidPointCloudError(f"a target of at least {config.fewest_points} points", given, "export it denser")
-    spread = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
     if spread[0] < 1e-3 * spread[2]:
         shape = "line" if spread[1] < 1e-3 * spread[2] else "plane"
         raise InvalidPointCloudError("a bone with extent in three directions", f"a {shape}", "check the file")

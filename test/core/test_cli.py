@@ -1,6 +1,10 @@
 """The command's contracts: exit codes, JSON, one line for bad input."""
 
 import json
+import os
+import shlex
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -141,3 +145,13 @@ def test_evaluate_answers_again_what_other_settings_have_answered(tmp_path, pair
     assert answers[1] == answers[2]  # not asked again
     assert answers[0]["version"].startswith("0.") and answers[0]["weights"]
     assert answers[0]["tre95_mm"] is None and answers[0]["covariance"] is None
+
+
+@pytest.mark.parametrize("is_unbuffered", [False, True])
+def test_the_pose_is_written_though_nobody_reads_the_output(tmp_path, files, is_unbuffered):
+    command = shlex.join([sys.executable, "-m", "gapr_core.cli", "register", *files, "--method", "gapr_search"])
+    environment = {**os.environ, **({"PYTHONUNBUFFERED": "1"} if is_unbuffered else {})}
+    script = f"set -o pipefail; {command} --out {tmp_path / 'pose.tfm'} | true"
+    ended = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert "Transform" in (tmp_path / "pose.tfm").read_text() and "BrokenPipe" not in ended.stderr

@@ -41,6 +41,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node.lifecycle import RegisterNode
+from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
 
 DOMAIN = domain.claim()
@@ -241,8 +242,14 @@ def _answered(values: dict[str, str]) -> int:
 
 
 @contextmanager
-def node_in_thread(method: Any, model_path: Path, namespace: str = "", **parameters: Any) -> Iterator[RegisterNode]:
-    """A register_node in this process with a registration method of the test's own."""
+def node_in_thread(
+    method: Any,
+    model_path: Path,
+    namespace: str = "",
+    factory: Callable[[NodeParameters], Any] | None = None,
+    **parameters: Any,
+) -> Iterator[RegisterNode]:
+    """A register_node in this process with a registration method of the test's own, or with what a factory makes."""
     spinner = Spinner(context())
     values = {
         "model_path": str(model_path),
@@ -253,7 +260,7 @@ def node_in_thread(method: Any, model_path: Path, namespace: str = "", **paramet
     }
     overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
     options = {"context": spinner.context, "parameter_overrides": overrides, "namespace": namespace}
-    node = RegisterNode(lambda _: method, **options)
+    node = RegisterNode(factory or (lambda _: method), **options)
     spinner.start(node)
     try:
         yield node

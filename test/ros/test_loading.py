@@ -12,6 +12,7 @@ import pytest
 from harness import PATIENCE_S, NodeProcess, StandIn, node_in_thread, wait_until
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 LIMIT_S = 2.0  # of CPU time
@@ -95,6 +96,27 @@ def test_while_it_reloads_clouds_are_registered_to_the_old_bone(blob_path, clien
         slow.gate.set()
         wait_until(reloaded.done)
         assert reloaded.result().success and client.ask(GOOD)["level"] == 0
+
+
+def test_a_limit_that_is_set_while_a_bone_is_read_holds_for_it(blob_path, client, slow):
+    """The method was made with the limits of before: another one is made, as if they had been set afterwards."""
+    made = []
+
+    def factory(parameters):
+        made.append(parameters.min_confidence)
+        return slow
+
+    slow.gate.set()
+    with node_in_thread(slow, blob_path, factory=factory, min_confidence=0.9) as node:
+        client.wait_for_state("active")
+        slow.gate.clear()
+        reloaded = client.ready(Trigger, "/register_node/reload_model").call_async(Trigger.Request())
+        wait_until(lambda: len(made) == 2)
+        assert node.set_parameters([Parameter("min_confidence", value=0.5)])[0].successful
+        slow.gate.set()
+        wait_until(reloaded.done)
+        wait_until(lambda: made[-1] == 0.5, what=made)
+    assert made[:2] == [0.9, 0.9]
 
 
 def test_a_bone_that_is_ready_after_the_node_was_destroyed_raises_nothing(blob_path, client, slow):

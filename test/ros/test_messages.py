@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import types
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from std_msgs.msg import Header
 from gapr_core.geometry import se3
 from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
 from gapr_ros.node import messages, wire
+from gapr_ros.node.guard import RosLogHandler
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.publishers import TOPICS
 from gapr_ros.node.refusal import OF_STATUS, Reason
@@ -207,3 +210,22 @@ def test_a_detection_has_pose_score_and_the_box_of_the_bone():
     np.testing.assert_allclose(pose_to_matrix(one.bbox.center)[:3, 3], middle, atol=1e-12)
     assert (one.bbox.size.x, one.bbox.size.y, one.bbox.size.z) == pytest.approx((0.1, 0.04, 0.02))
     assert messages.detection(VISION, outcome(reason=Reason.JUMP), "femur", points_mm).detections == []
+
+
+def test_the_z_axis_of_the_next_view_is_as_far_up_as_can_be():
+    for normal in ([1.0, 0.0, 0.0], [0.6, 0.0, 0.8], [-0.3, 0.5, -0.2]):
+        x = np.array(normal) / np.linalg.norm(normal)
+        assert messages._with_x(x)[2, 2] == pytest.approx(np.hypot(x[0], x[1]))
+
+
+def test_a_failure_in_the_log_comes_with_its_reason():
+    said = []
+    handler = RosLogHandler(SimpleNamespace(error=said.append, warning=said.append))
+    log = logging.getLogger("test of the handler")
+    log.addHandler(handler)
+    try:
+        raise OSError("no such settings file")
+    except OSError:
+        log.exception("work failed")
+    log.removeHandler(handler)
+    assert len(said) == 1 and said[0].startswith("work failed") and "no such settings file" in said[0]

@@ -138,6 +138,7 @@ def test_live_parameters_change_while_running_and_the_others_say_how(blob_path, 
         ("ultrasound", "", 0, 1, "by itself, because output_frame is empty"),
         ("ultrasound", "reference", 7, 7, "the last 7 clouds"),
         ("ultrasound", "reference", 1, 1, ""),
+        ("unknown", "", 5, 5, "clouds are collected in their own frames"),
     ],
 )
 def test_slices_and_touched_points_are_registered_together_where_the_bone_rests_and_the_node_says_so(

@@ -9,11 +9,12 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from harness import StandIn, accepted, node_in_thread, pose_mm
 from rclpy.parameter import Parameter
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import frames, region
+from gapr_ros.node.model import load_model
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import matrix_to_transform
@@ -76,6 +77,16 @@ def test_the_neighbourhood_of_the_bone_is_where_its_last_pose_puts_it():
     points_mm = np.array([[500.0, 100.0, 9.0], [500.0, 100.0, 11.0], [600.0, 0.0, 0.0], [495.0, 0.0, 0.0]])
     kept = region.around(SimpleNamespace(tree=cKDTree(model_mm)), T_cloud_model, 0.01)(points_mm)
     np.testing.assert_array_equal(kept, points_mm[[0, 3]])
+
+
+def test_points_on_the_bone_stay_however_far_apart_the_corners_of_its_mesh_are(tmp_path):
+    corners = np.array([[x, y, z] for x in (0.0, 40.0) for y in (0.0, 40.0) for z in (0.0, 300.0)])
+    np.savez(tmp_path / "shaft.npz", points=corners, faces=ConvexHull(corners).simplices)
+    parameters = NodeParameters(model_path=str(tmp_path / "shaft.npz"), model_unit="mm")
+    model = load_model(StandIn(), parameters)
+    middle = np.array([[0.0, 20.0, 150.0], [40.0, 10.0, 120.0], [20.0, 0.0, 200.0], [60.0, 20.0, 150.0]])
+    kept = region.around(model, np.eye(4), 0.01)(middle)
+    np.testing.assert_array_equal(kept, middle[:3])
 
 
 def test_a_cloud_with_points_metres_away_is_registered_when_it_is_cropped(blob_path, client, method):

@@ -8,6 +8,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
 
@@ -175,3 +176,18 @@ def test_a_source_without_a_finite_point_gets_no_answer_from_what_was_collected_
     for nothing in (np.full((50, 3), np.nan), np.empty((0, 3))):
         result = accumulator.register(nothing, target)
         assert result.status is RegistrationStatus.TOO_FEW_POINTS and result.T_target_source is None
+
+
+def test_a_refusal_does_not_break_a_row_of_sources_off_the_bone(frames, prepared):
+    """A pose finds two sources off the bone, then nothing is said once, then the third comes: the bone has moved."""
+    collected = Accumulator(Registrar(RegistrarConfig(num_threads=1)), most=20)
+    accepted = RegistrationResult(RegistrationStatus.OK, np.eye(4))
+    refused = RegistrationResult(RegistrationStatus.AMBIGUOUS)
+    collected._lies_off = lambda source, *_: bool(source[0, 0] > 100.0)
+    answers = []
+    for number, result in enumerate((accepted, accepted, refused, accepted)):
+        on_bone = number == 2
+        collected._new = [np.full((30, 3), 0.0 if on_bone else 200.0 + number)]
+        answers.append(collected._look_at_new(result, prepared))
+    assert answers[2] is refused
+    assert "it has moved" in answers[3].reason

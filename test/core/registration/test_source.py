@@ -47,3 +47,12 @@ def test_frames_are_the_principal_axes_and_face_the_viewpoint_where_that_is_know
         assert (np.einsum("ni,ni->n", facing.normals, viewpoint - facing.points) > 0.0).all()
         signs = np.sign(np.einsum("ni,ni->n", wanted[:, 2], viewpoint - facing.points[chosen]))
         assert np.array_equal(facing.axes(chosen), wanted * np.stack([signs**2, signs, signs], axis=1)[:, :, None])
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_straight_line_is_refused_however_its_sums_are_rounded(seed):
+    """The smaller eigenvalues of its covariance are 0, or -1e-13: no number is its root."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=3)
+    refused = sources.prepare(rng.uniform(0.0, 200.0, (500, 1)) * direction / np.linalg.norm(direction), CONFIG)
+    assert "the source is a line" in refused.reason

@@ -35,6 +35,13 @@ def main(args: list[str] | None = None) -> int:
     if why:
         return _fail(why)
     try:
+        return _started(args)
+    except KeyboardInterrupt:  # while it imports
+        return 0
+
+
+def _started(args: list[str] | None) -> int:
+    try:
         import rclpy
     except ModuleNotFoundError as error:
         return _fail(f"{error}: source a ROS 2, or install the wheels with pip install '.[ros]'")
@@ -52,8 +59,6 @@ def main(args: list[str] | None = None) -> int:
         rclpy.init(args=args)
         node = RegisterNode()
         executor = SingleThreadedExecutor()
-    except KeyboardInterrupt:
-        return 0
     except Exception as error:
         rclpy.try_shutdown()
         if "context is invalid" in str(error):  # asked to stop while starting

@@ -139,7 +139,9 @@ class Registrar:
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
         named = explained.named_clutter(assessment, self.config)
-        return replace(answer(named, self.config), guidance=guidance, stage_ms=clock.stages)
+        result = replace(answer(named, self.config), guidance=guidance)
+        clock.lap("assess")
+        return replace(result, stage_ms=clock.stages)
 
     @single_threaded_libraries
     def assess(

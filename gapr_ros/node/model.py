@@ -62,7 +62,8 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     if not parameters.model_path:
         raise ConfigError("model_path", "nothing", "give -p model_path:=/path/to/bone.stl")
     options = ReadOptions(axes=parameters.model_axes, labels=labels_of(parameters.model_label))
-    surface = clouds.load(parameters.model_path, units=parameters.model_unit, options=options)
+    path = Path(parameters.model_path).expanduser()  # a shell leaves the ~ of model_path:=~/bone.stl as it is
+    surface = clouds.load(path, units=parameters.model_unit, options=options)
     surface = Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
     target = method.prepare(surface, units="mm")
     points_mm = _for_display(surface)

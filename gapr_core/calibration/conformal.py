@@ -21,7 +21,7 @@ from gapr_core.registration.precision_model import PRECISION_FEATURES, SCALE_LIM
 Array = NDArray[np.float64]
 MEDIAN_NEES = 5.348  # of chi square with six degrees of freedom
 MEDIAN_RATIO = 0.8  # of a true error to its expected root mean square: of two to three directions that matter
-OVERALL, IN_EACH = 0.955, 0.91  # aims of coverage: a little above what is asked for
+OVERALL, IN_EACH = 0.955, 0.91  # coverage: a little above what is asked for, 95 % over all and 90 % in each
 FEWEST = 30  # accepted answers of a family that has a say of its own
 
 

@@ -3,8 +3,8 @@
 The covariance of a pose predicts the root-mean-square error over any points, the root of the mean of their traces of
 J Sigma J^T. How much larger the true error is depends on what the residuals cannot show. An additive model of a few
 features scales the covariance; a factor, found by conformal prediction over subjects and sensor families (Vovk et al.
-2005; Papadopoulos et al. 2002 for the normalised score), takes its 95 % quantile to a bound that 95 % of the true errors
-stay below.
+2005; Papadopoulos et al. 2002 for the normalised score), takes its 95 % quantile to a bound that 95 % of the true
+errors stay below.
 """
 
 from __future__ import annotations

@@ -23,11 +23,11 @@ from tqdm import tqdm
 from gapr_core.benchmark import geotransformer
 from gapr_core.benchmark.geotransformer import Checkout, without_cuda
 from gapr_core.data.protocols import Pair
-from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.runtime import files
 from gapr_core.training.bone_cache import PooledBone
 from gapr_core.training.config import TrainConfig
-from gapr_core.training.dataset import TrainingPairs
+from gapr_core.training.dataset import OWN_TARGET, TrainingPairs
 from gapr_core.training.targets import TrainingPair
 from gapr_core.training.trainer import learning_rate
 
@@ -67,7 +67,13 @@ def main() -> int:
 
 
 def train(code: Checkout, config: TrainConfig, anatomy: Path | None, folder: Path) -> None:
-    """Run until the schedule ends; `folder` gets checkpoint.pt, log.csv and weights.safetensors."""
+    """Run until the schedule ends; `folder` gets checkpoint.pt, log.csv and weights.safetensors.
+
+    Raises:
+        ConfigError: a protocol whose target is not the whole bone, of which the first voxel is not known here.
+    """
+    if partial := sorted(set(config.mix) & set(OWN_TARGET)):
+        raise ConfigError("protocols with whole targets", ", ".join(partial), "leave it out of `mix`")
     torch.manual_seed(config.seed)
     np.random.seed(config.seed)  # its kernels are turned at random
     learner = Learner(code, config, anatomy)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,8 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavaila
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import build_cloud, target_frame
+from gapr_core.training.config import TrainConfig
+from gapr_core.training.geotransformer import train
 
 RNG = np.random.default_rng(0)
 
@@ -130,13 +133,14 @@ def test_without_weights_it_says_how_to_train_them():
     methods.check(["geotransformer@a.safetensors", "geotransformer_ransac@a.safetensors+point_to_plane"])
 
 
+def test_targets_that_are_not_whole_are_not_trained_on(tmp_path):
+    config = replace(TrainConfig(), mix={"paper": 1.0, "incomplete": 1.0})
+    with pytest.raises(ConfigError, match="protocols with whole targets; got incomplete"):
+        train(SimpleNamespace(), config, None, tmp_path)
+
+
 @pytest.mark.skipif(CHECKOUT not in os.environ, reason=f"{CHECKOUT} names no checkout of GeoTransformer")
 def test_the_authors_code_learns_a_step_and_registers(tmp_path):
-    from dataclasses import replace
-
-    from gapr_core.training.config import TrainConfig
-    from gapr_core.training.geotransformer import train
-
     config = replace(TrainConfig(), pairs=2, batch=2, micro_batch=1, mix={"paper": 1.0}, model_settings={"width": 16})
     train(Checkout.at(), config, None, tmp_path)
     made = methods.make(f"geotransformer@{tmp_path / 'weights.safetensors'}")

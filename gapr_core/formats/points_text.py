@@ -50,7 +50,7 @@ def _surface(data: bytes, columns: list[int] | None = None) -> Surface:
     delimiter = next((d for d in DELIMITERS if rows and d in rows[0]), None)
     names: list[str] = []
     if rows and not _is_numbers(rows[0], delimiter):
-        names = [re.sub(r"[\s(\[].*", "", name.strip(' "\ufeff').lower()) for name in rows[0].split(delimiter)]
+        names = [re.sub(r"[\s(\[_/].*", "", name.strip(' "\ufeff').lower()) for name in rows[0].split(delimiter)]
         rows = rows[1:]
     values = text.table(rows, delimiter=delimiter)
     if values.shape[1] < 3:

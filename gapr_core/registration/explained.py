@@ -94,19 +94,16 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
     With a viewpoint, by what the pose explains; of another dense cloud, by what lies on the bone. This is no safety
     rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed.
     """
-    in_scene, source = assessment.seen is not None, assessment.source
-    if assessment.is_sure(config.min_confidence):
+    source, least, in_scene = assessment.source, config.min_confidence, assessment.seen is not None
+    believed = assessment.probability >= least if in_scene else assessment.is_sure(least)
+    if believed or not (in_scene or len(source.points) >= config.source.dense_points):
         return assessment
     if in_scene:
-        share, limit = assessment.features["inlier_ratio"], config.part.mostly_clutter
-        is_named = assessment.probability < config.min_confidence and share < limit
+        share, limit, more = assessment.features["inlier_ratio"], config.part.mostly_clutter, ""
     else:
-        share = _on_surface(assessment.fit.T, source, assessment.target, config).mean()
-        is_named = len(source.points) >= config.source.dense_points and share < config.part.mostly_off
-    if not is_named:
-        return assessment
-    more = "" if in_scene else "say where the camera was, "
-    return replace(assessment, refusal=_clutter(float(share), assessment.refusal, more))
+        share = float(_on_surface(assessment.fit.T, source, assessment.target, config).mean())
+        limit, more = config.part.mostly_off, "say where the camera was, "
+    return assessment if share >= limit else replace(assessment, refusal=_clutter(share, assessment.refusal, more))
 
 
 def _clutter(share: float, other: Refusal | None, more: str) -> Refusal:

@@ -7,7 +7,7 @@ import sys
 
 
 def say(text: str) -> None:
-    """One line on standard output; nobody who listens any more is no reason to write no file, or to end with 0."""
+    """One line on standard output; it goes nowhere, and the program goes on, where nobody reads it any more."""
     try:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()

@@ -139,7 +139,9 @@ def test_targets_that_are_not_whole_are_not_trained_on(tmp_path):
         train(SimpleNamespace(), config, None, tmp_path)
 
 
-@pytest.mark.skipif(CHECKOUT not in os.environ, reason=f"its authors' code does not ship: set {CHECKOUT} to a clone of it")
+@pytest.mark.skipif(
+    CHECKOUT not in os.environ, reason=f"its authors' code does not ship: set {CHECKOUT} to a clone of it"
+)
 def test_the_authors_code_learns_a_step_and_registers(tmp_path):
     config = replace(TrainConfig(), pairs=2, batch=2, micro_batch=1, mix={"paper": 1.0}, model_settings={"width": 16})
     train(Checkout.at(), config, None, tmp_path)

@@ -240,6 +240,9 @@ class EvidenceConfig(Settings):
     correlation: float = setting(0.8, "of two frames: 0 independent, 1 the same again", low=0, high=1)
     memory: float = setting(10.0, "frames after which a frame's weight has fallen to about 1/e", low=1)
     agree_mm: float = setting(15.0, "largest motion between frames (rms) that continues a track", low=0, unit="mm")
+    stands: float = setting(
+        0.8, "a tracked answer as sure as this stands after a frame that was sure; above 1 none does", low=0, high=2
+    )
 
 
 @dataclass(frozen=True)

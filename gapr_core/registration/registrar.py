@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -36,8 +36,15 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by itself needs no other proposer
+
 NO_POSES = np.empty((0, 4, 4))
 FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity: poses are often written with few digits
+
+
+def never(assessment: Assessment) -> bool:
+    """Only what is sure by itself is enough."""
+    return False
 
 
 class Registrar:
@@ -151,8 +158,12 @@ class Registrar:
         initial: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
         clock: Clock | None = None,
+        enough: Enough = never,
     ) -> Assessment | Refusal:
-        """What `register` knows before `min_confidence` and `max_tre_mm` decide: for calibration and research."""
+        """What `register` knows before `min_confidence` and `max_tre_mm` decide: for streams, calibration and research.
+
+        An answer that is `enough` ends the rounds, and no mirror image of its source is registered in full.
+        """
         clock = clock or Clock()
         if not isinstance(target, PreparedTarget):
             how = "pass what `prepare` returns for it"
@@ -164,7 +175,7 @@ class Registrar:
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
         start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
-            assessment = self._in_rounds(prepared, target, start, clock)
+            assessment = self._in_rounds(prepared, target, start, clock, enough)
         else:
             eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
             assessment = self._in_scene(prepared, target, start, eye, clock)
@@ -174,7 +185,7 @@ class Registrar:
             again = self._in_rounds(prepared, target.both_cortices, assessment.fit.T[None], clock)
             assessment = (again or assessment).limited(self.config.cortices.largest_confidence)
         if assessment.is_sure(self.config.min_confidence**2):  # as in `rules.by_geometry`
-            assessment = self._unless_mirrored(assessment, clock)
+            assessment = self._unless_mirrored(assessment, clock, enough)
         if assessment.is_sure(self.config.min_confidence**2):
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
@@ -183,7 +194,7 @@ class Registrar:
             return judged
         return replace(judged, refusal=rules.asking_the_unit(judged.refusal, prepared.points, target.points))
 
-    def _unless_mirrored(self, assessment: Assessment, clock: Clock) -> Assessment:
+    def _unless_mirrored(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The same; refused where the mirror image of the source fits better.
 
         A few points leave much to chance, wherever on the bone, and so does an answer that is not sure: the mirror
@@ -191,7 +202,8 @@ class Registrar:
         """
         a, config = assessment, self.config
         found = mirror.image_margin(a.fit.T, a.source, a.target, config.verification, config.num_threads)
-        by_chance = len(a.source.points) <= config.rules.mirrored_points or not a.is_sure(config.rules.mirrored_below)
+        is_sure = a.is_sure(config.rules.mirrored_below) or enough(a)
+        by_chance = len(a.source.points) <= config.rules.mirrored_points or not is_sure
         if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
             flipped = sources.prepare(a.source.points * [1.0, 1.0, -1.0], config.source, config.num_threads)
             image = None if isinstance(flipped, Refusal) else self._in_rounds(flipped, a.target, NO_POSES, clock)
@@ -201,9 +213,9 @@ class Registrar:
         return a.refused(rules.by_mirror(found, config.rules), config.rules)
 
     def _in_rounds(
-        self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock
+        self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough = never
     ) -> Assessment | None:
-        """Ask one proposer after the other, each round with the poses of all so far, until an answer is sure."""
+        """Ask one proposer after the other, each with the poses of all so far, until an answer is sure or enough."""
         config, assessment = self.config, None
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(config.seed)
@@ -219,7 +231,7 @@ class Registrar:
             assessment = assess(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            if assessment.is_sure(max(config.sure, config.min_confidence)):
+            if assessment.is_sure(max(config.sure, config.min_confidence)) or enough(assessment):
                 break
         return assessment
 

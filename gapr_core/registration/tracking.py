@@ -67,10 +67,10 @@ class Tracker:
     """Registers a stream of sources in one frame, such as the clouds of a tracked probe.
 
     The last pose and its rivals are refined on the new source first. Where that answer is sure (`RegistrarConfig.sure`)
-    it stands; else the registrar's proposers are asked as for a single source. So a jump, another frame or a wrong
-    track costs time, not truth. The confidence of a source also rests on those before it: sources that agree raise it,
-    those that fit badly lower it (`Evidence`), and so does a misfit that they share (`SharedMisfit`). Used by one
-    thread at a time.
+    it stands. In a stream that is sure, so does one near the last pose that reaches `evidence.stands`. Else the
+    registrar's proposers are asked as for a single source. So a jump, another frame or a wrong track costs time, not
+    truth. The confidence of a source also rests on those before it: sources that agree raise it, those that fit badly
+    lower it (`Evidence`), and so does a misfit that they share (`SharedMisfit`). Used by one thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
@@ -129,7 +129,7 @@ class Tracker:
             self._shared.forget()
 
     def _forget_track(self) -> None:
-        self._has_track = False
+        self._has_track = self._is_sure = False  # there are poses to follow; the last source was sure
         self._last: Array | None = None  # pose of the last source that no rule refused, (4, 4) T_target_source
         self._tracked = 0  # sources since the last full registration
 
@@ -175,8 +175,20 @@ class Tracker:
         if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if viewpoint is None and self._tracked + 1 < self.recheck:
-            return self._tracking.assess(source, target, clock=clock)
+            return self._tracking.assess(source, target, clock=clock, enough=self._stands)
         return self.registrar.assess(source, target, self._memory.poses[0], viewpoint, clock)
+
+    def _stands(self, assessment: Assessment) -> bool:
+        """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""
+        stands = assessment.proposer == Memory.name and assessment.is_sure(self.registrar.config.evidence.stands)
+        return self._is_sure and stands and self._agrees(assessment)
+
+    def _agrees(self, assessment: Assessment) -> bool:
+        """True when the pose continues that of the last source."""
+        if self._last is None:
+            return False
+        moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last, assessment.source.points)
+        return moved_mm <= self.registrar.config.evidence.agree_mm
 
     def _with_evidence(self, assessment: Assessment) -> Assessment:
         """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.
@@ -186,10 +198,8 @@ class Tracker:
         """
         if assessment.refusal is not None:
             return assessment
-        T, agree_mm = assessment.fit.T, self._evidence.config.agree_mm
-        agrees = self._last is not None and se3.rms_apart_mm(T, self._last, assessment.source.points) <= agree_mm
-        self._last = T
-        alone = assessment.probability
+        agrees, alone = self._agrees(assessment), assessment.probability
+        self._last = assessment.fit.T
         one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))
         together = self._with_shared_misfit(one_by_one, agrees)
         return together.limited(float(np.sqrt(alone)) if agrees else alone)
@@ -226,6 +236,7 @@ class Tracker:
 
         As it does not count either, a refused full registration is followed by another one.
         """
+        self._is_sure = result.ok and result.confidence >= self.registrar.config.sure
         if result.T_target_source is None:
             return
         followed = result.proposer == Memory.name

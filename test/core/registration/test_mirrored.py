@@ -77,10 +77,10 @@ def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(monkeypat
     registrar, femur = Registrar(config), make_bone("femur", 900_001)
     in_rounds, asked, own = Registrar._in_rounds, [], []
 
-    def rounds(self, source, target, poses, clock):
+    def rounds(self, source, target, poses, clock, *enough):
         asked.append(source.points)
         if len(asked) == 1:
-            own.append(in_rounds(self, source, target, poses, clock))
+            own.append(in_rounds(self, source, target, poses, clock, *enough))
             return own[0]
         return SimpleNamespace(candidates=SimpleNamespace(scores=own[0].candidates.scores / better))
 
@@ -91,6 +91,19 @@ def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(monkeypat
     if len(asked) == 2:
         gaps = np.sort(asked[0] * [1.0, 1.0, -1.0], axis=0) - np.sort(asked[1], axis=0)
         np.testing.assert_allclose(gaps, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("count", "is_enough", "rounds"), [(401, False, 2), (401, True, 1), (400, True, 2)])
+def test_an_unsure_answer_that_is_enough_is_not_registered_mirrored_but_few_points_are(
+    monkeypatch, count, is_enough, rounds
+):
+    registrar, femur = Registrar(CONFIG), make_bone("femur", 900_001)
+    in_rounds, asked, seen_femur = Registrar._in_rounds, [], seen(femur, count)
+    target = registrar.prepare(femur)
+    monkeypatch.setattr(Registrar, "_in_rounds", lambda *given: asked.append(1) or in_rounds(*given))
+    config = replace(CONFIG, rules=replace(CONFIG.rules, mirrored_below=1.0))
+    Registrar(config).assess(seen_femur, target, enough=lambda assessment: is_enough)
+    assert len(asked) == rounds
 
 
 def test_nothing_is_registered_mirrored_where_the_image_on_the_bone_fits_better_already(monkeypatch):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.specimen import Specimen
@@ -50,6 +50,45 @@ def test_after_the_first_source_only_what_is_remembered_is_asked(tracker, frames
     assert [r.proposer == "track" for r in results] == [False, True, True, True]
     assert all(is_right(r, pair) for r, pair in zip(results, frames, strict=True))
     assert all(r.confidence >= tracker.registrar.config.sure for r in results[1:])
+
+
+def unsure(registrar, probability=0.9, **evidence):
+    """A tracker to which every tracked answer has this probability, which is not sure."""
+    config = replace(registrar.config, evidence=replace(registrar.config.evidence, **evidence))
+    calibration = Calibration(Memory.name, Additive(float(logit(probability)), ()), {})
+    assert probability < config.sure
+    return Tracker(Registrar(config, registrar.proposers, registrar.calibrations), calibration=calibration)
+
+
+def proposers_of(tracker, frames, prepared):
+    return [tracker.register(pair.source, prepared).proposer for pair in frames[:2]]
+
+
+def test_a_tracked_answer_that_is_not_sure_stands_in_a_sure_stream(registrar, frames, prepared):
+    assert proposers_of(unsure(registrar), frames, prepared)[1] == "track"
+
+
+def test_it_does_not_stand_below_the_setting(registrar, frames, prepared):
+    assert proposers_of(unsure(registrar, stands=0.91), frames, prepared)[1] != "track"
+    assert proposers_of(unsure(registrar, stands=0.89), frames, prepared)[1] == "track"
+
+
+def test_it_does_not_stand_where_the_pose_has_jumped(registrar, frames, prepared):
+    assert proposers_of(unsure(registrar, agree_mm=0.0), frames, prepared)[1] != "track"
+
+
+def test_it_does_not_stand_after_a_source_that_was_not_sure(registrar, frames, prepared):
+    tracker = unsure(registrar)
+    first = tracker.register(frames[0].source, prepared)
+    tracker._remember(replace(first, confidence=0.94), frames[0].source)
+    assert tracker.register(frames[1].source, prepared).proposer != "track"
+
+
+def test_it_does_not_stand_after_a_source_that_was_refused(registrar, frames, prepared):
+    tracker = unsure(registrar)
+    first = tracker.register(frames[0].source, prepared)
+    tracker._remember(replace(first, status=RegistrationStatus.AMBIGUOUS, T_target_source=None), frames[0].source)
+    assert tracker.register(frames[1].source, prepared).proposer != "track"
 
 
 def test_a_jump_is_found_by_a_full_registration(tracker, frames, prepared):

@@ -14,6 +14,7 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
 from gapr_core.registration.kernels import residuals_at
 from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -143,7 +144,8 @@ class Accumulator:
             self._kept, self._new = self._last(), []
             return result
         newest, everything = self._new[-1:], _together(self._last())
-        off = [source for source in self._new if self._lies_off(source, everything, result.T_target_source, target)]
+        seen = offset_surface(target, self.config.sensor)
+        off = [source for source in self._new if self._lies_off(source, everything, result.T_target_source, seen)]
         newly_off = [source for source in off if not _is_among(source, self._off)]
         self._off = [*self._off, *newly_off] if off and len(off) == len(self._new) else newly_off
         self._kept = [s for s in self._kept + self._new if not _is_among(s, off)][-self.most :]

@@ -24,6 +24,9 @@ from gapr_core.results import Guidance, Hypothesis, Patch
 
 Array = NDArray[np.float64]
 
+FACING_COS = 0.3  # least cosine between normals of a patch and that of its centre
+SEEN_SHARE = 0.5  # of a patch, from which there is nothing new to see
+
 
 @dataclass(frozen=True, eq=False)
 class Patches:
@@ -50,10 +53,12 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
     patches = _unseen(_patches(target, config), assessment, config)
     if not len(patches.centres):
         return None
-    bounds = _bounds_mm(assessment, patches, config)
+    noise_mm = max(assessment.fit.sigma_mm, config.noise_mm)
+    bias_mm = max(assessment.uncertainty.bias_mm, config.bias_mm)
+    bounds = _bounds_mm(assessment, patches, config.points, noise_mm, bias_mm)
     distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
     weights = np.array([rival.probability for rival in rivals])
-    excluded = np.array([_excluded(assessment, rivals, members, config) for members in patches.members])
+    excluded = np.array([_excluded(assessment, rivals, members, noise_mm, bias_mm) for members in patches.members])
     open_mm2 = (weights * distances**2) @ (1.0 - excluded).T if len(weights) else np.zeros(len(bounds))
     now_mm = float(np.sqrt(assessment.tre95_mm**2 + weights @ distances**2))
     after_mm = np.sqrt(bounds**2 + open_mm2)
@@ -85,9 +90,8 @@ def _patches(target: PreparedTarget, config: GuidanceConfig) -> Patches:
     """Balls around evenly spread points, less what faces another way than the centre."""
     centres = sampling.thin(target.points, config.patches)
     balls = target.tree.query_ball_point(target.points[centres], config.patch_mm / 2.0)
-    members = [
-        np.array(ball)[target.normals[ball] @ target.normals[i] > 0.3] for i, ball in zip(centres, balls, strict=True)
-    ]
+    members = [np.array(ball)[target.normals[ball] @ target.normals[i] > FACING_COS]
+               for i, ball in zip(centres, balls, strict=True)]  # fmt: skip
     return Patches(centres, members)
 
 
@@ -96,24 +100,21 @@ def _unseen(patches: Patches, assessment: Assessment, config: GuidanceConfig) ->
     seen = assessment.fit.moved[assessment.fit.weights > 0.0]
     if not len(seen):
         return patches
-    near = cKDTree(seen).query(assessment.target.points)[0] < config.seen_mm
-    kept = [k for k, members in enumerate(patches.members) if near[members].mean() < 0.5]
+    surface = assessment.target.elements[:, :3]  # where a sensor with a stand-off sees the bone
+    near = cKDTree(seen).query(surface)[0] < config.seen_mm
+    kept = [k for k, members in enumerate(patches.members) if near[members].mean() < SEEN_SHARE]
     return Patches(patches.centres[kept], [patches.members[k] for k in kept])
 
 
-def _bounds_mm(assessment: Assessment, patches: Patches, config: GuidanceConfig) -> Array:
-    """(K,) 95 % bound of the error over the bone after a look at each patch."""
+def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: float, bias_mm: float) -> Array:
+    """(K,) 95 % bound of the error over the bone after a look of so many points at each patch."""
     target, centre = assessment.target, assessment.centre_mm
-    noise_mm, bias_mm = (
-        max(assessment.fit.sigma_mm, config.noise_mm),
-        max(assessment.uncertainty.bias_mm, config.bias_mm),
-    )
     known = np.linalg.inv(assessment.uncertainty.covariance)
     bounds = []
     for members in patches.members:
         normals = target.normals[members]
         J = np.hstack([normals, np.cross(target.points[members] - centre, normals)])
-        covariance = np.asarray(np.linalg.inv(known + information(J, config.points, noise_mm, bias_mm)), np.float64)
+        covariance = np.asarray(np.linalg.inv(known + information(J, points, noise_mm, bias_mm)), np.float64)
         bound_mm = precision.bound_mm(covariance, target.points[target.anchors], centre)
         bounds.append(assessment.factor95 * bound_mm)
     return np.array(bounds)
@@ -126,14 +127,14 @@ def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> fl
 
 
 def _excluded(
-    assessment: Assessment, rivals: Sequence[Hypothesis], members: NDArray[np.int64], config: GuidanceConfig
+    assessment: Assessment, rivals: Sequence[Hypothesis], members: NDArray[np.int64], noise_mm: float, bias_mm: float
 ) -> Array:
     """(R,) share of each rival's probability that a look at the patch would take.
 
     Under a rival the patch of the best pose lies d off the surface; its likelihood falls by exp(-d^2 / 2 (s^2 + b^2)).
     """
     target, best = assessment.target, assessment.hypotheses[0]
-    variance = max(assessment.fit.sigma_mm, config.noise_mm) ** 2 + config.bias_mm**2
+    variance = noise_mm**2 + bias_mm**2
     points = se3.apply(se3.inverse(best.T_target_source), target.points[members])
     off = [target.tree.query(se3.apply(rival.T_target_source, points))[0] for rival in rivals]
     return np.array([1.0 - np.exp(-0.5 * (d**2).mean() / variance) for d in off])

@@ -64,9 +64,10 @@ def image_margin(
         config: how hypotheses are refined.
         num_threads: 0 for all cores.
     """
-    if "own image" not in target.cache:
-        target.cache["own image"] = _own_image(target, config, num_threads)
-    image = target.cache["own image"]
+    key = "own image", target.offset_mm  # targets that differ in the stand-off alone share their cache
+    if key not in target.cache:
+        target.cache[key] = _own_image(target, config, num_threads)
+    image = target.cache[key]
     if image is None:
         return LIMITS[1]
     some, limits_mm = source.subset(config.middle_points), np.linspace(*config.middle_limits_mm)
@@ -82,7 +83,7 @@ def log_ratio(changed_mm2: float, own_mm2: float) -> float:
 
 def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: int) -> Array | None:
     """(4, 4) motion with a reflection that lays the bone on itself, target frame; None where there is none."""
-    some = target.points[:: max(1, len(target.points) // POINTS)]
+    some = target.elements[:: max(1, len(target.points) // POINTS), :3]  # as a sensor with a stand-off sees them
     centre, limits_mm = target.points.mean(axis=0), np.linspace(*config.middle_limits_mm)
     planes = np.array([_reflection(normal, centre) for normal in _axes(target.points)])
     poses, scores = refine_many(planes @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)

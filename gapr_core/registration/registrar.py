@@ -206,11 +206,15 @@ class Registrar:
         by_chance = len(a.source.points) <= config.rules.mirrored_points or not is_sure
         if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
             flipped = sources.prepare(a.source.points * [1.0, 1.0, -1.0], config.source, config.num_threads)
-            image = None if isinstance(flipped, Refusal) else self._in_rounds(flipped, a.target, NO_POSES, clock)
+            image = None if isinstance(flipped, Refusal) else self._of_image(flipped, a.target, clock)
             if image is not None:
                 found = min(found, mirror.log_ratio(image.candidates.scores[0], a.candidates.scores[0]))
         clock.lap("assess")
         return a.refused(rules.by_mirror(found, config.rules), config.rules)
+
+    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
+        """The mirror image of a source, registered in full."""
+        return self._in_rounds(flipped, target, NO_POSES, clock)
 
     def _in_rounds(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough = never

@@ -105,11 +105,13 @@ def _described(
 ) -> PreparedTarget:
     """Everything that follows from points (M, 3) with outward normals (M, 3)."""
     tree = cKDTree(points)
-    gaps, neighbours = quadrics.nearest(points, config.quadric_neighbours, tree, num_threads)
+    count = max(config.quadric_neighbours, 1 + config.misfit_neighbours)
+    gaps, around = quadrics.nearest(points, count, tree, num_threads)
+    neighbours = np.ascontiguousarray(around[:, : config.quadric_neighbours])
     spacing_mm = float(np.median(gaps[:, 1]))
     for _ in range(2):  # the second fit knows better which neighbours are on the other side of a blade
         normals, shapes = quadrics.fit_quadrics(points, normals, neighbours, num_threads)
-    others = neighbours[:, 1 : 1 + config.misfit_neighbours]
+    others = around[:, 1 : 1 + config.misfit_neighbours]
     misfit = quadrics.misfit_mm(points, normals, shapes, others, num_threads=num_threads)
     return PreparedTarget(
         points=points,

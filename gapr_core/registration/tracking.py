@@ -63,6 +63,24 @@ class Memory:
         self.poses = np.concatenate([moved[nearest : nearest + 1], np.delete(moved, nearest, axis=0)])
 
 
+class Following(Registrar):
+    """Asks a memory first, then the proposers of another registrar.
+
+    Args:
+        memory: what is remembered of the last source.
+        calibration: the confidence model of its answers.
+        full: registers what the memory knows nothing of: the mirror image of a source.
+    """
+
+    def __init__(self, memory: Memory, calibration: Calibration, full: Registrar) -> None:
+        proposers, calibrations = (memory, *full.proposers), (calibration, *full.calibrations)
+        super().__init__(full.config, proposers, calibrations, precision=full.precision)
+        self._full = full
+
+    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
+        return self._full._of_image(flipped, target, clock)
+
+
 class Tracker:
     """Registers a stream of sources in one frame, such as the clouds of a tracked probe.
 
@@ -96,9 +114,7 @@ class Tracker:
         self.registrar = registrar or Registrar.from_pretrained()
         self.recheck = recheck
         self._memory = Memory()
-        proposers = (self._memory, *self.registrar.proposers)
-        calibrations = (calibration or Calibration.shipped(Memory.name), *self.registrar.calibrations)
-        self._tracking = Registrar(self.registrar.config, proposers, calibrations, precision=self.registrar.precision)
+        self._tracking = Following(self._memory, calibration or Calibration.shipped(Memory.name), self.registrar)
         self._evidence = Evidence(self.registrar.config.evidence)
         self._stream = stream or Calibration.shipped(STREAM)
         self._shared: SharedMisfit | None = SharedMisfit(self.registrar.config.evidence.memory)

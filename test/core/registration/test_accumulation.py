@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, RegistrationStatus, Tracker
+from gapr_core.config import SensorConfig
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
@@ -191,3 +192,36 @@ def test_a_refusal_does_not_break_a_row_of_sources_off_the_bone(frames, prepared
         answers.append(collected._look_at_new(result, prepared))
     assert answers[2] is refused
     assert "it has moved" in answers[3].reason
+
+
+@pytest.mark.parametrize(("standoff_mm", "lies_off"), [(None, False), (2.0, True)])
+def test_a_source_is_compared_where_a_sensor_with_a_stand_off_sees_the_bone(femur, standoff_mm, lies_off):
+    """All lie 2 mm outside, the newest 2 mm farther: three times as far off a bone that is seen 2 mm outside."""
+    config = RegistrarConfig(num_threads=1, sensor=SensorConfig(standoff_mm=standoff_mm))
+    registrar = Registrar(config)
+    target = registrar.prepare(femur)
+    lifted = [target.points[k::40] + 2.0 * target.normals[k::40] for k in range(6)]
+    collected = Accumulator(registrar, most=20)
+    collected._kept = lifted
+    collected._new = [target.points[7::40] + 4.0 * target.normals[7::40]]
+    result = collected._look_at_new(RegistrationResult(RegistrationStatus.OK, np.eye(4)), target)
+    assert ("left out" in result.reason) is lies_off
+
+
+@pytest.mark.parametrize(("points", "lies_off"), [(19, False), (20, True)])
+def test_a_source_of_few_points_is_not_judged_by_itself(registrar, prepared, points, lies_off):
+    collected = Accumulator(registrar, most=20)
+    assert collected.config.accumulation.fewest_points == 20
+    away = prepared.points[:points] + 30.0 * prepared.normals[:points]
+    assert collected._lies_off(away, prepared.points, np.eye(4), prepared) is lies_off
+
+
+@pytest.mark.parametrize(("times", "lies_off"), [(0.9, False), (1.1, True)])
+def test_what_lies_within_the_least_noise_of_a_perfect_collection_is_on_the_bone(registrar, prepared, times, lies_off):
+    """All others lie on the bone to the last bit: then the least noise of the refinement stands for theirs."""
+    collected = Accumulator(registrar, most=20)
+    config = collected.config
+    limit_mm = times * config.accumulation.off * config.refinement.smallest_sigma_mm
+    some = slice(0, 50)
+    source = prepared.points[some] + limit_mm * prepared.normals[some]
+    assert collected._lies_off(source, prepared.points, np.eye(4), prepared) is lies_off

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.config import GuidanceConfig
+from gapr_core.config import GuidanceConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import guidance, precision
 from gapr_core.registration.guidance import guide, information
+from gapr_core.registration.sensor import offset_surface
 
 CONFIG = GuidanceConfig(patches=120)
 
@@ -87,6 +88,52 @@ def test_a_rival_sends_the_probe_to_where_it_differs(distal):
     assert found.now_mm > 2.0 * distal.tre95_mm
     assert found.patches[0].rivals_excluded > 0.95
     assert min(patch.rivals_excluded for patch in found.patches) < 0.9
+
+
+def rivalled(distal, turn_rad, probability=0.4):
+    turn = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, turn_rad], distal.fit.moved.mean(axis=0))
+    poses = np.stack([distal.candidates.poses[0], turn @ distal.fit.T])
+    scores = np.repeat(distal.candidates.scores[0], 2)
+    return replace(distal, candidates=replace(distal.candidates, poses=poses, scores=scores), probability=probability)
+
+
+def test_the_bias_that_was_found_makes_a_look_exclude_less(distal):
+    """1 - exp(-d^2 / 2 (s^2 + b^2)), b the larger one of what was found and what is assumed."""
+    rival, shares = rivalled(distal, 0.1), {}
+    for bias_mm in (0.1, CONFIG.bias_mm, 3.0):
+        uncertain = replace(rival, uncertainty=replace(rival.uncertainty, bias_mm=bias_mm))
+        found = guide(uncertain, CONFIG)
+        shares[bias_mm] = {tuple(patch.centre): patch.rivals_excluded for patch in found.patches}
+    assert shares[0.1] == shares[CONFIG.bias_mm]
+    variances = (max(distal.fit.sigma_mm, CONFIG.noise_mm) ** 2 + bias_mm**2 for bias_mm in (CONFIG.bias_mm, 3.0))
+    ratio = next(variances) / next(variances)
+    for centre, share in shares[3.0].items():
+        assert share == pytest.approx(1.0 - (1.0 - shares[CONFIG.bias_mm][centre]) ** ratio, abs=1e-9)
+
+
+def test_what_the_rivals_leave_open_counts_by_their_probability(distal):
+    """now^2 = bound^2 + sum of p d^2; after a look the same with what it leaves of each."""
+    rival = rivalled(distal, 1.5)
+    found, target = guide(rival, CONFIG), distal.target
+    best, other = rival.hypotheses
+    motion = best.T_target_source @ se3.inverse(other.T_target_source)
+    apart_mm2 = se3.rms_apart_mm(np.eye(4), motion, target.points[target.anchors]) ** 2
+    assert 0.0 < other.probability < 0.9
+    assert found.now_mm == pytest.approx(np.sqrt(rival.tre95_mm**2 + other.probability * apart_mm2))
+    for patch in found.patches[:5]:
+        left = other.probability * apart_mm2 * (1.0 - patch.rivals_excluded)
+        assert found.now_mm - patch.gain_mm == pytest.approx(np.sqrt(patch.tre95_mm**2 + left))
+
+
+def test_a_sensor_that_stands_off_has_seen_the_bone_under_it(distal):
+    """Everything was seen, 8 mm outside: with the stand-off there is nothing left to look at."""
+    target, far_mm = distal.target, 8.0
+    assert far_mm > CONFIG.seen_mm
+    outside = target.points + far_mm * target.normals
+    lifted = replace(distal, fit=replace(distal.fit, moved=outside, weights=np.ones(len(outside))))
+    assert guide(lifted, CONFIG) is not None
+    sensor = SensorConfig(standoff_mm=far_mm)
+    assert guide(replace(lifted, target=offset_surface(target, sensor)), CONFIG) is None
 
 
 def test_only_the_likeliest_rivals_count(distal):

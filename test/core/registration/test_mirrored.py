@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
+from gapr_core.config import SensorConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.registration import mirror
+from gapr_core.registration import source as sources
+from gapr_core.registration.sensor import offset_surface
 from gapr_core.results import RegistrationStatus
 
 CONFIG = RegistrarConfig(num_threads=1)
@@ -53,12 +56,22 @@ def test_the_image_of_a_bone_is_a_reflection_and_found_once(registrar, target, m
     image = mirror._own_image(target, CONFIG.verification, 1)
     assert np.linalg.det(image[:3, :3]) == pytest.approx(-1.0)
     monkeypatch.setattr(mirror, "_own_image", None)  # is not called again
-    np.testing.assert_array_equal(target.cache["own image"], image)
+    np.testing.assert_array_equal(target.cache["own image", 0.0], image)
     assert registrar.register(seen(make_bone("pelvis", 900_001)), target).ok
 
 
+def test_the_image_is_found_where_a_sensor_with_a_stand_off_sees_the_bone(pelvis):
+    """Targets that differ in the stand-off alone share their cache, and not their image."""
+    target = Registrar(CONFIG).prepare(pelvis)
+    raised = offset_surface(target, SensorConfig(standoff_mm=5.0))
+    for each in (raised, target):
+        found = mirror.image_margin(np.eye(4), sources.prepare(seen(pelvis)), each, CONFIG.verification, 1)
+        assert found < mirror.LIMITS[1]
+    assert {("own image", 0.0), ("own image", 5.0)} <= target.cache.keys()
+
+
 def test_a_bone_without_an_image_has_the_largest_margin(target):
-    unlike = replace(target, cache={"own image": None})
+    unlike = replace(target, cache={("own image", 0.0): None})
     assert mirror.image_margin(np.eye(4), None, unlike, CONFIG.verification, 1) == mirror.LIMITS[1]
 
 

@@ -14,6 +14,7 @@ from gapr_core.geometry import se3
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.tracking import Memory
 
@@ -89,6 +90,37 @@ def test_it_does_not_stand_after_a_source_that_was_refused(registrar, frames, pr
     first = tracker.register(frames[0].source, prepared)
     tracker._remember(replace(first, status=RegistrationStatus.AMBIGUOUS, T_target_source=None), frames[0].source)
     assert tracker.register(frames[1].source, prepared).proposer != "track"
+
+
+def test_the_mirror_image_of_a_tracked_source_is_registered_without_the_memory(
+    registrar, frames, prepared, monkeypatch
+):
+    """What is remembered are poses of the source itself."""
+    asked, in_rounds = [], Registrar._in_rounds
+
+    def rounds(self, *given):
+        asked.append(self)
+        return in_rounds(self, *given)
+
+    config = replace(registrar.config, rules=replace(registrar.config.rules, mirrored_below=1.0))
+    tracker = Tracker(Registrar(config, registrar.proposers, registrar.calibrations))
+    tracker.register(frames[0].source, prepared)
+    monkeypatch.setattr(Registrar, "_in_rounds", rounds)
+    monkeypatch.setattr(tracker, "_is_sure", False)
+    assert tracker.register(frames[1].source, prepared).proposer == "track"
+    assert asked == [tracker._tracking, tracker.registrar]
+
+
+def test_what_corrects_the_errors_of_the_registrar_corrects_those_of_the_tracker(registrar, frames, prepared):
+    tre_mm = []
+    for learned in (Precision.unscaled(), registrar.precision):
+        given = Registrar(registrar.config, registrar.proposers, registrar.calibrations, precision=learned)
+        tracker = Tracker(given)
+        tracker.register(frames[0].source, prepared)
+        tracked = tracker.register(frames[1].source, prepared)
+        assert tracked.proposer == "track"
+        tre_mm.append(tracked.tre_mm)
+    assert tre_mm[0] != tre_mm[1]
 
 
 def test_a_jump_is_found_by_a_full_registration(tracker, frames, prepared):

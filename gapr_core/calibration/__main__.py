@@ -121,7 +121,10 @@ def fit_precision(rounds: Sequence[Answers]) -> tuple[Additive, float, dict[str,
         raise ConfigError("accepted answers with a truth", "none", "collect more pairs (--count)")
     answers = together(found)
     known = known_families(answers)
-    new_sensor, new_subject = conformal.of_unseen(answers, known), conformal.of_unseen_people(answers, known)
+    new_sensor, new_subject = (
+        conformal.scales_of_unseen_families(answers, known),
+        conformal.scales_of_unseen_people(answers, known),
+    )
     scores = [answers.true_mm / (scale * answers.tre95_mm) for scale in (new_sensor, new_subject)]
     factor = max(
         conformal.factor_overall(scores[0][known]),

@@ -1,6 +1,6 @@
 """Records to learn from: every pair registered in each way that an answer can come about, and judged.
 
-The registrars here accept everything (`ACCEPTED`): what a model of the confidence would say must not decide which
+The registrars here accept everything (`ACCEPTING`): what a model of the confidence would say must not decide which
 records it is fitted to. Finished pairs stay in the records file, so that a stopped run goes on where it was.
 """
 
@@ -54,11 +54,11 @@ LOOKED_AT = 3  # of the clean clouds with a viewpoint every third is registered 
 ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
-ACCEPTED = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
+ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
 
 def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = None) -> list[Record]:
-    """Register every pair that the records file does not hold yet, or holds with other features.
+    """Register every pair that the records file does not hold yet, or holds of other bones or with other features.
 
     Args:
         tasks: of one folder and split.
@@ -70,8 +70,9 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = Non
         The records of these tasks.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    wanted = {_name(task) for task in tasks}
-    done = {record["name"]: record for record in _read(path) if _is_current(record)}
+    wanted, bones = {_name(task) for task in tasks}, (_anatomy(tasks[0]), tasks[0].split)
+    of_these = [record for record in _read(path) if (record.get("anatomy"), record.get("split")) == bones]
+    done = {record["name"]: record for record in of_these if _is_current(record)}
     left = [task for task in tasks if _name(task) not in done]
     where = (tasks[0].folder, tasks[0].split)
     shared = *where, pairs.bones_of(*where) if left else {}
@@ -107,14 +108,14 @@ def _records_of(tasks: Sequence[Task], shared: Shared) -> list[Record]:
 
 def record_of(task: Task) -> Record:
     """One pair registered in every way, or the frames of a stream one after another; judged, with their features."""
+    named = {"name": _name(task), "anatomy": _anatomy(task), "split": task.split, "commit": origin.commit()}
     if task.family == STREAM:
-        return {"name": _name(task), "commit": origin.commit()} | streams.record_of(task)
+        return named | streams.record_of_stream(task)
     drawn = pairs.draw(task)
     target = _prepared(drawn.pair.target)
-    facts = {"name": _name(task), "family": drawn.family, "seen_as": drawn.seen_as, "what": drawn.what,
-             "sensor": drawn.sensor, "bone": drawn.pair.bone, "people": list(drawn.people),
-             "commit": origin.commit()}  # fmt: skip
-    return facts | {"answers": dict(_answers(drawn, target, task))}
+    facts = {"family": drawn.family, "seen_as": drawn.seen_as, "what": drawn.what, "sensor": drawn.sensor,
+             "bone": drawn.pair.bone, "people": list(drawn.people)}  # fmt: skip
+    return named | facts | {"answers": dict(_answers(drawn, target, task))}
 
 
 def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple[str, Record]]:
@@ -125,23 +126,23 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
         registrar = registrars["first round" if task.number % 2 else "search"]
         in_scene = registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
         if isinstance(in_scene, Assessment):
-            yield clutter.NAME, judged(in_scene, drawn.pair)
+            yield clutter.NAME, judged_answer(in_scene, drawn.pair)
     if drawn.family == "scene":
         return
     of_round = {"network": "network", "search": "search alone" if task.number % ALONE == 0 else "search"}
     found = {name: registrars[used].assess(drawn.pair.source, target) for name, used in of_round.items()}
     for name, assessment in found.items():
         if isinstance(assessment, Assessment):
-            yield name, judged(assessment, drawn.pair)
+            yield name, judged_answer(assessment, drawn.pair)
     last = found["network" if task.number % 2 else "search"]
     if rng.random() < FOLLOWED and isinstance(last, Assessment) and len(last.hypotheses) > 1:
         moved, memory = moved_on(drawn.pair, last.hypotheses, rng)
         tracked = accepting([memory], drawn.sensor).assess(moved.source, target)
         if isinstance(tracked, Assessment):
-            yield memory.name, judged(tracked, moved)
+            yield memory.name, judged_answer(tracked, moved)
 
 
-def judged(assessment: Assessment, pair: protocols.Pair) -> Record:
+def judged_answer(assessment: Assessment, pair: protocols.Pair) -> Record:
     """Features of an answer, what a rule says against it, and its errors where there is a truth."""
     features = {name: round(value, 6) for name, value in assessment.features.items()}
     refusal = assessment.refusal.status.value if assessment.refusal else None
@@ -207,12 +208,12 @@ class AskedOnce:
 
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig | None = None) -> Registrar:
     """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
-    calibrations = [Calibration(proposer.name, ACCEPTED, {}) for proposer in proposers]
+    calibrations = [Calibration(proposer.name, ACCEPTING, {}) for proposer in proposers]
     sensor_config = SensorConfig(kind=sensor)
     config = RegistrarConfig(
         num_threads=1, sensor=sensor_config, clutter=clutter_config or ClutterConfig(), rules=UNCHECKED
     )
-    of_scenes = Calibration(clutter.NAME, ACCEPTED, {})
+    of_scenes = Calibration(clutter.NAME, ACCEPTING, {})
     return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
 
 
@@ -249,6 +250,11 @@ def _prepared(cloud: Array) -> PreparedTarget:
 
 def _name(task: Task) -> str:
     return "-".join(filter(None, (str(task.seed), task.family, task.what, str(task.number))))
+
+
+def _anatomy(task: Task) -> str:
+    """The folder's own name, which is the same on all machines."""
+    return Path(task.folder).resolve().name
 
 
 def _read(path: Path) -> list[Record]:

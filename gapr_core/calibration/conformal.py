@@ -27,8 +27,9 @@ FEWEST = 30  # accepted answers of a family that has a say of its own
 
 def fit_scale(answers: Answers) -> Additive:
     """Of the logarithm of the scale that a predicted standard deviation needs."""
-    wanted = 0.5 * np.log(answers.true_mm / (MEDIAN_RATIO * answers.tre_mm)) + 0.25 * np.log(answers.nees / MEDIAN_NEES)
-    return fit_centre(precision_table(answers), wanted, PRECISION_FEATURES)
+    by_error = np.log(answers.true_mm / (MEDIAN_RATIO * answers.tre_mm))
+    by_nees = 0.5 * np.log(answers.nees / MEDIAN_NEES)  # a variance over a variance
+    return fit_centre(precision_table(answers), 0.5 * (by_error + by_nees), PRECISION_FEATURES)
 
 
 def scales(model: Additive, answers: Answers) -> Array:
@@ -43,12 +44,12 @@ def precision_table(answers: Answers) -> Array:
     return np.column_stack([columns[name] for name in PRECISION_FEATURES])
 
 
-def of_unseen(answers: Answers, known: NDArray[np.bool_]) -> Array:
+def scales_of_unseen_families(answers: Answers, known: NDArray[np.bool_]) -> Array:
     """(N,) scales by models of the known families that have seen neither the subject nor the sensor family."""
     return of_models_that_saw_neither(answers, known, fit_scale, scales)
 
 
-def of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array:
+def scales_of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array:
     """(N,) scales by models of the known families that have not seen the subject."""
     return of_models_that_saw_no_subject(answers, known, fit_scale, scales)
 

@@ -45,7 +45,7 @@ def of_unseen_families(answers: Answers) -> Array:
     return of_models_that_saw_neither(answers, known_families(answers), fit, probability)
 
 
-def judged(answers: Answers, confidence: Array) -> dict[str, Any]:
+def quality(answers: Answers, confidence: Array) -> dict[str, Any]:
     """How well confidences (N,) tell right from wrong, and whether they are probabilities.
 
     `wrong` counts wrong poses that would be accepted at 0.5 or more, `wrong_sure` at 0.9 or more: no rule refuses them.
@@ -66,10 +66,10 @@ def judged(answers: Answers, confidence: Array) -> dict[str, Any]:
 
 
 def by_group(answers: Answers, confidence: Array, groups: NDArray[np.str_]) -> dict[str, dict[str, Any]]:
-    """`judged` of all, and of each group."""
-    rows = {"all": judged(answers, confidence)}
+    """`quality` of all, and of each group."""
+    rows = {"all": quality(answers, confidence)}
     for group in np.unique(groups):
-        rows[str(group)] = judged(answers.of(groups == group), confidence[groups == group])
+        rows[str(group)] = quality(answers.of(groups == group), confidence[groups == group])
     return rows
 
 

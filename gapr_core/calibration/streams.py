@@ -21,9 +21,8 @@ from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.registrar import Registrar
-from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.results import RegistrationResult
 
 FRAMES = 12
 JUMPS = 0.2  # share of the streams in which the bone is somewhere else halfway
@@ -46,20 +45,20 @@ def tasks(folder: str, split: str, seed: int, count: int) -> list[Task]:
     return found + [Task(folder, split, seed, number, STREAM, "person", True) for number in long[: count // 2]]
 
 
-def record_of(task: Task) -> dict[str, Any]:
+def record_of_stream(task: Task) -> dict[str, Any]:
     """The facts of a stream, and an answer "stream K" for each frame of which those before it say something."""
-    family, what, people, frames = draw(task)
-    tracker, target = tracker_of_frames_alone(), _prepared(frames[0])
+    family, what, people, frames = draw_stream(task)
+    tracker, target = tracker_of_frames_alone(), _registrar().prepare(frames[0].target)
     answers = {}
     for number, frame in enumerate(frames):
         result = tracker.register(frame.source, target)
         if STREAM_FEATURES[-1] in result.features:
-            answers[f"{STREAM} {number}"] = judged(result, frame)
+            answers[f"{STREAM} {number}"] = judged_frame(result, frame)
     return {"family": f"stream-{family}", "seen_as": "stream", "what": what, "sensor": "unknown",
             "bone": frames[0].bone, "people": list(people), "answers": answers}  # fmt: skip
 
 
-def draw(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
+def draw_stream(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
     """(family of the bias, key of `pairs.WHAT`, everybody whose bone it is, frames on one target); always the same."""
     rng = np.random.default_rng([task.seed, task.number, 63, len(task.what)])
     setting = pairs.setting_of(task.folder, task.split, task.seed + STREAM_SEEDS, task.number, task.real)
@@ -84,11 +83,13 @@ def draw(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
     return family, what, people, [pairs.before(setting, source, what, frame) for frame in frames]
 
 
-def judged(result: RegistrationResult, frame: Pair) -> dict[str, Any]:
-    """The features of a frame in its stream, whether a rule speaks against it, and whether its best pose is right."""
+def judged_frame(result: RegistrationResult, frame: Pair) -> dict[str, Any]:
+    """The features of a frame in its stream, and whether its best pose is right.
+
+    What a rule refuses has no such features.
+    """
     features = {name: round(result.features[name], 6) for name in STREAM_FEATURES}
-    by_rule = result.status not in (RegistrationStatus.OK, RegistrationStatus.LOW_CONFIDENCE)
-    record = {"features": features, "refusal": result.status.value if by_rule else None, "right": False}
+    record = {"features": features, "refusal": None, "right": False}
     if not frame.has_truth:
         return record
     error = metrics.pose_error(result.hypotheses[0].T_target_source, frame.T_target_source, frame.source)
@@ -106,7 +107,3 @@ def tracker_of_frames_alone() -> Tracker:
 @cache
 def _registrar() -> Registrar:
     return Registrar.from_pretrained(RegistrarConfig(num_threads=1))
-
-
-def _prepared(frame: Pair) -> PreparedTarget:
-    return _registrar().prepare(frame.target)

@@ -115,7 +115,8 @@ def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tm
     old = {name: value for name, value in features.items() if name != "mirror_margin"}
     answer = {"refusal": None, "right": True}
     path = tmp_path / "records.jsonl"
-    lines = [json.dumps({"name": f"0-{number}", "answers": {"search": answer | {"features": values}}}) + "\n"
+    bones = {"anatomy": "folder", "split": "train"}
+    lines = [json.dumps(bones | {"name": f"0-{number}", "answers": {"search": answer | {"features": values}}}) + "\n"
              for number, values in enumerate((features, old, features))]  # fmt: skip
     path.write_text("".join(lines) + '{"name": "0-3", "answ')
     asked = []
@@ -128,6 +129,19 @@ def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tm
     assert collect.collect(tasks, path, 1) and len(asked) == 2
 
 
+@pytest.mark.parametrize("other", [{"split": "val"}, {"anatomy": "others"}, {"split": None}])
+def test_records_of_other_bones_are_made_again(tmp_path, monkeypatch, other):
+    path, asked = tmp_path / "records.jsonl", []
+    record = {"name": "0-1", "anatomy": "folder", "split": "train", "answers": {}}
+    monkeypatch.setattr(pairs, "bones_of", lambda folder, split: {})
+    monkeypatch.setattr(collect, "ProcessPoolExecutor", lambda *_: nullcontext(_Pool(asked)))
+    task = Task(str(tmp_path / "folder"), "train", 0, 1)
+    path.write_text(json.dumps(record) + "\n")
+    assert collect.collect([task], path, 1) == [record] and not asked
+    path.write_text(json.dumps(record | other) + "\n")
+    assert collect.collect([task], path, 1) and asked == [task]
+
+
 class _Pool:
     """A pool that registers nothing."""
 
@@ -137,4 +151,4 @@ class _Pool:
     def map(self, _, tasks, chunksize):
         for task in tasks:
             self.asked.append(task)
-            yield {"name": f"{task.seed}-{task.number}", "answers": {}}
+            yield {"name": f"{task.seed}-{task.number}", "anatomy": "folder", "split": task.split, "answers": {}}

@@ -39,7 +39,7 @@ def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_famil
         return np.exp(0.7 * np.abs(features[:, FEATURES.index("smooth_misfit")]))
 
     answers = made_answers(3000, error_scale=doubled_where_smooth)
-    scale = conformal.of_unseen(answers, np.full(len(answers), True))
+    scale = conformal.scales_of_unseen_families(answers, np.full(len(answers), True))
     factor = conformal.factor_overall(answers.true_mm / (scale * answers.tre95_mm))
     rows = conformal.coverage(answers, scale, factor)
     assert 0.945 < rows["all"]["covered"] < 0.975
@@ -79,7 +79,7 @@ def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):
 
     monkeypatch.setattr(conformal, "fit_scale", fit_nothing)
     monkeypatch.setattr(conformal, "scales", lambda model, judged: np.full(len(judged), float(model)))
-    models = conformal.of_unseen(answers, answers.family != held_out).astype(int)
+    models = conformal.scales_of_unseen_families(answers, answers.family != held_out).astype(int)
     for family, model in zip(answers.family, models, strict=True):
         assert seen[model - 1] == set(answers.family) - {family, held_out}
 
@@ -94,7 +94,7 @@ def test_no_scale_of_an_unseen_subject_is_from_a_model_that_has_seen_him_or_an_u
 
     monkeypatch.setattr(conformal, "fit_scale", fit_nothing)
     monkeypatch.setattr(conformal, "scales", lambda model, judged: np.full(len(judged), float(model)))
-    found = conformal.of_unseen_people(answers, known).astype(int)
+    found = conformal.scales_of_unseen_people(answers, known).astype(int)
     assert {model - 1 for model in found} == set(range(len(seen)))
     for people, family, model in zip(answers.people, answers.family, found, strict=True):
         families, subjects = seen[model - 1]

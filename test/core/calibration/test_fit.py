@@ -80,7 +80,7 @@ def test_no_model_judges_a_family_that_it_was_fitted_on(answers, monkeypatch):
 def test_a_wrong_pose_counts_where_it_is_accepted_and_no_rule_refuses_it(answers):
     four = answers.of(np.arange(len(answers)) < 4)
     four = replace(four, right=np.array([True, False, False, False]), refused=np.array([False, False, True, False]))
-    row = fits.judged(four, np.array([0.95, 0.92, 0.99, 0.6]))
+    row = fits.quality(four, np.array([0.95, 0.92, 0.99, 0.6]))
     assert (row["wrong"], row["wrong_sure"], row["right_accepted"], row["right_sure"]) == (2, 1, 1.0, 1.0)
     assert row["auroc"] == pytest.approx(2 / 3, abs=1e-4)
 

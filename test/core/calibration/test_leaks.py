@@ -68,7 +68,7 @@ def test_calibration_pairs_never_touch_val_or_test_subjects_and_say_whose_bone_t
         assert np.isfinite(drawn.pair.source).all() and np.isfinite(drawn.pair.target).all()
         named |= set(drawn.people)
     for number in range(8):
-        _, _, people, frames = streams.draw(Task(str(poisoned), "train", 0, number, "stream"))
+        _, _, people, frames = streams.draw_stream(Task(str(poisoned), "train", 0, number, "stream"))
         assert all(np.isfinite(frame.source).all() and np.isfinite(frame.target).all() for frame in frames)
         named |= set(people)
     assert named & set(TRAIN) and not named & set(HELD_OUT)

@@ -363,3 +363,8 @@ class RegistrarConfig(Settings):
     sure: float = setting(0.95, "a confidence from which no further proposer is asked; above 1 all are", low=0, high=2)
     num_threads: int = setting(0, "threads of a registration and its target; 0: all cores", low=0, high=1024)
     seed: int = setting(0, "seed of every random choice", low=0, high=2**31 - 1)
+
+    @property
+    def may_pass(self) -> float:
+        """The least probability p of one source that may yet be accepted: a stream raises it to sqrt(p) at most."""
+        return self.min_confidence**2

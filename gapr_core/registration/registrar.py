@@ -181,18 +181,24 @@ class Registrar:
             assessment = self._in_scene(prepared, target, start, eye, clock)
         if assessment is None:
             return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
-        if viewpoint is None and target.both_cortices is not None and cortices.follows_both(assessment, self.config):
-            again = self._in_rounds(prepared, target.both_cortices, assessment.fit.T[None], clock)
-            assessment = (again or assessment).limited(self.config.cortices.largest_confidence)
-        if assessment.is_sure(self.config.min_confidence**2):  # as in `rules.by_geometry`
+        if viewpoint is None and cortices.follows_both(assessment, self.config):
+            assessment = self._on_both_cortices(assessment, clock)
+        if assessment.is_sure(self.config.may_pass):
             assessment = self._unless_mirrored(assessment, clock, enough)
-        if assessment.is_sure(self.config.min_confidence**2):
+        if assessment.is_sure(self.config.may_pass):
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
         judged = assessment.corrected(self.precision)
         if judged.refusal is None or judged.seen is not None:  # a part that was found in a scene has no size of its own
             return judged
         return replace(judged, refusal=rules.asking_the_unit(judged.refusal, prepared.points, target.points))
+
+    def _on_both_cortices(self, assessment: Assessment, clock: Clock) -> Assessment:
+        """The source registered to the inner cortex as well; no more than so sure, as no such source was calibrated."""
+        a, most = assessment, self.config.cortices.largest_confidence
+        both = a.target.both_cortices
+        again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
+        return (again or a).limited(most)
 
     def _unless_mirrored(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The same; refused where the mirror image of the source fits better.

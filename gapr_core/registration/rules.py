@@ -40,14 +40,13 @@ def by_geometry(
 ) -> Refusal | None:
     """Why the pose may as well be another one; None when no rule says so.
 
-    The costly rule, which pushes the pose, is asked for only where the pose may be accepted otherwise: a stream may
-    raise a probability p to sqrt(p) (`evidence`).
+    The costly rule, which pushes the pose, is asked for only where the pose may be accepted otherwise.
     """
     if is_loose(uncertainty, config.rules):
         return Refusal(RegistrationStatus.DEGENERATE, _what_is_loose(uncertainty))
     if is_matched(candidates, config.rules):
         return Refusal(RegistrationStatus.AMBIGUOUS, _which_rival(candidates, source))
-    may_pass = probability >= config.min_confidence**2
+    may_pass = probability >= config.may_pass
     if may_pass and can_be_pushed(fit, source, target, config.verification, config.num_threads, config.rules):
         return Refusal(
             RegistrationStatus.DEGENERATE,

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from gapr_core.config import TargetConfig
 from gapr_core.geometry import distance_field, quadrics, sampling, visibility
+from gapr_core.registration import target as targets
 
 
 def sphere(count=4000, radius=30.0):
@@ -187,6 +189,15 @@ def test_the_misfit_is_the_rms_height_of_the_neighbours_above_the_quadric_up_to_
     found = quadrics.misfit_mm(points, normals, shapes, neighbours[:, 1:11], 2.0, num_threads=2)
     assert (off > 2.0).any()
     assert found == pytest.approx(np.sqrt((np.minimum(off, 2.0) ** 2).mean(axis=1)), abs=1e-12)
+
+
+@pytest.mark.parametrize(("gain", "count"), [(0.5, 10), (2.0, 10), (0.5, 40)])
+def test_the_variance_of_a_surface_element_is_its_gain_times_the_mean_square_misfit(femur_cloud, gain, count):
+    target = targets.prepare(femur_cloud, config=TargetConfig(misfit_gain=gain, misfit_neighbours=count), num_threads=1)
+    others = cKDTree(target.points).query(target.points, k=count + 1)[1][:, 1:]
+    misfit = quadrics.misfit_mm(target.points, target.normals, target.shapes, others)
+    assert target.elements[:, 12] == pytest.approx(gain * misfit**2, abs=1e-12)
+    assert misfit.max() > 0.05
 
 
 def test_quadrics_find_normals_and_curvature_of_a_sphere():

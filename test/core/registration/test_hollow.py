@@ -1,9 +1,13 @@
 """Bones whose model follows the cortical bone on both sides, as a segmentation by threshold gives them."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
+from gapr_core.config import CorticesConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
@@ -76,6 +80,29 @@ def test_the_bone_of_somebody_else_does_not_follow_both_cortices(registrar, holl
         source = make_pair("L2", other, seed).source
         assessment = registrar.assess(source, hollow)
         assert not cortices.follows_both(assessment, registrar.config)
+
+
+@pytest.mark.parametrize(
+    ("both_mm", "outer_mm", "noise_mm", "follows"),
+    [
+        (0.50, 1.0, 0.4, True),
+        (0.62, 1.0, 0.4, False),  # the inner cortex leaves more than .6 of what the outer one leaves
+        (0.50, 1.0, 0.3, False),  # and more than 1.5 times the noise of the source
+        (0.07, 1.0, 0.0, True),  # noise has a floor
+        (0.08, 1.0, 0.0, False),
+    ],
+)
+def test_each_rule_of_both_cortices_refuses_alone(monkeypatch, both_mm, outer_mm, noise_mm, follows):
+    config = RegistrarConfig(cortices=CorticesConfig(share=0.6, noise=1.5))
+    config = replace(config, refinement=replace(config.refinement, smallest_sigma_mm=0.05))
+    monkeypatch.setattr(cortices, "evaluate", lambda *_: SimpleNamespace(sigma_mm=both_mm))
+    assessment = SimpleNamespace(
+        target=SimpleNamespace(both_cortices="both"),
+        source=SimpleNamespace(points=None, noise_mm=noise_mm),
+        fit=SimpleNamespace(T=np.eye(4)),
+        features={"log_sigma": np.log(outer_mm)},
+    )
+    assert cortices.follows_both(assessment, config) is follows
 
 
 def test_who_wants_more_than_such_a_source_can_give_gets_a_refusal(hollow, hollow_cloud):

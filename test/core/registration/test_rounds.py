@@ -1,9 +1,11 @@
 """Who is asked, and how often: the network first, the search only if the answer is not sure."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import logit
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.benchmark import methods
@@ -11,6 +13,8 @@ from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.geometry import se3
+from gapr_core.registration import mirror
+from gapr_core.registration import registrar as registrars
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.proposals.base import Proposals
@@ -134,3 +138,20 @@ def test_a_clean_piece_of_the_target_itself_is_found_and_accepted(registrar, fem
     result = registrar.register(se3.apply(motion, piece), target)
     assert result.ok, str(result)
     assert np.abs(se3.apply(result.T_target_source, se3.apply(motion, piece)) - piece).max() < 0.1
+
+
+@pytest.mark.parametrize(("probability", "is_checked"), [(0.17, True), (0.15, False)])
+def test_what_a_stream_may_still_accept_is_checked_against_its_image_and_corrected(
+    pair, monkeypatch, probability, is_checked
+):
+    """A stream raises p to sqrt(p) at most: with a threshold of .4, answers from .16 on."""
+    done = []
+    monkeypatch.setattr(registrars.mirror, "image_margin", lambda *_: done.append("mirror") or mirror.LIMITS[1])
+    monkeypatch.setattr(registrars, "bias_corrected", lambda assessment, _: done.append("bias") or assessment)
+    config = replace(ONE_THREAD, min_confidence=0.4, rules=replace(ONE_THREAD.rules, mirrored_below=0.0))
+    calibration = Calibration("fixed", Additive(float(logit(probability)), ()), {})
+    poses = np.stack([pair.T_target_source, se3.exp([0.0, 0.0, 40.0, 0.0, 0.0, 2.0]) @ pair.T_target_source])
+    registrar = Registrar(config, [Fixed("fixed", poses)], [calibration])
+    found = registrar.assess(pair.source, registrar.prepare(pair.target))
+    assert found.refusal is None and found.probability == pytest.approx(probability)
+    assert done == (["mirror", "bias"] if is_checked else [])

@@ -9,6 +9,8 @@ import numpy as np
 from gapr_core.registration.kernels import step
 from gapr_core.registration.surface_kernels import FAST, element_near, moved, residual, tukey
 
+OFFSET, DEPTH, FRONT = 3, 4, 5  # columns of a pixel after its normal, as in `free_space.DepthImage`
+
 
 @numba.njit(**FAST)
 def compare_with_image(
@@ -39,9 +41,9 @@ def compare_with_image(
             if i < 0 or i >= rows:
                 continue
             seen = pixels[i, j]
-            if seen[4] == np.float32(0.0):
+            if seen[DEPTH] == np.float32(0.0):
                 continue
-            if depth < seen[5] - front_mm:
+            if depth < seen[FRONT] - front_mm:
                 violating += 1
             x, y, z = cloud[m, 3], cloud[m, 4], cloud[m, 5]
             nx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
@@ -50,10 +52,10 @@ def compare_with_image(
             towards = nx * right + ny * down + nz * depth
             if towards > -facing_cos * depth:
                 continue
-            off = seen[0] * right + seen[1] * down + seen[2] * depth - seen[3]
-            if depth < seen[4] + hidden_mm and depth > seen[5] - front_mm:
+            off = seen[0] * right + seen[1] * down + seen[2] * depth - seen[OFFSET]
+            if depth < seen[DEPTH] + hidden_mm and depth > seen[FRONT] - front_mm:
                 compared += 1
-            if abs(off) < on_mm and abs(depth - seen[4]) < slant_mm:
+            if abs(off) < on_mm and abs(depth - seen[DEPTH]) < slant_mm:
                 same = nx * seen[0] + ny * seen[1] + nz * seen[2]
                 if same > same_surface_cos:
                     off /= on_mm

@@ -32,7 +32,7 @@ def weights(residuals, aside, nearest, elements, variance, limit):
         if nearest[p] >= 0:
             square = (residuals[p] * residuals[p] + aside[p] * aside[p]) / (limit * limit)
             inside = min(max(1.0 - square, 0.0), 1.0)
-            out[p] = inside * inside * variance / (variance + elements[nearest[p], 12])
+            out[p] = inside * inside * variance / (variance + elements[nearest[p], -1])
     return out
 
 

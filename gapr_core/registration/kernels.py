@@ -16,6 +16,8 @@ from gapr_core.registration.block_kernels import accumulate, mean_square
 from gapr_core.registration.surface_kernels import FAST, element_near, moved, residual
 
 LARGEST_TURN_RAD = 0.35  # of one step
+DAMPING = 1e-4  # of each point's say in a shift, and of the information on a turn: what nothing observes stays
+TURN_DAMPING_MM2 = 1.0  # and so much more of a turn
 
 
 @numba.njit(**FAST)
@@ -43,8 +45,8 @@ def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spac
 def step(T, middle, H, g, count):
     """Solve, limit the turn, move T in place; H is overwritten, g becomes the twist about the moved `middle`."""
     for a in range(3):
-        H[a, a] += 1e-4 * count
-        H[a + 3, a + 3] += 1e-4 * H[a + 3, a + 3] + 1.0
+        H[a, a] += DAMPING * count
+        H[a + 3, a + 3] += DAMPING * H[a + 3, a + 3] + TURN_DAMPING_MM2
     solve(H, g)
     angle = np.sqrt(g[3] ** 2 + g[4] ** 2 + g[5] ** 2)
     if angle > LARGEST_TURN_RAD:

@@ -47,7 +47,7 @@ class SharedMisfit:
 
         Returns:
             Roots, mm, of the covariance that the frames share at short range only, and of that at long range, negative
-            where the covariance is; None while too few points of different frames are near each other.
+            where the covariance is; None while one of them has too few pairs of points of different frames.
         """
         feet, damped = on_the_bone(fit)
         if self._frames and len(feet):

@@ -17,6 +17,7 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neighbours
 
+SPREAD_OUT = 512  # points that are spread evenly, before the others in any order
 SPARE_NEIGHBOURS = 6  # of a point, for means over those that lie on the bone
 
 
@@ -175,11 +176,11 @@ def _around_count(count: int, config: SourceConfig) -> int:
     return min(_neighbour_count(count, config) + SPARE_NEIGHBOURS, count)
 
 
-def _spread_order(points: Array, isolation: Array, spread: int = 512) -> NDArray[np.int64]:
+def _spread_order(points: Array, isolation: Array) -> NDArray[np.int64]:
     """Points in the middle of their neighbours first, farthest-point order among them; then the rest, shuffled."""
     trusted = np.flatnonzero(isolation <= np.quantile(isolation, 0.8))
     start = int(np.linalg.norm(points[trusted] - points[trusted].mean(axis=0), axis=1).argmin())
-    spread_out = sampling.farthest_points(points[trusted], spread, start)
+    spread_out = sampling.farthest_points(points[trusted], SPREAD_OUT, start)
     first = trusted[spread_out[np.sort(np.unique(spread_out, return_index=True)[1])]]  # some may lie on each other
     is_rest = np.ones(len(points), dtype=bool)
     is_rest[first] = False

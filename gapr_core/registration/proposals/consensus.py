@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 SHRINKING = (2.0, 1.5, 1.0, 0.7)  # radii, one after the other, within which a correspondence counts in `sharpened`
 ROUNDS = 5  # fits with each of them
+REFITS = 4  # of a pose to the correspondences that agree with it
+APART_MM, APART_DEG = 8.0, 8.0  # poses within both are the same
 
 
 @dataclass(frozen=True)
@@ -85,16 +87,14 @@ def sharpened(pose: Array, found: Correspondences, radius_mm: float) -> Array:
     return pose
 
 
-def _converge(
-    poses: Array, found: Correspondences, radius_mm: float, count: int, rounds: int = 4
-) -> tuple[Array, Array]:
+def _converge(poses: Array, found: Correspondences, radius_mm: float, count: int) -> tuple[Array, Array]:
     """The best poses, each refitted to the correspondences it explains, near-copies dropped."""
     if len(poses) == 0:
         return np.empty((0, 4, 4)), np.empty(0)
     centroid = found.source.mean(axis=0)
     scores = _support(poses, found, radius_mm).sum(axis=1)
     poses = poses[distinct(poses, scores, centroid, 2 * count)]
-    for _ in range(rounds):
+    for _ in range(REFITS):
         weights = _support(poses, found, radius_mm)
         enough = (weights > 0).sum(axis=1) >= 3
         refitted = _batched_kabsch(found, weights)
@@ -104,14 +104,14 @@ def _converge(
     return poses[kept], scores[kept]
 
 
-def distinct(
-    poses: Array, scores: Array, centroid: Array, count: int, apart_mm: float = 8.0, apart_deg: float = 8.0
-) -> NDArray[np.int64]:
-    """Rows of up to `count` poses, best first, none within both limits of a better one (at the source's centroid)."""
+def distinct(poses: Array, scores: Array, centroid: Array, count: int) -> NDArray[np.int64]:
+    """Rows of up to `count` poses, best first, none within `APART_MM` (at the source's centroid) and `APART_DEG` of a
+    better one.
+    """
     order = np.argsort(-scores, kind="stable")
     rotations = np.ascontiguousarray(poses[order, :3, :3])
     places = rotations @ centroid + poses[order, :3, 3]
-    trace_limit = 1.0 + 2.0 * np.cos(np.radians(apart_deg))
+    trace_limit = 1.0 + 2.0 * np.cos(np.radians(APART_DEG))
     kept: list[int] = []
     left = np.arange(len(order))
     while len(left) and len(kept) < count:
@@ -119,7 +119,7 @@ def distinct(
         kept.append(best)
         shift = np.linalg.norm(places[left] - places[best], axis=1)
         trace = np.einsum("kij,ij->k", rotations[left], rotations[best])
-        left = left[~((shift < apart_mm) & (trace > trace_limit))]
+        left = left[~((shift < APART_MM) & (trace > trace_limit))]
     return order[kept]
 
 

@@ -67,7 +67,7 @@ class NormalAlignedSearch:
 
 
 def _references(source: PreparedSource, count: int) -> NDArray[np.int64]:
-    """Points far apart, each the one with the flattest surroundings among its neighbours in the spread order."""
+    """Points far apart, of the half of the first ones in the spread order that has the flattest surroundings."""
     candidates = source.order[: 8 * count]
     flat = candidates[np.argsort(source.flatness_mm[candidates], kind="stable")[: max(count, len(candidates) // 2)]]
     return flat[sampling.farthest_points(source.points[flat], count)]

@@ -1,8 +1,9 @@
 """A smooth bias as a Gaussian process over the source, and how large the residuals say it is.
 
-The field has correlation exp(-d^2 / 2 l^2) and is spanned by a few dozen of the inliers (Nystrom). Its size follows
-from the residuals by restricted maximum likelihood, in which the pose is integrated out (Patterson and Thompson 1971;
-Rasmussen and Williams 2006, section 2.7).
+The field has correlation exp(-d^2 / 2 l^2) and is spanned by a few dozen of the inliers (Nystrom). It is a function of
+the foot points: at the points themselves it would change along the normal with their own noise, which then passes for a
+bias. Its size follows from the residuals by restricted maximum likelihood, in which the pose is integrated out
+(Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be f
 
 @lru_cache(maxsize=4)  # covariance, size and bias of one fit ask in turn
 def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
-    """(N, m) whose products are the correlation of the bias between points, from m of the inliers (Nystrom).
+    """(N, m) whose products are the correlation of the bias between foot points, from m of the inliers (Nystrom).
 
     Read-only: the same fit gets the same array.
     """
-    spanned = _spanned(fit.moved, fit.weights > 0.0, correlation_mm, centres)
+    spanned = _spanned(fit.feet, fit.weights > 0.0, correlation_mm, centres)
     spanned.flags.writeable = False
     return spanned
 

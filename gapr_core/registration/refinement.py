@@ -54,6 +54,11 @@ class Fit:
         """(N, 6) derivative of the residuals by x y z rx ry rz about the moved source's centroid."""
         return np.hstack([self.gradients, np.cross(self.moved - self.moved.mean(axis=0), self.gradients)])
 
+    @cached_property
+    def feet(self) -> Array:
+        """(N, 3) foot points on the surface, target frame; the points themselves where no surface is near."""
+        return self.moved - np.nan_to_num(self.signed_mm)[:, None] * self.gradients
+
 
 def refine_many(
     poses: Array, points: Array, target: PreparedTarget, limits_mm: Array, num_threads: int = 0

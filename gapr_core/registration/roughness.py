@@ -43,7 +43,7 @@ def on_the_bone(fit: Fit) -> tuple[Array, Array]:
     inlier = fit.weights > 0.0
     signed = fit.signed_mm[inlier]
     damped = signed * np.maximum(1.0 - (signed / (LARGEST_SIGMAS * fit.sigma_mm)) ** 2, 0.0)
-    return fit.moved[inlier] - signed[:, None] * fit.gradients[inlier], damped
+    return fit.feet[inlier], damped
 
 
 def signed_root(near_mm2: float, far_mm2: float) -> float:

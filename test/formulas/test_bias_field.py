@@ -52,8 +52,31 @@ def test_fields_of_all_points_have_the_correlation_of_the_bias(fit):
     F = fields(fit, 12.0, COUNT)
     inlier = fit.weights > 0.0
     assert F.shape == (COUNT, inlier.sum())
-    wanted = smooth_correlation(fit.moved, fit.moved, 12.0)
+    feet = fit.moved - np.nan_to_num(fit.signed_mm)[:, None] * fit.gradients
+    wanted = smooth_correlation(feet, feet, 12.0)
     assert (F @ F.T)[np.ix_(inlier, inlier)] == pytest.approx(wanted[np.ix_(inlier, inlier)], abs=2e-5)
+
+
+def test_noise_along_the_normal_does_not_pass_for_a_bias():
+    """A cap of 20 mm on a ball, noise of 1 mm and no bias: each field's score is of the size that chance gives it.
+
+    As functions of the noisy points some fields change along the normal, as the residuals do.
+    """
+    rng = np.random.default_rng(4)
+    normals = rng.normal(size=(60_000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 2] > 0.7][:4000]
+    signed = rng.normal(0.0, 1.0, len(normals))
+    moved, weights = (25.0 + signed[:, None]) * normals, np.ones(len(normals))
+    cap = Fit(np.eye(4), 1.0, signed, weights, normals, np.zeros(len(normals), dtype=np.int64), moved)
+
+    def largest(places):
+        information, score = NormalEquations.of(cap, bias_field._spanned(places, weights > 0.0, 20.0, 60))._fields_alone
+        counted = information > 0.03 * information[-1]
+        return (score[counted] ** 2 / information[counted]).max()
+
+    np.testing.assert_array_equal(fields(cap, 20.0, 60), bias_field._spanned(cap.feet, weights > 0.0, 20.0, 60))
+    assert largest(cap.feet) < 15.0 < 30.0 < largest(cap.moved)
 
 
 def test_fields_are_spanned_by_as_many_inliers_as_asked_for(fit):

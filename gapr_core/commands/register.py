@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapr_core.commands import options
+from gapr_core.commands import checks, options
 from gapr_core.errors import ConfigError
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import files
@@ -76,7 +76,7 @@ def run(args: Namespace) -> int:
     """Print the result; exit code 0 with a pose, 2 when the data refuse one."""
     from gapr_core.benchmark import methods
 
-    _check_outputs(args)
+    checks.check_outputs(args)
     if args.guide and args.method not in methods.OWN:
         raise ConfigError(f"--guide with one of {', '.join(methods.OWN)}", args.method, "leave --guide out")
     config = options.registrar_config(args)
@@ -84,6 +84,7 @@ def run(args: Namespace) -> int:
     method = methods.make(args.method, config)
     plan = _plan(args)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
+    checks.warn_of_axes(args)
     whole = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds)
     if whole.faces is not None and target.faces is None:
         log.warning(
@@ -108,26 +109,6 @@ def run(args: Namespace) -> int:
     if config.guide:
         _say_where_next(result, spots)
     return code
-
-
-def _check_outputs(args: Namespace) -> None:
-    """Before the work, what cannot be written, and what does not go together."""
-    from gapr_core.formats import transforms
-
-    if args.out:
-        transforms.check(args.out)
-        if args.axes == "lps_to_ras":
-            raise ConfigError("--axes lps or ras with --out, which is LPS", "lps_to_ras", "say what the mesh is in")
-    if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
-        raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
-    if args.rerun:
-        from gapr_core.formats import recording
-
-        recording.check(args.rerun)
-    if args.report:
-        if args.report.suffix.lower() not in (".html", ".htm"):
-            raise ConfigError("a report as .html", args.report.name, "let its name end with .html")
-        from gapr_core.pages import registration_report  # noqa: F401  a missing library is said before the work
 
 
 def _load(args: Namespace, path: Path, **how: Any) -> Surface:
@@ -216,7 +197,6 @@ def _write(args: Namespace, result: RegistrationResult, errors: list[TargetError
 
     if args.out:
         transforms.write(args.out, result.T_target_source)  # type: ignore[arg-type]
-        _warn_of_axes(args)
     if (args.residuals or args.slicer) and result.residuals is None:
         raise ConfigError("a method that says the residuals", result.method, "use --method gapr")
     if args.residuals and args.residuals.suffix.lower() == ".json":
@@ -225,15 +205,6 @@ def _write(args: Namespace, result: RegistrationResult, errors: list[TargetError
         scene.write_coloured(args.residuals, result.apply(result.residuals.points), result.residuals)  # type: ignore
     if args.slicer:
         scene.write_slicer(args.slicer, target, result, errors)
-
-
-def _warn_of_axes(args: Namespace) -> None:
-    """A transform file is LPS by definition; a mesh may be anything."""
-    from gapr_core.formats import axes, reading
-
-    unknown = args.axes == "auto" and axes.stated(args.target) is None and not args.target.is_dir()
-    if args.axes == "as_is" or (unknown and not reading.format_of(args.target).in_patient):
-        log.warning("%s is written as LPS: if %s is RAS, give --axes ras", args.out.name, args.target.name)
 
 
 def as_json(result: RegistrationResult) -> dict[str, Any]:

@@ -1,0 +1,89 @@
+"""`gapr register`: what is checked before the work, and what a finished pose leaves behind."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gapr_core import cli
+from gapr_core.formats.markups import Markups, save
+from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
+
+POINTS = np.random.default_rng(0).uniform(-100.0, 100.0, (60, 3))
+FACES = [[0, 1, 2], [3, 4, 5]]
+
+
+class Known:
+    """A method that answers at once, and counts how often it was asked."""
+
+    name, asked, more = "known", 0, {}
+
+    def prepare(self, target, units="mm"):
+        return target
+
+    def register(self, source, target, initial=None):
+        Known.asked += 1
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **Known.more)
+
+
+FULL = {
+    "covariance": np.eye(6) * 1e-4,
+    "centre_mm": np.zeros(3),
+    "residuals": Residuals(POINTS, np.zeros(len(POINTS)), np.ones(len(POINTS), bool)),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Files of a case as the working folder, and a method that says all that GAPR says."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "known_method", SimpleNamespace(make=Known))
+    monkeypatch.setattr(Known, "asked", 0)
+    monkeypatch.setattr(Known, "more", FULL)
+    np.save("s.npy", POINTS)
+    np.savetxt("s.txt", POINTS)
+    rows = [" ".join(map(str, point)) for point in POINTS] + [" ".join(map(str, (3, *face))) for face in FACES]
+    for name, comment in (("bone", "a bone"), ("lps", "SPACE=LPS"), ("ras", "SPACE=RAS")):
+        head = ["ply", "format ascii 1.0", f"comment {comment}", f"element vertex {len(POINTS)}"]
+        head += [f"property float {axis}" for axis in "xyz"]
+        head += [f"element face {len(FACES)}", "property list uchar int vertex_indices", "end_header"]
+        (tmp_path / f"{name}.ply").write_text("\n".join([*head, *rows]) + "\n")
+    save(tmp_path / "p.mrk.json", Markups(POINTS[:4], ("a", "b", "c", "d")))
+    (tmp_path / "a_file").write_text("")
+    return tmp_path
+
+
+def register(line, target="bone.ply", source="s.npy"):
+    command = f"register --source {source} --target {target} --method known_method:make {line}"
+    try:
+        return cli.main(command.split())
+    except SystemExit as stop:
+        return stop.code
+
+
+IN_LPS = ["--out p.tfm", "--slicer scene", "--residuals r.ply", "--targets p.mrk.json",
+          "--landmarks p.mrk.json p.mrk.json"]  # fmt: skip
+
+
+@pytest.mark.parametrize("option", IN_LPS)
+def test_files_in_lps_of_a_bone_without_axes_are_warned_of(folder, caplog, option):
+    said = f"in LPS: {option.split()[-1]}. If bone.ply is RAS, give --axes ras"
+    assert register(option) == 0 and said in caplog.text
+    caplog.clear()
+    assert register(f"{option} --axes as_is") == 0 and said in caplog.text
+    for target, more in (("bone.ply", "--axes ras"), ("bone.ply", "--axes lps"), ("lps.ply", ""), ("ras.ply", "")):
+        caplog.clear()
+        assert register(f"{option} {more}", target) == 0 and "in LPS: " not in caplog.text
+
+
+@pytest.mark.parametrize("option", IN_LPS)
+def test_files_in_lps_of_a_bone_that_is_turned_to_ras_are_refused(folder, capsys, option):
+    assert register(f"{option} --axes lps_to_ras") == 1 and Known.asked == 0
+    assert f"--axes lps or ras with {option.split()[0]}, which is LPS" in capsys.readouterr().err
+
+
+def test_residuals_as_json_say_no_axes(folder, caplog):
+    assert register("--residuals r.json --axes lps_to_ras") == 0 and register("--residuals r.json") == 0
+    assert "in LPS: " not in caplog.text

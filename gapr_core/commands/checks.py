@@ -4,24 +4,47 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
+from importlib.util import find_spec
 from pathlib import Path
 
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.results import RegistrationResult
+from gapr_core.runtime import files
 
 log = logging.getLogger(__name__)
+Named = tuple[str, Path]  # an option, and what it names
+
+TARGETS = "targets.mrk.json"
+SCENE = ("target.vtk", "source.vtk", "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `scene.write_slicer`
 
 
 def check_outputs(args: Namespace) -> None:
-    """Raise before the work for outputs of a kind that is not written, or that do not go with the axes.
+    """Raise before the work for outputs that cannot be written, or that do not go with an input.
 
     Raises:
-        ConfigError: an ending that nothing is written to, or files in LPS of a bone that is turned to RAS.
+        ConfigError: an ending that nothing is written to, a folder that cannot be written, the file of another
+            option, or files in LPS of a bone that is turned to RAS.
         MethodUnavailableError: a library that an output needs is not installed.
     """
+    _check_kinds(args)
+    in_lps = files_in_lps(args)
+    if in_lps and args.axes == "lps_to_ras":
+        option = next(iter(in_lps))
+        how = f"say what the mesh is in, or leave {option} out"
+        raise ConfigError(f"--axes lps or ras with {option}, which is LPS", "lps_to_ras", how)
+    _check_collisions(_inputs(args), _outputs(args))
+    for _, path in _outputs(args):
+        files.check_writable(path)
+
+
+def _check_kinds(args: Namespace) -> None:
+    """Endings, and the libraries that write them."""
     from gapr_core.formats import transforms
 
     if args.out:
         transforms.check(args.out)
+        if args.out.suffix.lower() == ".h5" and find_spec("SimpleITK") is None:
+            raise MethodUnavailableError(".h5 files", "no SimpleITK", "pip install 'gapr_ros[medical]'")
     if args.residuals and args.residuals.suffix.lower() not in (".json", ".ply"):
         raise ConfigError("residuals as .json or .ply", args.residuals.name, "choose one of these")
     if args.rerun:
@@ -32,11 +55,68 @@ def check_outputs(args: Namespace) -> None:
         if args.report.suffix.lower() not in (".html", ".htm"):
             raise ConfigError("a report as .html", args.report.name, "let its name end with .html")
         from gapr_core.pages import registration_report  # noqa: F401  a missing library is said before the work
-    in_lps = files_in_lps(args)
-    if in_lps and args.axes == "lps_to_ras":
-        option = next(iter(in_lps))
-        how = f"say what the mesh is in, or leave {option} out"
-        raise ConfigError(f"--axes lps or ras with {option}, which is LPS", "lps_to_ras", how)
+
+
+def _inputs(args: Namespace) -> list[Named]:
+    """The option and the path of every file or folder that is read."""
+    named = [("--source", args.source), ("--target", args.target), ("--targets", args.targets)]
+    named += [("--landmarks", path) for path in args.landmarks or ()] + [("--config", args.config)]
+    return [(option, path) for option, path in named if path]
+
+
+def _outputs(args: Namespace) -> list[Named]:
+    """The option and the path of every file that is written, those of a scene as well."""
+    named = [(f"--{name}", getattr(args, name)) for name in ("out", "residuals", "report", "rerun", "json")]
+    scene = [name for name in SCENE if args.targets or name != TARGETS] if args.slicer else []
+    return [(option, path) for option, path in named if path] + [("--slicer", args.slicer / name) for name in scene]
+
+
+def _check_collisions(inputs: list[Named], outputs: list[Named]) -> None:
+    """Raise `ConfigError` where a file would be written over another one of the same run."""
+    from gapr_core.formats.sweeps import SLICE_ENDINGS
+
+    for i, (option, path) in enumerate(outputs):
+        for other, taken in [*inputs, *outputs[:i]]:
+            is_slice = taken.is_dir() and path.suffix.lower() in SLICE_ENDINGS and _is_same(path.parent, taken)
+            if is_slice or _is_same(path, taken):
+                given = f"{path}, which belongs to {other}"
+                raise ConfigError(f"a file for {option} that no other option names", given, "choose another name")
+        for other, written in outputs[:i]:
+            if path.resolve() in written.resolve().parents or written.resolve() in path.resolve().parents:
+                given = f"{path}, and {written} for {other}"
+                raise ConfigError(f"a file for {option} that is no folder of another", given, "choose another name")
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    """By name, links followed, and by what is there: some file systems do not distinguish a from A."""
+    return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
+
+
+def check_method(args: Namespace) -> None:
+    """Raise before the work where a method is known not to say what is asked of it.
+
+    Raises:
+        ConfigError: an option that a method of this name cannot follow.
+    """
+    from gapr_core.benchmark import methods
+
+    wanted = [name for name in ("guide", "residuals", "slicer", "targets") if getattr(args, name)]
+    may_say = args.method in methods.OWN or (":" in args.method and "guide" not in wanted)
+    if wanted and not may_say:
+        own = ", ".join(methods.OWN)
+        raise ConfigError(f"--{wanted[0]} with one of {own}", args.method, f"leave --{wanted[0]} out")
+
+
+def check_answer(args: Namespace, result: RegistrationResult) -> None:
+    """Raise at the end for files that could not be written, since the method did not say what they hold.
+
+    Raises:
+        ConfigError: a pose without residuals or without a covariance, and an option that needs them.
+    """
+    if result.ok and result.residuals is None and (args.residuals or args.slicer):
+        raise ConfigError("a method that says the residuals", result.method, "use --method gapr")
+    if result.ok and result.covariance is None and args.targets:
+        raise ConfigError("a method that says the covariance, for --targets", result.method, "use --method gapr")
 
 
 def files_in_lps(args: Namespace) -> dict[str, Path]:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.commands import checks, options
 from gapr_core.errors import ConfigError
@@ -25,6 +26,16 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
+
+
+class Registration(NamedTuple):
+    """What was registered, and what came of it."""
+
+    target: Surface
+    source: NDArray[np.float64]
+    result: RegistrationResult
+    errors: list[TargetError]
+    spots: Sequence[Patch]
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -73,16 +84,19 @@ def _span(text: str) -> tuple[int | None, int | None]:
 
 
 def run(args: Namespace) -> int:
-    """Print the result; exit code 0 with a pose, 2 when the data refuse one."""
+    """Print the result; exit code 0 with a pose, 2 when the data refuse one.
+
+    Raises:
+        GaprError: options or files that cannot be used, before the work; what a method did not say, at the end.
+    """
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
-    if args.guide and args.method not in methods.OWN:
-        raise ConfigError(f"--guide with one of {', '.join(methods.OWN)}", args.method, "leave --guide out")
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
     method = methods.make(args.method, config)
-    plan = _plan(args)
+    checks.check_method(args)
+    plan, hints = _plan(args), _hints(args, method)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
     checks.warn_of_axes(args)
     whole = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds)
@@ -90,24 +104,14 @@ def run(args: Namespace) -> int:
         log.warning(
             "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
         )
-    source = whole.points
-    result = method.register(source, method.prepare(target), **_hints(args, method))  # type: ignore[call-arg]
+    result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
-    if args.json:
-        more = {"targets": [asdict(error) for error in errors], "guidance": _guidance_json(result, spots)}
-        files.write_json(args.json, as_json(result) | more)
-    if args.report:
-        from gapr_core.pages import registration_report
-
-        registration_report.write(args.report, registration_report.Registration(target, source, result, errors, spots))
-    if args.rerun:
-        from gapr_core.formats import recording
-
-        recording.write(args.rerun, target, source, result, errors)
-    code = _show(args, result, errors, target)
+    code = _show(args, result, errors)
     if config.guide:
         _say_where_next(result, spots)
+    _write(args, Registration(target, whole.points, result, errors, spots))
+    checks.check_answer(args, result)
     return code
 
 
@@ -145,11 +149,11 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
 def _errors(plan: Any, result: RegistrationResult) -> list[TargetError]:
     from gapr_core.formats import planning
 
-    return planning.errors_at(plan, result) if plan is not None and result.ok else []
+    return planning.errors_at(plan, result) if plan is not None and result.covariance is not None else []
 
 
-def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError], target: Surface) -> int:
-    """The result in words, and in the files that were asked for."""
+def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]) -> int:
+    """The result in words, before a file can fail."""
     say(str(result))
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
@@ -161,7 +165,6 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
     say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
     for error in errors:
         say(f"{error.label}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")
-    _write(args, result, errors, target)
     return OK
 
 
@@ -192,19 +195,38 @@ def _guidance_json(result: RegistrationResult, spots: Sequence[Patch]) -> dict[s
     return {"now_mm": result.guidance.now_mm, "patches": patches}
 
 
-def _write(args: Namespace, result: RegistrationResult, errors: list[TargetError], target: Surface) -> None:
+def _write(args: Namespace, done: Registration) -> None:
+    """The files that were asked for; those of a pose only where there is one."""
+    if args.json:
+        errors = [asdict(error) for error in done.errors]
+        more = {"targets": errors, "guidance": _guidance_json(done.result, done.spots)}
+        files.write_json(args.json, as_json(done.result) | more)
+    if args.report:
+        from gapr_core.pages import registration_report
+
+        registration_report.write(args.report, registration_report.Registration(*done))
+    if args.rerun:
+        from gapr_core.formats import recording
+
+        recording.write(args.rerun, done.target, done.source, done.result, done.errors)
+    if done.result.ok:
+        _write_pose(args, done)
+
+
+def _write_pose(args: Namespace, done: Registration) -> None:
     from gapr_core.formats import scene, transforms
 
+    result = done.result
     if args.out:
         transforms.write(args.out, result.T_target_source)  # type: ignore[arg-type]
-    if (args.residuals or args.slicer) and result.residuals is None:
-        raise ConfigError("a method that says the residuals", result.method, "use --method gapr")
+    if result.residuals is None:
+        return
     if args.residuals and args.residuals.suffix.lower() == ".json":
-        files.write_json(args.residuals, scene.residuals_json(result.residuals))  # type: ignore[arg-type]
+        files.write_json(args.residuals, scene.residuals_json(result.residuals))
     elif args.residuals:
-        scene.write_coloured(args.residuals, result.apply(result.residuals.points), result.residuals)  # type: ignore
+        scene.write_coloured(args.residuals, result.apply(result.residuals.points), result.residuals)
     if args.slicer:
-        scene.write_slicer(args.slicer, target, result, errors)
+        scene.write_slicer(args.slicer, done.target, result, done.errors)
 
 
 def as_json(result: RegistrationResult) -> dict[str, Any]:

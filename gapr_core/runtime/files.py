@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from gapr_core.errors import ConfigError
@@ -22,8 +23,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         ConfigError: the file cannot be written: no such folder, no permission, a full disk.
     """
     path = Path(path)
-    if not path.name or path.is_dir():
-        raise ConfigError("a path of a file", f"{path}, a folder", "add the name of the file")
+    _refuse_folder(path)
     scratch = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -34,6 +34,22 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # no such folder: the error above says more
             scratch.unlink(missing_ok=True)
+
+
+def check_writable(path: str | Path) -> None:
+    """Raise what writing a file would raise, before there is anything to write; nothing stays behind.
+
+    Raises:
+        ConfigError: a folder, or a place where no file can be written.
+    """
+    path = Path(path)
+    _refuse_folder(path)
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -62,6 +78,11 @@ def read_json(path: str | Path, what: str) -> Any:
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(what, f"{path} ({why})", "check the path, or make the file again") from error
+
+
+def _refuse_folder(path: Path) -> None:
+    if not path.name or path.is_dir():
+        raise ConfigError("a path of a file", f"{path}, a folder", "add the name of the file")
 
 
 def unwritable(path: str | Path, error: OSError) -> ConfigError:

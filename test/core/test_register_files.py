@@ -87,3 +87,61 @@ def test_files_in_lps_of_a_bone_that_is_turned_to_ras_are_refused(folder, capsys
 def test_residuals_as_json_say_no_axes(folder, caplog):
     assert register("--residuals r.json --axes lps_to_ras") == 0 and register("--residuals r.json") == 0
     assert "in LPS: " not in caplog.text
+
+
+@pytest.mark.parametrize("line", [
+    "--out s.txt", "--out ./s.txt", "--residuals bone.ply", "--targets p.mrk.json --json p.mrk.json",
+    "--landmarks p.mrk.json p.mrk.json --json p.mrk.json", "--json x.html --report x.html", "--out link.txt",
+    "--config a.json --json a.json", "--json o --slicer o", "--json o/scene.mrml --slicer o",
+    "--out t/pose.tfm --slicer t", "--targets rec/targets.mrk.json --slicer rec",
+])  # fmt: skip
+def test_a_file_of_another_option_is_never_written_over(folder, capsys, line):
+    (folder / "rec").mkdir()
+    save(folder / "rec" / "targets.mrk.json", Markups(POINTS[:4], ("a", "b", "c", "d")))
+    (folder / "link.txt").symlink_to(folder / "s.txt")
+    (folder / "a.json").write_text("{}")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert register(line, source="s.txt") == 1 and Known.asked == 0
+    assert "expected a file for --" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_pose_does_not_become_a_slice_of_the_source(folder, capsys):
+    (folder / "sweep").mkdir()
+    np.savetxt(folder / "sweep" / "0.txt", POINTS)
+    assert register("--out sweep/pose.txt", source="sweep") == 1
+    assert "which belongs to --source" in capsys.readouterr().err
+    assert register("--out sweep/pose.tfm", source="sweep") == 0
+
+
+@pytest.mark.parametrize("option", ["--residuals r.ply", "--slicer scene", "--targets p.mrk.json"])
+def test_a_method_that_does_not_say_what_is_asked_is_refused_before_the_work(folder, capsys, option):
+    assert register(f"--method icp --out p.tfm {option}") == 1
+    printed = capsys.readouterr()
+    assert option.split()[0] in printed.err and not printed.out and not (folder / "p.tfm").exists()
+
+
+@pytest.mark.parametrize("path", ["a_file/x.json", ".", "a_file/b/c/x.json", "/proc/x.json"])
+def test_a_path_that_cannot_be_written_is_refused_before_the_work(folder, path):
+    assert register(f"--json {path}") == 1 and Known.asked == 0
+    assert not list(folder.glob("a_file*/"))
+
+
+def test_a_path_in_folders_that_are_not_there_yet_is_made(folder):
+    assert register("--json a/b/x.json --slicer c/d") == 0
+    assert (folder / "a/b/x.json").is_file() and (folder / "c/d/scene.mrml").is_file()
+
+
+@pytest.mark.parametrize("option", ["--residuals r.ply", "--slicer scene", "--targets p.mrk.json"])
+def test_a_pose_is_printed_and_written_though_the_method_says_no_more(folder, capsys, monkeypatch, option):
+    monkeypatch.setattr(Known, "more", {})
+    assert register(f"--out p.tfm --json x.json {option}") == 1
+    printed = capsys.readouterr()
+    assert "[1. 0. 0. 0.]" in printed.out and "use --method gapr" in printed.err
+    assert (folder / "p.tfm").is_file() and json.loads((folder / "x.json").read_text())["status"] == "OK"
+
+
+def test_a_pose_is_printed_before_a_file_fails(folder, capsys, monkeypatch):
+    monkeypatch.setattr("gapr_core.runtime.files.check_writable", lambda path: None)
+    assert register("--json a_file/x.json") == 1
+    assert "[1. 0. 0. 0.]" in capsys.readouterr().out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -10,16 +11,14 @@ from numpy.typing import NDArray
 from gapr_core import metrics
 from gapr_core.benchmark.record import ERROR, Answer, PairFacts, Verdict
 from gapr_core.data.pair import Pair
+from gapr_core.data.pair_files import LANDMARK, NUMBERS, TEXTS
 from gapr_core.geometry import extent, se3
 from gapr_core.metrics.pose import STRICT_LIMITS
 from gapr_core.results import RegistrationResult
 
 Array = NDArray[np.float64]
 
-FACTS = (
-    "cohort", "overlap", "noise_mm", "bias_mm", "outlier_share", "wrong_kind", "degraded_as", "source_person",
-    "bone_share",
-)  # fmt: skip
+FACTS = (*NUMBERS, *TEXTS)  # in the metadata of a pair
 
 
 def pair_facts(pair: Pair) -> PairFacts:
@@ -49,6 +48,26 @@ def answer_of(result: RegistrationResult) -> Answer:
         predicted_tre_mm=result.tre_mm,
         predicted_tre95_mm=result.tre95_mm,
     )
+
+
+def why_unusable(result: Any) -> str:
+    """What of an answer can be neither judged nor written down, in words; empty where all can."""
+    if not isinstance(result, RegistrationResult):
+        return f"the method answered {type(result).__name__}, no RegistrationResult"
+    if not isinstance(result.confidence, Real) or not np.isfinite(result.confidence):
+        return f"the method's confidence is {result.confidence}, no finite number"
+    for name, shape in {"T_target_source": (4, 4), "best": (4, 4), "covariance": (6, 6), "centre_mm": (3,)}.items():
+        array = getattr(result, name)
+        if array is not None and not _is_finite(array, shape):
+            return f"the method's {name} is no array of {shape} finite numbers"
+        if array is not None and shape == (4, 4) and (why := se3.why_not_rigid(array)):
+            return f"the method's {name} is not rigid: its {why}"
+    return ""
+
+
+def _is_finite(array: Any, shape: tuple[int, ...]) -> bool:
+    is_array = isinstance(array, np.ndarray) and array.shape == shape
+    return is_array and array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
 
 
 def failure(reason: str) -> Answer:
@@ -104,7 +123,11 @@ def uncertainty(pair: Pair, T: Array, result: RegistrationResult) -> dict[str, A
     if result.covariance is not None:
         facts |= {"nees": metrics.nees(twist, result.covariance), "covariance": result.covariance.tolist()}
     sigma = pair.metadata.get("noise_mm")
-    bound = metrics.pose_bound(pair.source, pair.target, pair.T_target_source, float(sigma)) if sigma else None
+    bound = (
+        metrics.pose_bound(pair.source, pair.target, pair.T_target_source, float(sigma))
+        if sigma and np.isfinite(sigma)
+        else None
+    )
     if bound is not None:
         rmse = metrics.rmse_mm(T, pair.T_target_source, pair.source)
         facts |= {"bound_rmse_mm": bound.rmse_mm, "bound_ratio": rmse / bound.rmse_mm}
@@ -114,5 +137,5 @@ def uncertainty(pair: Pair, T: Array, result: RegistrationResult) -> dict[str, A
 
 def named_targets(pair: Pair) -> dict[str, Array]:
     """Arrays `landmark_NAME` (3,) of the pair, target frame; the six extreme points of the bone where it has none."""
-    marked = {key[9:]: np.asarray(value) for key, value in pair.metadata.items() if key.startswith("landmark_")}
+    marked = {key[9:]: np.asarray(value) for key, value in pair.metadata.items() if key.startswith(LANDMARK)}
     return marked or metrics.extreme_points(pair.target)

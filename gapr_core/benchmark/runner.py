@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 from gapr_core.baselines import RegistrationMethod
 from gapr_core.benchmark import methods
-from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts
+from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts, why_unusable
 from gapr_core.benchmark.record import Answer, Record, Verdict
 from gapr_core.config import RegistrarConfig
-from gapr_core.data.pair_files import load_pair, pair_hash
+from gapr_core.data.pair_files import load_facts, load_pair, pair_hash
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult
@@ -100,12 +100,27 @@ def run_task(task: Task) -> Record:
             _methods[made_of] = methods.make(task.method, methods.config_of(task.method, task.config))
             _timed(_methods[made_of], pair)
         result, times = _timed(_methods[made_of], pair)
+        why = why_unusable(result)
     except (ConfigError, MethodUnavailableError, WeightsError):
         raise
     except Exception as error:
         log.warning("%s failed on %s", task.method, pair.name, exc_info=True)
         return _failure(task, pair, f"{type(error).__name__}: {error}")
+    if why:
+        log.warning("%s on %s: %s", task.method, pair.name, why)
+        return _failure(task, pair, why)
     return _record(task, pair, answer_of(result), judge(pair, result), *times)
+
+
+def check_pairs(paths: Iterable[Path]) -> None:
+    """Check before the first registration what every file says of its pair; the clouds are not read.
+
+    Raises:
+        InvalidPointCloudError: a file that is no pair, or says what cannot be.
+        ConfigError: a pair without a truth.
+    """
+    for path in paths:
+        check_truth(load_facts(path))
 
 
 def check_truth(pair: Pair) -> None:

@@ -98,7 +98,8 @@ def benchmark(
 
     Raises:
         ConfigError: no pairs, an unknown method, settings without a method of ours, or results of other pairs or
-            settings in `out`.
+            settings in `out`; a pair without a truth.
+        InvalidPointCloudError: a file that is no pair, or whose truth, landmarks or facts cannot be.
         MethodUnavailableError: a method whose library is not installed.
     """
     paths = pair_paths(pairs)
@@ -108,8 +109,9 @@ def benchmark(
     config = config or RegistrarConfig()
     if config != RegistrarConfig() and not any(name in known_methods.OWN for name in methods):
         raise ConfigError(f"settings with one of {', '.join(known_methods.OWN)}", ", ".join(methods), "leave them out")
-    plan, done = _begin(pairs, paths, methods, out, threads, ours, config)
     chosen = [path.resolve() for path in paths[shard[0] - 1 :: shard[1]]]
+    runner.check_pairs(tqdm(chosen, desc="checking pairs", disable=None, leave=False))
+    plan, done = _begin(pairs, paths, methods, out, threads, ours, config)
     tasks = [runner.Task(path, method, config) for path in chosen for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:

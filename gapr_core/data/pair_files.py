@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 
 from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.geometry import se3
 from gapr_core.runtime import files
 from gapr_core.surface import as_points
 
 Array = NDArray[np.float64]
 
 NAMES = ("name", "bone", "person", "protocol")
+NUMBERS = ("overlap", "noise_mm", "bias_mm", "outlier_share", "bone_share")  # facts that records keep
+TEXTS = ("cohort", "wrong_kind", "degraded_as", "source_person")
+CLOUDS = ("source", "target")
+LANDMARK = "landmark_"
 
 
 def save_pair(path: str | Path, pair: Pair) -> None:
@@ -52,7 +57,7 @@ def load_clouds(path: str | Path) -> tuple[Array, Array, Array | None]:
     Raises:
         InvalidPointCloudError: not a readable .npz with these arrays.
     """
-    arrays = _arrays(path, ("source", "target", "viewpoint"))
+    arrays = _arrays(path, lambda name: name in (*CLOUDS, "viewpoint"))
     return (*_clouds(arrays, path), _of_shape(arrays, "viewpoint", (3,), path))
 
 
@@ -60,22 +65,91 @@ def load_pair(path: str | Path) -> Pair:
     """Read one pair; a file with `source` and `target` alone is a pair without truth, named after the file.
 
     Raises:
-        InvalidPointCloudError: not a readable .npz with these arrays.
+        InvalidPointCloudError: not a readable .npz with these arrays, or one with points that are not finite, a
+            transform that is not rigid, or landmarks and facts that are none.
     """
     arrays = _arrays(path)
-    source, target = _clouds(arrays, path)
-    transform = _of_shape(arrays, "transform", (4, 4), path)
-    arrays = {key: array for key, array in arrays.items() if key not in ("source", "target", "transform", "has_truth")}
-    names = {key: str(arrays.pop(key, "")) for key in NAMES}
-    names["name"] = names["name"] or Path(path).stem
-    metadata: dict[str, Any] = {key: a.item() if a.ndim == 0 else a for key, a in arrays.items()}
-    return Pair(source, target, np.full((4, 4), np.nan) if transform is None else transform, **names, metadata=metadata)
+    clouds = _clouds(arrays, path)
+    for name, points in zip(CLOUDS, clouds, strict=True):
+        if not np.isfinite(points).all():
+            raise _wrong(path, f"finite points in {name}", "some that are not", "remove these rows")
+    return _pair(clouds, arrays, path)
 
 
-def _arrays(path: str | Path, wanted: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
+def load_facts(path: str | Path) -> Pair:
+    """What a file says of its pair, checked like a whole one; the clouds are not read, and empty in the answer.
+
+    Raises:
+        InvalidPointCloudError: as of `load_pair`, as far as it can be known without the coordinates.
+    """
+    arrays = _arrays(path, _is_fact)
     try:
         with np.load(path, allow_pickle=False) as data:
-            return {key: data[key] for key in data.files if wanted is None or key in wanted}
+            heads = {name: _head(data, name) for name in CLOUDS}
+    except Exception as error:  # NumPy, zipfile and zlib raise many kinds
+        raise _unreadable(path, " ".join(str(error).split())) from error
+    for name, (shape, dtype) in heads.items():
+        if len(shape) != 2 or shape[1] != 3 or dtype.kind not in "fiu":
+            raise _unreadable(path, f"{name} of shape {shape} and type {dtype}")
+    return _pair((np.zeros((0, 3)), np.zeros((0, 3))), arrays, path)
+
+
+def _is_fact(name: str) -> bool:
+    return name in (*NAMES, *NUMBERS, *TEXTS, "transform", "viewpoint") or name.startswith(LANDMARK)
+
+
+def _head(data: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of an array in an open .npz file, from its first bytes."""
+    with data.zip.open(f"{name}.npy") as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+    return shape, dtype
+
+
+def _pair(clouds: tuple[Array, Array], arrays: Mapping[str, NDArray[Any]], path: str | Path) -> Pair:
+    """The pair with its metadata, whose shapes and types are checked."""
+    _check_facts(arrays, path)
+    transform = _transform(arrays, path)
+    facts = {key: array for key, array in arrays.items() if key not in (*CLOUDS, "transform", "has_truth")}
+    names = {key: str(facts.pop(key, "")) for key in NAMES}
+    names["name"] = names["name"] or Path(path).stem
+    metadata: dict[str, Any] = {key: a.item() if a.ndim == 0 else a for key, a in facts.items()}
+    source, target = clouds
+    return Pair(source, target, transform, **names, metadata=metadata)
+
+
+def _check_facts(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> None:
+    """Everything that a judge computes with, or a record keeps."""
+    _of_shape(arrays, "viewpoint", (3,), path)
+    for name in arrays:
+        if name.startswith(LANDMARK):
+            point = _of_shape(arrays, name, (3,), path)
+            if not np.isfinite(point).all():  # type: ignore[arg-type]
+                raise _wrong(path, f"a finite {name}", str(point), "leave it out, or write x y z in mm")
+    for name, kinds, what in [(n, "fiu", "a number") for n in NUMBERS] + [(n, "U", "a text") for n in TEXTS]:
+        array = arrays.get(name)
+        if array is not None and (array.ndim or array.dtype.kind not in kinds):
+            raise _wrong(path, f"{name} as {what}", f"shape {array.shape} and type {array.dtype}", "write one, or none")
+
+
+def _transform(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> Array:
+    """(4, 4) the truth; all NaN where there is none."""
+    T = _of_shape(arrays, "transform", (4, 4), path)
+    if T is None or np.isnan(T).all():
+        return np.full((4, 4), np.nan)
+    how = "write T_target_source in mm, or NaN where no pose is right"
+    if not np.isfinite(T).all():
+        raise _wrong(path, "a finite transform (4, 4)", "some entries that are not", how)
+    if why := se3.why_not_rigid(T):
+        raise _wrong(path, "a rigid transform (4, 4)", f"one whose {why}", how)
+    return T
+
+
+def _arrays(path: str | Path, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return {key: data[key] for key in data.files if is_wanted(key)}
     except Exception as error:  # NumPy, zipfile and zlib raise many kinds
         raise _unreadable(path, " ".join(str(error).split())) from error
 
@@ -94,8 +168,13 @@ def _of_shape(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, .
     if array is None:
         return None
     if array.shape != shape or array.dtype.kind not in "fiu":
-        raise _unreadable(path, f"{name} of shape {array.shape} and type {array.dtype}")
+        given = f"shape {array.shape} and type {array.dtype}"
+        raise _wrong(path, f"{name} as {shape} numbers", given, "write it again, or leave it out")
     return array.astype(np.float64)
+
+
+def _wrong(path: str | Path, expected: str, given: str, how: str) -> InvalidPointCloudError:
+    return InvalidPointCloudError(expected, f"{given}, in {path}", how)
 
 
 def _unreadable(path: str | Path, why: str) -> InvalidPointCloudError:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0  # a pose farther off at the source's centroid, or turned farther, is wrong
+LAST_ROW = 1e-6  # how far an entry of the last row may be from 0 0 0 1
 
 
 class PoseError(NamedTuple):
@@ -59,6 +60,21 @@ def nearest_rigid(T: ArrayLike) -> Array:
     T = np.asarray(T, dtype=np.float64)
     u, _, vt = np.linalg.svd(T[:3, :3])
     return from_rotation_translation(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, T[:3, 3])
+
+
+def why_not_rigid(T: Array, farthest: float = 1e-2) -> str:
+    """What keeps a finite T (4, 4) from being rigid, in words; empty where it is.
+
+    Args:
+        T: the transform.
+        farthest: an entry of R^T R may be from the identity: poses are often written with few digits.
+    """
+    R, last = T[:3, :3], T[3]
+    if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > LAST_ROW:
+        return "last row is {:g} {:g} {:g} {:g}, not 0 0 0 1".format(*last)
+    if np.abs(R.T @ R - np.eye(3)).max() > farthest or np.linalg.det(R) < 0.0:
+        return f"rotation part has determinant {np.linalg.det(R):.3g}"
+    return ""
 
 
 def kabsch(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:

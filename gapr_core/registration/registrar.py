@@ -304,8 +304,7 @@ def _finite(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> A
 
 def _rigid(pose: ArrayLike) -> Array:
     T = _finite(pose, (4, 4), "initial pose", "pass T_target_source in mm")
-    R = T[:3, :3]
-    if np.abs(R.T @ R - np.eye(3)).max() > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
-        given = f"a matrix whose rotation part has determinant {np.linalg.det(R):.3g}"
-        raise InvalidPointCloudError("a rigid (4, 4) initial pose", given, "no scale and no reflection; lengths in mm")
+    if why := se3.why_not_rigid(T, FARTHEST_FROM_RIGID):
+        how = "no scale, no reflection, translation in the last column; lengths in mm"
+        raise InvalidPointCloudError("a rigid (4, 4) initial pose", f"a matrix whose {why}", how)
     return se3.nearest_rigid(T)

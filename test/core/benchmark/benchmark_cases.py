@@ -12,6 +12,7 @@ from gapr_core.runtime.settings import from_dict
 FAKES = '''
 import os
 import time
+from dataclasses import replace
 import numpy as np
 from gapr_core.errors import MethodUnavailableError
 from gapr_core.geometry import se3
@@ -67,7 +68,28 @@ class Missing(Fake):
     def prepare(self, target, units="mm"):
         raise MethodUnavailableError("the library nope", "no module", "run: pip install nope")
 
+class Odd(Fake):
+    """Answers what cannot be judged or written down."""
+
+    def __init__(self, name, **changes):
+        self.name, self.changes = name, changes
+
+    def answer(self, source, target, T):
+        said = super().answer(source, target, T)
+        return replace(said, **self.changes)
+
+class Nothing(Fake):
+    def answer(self, source, target, T):
+        return None
+
 good = lambda: Fake("good")
+unsure = lambda: Odd("unsure", confidence=float("nan"))
+boundless = lambda: Odd("boundless", confidence=np.float32("inf"))
+wordy = lambda: Odd("wordy", confidence="high")
+astray = lambda: Odd("astray", T_target_source=np.full((4, 4), np.nan))
+reflecting = lambda: Odd("reflecting", T_target_source=np.diag([1.0, 1.0, -1.0, 1.0]))
+vague = lambda: Odd("vague", covariance=np.full((6, 6), np.nan))
+dumb = lambda: Nothing("dumb")
 turned = lambda: Turned("turned")
 shy = lambda: Shy("shy")
 raising = lambda: Raising("raising")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +135,18 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
         return specimens
     known = splits(folder) if (folder / "splits.json").is_file() else _draw_splits({s.person for s in specimens})
     return _of_split(specimens, split, known)
+
+
+def meshes_hash(folder: str | Path, bones: Sequence[str], split: str = "all") -> str:
+    """sha256 over names and contents of the files that `meshes` reads for these bones, and of what splits them."""
+    folder = Path(folder)
+    found = _mesh_files(folder) or [file for bone in sorted(bones) for file in _mesh_files(folder / bone)]
+    if split != "all" and (folder / "splits.json").is_file():
+        found = [*found, folder / "splits.json"]
+    digest = sha256()
+    for file in found:
+        digest.update(f"{file.relative_to(folder).as_posix()} {sha256(file.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()
 
 
 def _mesh_files(folder: Path) -> list[Path]:

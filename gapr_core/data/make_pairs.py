@@ -27,7 +27,11 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that a list of pairs depends on but the meshes themselves."""
+    """Everything that a list of pairs depends on but the bones of `anatomy`; a user's meshes stand in it by their hash.
+
+    Raises:
+        ConfigError: an unknown protocol, nothing to make, or a number out of range.
+    """
 
     protocols: tuple[str, ...]
     bones: tuple[str, ...]
@@ -36,6 +40,8 @@ class Recipe:
     split: str = "all"
     people: int = 20
     origin: str = "parametric"  # or "anatomy", "meshes"
+    units: str = "mm"  # of meshes
+    meshes: str = ""  # hash of the files; empty for other origins
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.protocols if name not in PROTOCOLS]
@@ -43,6 +49,11 @@ class Recipe:
             raise ConfigError(f"protocols of {', '.join(PROTOCOLS)}", ", ".join(unknown) or "none", "choose of these")
         if self.count < 1 or self.people < 1 or self.seed < 0 or not self.bones:
             raise ConfigError("count and subjects of at least 1, a seed from 0, a bone", str(self), "correct it")
+
+    def listed(self) -> dict[str, Any]:
+        """As a manifest has it, read back from its file; without the meshes where there are none."""
+        values = json.loads(json.dumps(asdict(self)))
+        return {key: value for key, value in values.items() if self.meshes or key not in ("units", "meshes")}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -68,9 +79,11 @@ def run(args: Namespace) -> int:
     """Make the pairs that the arguments name; says what it made, or takes up what an earlier run left."""
     origin = "anatomy" if args.anatomy else "meshes" if args.meshes else "parametric"
     named = args.bones.split(",") if args.bones else pool.bones_in(args.meshes) if args.meshes else anatomy.BONES
+    made_of = anatomy.meshes_hash(args.meshes, named, args.split) if args.meshes else ""
     recipe = Recipe(
-        tuple(args.protocol.split(",")), tuple(named), args.count, args.seed, args.split, args.people, origin
-    )
+        tuple(args.protocol.split(",")), tuple(named), args.count, args.seed, args.split, args.people, origin,
+        args.units if args.meshes else "mm", made_of,
+    )  # fmt: skip
     begin(recipe, args.out)
     bones = {bone: _bones(args, bone) for bone in tqdm(recipe.bones, desc="bones", disable=None)}
     manifest = write_pairs(recipe, bones, args.out, args.dask)
@@ -114,12 +127,12 @@ def begin(recipe: Recipe, out: Path) -> None:
     """Make the folder with a manifest without pairs, or check that it was begun with this recipe.
 
     Raises:
-        ConfigError: it holds pairs of another recipe, a damaged manifest, or cannot be written.
+        ConfigError: it holds pairs of another recipe or of changed meshes, a damaged manifest, or cannot be written.
     """
     if not (out / MANIFEST).exists():
         _write_manifest(out, recipe, [], "")
-    elif read_manifest(out)["recipe"] != json.loads(json.dumps(asdict(recipe))):
-        wanted = "an empty folder or one with pairs of this recipe"
+    elif read_manifest(out)["recipe"] != recipe.listed():
+        wanted = "an empty folder or one with pairs of this recipe, of the same meshes and unit"
         raise ConfigError(wanted, f"other pairs in {out}", "choose another --out")
 
 
@@ -175,6 +188,6 @@ def _pair_entry(job: _Job, shared: tuple[dict[str, list[Specimen]], Path]) -> di
 
 
 def _write_manifest(out: Path, recipe: Recipe, pairs: list[dict[str, Any]], digest: str) -> dict[str, Any]:
-    manifest = {"format": FORMAT, "recipe": asdict(recipe), "hash": digest, "pairs": pairs}
+    manifest = {"format": FORMAT, "recipe": recipe.listed(), "hash": digest, "pairs": pairs}
     files.write_json(out / MANIFEST, manifest)
     return manifest

@@ -9,7 +9,6 @@ folder a network and seed, as `gapr train` writes it, with exam.json.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -17,7 +16,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -152,7 +151,7 @@ def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
     if "wrong" in recipe.protocols:
         raise ConfigError("protocols with a true pose", "wrong", "leave it out")
     complete = (folder / MANIFEST).exists() and read_manifest(folder)
-    if not (complete and complete["hash"] and complete["recipe"] == json.loads(json.dumps(asdict(recipe)))):
+    if not (complete and complete["hash"] and complete["recipe"] == recipe.listed()):
         people = {bone: specimens(bone, recipe.split, recipe.people, anatomy) for bone in recipe.bones}
         write_pairs(recipe, people, folder)
 

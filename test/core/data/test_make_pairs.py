@@ -9,6 +9,7 @@ import open3d as o3d
 import pytest
 from shapes import ball_specimen, knob_specimen
 
+from gapr_core.cli import main
 from gapr_core.data import anatomy, make_pairs, pool
 from gapr_core.data.make_pairs import Recipe, read_manifest, write_pairs
 from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
@@ -139,6 +140,31 @@ def test_folders_in_the_folder_are_bones_and_no_person_is_in_two_splits(tmp_path
     people = {s: {x.person for x in anatomy.meshes(tmp_path, split=s)} for s in anatomy.SPLITS}
     assert sum(map(len, people.values())) == 6 == len(set.union(*people.values()))
     assert min(map(len, people.values())) >= 1
+
+
+def test_pairs_of_meshes_that_have_changed_are_not_taken_up(tmp_path, capsys):
+    write_meshes(tmp_path / "bones" / "humerus", 3)
+    write_meshes(tmp_path / "bones" / "ulna", 1)
+    words = ["make-pairs", "--split", "all", "--protocol", "L1", "--count", "2", "--bones", "humerus"]
+    words += ["--meshes", str(tmp_path / "bones"), "--out", str(tmp_path / "pairs")]
+    assert main(words) == 0 and main(words) == 0
+    (tmp_path / "bones" / "ulna" / "person0.stl").unlink()  # of another bone
+    assert main(words) == 0
+    before = (tmp_path / "pairs" / "manifest.json").read_bytes()
+    capsys.readouterr()
+    assert main([*words, "--units", "m"]) == 1 and "same meshes and unit" in capsys.readouterr().err
+    mesh = tmp_path / "bones" / "humerus" / "person1.stl"
+    content = mesh.read_bytes()
+    mesh.write_bytes((tmp_path / "bones" / "humerus" / "person0.stl").read_bytes())
+    assert main(words) == 1 and "same meshes and unit" in capsys.readouterr().err
+    assert (tmp_path / "pairs" / "manifest.json").read_bytes() == before
+    mesh.write_bytes(content)
+    assert main(words) == 0
+
+
+def test_a_recipe_without_meshes_is_listed_as_before():
+    assert "meshes" not in RECIPE.listed() and "units" not in RECIPE.listed()
+    assert RECIPE.listed()["protocols"] == ["L3", "wrong"]
 
 
 def test_a_folder_without_meshes_says_what_it_wants(tmp_path):

@@ -98,14 +98,27 @@ class Surface:
 
 
 def as_points(array: ArrayLike) -> Array:
-    """An (N, 3) float64 array from anything of that shape.
+    """An (N, 3) float64 array from anything of that shape; masked entries become NaN.
 
     Raises:
-        InvalidPointCloudError: for another shape or for entries that are not real numbers.
+        InvalidPointCloudError: for another shape, rows of several lengths, or entries that are not real numbers.
     """
-    points = np.asarray(array)
+    points = _as_array(array)
     if points.dtype.kind not in "fiu":
         raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InvalidPointCloudError("an array of shape (N, 3)", f"shape {points.shape}", "pass x y z in columns")
     return points.astype(np.float64)
+
+
+def _as_array(array: Any) -> NDArray[Any]:
+    """A NumPy array; a tensor is taken without its gradient, from whatever device it is on."""
+    if hasattr(array, "detach"):
+        array = array.detach().cpu()
+    if np.ma.isMaskedArray(array) and array.dtype.kind in "fiu":
+        return np.asarray(np.ma.filled(array.astype(np.float64), np.nan))
+    try:
+        return np.asarray(array)
+    except (ValueError, TypeError, RuntimeError) as error:
+        given = f"{type(array).__name__} ({' '.join(str(error).split())})"
+        raise InvalidPointCloudError("an array of shape (N, 3)", given, "pass x y z in every row") from error

@@ -21,7 +21,7 @@ from gapr_core.data import anatomy
 from gapr_core.data.make_pairs import Recipe, write_pairs
 from gapr_core.data.pool import specimens
 from gapr_core.errors import ConfigError
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import above_zero, at_least_one
 from gapr_core.runtime.console import say
 
 PROTOCOLS = {
@@ -46,7 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="of the trainings in tables 4 and 5 (config/ablate_paper.yaml)")
     parser.add_argument("--pairs", type=at_least_one, help="budget of every network in tables 4 and 5")
     parser.add_argument("--seeds", type=at_least_one, default=1, help="trainings of every network in them (1)")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop a training after so long")
+    parser.add_argument("--minutes", type=above_zero, default=math.inf, help="stop a training after so long")
 
 
 def run(args: Namespace) -> int:

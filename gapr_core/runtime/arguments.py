@@ -5,6 +5,17 @@ from __future__ import annotations
 from argparse import ArgumentTypeError
 
 
+def above_zero(text: str) -> float:
+    """A number above 0; it may be infinite."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not number > 0.0:  # NaN neither
+        raise ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return number
+
+
 def at_least_one(text: str) -> int:
     """A count of 1 or more."""
     if not text.strip().isdecimal() or int(text) < 1:

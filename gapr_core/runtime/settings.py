@@ -44,10 +44,18 @@ def setting(
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of settings: values out of range cannot be made."""
+    """Base of settings: values of another type or out of range cannot be made.
+
+    Whole numbers become floats where floats are wanted, lists tuples, and NumPy's numbers plain ones.
+
+    Raises:
+        ConfigError: a value of another type, out of range, or none of the choices.
+    """
 
     def __post_init__(self) -> None:
+        hints = _hints(type(self))  # type: ignore[arg-type]
         for each in fields(self):
+            object.__setattr__(self, each.name, _of_type(hints[each.name], getattr(self, each.name), each.name))
             problem = why_not(each, getattr(self, each.name))
             if problem:
                 raise ConfigError(f"{each.name} {problem}", repr(getattr(self, each.name)), "correct the setting")
@@ -65,6 +73,16 @@ class Settings:
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries, as `from_dict` takes them."""
         return asdict(self)
+
+
+def _of_type(hint: Any, value: Any, name: str) -> Any:
+    """A value that was given in Python, as its annotation wants it; nested settings are made already."""
+    if not (isinstance(hint, type) and is_dataclass(hint)):
+        return _converted(hint, value, name)
+    if not isinstance(value, hint):
+        how = f"write {name}={hint.__name__}(...), or take from_dict for mappings"
+        raise ConfigError(f"{name} of type {hint.__name__}", repr(value), how)
+    return value
 
 
 def why_not(of: Field, value: Any) -> str:
@@ -132,18 +150,42 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """The mapping in a YAML file; an empty file is an empty mapping.
 
     Raises:
-        ConfigError: it cannot be read, is no YAML, or holds something else than a mapping.
+        ConfigError: it cannot be read, is no YAML, names a key twice, or holds something else than a mapping.
     """
     import yaml
 
     try:
-        values = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
+        text = Path(path).read_text(encoding="utf-8")
+        twice = _key_named_twice(yaml.compose(text, Loader=yaml.SafeLoader))
+        values = yaml.safe_load(text) or {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         why = " ".join(str(getattr(error, "strerror", None) or error).split())
         raise ConfigError("a YAML file", f"{path} ({why})", "check the path and the file") from error
+    if twice:
+        raise ConfigError(f"every key once in {path}", twice, "keep one of them")
     if not isinstance(values, dict):
         raise ConfigError(f"a mapping in {path}", type(values).__name__, "write `name: value` lines")
     return values
+
+
+def _key_named_twice(root: Any) -> str:
+    """The first key of a tree of YAML nodes that stands twice in one mapping, with its line; empty without one."""
+    waiting, seen = [root], set[int]()
+    while waiting:
+        node = waiting.pop()
+        if node is None or isinstance(node.value, str) or id(node) in seen:  # an alias is a node that was seen
+            continue
+        seen.add(id(node))
+        if node.id == "sequence":
+            waiting += node.value
+            continue
+        known = set[tuple[str, str]]()
+        for key, value in node.value:
+            if (named := (key.tag, str(key.value))) in known:
+                return f"{key.value} again in line {key.start_mark.line + 1}"
+            known.add(named)
+            waiting.append(value)
+    return ""
 
 
 class Row(NamedTuple):
@@ -198,6 +240,7 @@ def _is_within(number: Any, low: float | None, high: float | None) -> bool:
 
 def _converted(hint: Any, value: Any, path: str) -> Any:
     """The value as its annotation wants it."""
+    value = value.item() if getattr(value, "shape", None) == () else value  # of NumPy
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):  # only X | None is used
         return None if value is None else _converted(arguments[0], value, path)

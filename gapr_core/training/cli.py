@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gapr_core.errors import ConfigError
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import above_zero, at_least_one
 from gapr_core.runtime.console import say
 from gapr_core.runtime.settings import load
 
@@ -25,7 +25,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--out", type=Path, help="folder of the run, an interrupted one goes on; with --plot a PNG")
     parser.add_argument("--pairs", type=at_least_one, default=None, help="length of the schedule, in pairs")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
+    parser.add_argument("--minutes", type=above_zero, default=math.inf, help="stop after so long; call again to go on")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting over those of --config; repeatable"
     )

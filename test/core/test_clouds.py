@@ -186,6 +186,28 @@ def test_rows_that_are_not_finite_are_dropped_but_not_all_of_them():
         clouds.load(np.full((5, 3), np.nan))
 
 
+@pytest.mark.parametrize("ragged", [[[1.0, 2.0, 3.0], [1.0, 2.0]], [[1.0, 2.0, 3.0], 4.0], [np.zeros((2, 3)), [1.0]]])
+def test_rows_of_several_lengths_are_refused(ragged):
+    with pytest.raises(InvalidPointCloudError, match="shape"):
+        clouds.load(ragged)
+
+
+def test_masked_rows_are_missing():
+    points = np.random.default_rng(0).normal(size=(40, 3)) * 30.0
+    mask = np.zeros((40, 3), bool)
+    mask[::2], mask[1, 0] = True, True
+    kept = clouds.load(np.ma.masked_array(points, mask)).points
+    np.testing.assert_array_equal(kept, points[3::2])
+    whole = np.ma.masked_array((points * 10).astype(int), mask)
+    np.testing.assert_array_equal(clouds.load(whole).points, (points * 10).astype(int)[3::2])
+
+
+def test_a_tensor_is_taken_without_its_gradient():
+    torch = pytest.importorskip("torch", reason="tensors: pip install torch")
+    points = np.random.default_rng(0).normal(size=(40, 3)) * 30.0
+    np.testing.assert_array_equal(clouds.load(torch.tensor(points, requires_grad=True)).points, points)
+
+
 def test_points_are_drawn_uniformly_in_area_on_the_faces():
     surface = Surface(VERTICES, FACES)
     points, normals = surface.sample(20_000, np.random.default_rng(0))

@@ -25,6 +25,7 @@ def folder(tmp_path, monkeypatch):
     np.savez("flat/a.npz", source=CLOUD[:, 0], target=CLOUD)
     np.savez("text/a.npz", source=np.array(["a", "b"]), target=CLOUD, transform="no matrix")
     (tmp_path / "broken.yaml").write_text("a: [")
+    (tmp_path / "twice.yaml").write_text("seed: 1\nseed: 2")
     (tmp_path / "list.yaml").write_text("- 1")
     (tmp_path / "range.yaml").write_text("min_confidence: 7")
     (tmp_path / "answers.json").write_text('{"a": 3}')
@@ -59,6 +60,7 @@ REGISTER --method :
 REGISTER --config none.yaml
 REGISTER --config broken.yaml
 REGISTER --config list.yaml
+REGISTER --config twice.yaml
 REGISTER --config range.yaml
 REGISTER --config .
 REGISTER --set min_confidence=7
@@ -105,6 +107,11 @@ train
 train --out o --config none.yaml
 train --out o --config broken.yaml
 train --out o --config range.yaml
+train --out o --minutes -1
+train --out o --minutes nan
+train --out o --minutes 0
+train --out o --minutes soon
+ablate --out o --pairs 4 --minutes nan
 train --plot none
 train --plot pairs pairs
 ablate --out o --pairs x

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, is_dataclass
 
+import numpy as np
 import pytest
 
 from gapr_core.config import (
@@ -161,3 +162,46 @@ def test_the_table_of_settings_has_dotted_names_ranges_and_help():
     assert rows["min_confidence"].range == "0 to 1" and rows["min_confidence"].text
     assert rows["verification.same_pose_mm"].range == "at least 0.1 mm"
     assert rows["verification.final_limits_mm"].default == VerificationConfig().final_limits_mm
+
+
+WRONG_IN_PYTHON = [
+    {"sensor": "ultrasound"}, {"refinement": {"iterations": 5}}, {"num_threads": 1.5}, {"seed": 1.5}, {"guide": "no"},
+    {"seed": "4"}, {"num_threads": True}, {"min_confidence": None}, {"seed": np.float64(1.5)}, {"guide": 1},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("values", WRONG_IN_PYTHON)
+def test_a_value_of_another_type_is_refused_in_python_as_well(values):
+    with pytest.raises(ConfigError, match=f"{next(iter(values))} of type"):
+        RegistrarConfig(**values)
+
+
+def test_numbers_of_numpy_are_numbers():
+    config = RegistrarConfig(
+        seed=np.int64(3),
+        num_threads=np.uint8(1),
+        guide=np.True_,
+        min_confidence=np.float32(0.5),
+        max_tre_mm=np.array(2),
+    )
+    assert config == RegistrarConfig(seed=3, num_threads=1, guide=True, min_confidence=0.5, max_tre_mm=2.0)
+    kinds = [type(getattr(config, name)) for name in ("seed", "num_threads", "guide", "min_confidence", "max_tre_mm")]
+    assert kinds == [int, int, bool, float, float]
+    assert from_dict(RegistrarConfig, {"seed": np.int32(3)}).seed == 3
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("seed: 1\nguide: true\nseed: 2\n", "seed again in line 3"),
+    ("search:\n  keep: 7\n  keep: 8\n", "keep again in line 3"),
+    ("search: {spins: 3}\nseed: 1\nsearch: {keep: 7}\n", "search again in line 3"),
+    ("a:\n- b: 1\n  b: 2\n", "b again in line 3"),
+])  # fmt: skip
+def test_a_key_that_stands_twice_in_a_file_is_refused(tmp_path, text, said):
+    (tmp_path / "my.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=f"every key once in .*my.yaml; got {said}"):
+        settings.load(RegistrarConfig, tmp_path / "my.yaml")
+
+
+def test_a_key_may_stand_in_several_mappings_and_an_alias_be_used_again(tmp_path):
+    (tmp_path / "my.yaml").write_text("a: &x {one: 1}\nb: *x\nc: {one: 2}\nd: [&y [*x], *y]\n")
+    assert settings.read_yaml(tmp_path / "my.yaml")["b"] == {"one": 1}

@@ -40,7 +40,7 @@ from gapr_core.registration.proposals.consensus import sharpened
 from gapr_core.registration.proposals.network import METHODS, consensus, correspondences_mm
 from gapr_core.registration.refinement import refine_fully
 from gapr_core.runtime import files
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import above_zero, at_least_one
 from gapr_core.runtime.console import say
 from gapr_core.runtime.parallel import end_with_parent
 from gapr_core.training.ablation.table import FIGURES, folder_of, write
@@ -78,7 +78,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--count", type=at_least_one, default=10, help="test pairs per protocol and bone (10)")
     parser.add_argument("--split", default="test", choices=[s for s in SPLITS if s != "train"], help="whose bones")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="networks at a time, which share the cores (1)")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long; call again to go on")
+    parser.add_argument("--minutes", type=above_zero, default=math.inf, help="stop after so long; call again to go on")
 
 
 def run(args: Namespace) -> int:

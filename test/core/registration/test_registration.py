@@ -72,7 +72,10 @@ def test_a_good_start_does_no_harm_and_a_bad_one_neither(registrar, pairs):
         assert rmse(registrar.register(pair.source, target, initial=start).T_target_source, pair) < 0.5
 
 
-@pytest.mark.parametrize("start", [np.full((4, 4), np.nan), np.eye(3), "start.tfm"])
+@pytest.mark.parametrize("start", [
+    np.full((4, 4), np.nan), np.eye(3), "start.tfm", np.eye(4) + np.eye(4, k=-3), np.diag([1.0, 1.0, 1.0, 5.0]),
+    np.diag([2.0, 2.0, 2.0, 1.0]), np.diag([1.0, 1.0, -1.0, 1.0]),
+])  # fmt: skip
 def test_a_start_that_is_no_pose_is_refused_with_a_sentence(registrar, pairs, target, start):
     with pytest.raises(InvalidPointCloudError, match=r"\(4, 4\)"):
         registrar.register(pairs["L1"].source, target, initial=start)

@@ -51,10 +51,17 @@ def run(args: Namespace) -> int:
     for path in waiting[:1]:
         _answer(path, method)  # compiled code loads with the first call, whose time is not the method's
     for path in tqdm(waiting, unit="pair", disable=None):
-        answers[path.stem] = _answer(path, method) | made_of[path]
-        files.write_json(args.out, answers)
+        answers |= _written(args.out, {path.stem: _answer(path, method) | made_of[path]})
     _say_counts(args.out, [answers[path.stem] for path in paths])
     return 0
+
+
+def _written(path: Path, new: dict[str, Answer]) -> dict[str, Answer]:
+    """All answers in the file, the new ones among them: another run may have written some meanwhile."""
+    with files.one_at_a_time(path):
+        answers = _answers_so_far(path) | new
+        files.write_json(path, answers)
+    return answers
 
 
 def _say_counts(path: Path, answers: list[Answer]) -> None:

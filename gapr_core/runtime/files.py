@@ -36,6 +36,41 @@ def replacing(path: str | Path) -> Iterator[Path]:
             scratch.unlink(missing_ok=True)
 
 
+@contextmanager
+def one_at_a_time(path: str | Path) -> Iterator[None]:
+    """Wait until no other process is in such a block for a file of the same folder, which is made if it is missing.
+
+    Where the system has no such lock, as on Windows, nothing is waited for.
+
+    Raises:
+        ConfigError: the folder cannot be made.
+    """
+    folder = Path(path).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from error
+    lock = _locked(folder)
+    try:
+        yield
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def _locked(folder: Path) -> int | None:
+    """An open file that holds the lock of a folder until it is closed; None where there is none."""
+    try:
+        import fcntl
+
+        lock = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
+        return None
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(lock, fcntl.LOCK_EX)
+    return lock
+
+
 def check_writable(path: str | Path) -> None:
     """Raise what writing a file would raise, before there is anything to write; nothing stays behind.
 

@@ -79,6 +79,26 @@ def test_evaluate_goes_on_where_it_stopped(tmp_path, pair):
     assert set(both) == {"a", "b"} and both["a"] == first["a"]
 
 
+def test_two_runs_of_evaluate_lose_no_answers_of_each_other(tmp_path, pair):
+    out, running = tmp_path / "new" / "poses.json", []
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        for number in range(6):
+            np.savez(tmp_path / name / f"{name}{number}.npz", source=pair.source[:5], target=pair.target)
+        words = ["evaluate", "--pairs", str(tmp_path / name), "--out", str(out), "--method", "icp"]
+        running.append(subprocess.Popen([sys.executable, "-m", "gapr_core.cli", *words], cwd=tmp_path))
+    assert [run.wait() for run in running] == [0, 0]
+    assert sorted(json.loads(out.read_text())) == [f"{name}{number}" for name in "ab" for number in range(6)]
+
+
+def test_an_answer_is_added_to_those_of_another_run(tmp_path):
+    from gapr_core.commands import evaluate
+
+    (tmp_path / "poses.json").write_text('{"a": {"status": "OK"}}')
+    answers = evaluate._written(tmp_path / "poses.json", {"b": {"status": "ERROR"}})
+    assert set(answers) == {"a", "b"} and json.loads((tmp_path / "poses.json").read_text()) == answers
+
+
 def test_wrong_usage_is_bad_input_not_a_refusal(capsys):
     with pytest.raises(SystemExit) as exit:
         cli.main(["register", "--source", "only.ply"])

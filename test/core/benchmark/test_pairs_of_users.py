@@ -1,7 +1,5 @@
 """Pairs and methods that users bring: what cannot be is refused before the first registration, or is a failure."""
 
-import time
-
 import numpy as np
 import pytest
 from benchmark_cases import make_pair
@@ -79,15 +77,6 @@ def test_a_run_over_a_wrong_pair_ends_in_one_line(pairs, fakes, tmp_path, capsys
     assert cli.main(["benchmark", *words]) == 1
     said = capsys.readouterr().err
     assert "z.npz" in said and "Traceback" not in said
-
-
-def test_checking_many_pairs_takes_no_time_of_note(tmp_path):
-    pair = make_pair(0, count=8192)
-    for number in range(200):
-        save_pair(tmp_path / f"{number}.npz", pair)
-    begun = time.perf_counter()
-    runner.check_pairs(sorted(tmp_path.glob("*.npz")))
-    assert time.perf_counter() - begun < 4.0  # a few ms each
 
 
 ODD = {"unsure": "confidence is nan", "boundless": "confidence is inf", "wordy": "high, no finite number",

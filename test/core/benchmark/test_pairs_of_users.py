@@ -7,7 +7,7 @@ from benchmark_cases import make_pair
 from gapr_core import cli
 from gapr_core.benchmark import records, runner
 from gapr_core.commands import benchmark
-from gapr_core.data.pair_files import load_facts, load_pair, save_pair
+from gapr_core.data.pair_files import load_facts, load_pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 
 PAIR = make_pair(0)

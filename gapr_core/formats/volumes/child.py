@@ -71,7 +71,7 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
     voxels = SimpleITK.GetArrayFromImage(image)
     layers = list(np.moveaxis(voxels, 3, 0)) if voxels.ndim == 4 else [voxels]
     metadata = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}
-    named = names.of_seg_nrrd(metadata)
+    named = names.of_seg_nrrd(metadata, len(layers))
     if is_nifti:
         named = [Segment(name, value) for value, name in nifti.label_names(path).items()]
     direction = np.reshape(image.GetDirection(), (3, 3))

@@ -41,15 +41,17 @@ class Segment:
     layer: int = 0
 
 
-def of_seg_nrrd(metadata: Mapping[str, str]) -> list[Segment]:
-    """Segments of 3D Slicer's .seg.nrrd: keys Segment0_Name, Segment0_LabelValue, Segment0_Layer."""
+def of_seg_nrrd(metadata: Mapping[str, str], layers: int = 1) -> list[Segment]:
+    """Segments of 3D Slicer's .seg.nrrd: keys Segment0_Name, Segment0_LabelValue, Segment0_Layer.
+
+    Older files have neither value nor layer: segment N of several layers is number 1 of layer N, as 3D Slicer reads it.
+    """
     segments = []
     for key, name in metadata.items():
-        if found := re.fullmatch(r"(Segment\d+)_Name", key):
-            number = [
-                int(metadata.get(f"{found[1]}_{what}", default)) for what, default in (("LabelValue", 1), ("Layer", 0))
-            ]
-            segments.append(Segment(name.strip(), *number))
+        if found := re.fullmatch(r"Segment(\d+)_Name", key):
+            segment = f"Segment{found[1]}"
+            layer = int(metadata.get(f"{segment}_Layer", found[1] if layers > 1 else 0))
+            segments.append(Segment(name.strip(), int(metadata.get(f"{segment}_LabelValue", 1)), layer))
     return segments
 
 
@@ -111,6 +113,7 @@ def _by_number(value: int, named: list[Segment], present: Present) -> Segment:
 def _by_name(label: str, named: list[Segment], present: Present) -> Segment:
     found = [segment for segment in named if _key(segment.name) == _key(label)]
     if len(found) == 1:
+        _check_alone(found[0], named)
         return found[0]
     if found:
         given = f"{len(found)} of the name {label}"
@@ -118,6 +121,14 @@ def _by_name(label: str, named: list[Segment], present: Present) -> Segment:
     if named:
         raise InvalidPointCloudError(f"a segment {label}", _listed(_nearest(label, named)), "choose one of these")
     raise _nameless(label, present)
+
+
+def _check_alone(segment: Segment, named: list[Segment]) -> None:
+    """Raise where the header gives the same voxels several names: which of them they are is a guess."""
+    names = [other.name for other in named if (other.value, other.layer) == (segment.value, segment.layer)]
+    if len(names) > 1:
+        given = f"{_listed(names)}, all of number {segment.value}"
+        raise InvalidPointCloudError("a number for each segment", given, "save it again from 3D Slicer")
 
 
 def _nearest(label: str, named: list[Segment]) -> list[str]:

@@ -188,6 +188,33 @@ def test_segments_of_slicer_have_names_values_and_layers(tmp_path):
         clouds.load(tmp_path / "a.seg.nrrd", options=options("1"))
 
 
+def older_slicer(tmp_path, layers):
+    """Femur and tibia as 3D Slicer 4.10 writes them: no number and no layer of a segment in the header."""
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    balls = [voxels_of(affine, size, CENTRE + [0, 0, z], [12, 12, 12]).astype(np.uint8) for z in (20, -20)]
+    image = sitk.Compose([image_of(ball, affine) for ball in balls]) if layers == 2 else image_of(balls[0], affine)
+    for i, name in enumerate(("Femur", "Tibia")):
+        image.SetMetaData(f"Segment{i}_ID", f"Segment_{i + 1}")
+        image.SetMetaData(f"Segment{i}_Name", name)
+    sitk.WriteImage(image, str(tmp_path / "old.seg.nrrd"))
+    return tmp_path / "old.seg.nrrd"
+
+
+def test_segments_of_older_slicer_files_lie_in_the_layer_of_their_number(tmp_path):
+    path = older_slicer(tmp_path, layers=2)
+    assert mean_z(path, "Femur") == pytest.approx(20.0, abs=0.3)
+    assert mean_z(path, "Tibia") == pytest.approx(-20.0, abs=0.3)
+    with pytest.raises(InvalidPointCloudError, match="2 of them .Femur, Tibia."):
+        clouds.load(path)
+
+
+def test_names_that_share_their_voxels_are_no_choice(tmp_path):
+    path = older_slicer(tmp_path, layers=1)
+    with pytest.raises(InvalidPointCloudError, match="a number for each segment; got .*Femur, Tibia, all of number 1"):
+        clouds.load(path, options=options("Tibia"))
+    assert mean_z(path, "1") == pytest.approx(20.0, abs=0.3)
+
+
 def test_one_name_twice_is_no_choice():
     with pytest.raises(InvalidPointCloudError, match="2 of the name bone"):
         names.choose(["bone"], [Segment("bone", 1), Segment("Bone", 2)], {0: {1, 2}})

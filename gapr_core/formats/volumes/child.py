@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gapr_core.errors import GaprError, InvalidPointCloudError
 from gapr_core.formats.limits import MB, FileLimits
-from gapr_core.formats.volumes import names, nifti
+from gapr_core.formats.volumes import names, nifti, placement
 from gapr_core.formats.volumes.names import Segment
 
 Array = NDArray[np.float64]
@@ -68,6 +68,7 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
     if image.GetDimension() != 3:
         raise InvalidPointCloudError("a volume", f"{image.GetDimension()} dimensions", "export one time step")
     _check_axes(path, {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()})
+    placement.check(path)
     voxels = SimpleITK.GetArrayFromImage(image)
     layers = list(np.moveaxis(voxels, 3, 0)) if voxels.ndim == 4 else [voxels]
     metadata = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}

@@ -330,6 +330,81 @@ def test_a_header_that_does_not_say_the_patients_axes_is_refused(tmp_path):
             clouds.load(tmp_path / "a.nrrd")
 
 
+def nifti_with(path, turn=(0.0, 0.0, 0.0), **changes):
+    """A ball as nibabel writes it with the same qform and sform, and then its header changed."""
+    import nibabel
+
+    affine, size = affine_of((3.0, 3.0, 3.0), turn)
+    ras = np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
+    image = nibabel.Nifti1Image(voxels_of(affine, size).transpose(2, 1, 0).astype(np.uint8), ras)
+    image.set_qform(ras, 1)
+    image.set_sform(ras, 1)
+    data = bytearray(image.to_bytes())
+    header = nibabel.Nifti1Header(bytes(data[:348]))
+    for name, value in changes.items():
+        header[name] = value
+    data[:348] = header.binaryblock
+    path.write_bytes(bytes(data))
+    return path
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 0.0, 1e-4), (0.4, -0.2, 0.7), (1e-5, np.pi, 0.0)])
+def test_a_nifti_with_the_same_place_twice_is_read(tmp_path, turn):
+    """Near half a turn the quaternion of the qform is rounded to .03 deg."""
+    surface = clouds.load(nifti_with(tmp_path / "a.nii", turn))
+    assert np.abs(error_mm(surface.points)).max() < 2.0
+    shifted = clouds.load(nifti_with(tmp_path / "b.nii", turn, sform_code=0))
+    np.testing.assert_allclose(surface.points, shifted.points, atol=0.05)
+
+
+@pytest.mark.parametrize("changes", [
+    {"qoffset_x": 0.0}, {"quatern_b": 1.0, "quatern_c": 0.0, "quatern_d": 0.0}, {"srow_z": [0.0, 0.1, 3.0, -36.0]},
+])  # fmt: skip
+@pytest.mark.parametrize("codes", [(1, 1), (1, 2), (2, 4)])
+def test_a_nifti_with_two_places_is_refused(tmp_path, changes, codes):
+    path = nifti_with(tmp_path / "a.nii", **changes, qform_code=codes[0], sform_code=codes[1])
+    with pytest.raises(InvalidPointCloudError, match="qform and sform that agree; got a.nii: .* mm apart; .*set_qform"):
+        clouds.load(path)
+
+
+def test_a_nifti_with_two_sizes_of_a_voxel_is_refused(tmp_path):
+    wrong = nifti_with(tmp_path / "a.nii", qform_code=0, pixdim=[1.0, 3.0, 3.0, 3.1, 1.0, 1.0, 1.0, 1.0])
+    with pytest.raises(InvalidPointCloudError, match="one size of the voxels; got a.nii: 3 3 3 in the sform and 3 3 3"):
+        clouds.load(wrong)
+
+
+WHERE = "space directions: (3,0,0) (0,3,0) (0,0,3)\n", "space origin: (-30,-80,-40)\n"
+PLACES = {
+    "a.nrrd": ("".join(WHERE), None), "b.nrrd": (WHERE[0], "no space origin"),
+    "c.nrrd": (WHERE[1], "no space directions"),
+    "d.nrrd": (WHERE[0] + "space origin: (nan,nan,nan)\n", "no space origin"),
+    "e.nrrd": ("".join(WHERE) + 'space units: "cm" "cm" "cm"\n', "space units of mm; got e.nrrd: cm"),
+    "f.nrrd": ("".join(WHERE) + 'space units: "mm" "millimeters" "mm"\n', None),
+    "a.mha": ("TransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 1 2 3\nElementSpacing = 3 3 3\n", None),
+    "b.mha": ("Rotation = 1 0 0 0 1 0 0 0 1\nPosition = 1 2 3\nElementSize = 3 3 3\n", None),
+    "c.mha": ("ElementSpacing = 3 3 3\n", "no TransformMatrix and no Offset"),
+    "d.mha": ("TransformMatrix = 1 0 0 0 1 0 0 0 1\nElementSpacing = 3 3 3\n", "no Offset"),
+    "e.mha": ("TransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 1 2 3\n", "no ElementSpacing"),
+}  # fmt: skip
+HEADS = {
+    "nrrd": "NRRD0004\ntype: uint8\ndimension: 3\nsizes: {0}\nencoding: raw\nspace: LPS\n{1}\n",
+    "mha": "NDims = 3\nDimSize = {0}\nBinaryData = True\n{1}ElementType = MET_UCHAR\nElementDataFile = LOCAL\n",
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_header_says_its_origin_axes_and_spacing_in_mm(tmp_path, name):
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    where, refusal = PLACES[name]
+    head = HEADS[name.split(".")[1]].format(" ".join(map(str, size)), where)
+    (tmp_path / name).write_bytes(head.encode() + voxels_of(affine, size).astype(np.uint8).tobytes())
+    if refusal is None:
+        assert clouds.load(tmp_path / name).extent_mm == pytest.approx(80.0, abs=5.0)
+        return
+    with pytest.raises(InvalidPointCloudError, match=refusal):
+        clouds.load(tmp_path / name)
+
+
 @pytest.mark.parametrize("space", ["left-posterior-superior", "right-anterior-superior", "LAS"])
 def test_a_nrrd_comes_out_in_lps_whatever_its_space(tmp_path, space):
     affine, size = affine_of((3.0, 3.0, 3.0), turn=(0.2, 0.4, 0.1))

@@ -288,6 +288,14 @@ TABLES = {
     "d.csv": '"X","Y","Z"\n10,20,30\n-40,5,60\n7,-8,90\n',
     "f.csv": "id,x_mm,y_mm,z_mm\n0,10,20,30\n1,-40,5,60\n2,7,-8,90\n",
     "e.xyz": "a cloud\n10 20 30\n-40 5 60\n7 -8 90\n",
+    "g.txt": "# from a probe\n# id x y z\n0 10 20 30\n1 -40 5 60\n2 7 -8 90\n",
+    "h.txt": "//Z Y X R G B\n30 20 10 1 2 3\n60 5 -40 1 2 3\n90 -8 7 1 2 3\n",
+    "i.txt": "# x y z of the femur\n10 20 30\n-40 5 60\n7 -8 90\n",
+    "j.csv": "# made by hand\ntime,x,y,z,\n0,10,20,30\n1,-40,5,60\n2,7,-8,90\n",
+    "k.csv": "x_ref,y_ref,z_ref,x,y,z\n1,2,3,10,20,30\n1,2,3,-40,5,60\n1,2,3,7,-8,90\n",
+    "l.txt": "x (mm) y (mm) z (mm)\n10 20 30\n-40 5 60\n7 -8 90\n",
+    "m.txt": "x y z colour\n10 20 30 1 2\n-40 5 60 1 2\n7 -8 90 1 2\n",
+    "n.csv": '"Tool, time",x,y,z\n0,10,20,30\n1,-40,5,60\n2,7,-8,90\n',
 }
 
 
@@ -303,6 +311,42 @@ def test_names_that_say_something_else_are_refused(tmp_path, names):
     (tmp_path / "a.csv").write_text(f"{names}\n{numbers}\n")
     with pytest.raises(InvalidPointCloudError, match="name them x y z, or leave that line out"):
         reading.read(tmp_path / "a.csv")
+
+
+UNCLEAR = {
+    "a.txt": (
+        "Point ID x y z\n0 1 2 3\n1 4 5 6\n",
+        "a name for each of 4 columns; got a.txt: 5 .columns Point ID x y z",
+    ),
+    "b.txt": ("time x y z quality flag\n0 1 2 3 9\n", "a name for each of 5 columns; got b.txt: 6"),
+    "c.txt": ("Doe Jane\n0 1 2 3\n1 4 5 6\n", "a name for each of 4 columns; got c.txt: 2 names; give"),
+    "d.csv": ("x,y,z\n25,828,-183,606,289,912\n", "each of 6 columns; got d.csv: 3 .*; .* decimals with a point"),
+    "e.csv": ("25,828,-183,606,289,912\n", "decimals with a point, .* got e.csv: decimal commas"),
+    "f.csv": ("x;y;z\n25,828;-183,606;289,912\n", "decimals with a point, .* got f.csv: decimal commas"),
+    "g.txt": ("25,828 -183,606 289,912\n5,8 -3,6 2,2\n", "decimals with a point, .* got g.txt: decimal commas"),
+    "h.csv": (
+        "x_ref,y_ref,z_ref,x_tip,y_tip,z_tip\n1,2,3,4,5,6\n",
+        "one column each for x y z; got h.csv: .* x_ref .* z_tip",
+    ),
+    "i.txt": ("x y z x y z\n1 2 3 4 5 6\n", "one column each for x y z; got i.txt: columns x y z x y z; name"),
+}
+
+
+@pytest.mark.parametrize("name", UNCLEAR)
+def test_columns_are_never_guessed(tmp_path, name):
+    content, refusal = UNCLEAR[name]
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InvalidPointCloudError, match=refusal) as caught:
+        reading.read(tmp_path / name)
+    assert "Doe" not in str(caught.value)
+
+
+@pytest.mark.parametrize("head", ["", "x,y,z,nx,ny,nz\n"])
+def test_whole_numbers_with_normals_are_no_decimal_commas(tmp_path, head):
+    (tmp_path / "a.csv").write_text(head + "10,20,30,0,0,1\n40,5,60,0,1,0\n")
+    surface = reading.read(tmp_path / "a.csv")
+    np.testing.assert_allclose(surface.points, [[10, 20, 30], [40, 5, 60]])
+    np.testing.assert_allclose(surface.normals, [[0, 0, 1], [0, 1, 0]])
 
 
 def test_a_contradiction_of_axes_is_said(tmp_path, caplog):

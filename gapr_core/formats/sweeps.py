@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import text, tracker
 from gapr_core.formats.options import ReadOptions
+from gapr_core.geometry import se3
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 HEADER_BYTES = 64 << 20
 FRAME = re.compile(r"^Seq_Frame(\d+)_(\w+?)(Transform|TransformStatus)\s*=\s*(.+)$", re.MULTILINE)
+POSES = "poses.csv"
+NEAR_POSES = re.compile(r"(?<![a-z])poses?(?![a-z])")
+FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity, as of an initial pose
 SLICE_ENDINGS = (".csv", ".txt", ".xyz", ".npy")
 
 
@@ -79,24 +86,56 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
     """The slices of a folder as one cloud, in mm.
 
     Each slice is a file of points (x y z) in one common frame; or, where `poses.csv` gives a 4x4 matrix in 16 numbers
-    for each slice in the order of their names, of points in the slice's own frame.
+    for each slice in the order of their names (slice_2 before slice_10), of points in the slice's own frame.
 
     Raises:
+        InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid.
         ValueError: no slices, or another number of poses.
     """
-    files = sorted(f for f in path.iterdir() if f.suffix.lower() in SLICE_ENDINGS and f.stem != "poses")
+    files = [f for f in path.iterdir() if f.name != POSES and not f.name.startswith(".")]
+    if near := sorted(f.name for f in files if NEAR_POSES.search(f.stem.lower())):
+        how = f"rename it to {POSES}, 16 numbers a line, or take it out of the folder"
+        raise InvalidPointCloudError(f"poses in {POSES}", near[0], how)
+    files = sorted((f for f in files if f.suffix.lower() in SLICE_ENDINGS), key=_by_numbers)
     if not files:
         raise ValueError(f"no slices ({' '.join(SLICE_ENDINGS)}) in it")
     from gapr_core.formats.reading import read
 
     slices = [read(file, options).points for file in files]
-    if (path / "poses.csv").is_file():
-        slices = _placed(slices, path / "poses.csv", options)
+    if (path / POSES).is_file():
+        _say_order(files)
+        slices = _placed(slices, path / POSES, options)
     return Surface(np.vstack(slices))
+
+
+def _by_numbers(path: Path) -> tuple[list[str | int], str]:
+    """The order of names in which numbers count as numbers; words and numbers alternate."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+
+
+def _say_order(files: list[Path]) -> None:
+    """Poses may have been written in the other order."""
+    if files != sorted(files):
+        log.warning("%s: the first line of %s is of %s, the last of %s: numbers in names count as numbers",
+                    files[0].parent.name, POSES, files[0].name, files[-1].name)  # fmt: skip
 
 
 def _placed(slices: list[Array], path: Path, options: ReadOptions) -> list[Array]:
     poses = text.table(text.lines(options.limits.read(path)), 16, ",").reshape(-1, 4, 4)
     if len(poses) != len(slices):
         raise ValueError(f"{len(poses)} poses of {len(slices)} slices")
-    return [points @ T[:3, :3].T + T[:3, 3] for points, T in zip(slices, poses, strict=True)]
+    for number, T in enumerate(poses, start=1):
+        _check_rigid(T, number)
+    return [se3.apply(se3.nearest_rigid(T), points) for points, T in zip(slices, poses, strict=True)]
+
+
+def _check_rigid(T: Array, number: int) -> None:
+    """Raise for a matrix that is transposed, scaled or reflected, or has a number that is not finite."""
+    R = np.nan_to_num(T[:3, :3], posinf=0.0, neginf=0.0)
+    off = np.abs([*(R.T @ R - np.eye(3)).ravel(), *(T[3] - [0.0, 0.0, 0.0, 1.0])]).max()
+    if not np.isfinite(T).all() or off > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
+        row = " ".join(f"{value:.3g}" for value in T[3])
+        given = f"pose {number} with last row {row} and determinant {np.linalg.det(R):.3g} of its 3x3 part"
+        how = "write it row by row, in mm, with last row 0 0 0 1, without scale or reflection"
+        raise InvalidPointCloudError(f"rigid 4x4 matrices in {POSES}", given, how)

@@ -235,6 +235,57 @@ def test_a_folder_of_tracked_slices_is_one_cloud(tmp_path):
         reading.read(tmp_path)
 
 
+def slices_with_poses(folder, poses, names=None, file="poses.csv"):
+    folder.mkdir()
+    names = names or [f"slice_{i:02d}.xyz" for i in range(len(poses))]
+    for i, name in enumerate(names):
+        np.savetxt(folder / name, POINTS + i)
+    np.savetxt(folder / file, [np.ravel(T) for T in poses], delimiter=",")
+    return folder
+
+
+def test_slices_are_in_the_order_of_their_numbers(tmp_path, caplog):
+    poses = turned_poses(12)
+    expected = np.vstack([(POINTS + i) @ T[:3, :3].T + T[:3, 3] for i, T in enumerate(poses)])
+    padded = slices_with_poses(tmp_path / "padded", poses)
+    np.testing.assert_allclose(reading.read(padded).points, expected)
+    assert "count as numbers" not in caplog.text
+    plain = slices_with_poses(tmp_path / "plain", poses, [f"slice_{i}.xyz" for i in range(1, 13)])
+    np.testing.assert_allclose(reading.read(plain).points, expected)
+    assert "first line of poses.csv is of slice_1.xyz, the last of slice_12.xyz" in caplog.text
+
+
+@pytest.mark.parametrize("file", ["poses.txt", "Poses.csv", "pose.csv", "POSES.CSV", "slice_poses.csv", "poses.json"])
+def test_poses_under_a_name_like_theirs_are_refused(tmp_path, file):
+    folder = slices_with_poses(tmp_path / "a", turned_poses(2), file=file)
+    with pytest.raises(InvalidPointCloudError, match=f"poses in poses.csv; got a: {file}; rename it to poses.csv"):
+        reading.read(folder)
+
+
+def test_names_that_only_contain_the_word_are_slices(tmp_path):
+    folder = slices_with_poses(tmp_path / "a", turned_poses(1), ["exposed_bone.xyz"])
+    (folder / ".poses.csv.swp").write_text("an editor's own")
+    assert len(reading.read(folder).points) == 3
+
+
+CHANGES = {
+    "transposed": lambda T: T.T, "scaled": lambda T: T @ np.diag([2.0, 2.0, 2.0, 1.0]),
+    "reflected": lambda T: T @ np.diag([1.0, 1.0, -1.0, 1.0]), "nan": lambda T: T * np.nan,
+    "last row": lambda T: T + np.diag([0.0, 0.0, 0.0, 1.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_poses_of_slices_are_rigid(tmp_path, change):
+    poses = turned_poses(2)
+    rounded = slices_with_poses(tmp_path / "rounded", np.round(poses, 3))
+    moved = [(POINTS + i) @ T[:3, :3].T + T[:3, 3] for i, T in enumerate(poses)]
+    np.testing.assert_allclose(reading.read(rounded).points, np.vstack(moved), atol=0.2)
+    folder = slices_with_poses(tmp_path / "a", [poses[0], change(poses[1])])
+    with pytest.raises(InvalidPointCloudError, match="rigid 4x4 matrices in poses.csv; got a: pose 2 with last row"):
+        reading.read(folder)
+
+
 MESH = (
     "# vtk DataFile Version 3.0\n{}\nASCII\nDATASET POLYDATA\n"
     "POINTS 3 float\n10 20 30 -40 5 60 7 -8 90\nPOLYGONS 1 4\n3 0 1 2\n"

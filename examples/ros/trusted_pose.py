@@ -2,9 +2,9 @@
 
 python examples/ros/trusted_pose.py --ros-args -p min_confidence:=0.9 -p max_tre:=0.002
 
-It hears ~/status, which comes with every cloud and carries the cloud's stamp, and takes the pose of exactly that stamp:
-from tf2 where it is installed, so that any other frame can be asked for, else from ~/transform. The latest transform is
-never used: it may be that of another cloud.
+It hears ~/status, which comes with every cloud and carries the cloud's stamp, and takes the pose that ~/transform has
+for exactly that stamp. Neither the latest transform nor tf2's transform of the bone is used: they may be those of
+another cloud. For a pose in another frame (`frame`) tf2 gives where the cloud's frame was at that stamp.
 """
 
 from __future__ import annotations
@@ -19,7 +19,11 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import uninstall_signal_handlers
 from rclpy.time import Time
+from std_msgs.msg import Header
 
+from msg_adapters import matrix_to_transform, transform_to_matrix
+
+Stamp = tuple[int, int]
 WAIT_S = 0.5  # for tf2 to know the frames at the stamp of a pose; /tf may come after ~/transform
 POLL_S = 0.05
 
@@ -33,11 +37,13 @@ class TrustedPose(Node):
         self.min_confidence = declare("min_confidence", 0.9).value
         self.max_tre = declare("max_tre", 0.002).value  # m, 95 % bound over the whole bone
         self.frame = declare("frame", "").value  # that of the pose when empty; another one needs tf2
-        self.bone = declare("bone_frame", "bone_preop").value
+        self.bone = declare("bone_frame", "").value  # the only bone that is acted on; empty: any
         source = declare("register_node", "register_node").value
-        self.waiting: dict[tuple[int, int], dict[str, str]] = {}
-        self.transforms: dict[tuple[int, int], TransformStamped] = {}
-        self.since: dict[tuple[int, int], float] = {}
+        self.waiting: dict[Stamp, dict[str, str]] = {}  # statuses without their transform
+        self.transforms: dict[Stamp, TransformStamped] = {}  # and the other way round
+        self.since: dict[Stamp, float] = {}
+        self.held: set[Stamp] = set()  # whose transform is still to come, and to be left
+        self.newest: Stamp = (-1, 0)  # of the statuses that come with a transform
         self.buffer = self._listen_to_tf2()
         self.create_subscription(DiagnosticStatus, f"{source}/status", self._on_status, 10)
         self.create_subscription(TransformStamped, f"{source}/transform", self._on_transform, 10)
@@ -54,12 +60,29 @@ class TrustedPose(Node):
 
     def _on_status(self, status: DiagnosticStatus) -> None:
         values = {pair.key: pair.value for pair in status.values}
-        why = self._why_not(status, values)
+        key, why = _key(values["stamp"]), self._why_not(status, values)
+        if status.level == DiagnosticStatus.OK:
+            self._note_newest(key)
         if why:
+            self._leave(key, its_transform_comes=status.level == DiagnosticStatus.OK)
             self.hold(why)
             return
-        self.waiting[_key(values["stamp"])] = values
+        self.waiting[key] = values
         self._meet()
+
+    def _note_newest(self, key: Stamp) -> None:
+        """Stamps that do not go forward: time starts over, or a cloud was registered once more."""
+        if key < self.newest:
+            self._forget(max(self.newest, *self.transforms, *self.waiting))
+            self.held.clear()
+        self.newest = key
+
+    def _leave(self, key: Stamp, its_transform_comes: bool) -> None:
+        """A status was held back: neither an earlier one of its stamp nor its transform may be acted on later."""
+        if its_transform_comes and key not in self.transforms:
+            self.held.add(key)
+        for kept in (self.waiting, self.transforms, self.since):
+            kept.pop(key, None)
 
     def _why_not(self, status: DiagnosticStatus, values: dict[str, str]) -> str:
         """Empty when the pose may be used."""
@@ -72,8 +95,11 @@ class TrustedPose(Node):
         return ""
 
     def _on_transform(self, transform: TransformStamped) -> None:
-        stamp = transform.header.stamp
-        self.transforms[stamp.sec, stamp.nanosec] = transform
+        key = transform.header.stamp.sec, transform.header.stamp.nanosec
+        if key in self.held:
+            self.held.remove(key)
+            return
+        self.transforms[key] = transform
         self._meet()
 
     def _meet(self) -> None:
@@ -84,27 +110,45 @@ class TrustedPose(Node):
             if why and time.monotonic() - since < WAIT_S:
                 return
             values, transform = self.waiting[key], self.transforms[key]
-            for kept in (self.waiting, self.transforms, self.since):
-                for old in [k for k in kept if k <= key]:
-                    del kept[old]
+            self._forget(key)
+            why = why or self._not_mine(transform)
             if why:
                 self.hold(why)
             else:
                 self.act(self._at(transform), values)
 
+    def _forget(self, last: Stamp) -> None:
+        """All up to a stamp."""
+        for kept in (self.waiting, self.transforms, self.since):
+            for old in [key for key in kept if key <= last]:
+                del kept[old]
+        self.held = {key for key in self.held if key > last}
+
+    def _not_mine(self, transform: TransformStamped) -> str:
+        """Why this is not the bone that was asked for; empty when it is."""
+        bone = transform.child_frame_id
+        return f"it is that of {bone}, bone_frame is {self.bone}" if self.bone and bone != self.bone else ""
+
     def _not_yet(self, transform: TransformStamped) -> str:
         """Why the pose cannot be had in the frame that was asked for; empty when it can."""
-        if self.buffer is None or self.frame == transform.header.frame_id:
+        cloud_frame = transform.header.frame_id
+        if self.buffer is None or self.frame == cloud_frame:
             return ""
         stamp = Time.from_msg(transform.header.stamp)
-        there, why = self.buffer.can_transform(self.frame, self.bone, stamp, return_debug_tuple=True)
-        return "" if there else f"no transform {self.frame} <- {self.bone}: {why}"
+        there, why = self.buffer.can_transform(self.frame, cloud_frame, stamp, return_debug_tuple=True)
+        return "" if there else f"no transform {self.frame} <- {cloud_frame}: {why}"
 
     def _at(self, transform: TransformStamped) -> TransformStamped:
         """The pose in the frame that was asked for, at the stamp of the cloud."""
-        if self.buffer is None or self.frame == transform.header.frame_id:
+        cloud_frame = transform.header.frame_id
+        if self.buffer is None or self.frame == cloud_frame:
             return transform
-        return self.buffer.lookup_transform(self.frame, self.bone, Time.from_msg(transform.header.stamp))
+        stamp = Time.from_msg(transform.header.stamp)
+        moved = transform_to_matrix(self.buffer.lookup_transform(self.frame, cloud_frame, stamp))
+        header = Header(frame_id=self.frame, stamp=transform.header.stamp)
+        pose = TransformStamped(header=header, child_frame_id=transform.child_frame_id)
+        pose.transform = matrix_to_transform(moved @ transform_to_matrix(transform))
+        return pose
 
     def _listen_to_tf2(self) -> object | None:
         if not self.frame:
@@ -117,7 +161,7 @@ class TrustedPose(Node):
         return buffer
 
 
-def _key(stamp: str) -> tuple[int, int]:
+def _key(stamp: str) -> Stamp:
     """`12.000000034` as (12, 34)."""
     seconds, _, nanoseconds = stamp.partition(".")
     return int(seconds), int(nanoseconds)

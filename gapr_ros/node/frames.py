@@ -76,8 +76,12 @@ class Frames:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {error}") from error
 
     def send(self, transform: TransformStamped, stamp_ns: int) -> bool:
-        """To /tf, if its stamp is newer than that of the last one (tf2 warns about repeated data) and it has frames."""
-        if self._broadcaster is None or stamp_ns <= self._sent_ns or not transform.header.frame_id:
+        """To /tf, if it has frames, and a stamp newer than that of the last one or none (0).
+
+        `Timeline` lets no other pose of an older or the same stamp pass; tf2 warns about repeated data.
+        """
+        is_new = stamp_ns > self._sent_ns or stamp_ns == 0 == self._sent_ns
+        if self._broadcaster is None or not is_new or not transform.header.frame_id:
             return False
         if self._note_sent is not None:
             self._note_sent(transform)

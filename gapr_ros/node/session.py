@@ -7,10 +7,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from gapr_ros.node import intake, timeline, track
+from gapr_ros.node import intake, timeline, wire
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.node.diagnostics import RefusalLog
 from gapr_ros.node.frames import Frames
@@ -27,6 +29,7 @@ from gapr_ros.node.worker import Job, Worker
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
+Array = NDArray[np.float64]
 MOST_FRAMES = 5  # of clouds, that are named
 
 
@@ -193,11 +196,17 @@ class Session:
             self._track.miss()
             return
         try:
-            centre_m = track.centre_of(self.model.points_mm)
-            self._track.judge(outcome.pose, outcome.header.frame_id, centre_m, self._host.parameters)
-            self._seed = None
+            self._judge(outcome.pose, outcome.header)
         except RefusedError as refusal:
             outcome.refuse(refusal.reason, refusal.text)
+
+    def _judge(self, T_frame_model: Array, header: Header) -> None:
+        """Let a pose go out, or refuse it."""
+        points_m = wire.to_metres(self.model.points_mm)
+        self._timeline.check_answer(T_frame_model, header, points_m)
+        self._track.judge(T_frame_model, header.frame_id, points_m.mean(axis=0), self._host.parameters)
+        self._timeline.note_answer(T_frame_model, header)
+        self._seed = None
 
     # --- state ---
 

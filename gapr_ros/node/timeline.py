@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
 from std_msgs.msg import Header
 
+from gapr_core.geometry import se3
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
 
+Array = NDArray[np.float64]
 LAST_NS = 2**31 * 1_000_000_000  # the seconds of a stamp are an int32
 BACK_NS = 1_000_000_000  # older than the newest cloud by more than this: the stamps went back
 RESTART_AFTER = 3  # so many clouds in a row whose stamps went back are no stragglers: time has started over
+ALIKE_M = 1e-5  # two poses of one stamp that move no point of the bone by more are the same
 
 
 def stamp_ns(header: Header) -> int:
@@ -53,15 +58,18 @@ def check_age(stamp: int, now_ns: int, max_age_s: float) -> None:
 
 
 class Timeline:
-    """Judges the clouds as they arrive; what it refuses changes nothing, here or elsewhere.
+    """Judges the clouds as they arrive and their answers; what it refuses changes nothing, here or elsewhere.
 
-    A stamp that went back is that of a straggler, or time has started over, as in a bag that is looped without
-    simulated time. One cloud cannot say which: it is refused. Several in a row that arrive one after the other with
-    stamps that go forward among themselves can: with the last of them time starts over.
+    The poses that go out are in the order of their stamps, one for each stamp: tf2 has one transform for a stamp, and
+    its latest one is that with the newest stamp. A stamp that went back, by more than a second or behind the last
+    answer with a pose, is that of a straggler, or time has started over, as in a bag that is looped without simulated
+    time. One cloud cannot say which: it is refused. Several in a row that arrive one after the other with stamps that
+    go forward among themselves can: with the last of them time starts over.
     """
 
     def __init__(self) -> None:
         self._newest_ns = 0
+        self._answered_ns, self._answered_in, self._answer = 0, "", np.eye(4)  # the last pose that went out
         self._back_ns: list[int] = []  # stamps of the clouds in a row that went back
 
     def admit(self, stamp: int, now_ns: int, parameters: NodeParameters) -> bool:
@@ -79,16 +87,47 @@ class Timeline:
         check_future(stamp, now_ns, parameters.max_future)
         check_age(stamp, now_ns, parameters.max_cloud_age)
         stamp = stamp or now_ns
-        if stamp >= self._newest_ns - BACK_NS:
+        if stamp >= max(self._newest_ns - BACK_NS, self._answered_ns):
             self._newest_ns, self._back_ns = max(stamp, self._newest_ns), []
             return False
         self._note_back(stamp)
-        self._newest_ns, self._back_ns = stamp, []
+        self.forget()
+        self._newest_ns = stamp
         return True
+
+    def check_answer(self, T_frame_model: Array, header: Header, points_m: Array) -> None:
+        """Refuse a pose that would go out behind a newer one, or as the second one of its stamp.
+
+        Args:
+            T_frame_model: (4, 4), metres.
+            header: frame and stamp of the pose.
+            points_m: (N, 3) of the bone in its own frame.
+
+        Raises:
+            RefusedError: stale.
+        """
+        stamp = stamp_ns(header)
+        if stamp < self._answered_ns:  # it was let in before the newer one was answered
+            raise RefusedError(Reason.STALE, self._older(stamp))
+        if 0 < stamp == self._answered_ns and not self._is_sent(T_frame_model, header.frame_id, points_m):
+            text = "another pose was sent for this stamp, and stands; send clouds with stamps of their own, or ~/reset"
+            raise RefusedError(Reason.STALE, text)
+
+    def note_answer(self, T_frame_model: Array, header: Header) -> None:
+        """This pose goes out."""
+        self._answered_ns, self._answered_in, self._answer = stamp_ns(header), header.frame_id, T_frame_model
 
     def forget(self) -> None:
         """Time starts over: whatever comes next is the newest."""
         self.__init__()  # type: ignore[misc]
+
+    def _is_sent(self, T_frame_model: Array, frame: str, points_m: Array) -> bool:
+        """Whether the pose is the one that went out last."""
+        moved = se3.apply(T_frame_model, points_m) - se3.apply(self._answer, points_m)
+        return frame == self._answered_in and bool((np.linalg.norm(moved, axis=1) <= ALIKE_M).all())
+
+    def _older(self, stamp: int) -> str:
+        return f"the stamp is {(self._answered_ns - stamp) * 1e-9:.3g} s older than the last answer with a pose"
 
     def _note_back(self, stamp: int) -> None:
         """Count a stamp that went back; refuse it until there are enough of them."""
@@ -96,5 +135,7 @@ class Timeline:
         self._back_ns = [*self._back_ns, stamp] if goes_on else [stamp]
         if len(self._back_ns) < RESTART_AFTER:
             behind_s = (self._newest_ns - stamp) * 1e-9
+            far = stamp < self._newest_ns - BACK_NS
+            text = f"the stamp is {behind_s:.3g} s behind the newest cloud's" if far else self._older(stamp)
             count = f"{len(self._back_ns)} of {RESTART_AFTER} in a row that start time over"
-            raise RefusedError(Reason.STALE, f"the stamp is {behind_s:.3g} s behind the newest cloud's ({count})")
+            raise RefusedError(Reason.STALE, f"{text} ({count})")

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.geometry import se3
-from gapr_ros.node import wire
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.region import Place
 from gapr_ros.parameters import NodeParameters
@@ -82,8 +81,3 @@ def jump(T_before: Array, T_now: Array, centre_m: Array, parameters: NodeParamet
     if 0.0 < parameters.max_jump_rotation < angle:
         return f"turned {angle:.3g} rad, max_jump_rotation is {parameters.max_jump_rotation:g} rad"
     return ""
-
-
-def centre_of(points_mm: Array) -> Array:
-    """(3,) mean of the bone's points, m."""
-    return wire.to_metres(points_mm.mean(axis=0))

@@ -15,6 +15,7 @@ import bones
 import numpy as np
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Pose, PoseArray, TransformStamped
 from harness import PATIENCE_S, NodeProcess, Spinner, accepted, context, node_in_thread, pose_mm, wait_until
 from rclpy.parameter import Parameter
@@ -85,6 +86,59 @@ def test_the_consumer_acts_on_sure_and_bounded_poses_of_the_right_stamp_only(blo
     assert (done[0], done[5]) == ((100, -0.05), (105, -0.06))
     assert done[1].startswith("confidence 0.7") and "0.003 m only" in done[2] and "nothing" in done[3]
     assert done[4] == "ambiguous"
+
+
+def status(second, confidence, reason=""):
+    values = {"stamp": f"{second}.000000000", "confidence": str(confidence), "tre95": "0.001", "reason": reason}
+    level = DiagnosticStatus.WARN if reason else DiagnosticStatus.OK
+    return DiagnosticStatus(level=level, values=[KeyValue(key=key, value=value) for key, value in values.items()])
+
+
+def transform_at(second, x, child="bone_preop"):
+    stamped = TransformStamped(header=Header(frame_id="camera"), child_frame_id=child)
+    stamped.header.stamp.sec, stamped.transform.translation.x = second, x
+    return stamped
+
+
+SURE, HELD = 0.97, 0.6
+
+
+@pytest.mark.parametrize(
+    ("messages", "acted"),
+    [
+        ([status(100, HELD), transform_at(100, 0.5), status(100, SURE), transform_at(100, 0.0)], [(100, 0.0)]),
+        ([transform_at(100, 0.5), status(100, HELD), status(100, SURE), transform_at(100, 0.0)], [(100, 0.0)]),
+        ([status(100, HELD), status(100, SURE), transform_at(100, 0.5), transform_at(100, 0.0)], [(100, 0.0)]),
+        ([status(100, SURE), status(100, 0.0, "stale"), transform_at(100, 0.5)], []),
+        ([status(100, HELD), transform_at(101, 0.1), status(101, SURE), transform_at(100, 0.5)], [(101, 0.1)]),
+        ([transform_at(100, 0.5), status(101, HELD), status(100, SURE), transform_at(100, 0.0)], [(100, 0.0)]),
+        ([status(100, SURE), transform_at(100, 0.5, "tibia")], []),
+    ],
+)
+def test_the_consumer_never_pairs_a_status_with_the_transform_of_another(consumer, messages, acted):
+    node, done = consumer
+    node.bone = "bone_preop"
+    for message in messages:
+        (node._on_status if isinstance(message, DiagnosticStatus) else node._on_transform)(message)
+    assert [each for each in done if isinstance(each, tuple)] == acted
+
+
+def test_the_pose_in_another_frame_is_that_of_the_status_whatever_tf2_has_of_the_bone(consumer):
+    node, done = consumer
+    asked = []
+
+    class Buffer:
+        def can_transform(self, target, source, stamp, return_debug_tuple):
+            return True, ""
+
+        def lookup_transform(self, target, source, stamp):
+            asked.append((target, source, stamp.nanoseconds))
+            return transform_at(0, 1.0)
+
+    node.frame, node.buffer = "world", Buffer()
+    node._on_transform(transform_at(100, 0.5))
+    node._on_status(status(100, SURE))
+    assert done == [(100, 1.5)] and set(asked) == {("world", "camera", 100 * 10**9)}
 
 
 def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):

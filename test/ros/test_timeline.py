@@ -13,7 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.time import Time as RosTime
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
 
+from gapr_core.geometry import se3
 from gapr_ros.node import frames
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.timeline import BACK_NS, Timeline
@@ -79,6 +81,58 @@ def test_small_steps_back_do_not_add_up():
     judged(timeline, 100.0)
     answers = [judged(timeline, 100.0 - 0.6 * i) for i in range(4)]
     assert answers == [False, False, Reason.STALE, Reason.STALE]
+
+
+def answered(timeline, stamp_s, x_m=0.0, frame="probe"):
+    """The pose goes out: None; else the text of the refusal."""
+    T, header = se3.from_rotation_translation(np.eye(3), [x_m, 0, 0]), Header(frame_id=frame)
+    header.stamp = RosTime(nanoseconds=int(stamp_s * NS)).to_msg()
+    try:
+        timeline.check_answer(T, header, GOOD)
+    except RefusedError as refusal:
+        return str(refusal)
+    timeline.note_answer(T, header)
+    return None
+
+
+def test_a_cloud_older_than_the_last_answer_is_refused_and_the_third_of_a_row_starts_time_over():
+    timeline = Timeline()
+    assert judged(timeline, 100.0) is False and answered(timeline, 100.0) is None
+    with pytest.raises(RefusedError, match="0.4 s older than the last answer with a pose .1 of 3 in a row"):
+        timeline.admit(int(99.6 * NS), 0, NodeParameters())
+    assert judged(timeline, 100.0) is False, "the same cloud once more"
+    assert [judged(timeline, s) for s in (99.6, 99.5, 99.6, 99.7)] == [Reason.STALE] * 3 + [True]
+    assert judged(timeline, 99.8) is False and answered(timeline, 99.8, 1.0) is None
+
+
+def test_an_answer_behind_a_newer_one_is_refused_however_early_its_cloud_was_let_in():
+    timeline = Timeline()
+    assert judged(timeline, 100.0) is False and judged(timeline, 99.6) is False
+    assert answered(timeline, 100.0) is None
+    assert answered(timeline, 99.6).startswith("stale: the stamp is 0.4 s older than the last answer")
+
+
+def test_one_stamp_has_one_pose():
+    timeline = Timeline()
+    assert answered(timeline, 100.0) is None
+    assert answered(timeline, 100.0, 1e-6) is None, "the same but for rounding"
+    assert answered(timeline, 100.0, 1e-3).startswith("stale: another pose was sent for this stamp")
+    assert "another pose was sent" in answered(timeline, 100.0, frame="other")
+    timeline.forget()
+    assert answered(timeline, 100.0, 1e-3) is None
+    assert [answered(Timeline(), 0.0, x) for x in (0.0, 1.0)] == [None, None], "no stamp, no clock"
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 400), st.integers(0, 2)), min_size=1, max_size=30))
+def test_poses_go_out_in_the_order_of_their_stamps_unless_time_starts_over(clouds):
+    timeline, last = Timeline(), (0, 0)
+    for tenths, x in clouds:
+        answer = judged(timeline, tenths / 10)
+        last = (0, 0) if answer is True else last
+        if isinstance(answer, bool) and answered(timeline, tenths / 10, float(x)) is None:
+            assert tenths > last[0] or (tenths, x) == last
+            last = (tenths, x)
 
 
 @settings(max_examples=200, deadline=None)
@@ -180,6 +234,57 @@ def test_a_straggler_changes_neither_the_jump_guard_nor_the_epoch_nor_tf(blob_pa
         assert (node.session._epoch, len(method.calls), len(tf2.sent)) == (epoch, calls, 1)
         method.answer = accepted(MOVED)
         assert client.ask(GOOD, stamp_s=1000.5)["last_refusal"].startswith("jump"), "the guard still stands"
+
+
+@pytest.mark.parametrize("publish_tf", [True, False])
+def test_a_cloud_older_than_the_last_pose_gets_none_that_tf2_would_not_have(blob_path, client, method, tf2, publish_tf):
+    with node_in_thread(method, blob_path, publish_tf=publish_tf):
+        client.wait_for_state("active")
+        for stamp_s in (998.8, 1000.0):
+            assert client.ask(GOOD, stamp_s=stamp_s)["level"] == 0
+        method.answer = accepted(MOVED)
+        older = client.ask(GOOD, stamp_s=999.4)
+        assert older["last_refusal"].startswith("stale: the stamp is 0.6 s older than the last answer with a pose")
+        same = client.ask(GOOD, stamp_s=1000.0)
+        assert same["last_refusal"].startswith("stale: another pose was sent for this stamp")
+        method.answer = accepted()
+        assert client.ask(GOOD, stamp_s=1000.0)["level"] == 0
+        stamps = [pose.header.stamp.sec + pose.header.stamp.nanosec * 1e-9 for pose in client.poses]
+        assert stamps == [998.8, 1000.0, 1000.0]
+        assert tf2.sent == ([998.8, 1000.0] if publish_tf else [])
+
+
+def test_an_older_cloud_that_was_let_in_before_the_newer_one_was_answered_gets_no_pose(blob_path, client, method, tf2):
+    with node_in_thread(method, blob_path, publish_tf=True) as node:
+        client.wait_for_state("active")
+        method.gate.clear()
+        calls = len(method.calls)
+        client.send(GOOD, stamp_s=1000.0)
+        wait_until(lambda: len(method.calls) > calls)
+        client.send(GOOD, stamp_s=999.5)
+        wait_until(lambda: node.counters.received == 2)
+        method.gate.set()
+        wait_until(lambda: node.counters.accepted + node.counters.refused == 2)
+        assert "0.5 s older than the last answer" in node.counters.last_refusal
+        assert tf2.sent == [1000.0]
+
+
+def test_a_short_bag_that_is_looped_without_simulated_time_goes_on(blob_path, client, method, tf2):
+    with node_in_thread(method, blob_path, publish_tf=True):
+        client.wait_for_state("active")
+        levels = [client.ask(GOOD, stamp_s=1000.0 + 0.25 * i)["level"] for _ in range(3) for i in range(4)]
+        assert levels == [0] * 4 + [1, 1, 0, 0] * 2
+        wait_until(lambda: tf2.sent == [1000.0, 1000.25, 1000.5, 1000.75] + [1000.5, 1000.75] * 2, what=tf2.sent)
+
+
+def test_clouds_without_stamp_and_clock_go_to_tf_like_their_poses(blob_path, client, method, tf2):
+    with node_in_thread(method, blob_path, publish_tf=True, use_sim_time=True):
+        client.wait_for_state("active")
+        assert client.ask(GOOD, stamp_s=0.0)["level"] == 0
+        method.answer = accepted(MOVED)
+        assert client.ask(GOOD, stamp_s=0.0)["level"] == 0
+        wait_until(lambda: tf2.sent == [0.0, 0.0], what=tf2.sent)
+        assert tf2.latest() == pytest.approx(-0.05)
 
 
 def test_a_straggler_does_not_push_a_good_cloud_out_of_the_mailbox(blob_path, client, method):

@@ -64,7 +64,7 @@ class Services:
         if not session.enabled:
             raise NotNowError("the node is disabled: call ~/set_enabled")
         if not session.register_newest(waiter):
-            raise NotNowError("no cloud has come yet, or none since the last reset")
+            raise NotNowError("no cloud has come yet, or none since the last reset or reload")
         outcome = await waiter
         return outcome.ok, str(outcome)
 

@@ -132,7 +132,7 @@ class Session:
     def register_newest(self, waiter: Any) -> bool:
         """Register the newest cloud now; its outcome becomes the waiter's result.
 
-        False when none has come, or none since the last reset.
+        False when none has come, or none since the last reset or reload.
         """
         return self.worker.ask(waiter, self._epoch)
 
@@ -247,6 +247,7 @@ class Session:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self._ready, self._limits = ready, _limits(ready.parameters)
         self._begin_again()
+        self.worker.outdate(self._epoch)
         self.parameters_changed()
         self._publishers.withdraw_pose()
         self.send_model()

@@ -259,16 +259,17 @@ def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(
         assert node.counters.dropped == 2
 
 
-def test_a_cloud_from_before_a_reset_is_not_registered_on_request(blob_path, client, method):
+@pytest.mark.parametrize("service", ["reset", "reload_model"])
+def test_a_cloud_from_before_a_reset_or_another_bone_is_not_registered_on_request(blob_path, client, method, service):
     with node_in_thread(method, blob_path, continuous=False) as node:
         client.wait_for_state("active")
         client.send(GOOD)
         wait_until(lambda: node.counters.received == 1)
         assert client.call("register").success
         assert client.call("register").success, "once more, on the same cloud"
-        assert client.call("reset").success
+        assert client.call(service).success
         answer = client.call("register")
-        assert not answer.success and answer.message == "no cloud has come yet, or none since the last reset"
+        assert not answer.success and answer.message == "no cloud has come yet, or none since the last reset or reload"
         client.send(GOOD)
         wait_until(lambda: node.counters.received == 2)
         assert client.call("register").success

@@ -23,6 +23,7 @@ from gapr_ros.node.publishers import Publishers
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.registration import Registration, Seed, Situation, needs_frames
 from gapr_ros.node.shared_frame import SharedFrame
+from gapr_ros.node.shared_name import SharedName
 from gapr_ros.node.timeline import Timeline
 from gapr_ros.node.track import Track
 from gapr_ros.node.worker import Job, Worker
@@ -55,6 +56,7 @@ class Session:
         self._log_refusal = RefusalLog(host.ros.get_logger().warning)
         publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
         self._shared = SharedFrame(host, self.conflicts) if publish else None
+        self._named = SharedName(host, self.conflicts)
         self._frames = Frames(host.ros, publish, listen, self._shared.note_own if self._shared else None)
         self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation)
@@ -73,6 +75,7 @@ class Session:
         self.worker.stop()
         self._publishers.close()
         self._frames.close()
+        self._named.close()
         if self._shared is not None:
             self._shared.close()
 

@@ -50,6 +50,30 @@ def test_two_nodes_that_publish_one_bone_frame_say_so_and_stop_when_one_has_gone
     assert len(said) == 2, "each says it once"
 
 
+def test_two_nodes_of_one_name_say_so_and_stop_when_one_has_gone(blob_path, client, capfd):
+    """Without /tf, and though both have the same name in the diagnostics."""
+    text = "2 publishers on /register_node/pose (/register_node, /register_node): its poses may be those of another"
+    with node_in_thread(StandIn(), blob_path) as first:
+        wait_until(lambda: first.session, what="the first node")
+        with node_in_thread(StandIn(), blob_path) as second:
+            for node in (first, second):
+                wait_until(lambda node=node: node.session and "".join(node.session.conflicts.texts).startswith(text))
+            wait_until(lambda: text in client.values("input")["conflicts"])
+            assert client.values("input")["level"] == 1
+        wait_until(lambda: not first.session.conflicts.texts)
+    said = [line for line in capfd.readouterr().err.splitlines() if text in line]
+    assert len(said) == 2, "each says it once"
+
+
+def test_a_pose_that_is_withdrawn_and_advertised_again_is_no_second_publisher(blob_path, client, method):
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        for _ in range(4):
+            client.call("reset")
+            node.session._named.look()
+        assert not node.session.conflicts.texts
+
+
 def test_nodes_with_frames_of_their_own_have_no_conflict(blob_path, client):
     with node_in_thread(StandIn(), blob_path, namespace="/left", publish_tf=True, model_frame="left"):
         with node_in_thread(StandIn(), blob_path, namespace="/right", publish_tf=True, model_frame="right"):

@@ -15,6 +15,7 @@ from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_ros.node import intake, region, timeline, wire
+from gapr_ros.node.collection import Late, forget
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.guard import describe
 from gapr_ros.node.model import Model
@@ -38,12 +39,13 @@ class Seed:
 
 @dataclass(frozen=True)
 class Situation:
-    """What holds at the moment when a cloud is taken in hand."""
+    """What holds at the moment when a cloud is taken in hand: `oldest` is the first epoch of what may be collected."""
 
     method: Any
     model: Model
     parameters: NodeParameters
     epoch: int
+    oldest: int
     seed: Seed | None
     place: Place | None
     now_ns: int
@@ -56,10 +58,13 @@ class Registration:
         frames: look-up of transforms.
         situation: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
             when there is a seed, and with `accumulate` there are `collect` and `collected` as `Accumulator` has them.
+        left: is called for every cloud of `collect`, now or later: whether it was collected, and why not.
     """
 
-    def __init__(self, frames: Frames, situation: Callable[[], Situation]) -> None:
+    def __init__(self, frames: Frames, situation: Callable[[], Situation], left: Callable[[bool, str], None]) -> None:
         self._frames, self._situation = frames, situation
+        self._late = Late(self._collect, left)
+        self._pushed_out: Job | None = None
         self._frame = ""  # of the last answer; what the method remembers holds there only
 
     def process(self, job: Job) -> Outcome:
@@ -76,20 +81,32 @@ class Registration:
         outcome.exec_ms = (time.monotonic() - start) * 1000.0
         return outcome
 
-    def collect(self, job: Job) -> bool:
-        """Keep a cloud to be registered with a newer one; never raises. False when it cannot be used."""
-        try:
-            now = self._situation()
-            points_mm = self._points_mm(Outcome(job), replace(now, parameters=replace(now.parameters, tf_timeout=0.0)))
-            now.method.collect(points_mm)
-        except Exception:  # whatever is wrong with it, it is counted as dropped
-            return False
-        return True
+    def collect(self, job: Job) -> None:
+        """Keep a cloud to be registered with a newer one, once its transform is there; never raises, never waits."""
+        self._late.add(job)
+        self._pushed_out = job
+        self._late.take(self._situation().parameters.tf_timeout)
+
+    def _collect(self, job: Job) -> None:
+        now = self._situation()
+        if job.epoch < now.oldest:
+            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset")
+        outcome = Outcome(job)
+        now = replace(now, epoch=job.epoch, parameters=replace(now.parameters, tf_timeout=0.0))
+        points_mm = self._points_mm(outcome, now)
+        frame = outcome.header.frame_id
+        if job is self._pushed_out:  # for the first time, just now
+            self._watch_frame(frame, now)
+        elif frame != self._frame:
+            raise RefusedError(Reason.BAD_FRAME, f"it is in '{frame}', those that are collected are in '{self._frame}'")
+        now.method.collect(points_mm)
 
     def _run(self, outcome: Outcome, now: Situation, start: float) -> None:
         points_mm = self._points_mm(outcome, now)
-        outcome.points_used = len(points_mm)
+        self._watch_frame(outcome.header.frame_id, now)
+        outcome.points_used, self._pushed_out = len(points_mm), None
         if now.parameters.accumulate > 1:
+            self._late.take(now.parameters.tf_timeout)  # the transform of this cloud has come: so have those of before
             _check_together(points_mm, outcome, now)
         result = self._register(points_mm, outcome, now)
         _check(result, time.monotonic() - start, now.parameters)
@@ -105,9 +122,7 @@ class Registration:
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         crops = self._crops(T_frame_cloud, outcome, now)
         points_mm = intake.take_in(cloud, now.model.extent_mm, now.parameters, crops)
-        points_mm = wire.moved_mm(T_frame_cloud, points_mm)
-        self._watch_frame(outcome.header.frame_id, now)
-        return points_mm
+        return wire.moved_mm(T_frame_cloud, points_mm)
 
     def _crops(self, T_frame_cloud: Array, outcome: Outcome, now: Situation) -> list[Crop]:
         """What the region of interest takes away, in the cloud's own frame."""
@@ -121,8 +136,8 @@ class Registration:
 
     def _watch_frame(self, frame: str, now: Situation) -> None:
         """What the method remembers is of one frame."""
-        if self._frame and frame != self._frame and hasattr(now.method, "reset"):
-            now.method.reset()
+        if self._frame and frame != self._frame:
+            forget(now.method, f"the clouds come in '{frame}' and no longer in '{self._frame}'")
         self._frame = frame
 
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:

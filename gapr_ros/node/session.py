@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from std_msgs.msg import Header
 
 from gapr_ros.node import intake, timeline, wire
+from gapr_ros.node.collection import forget
 from gapr_ros.node.conflicts import Conflicts
-from gapr_ros.node.diagnostics import RefusalLog
+from gapr_ros.node.diagnostics import THROTTLE_S, RefusalLog
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model, Ready
@@ -52,14 +53,14 @@ class Session:
         self.last_outcome: Outcome | None = None
         self.conflicts = Conflicts(host.ros.get_logger().warning)
         self._timeline, self._track = Timeline(), Track()
-        self._epoch, self._seed, self._cloud_frames = 0, None, []
+        self._epoch, self._oldest, self._seed, self._cloud_frames = 0, 0, None, []
         self._log_refusal = RefusalLog(host.ros.get_logger().warning)
         publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
         self._shared = SharedFrame(host, self.conflicts) if publish else None
         self._named = SharedName(host, self.conflicts)
         self._frames = Frames(host.ros, publish, listen, self._shared.note_own if self._shared else None)
         self._publishers = Publishers(host, self._frames)
-        self._registration = Registration(self._frames, self._situation)
+        self._registration = Registration(self._frames, self._situation, self._left)
         self.worker = Worker(self._work, self._held, self._period_s)
         self.parameters_changed()  # a limit may have been set while the bone was read
 
@@ -107,9 +108,12 @@ class Session:
         self._note_frame(frame)
 
     def _put(self, job: Job) -> None:
-        accumulates = self._host.parameters.accumulate > 1
-        pushed_out = self.worker.put(job, leave=self._collect if accumulates else None)
-        self._host.counters.dropped += pushed_out and not accumulates
+        pushed_out = self.worker.put(job, leave=self._registration.collect if self._accumulates else None)
+        self._host.counters.dropped += pushed_out and not self._accumulates
+
+    @property
+    def _accumulates(self) -> bool:
+        return self._host.parameters.accumulate > 1
 
     def _note_frame(self, frame: str) -> None:
         """Clouds in two frames move the bone's parent to and fro, unless there is one output_frame for all."""
@@ -127,7 +131,7 @@ class Session:
         except InvalidMessageError as error:
             self._host.ros.get_logger().warning(f"initialpose is ignored: {error}")
             return
-        self._begin_again()
+        self._begin_again("an initialpose")
         self._seed = Seed(T_frame_model, intake.plain_frame(message.header.frame_id))
         if message.header.frame_id:
             self._frames.listen()
@@ -144,23 +148,18 @@ class Session:
     def _work(self, job: Job) -> None:
         self._host.call_soon(partial(self._conclude, self._registration.process(job)))
 
-    def _collect(self, job: Job) -> None:
-        """A cloud that a newer one pushed out of the mailbox is registered with it."""
-        self._host.call_soon(partial(self._host.counters.leave, self._registration.collect(job)))
+    def _left(self, collected: bool, why: str) -> None:
+        """A cloud that a newer one pushed out of the mailbox is registered with it, or could not be."""
+        self._host.call_soon(partial(self._count_left, collected, why))
 
     def _situation(self) -> Situation:
         host, ready = self._host, self._ready
-        place = self._track.place
-        return Situation(ready.method, ready.model, host.parameters, self._epoch, self._seed, place, host.now_ns())
+        epochs, place = (self._epoch, self._oldest), self._track.place
+        return Situation(ready.method, ready.model, host.parameters, *epochs, self._seed, place, host.now_ns())
 
     def _renew_method(self) -> None:
         method = self._method_factory(self._host.parameters)
         self._host.call_soon(lambda: setattr(self, "_ready", replace(self._ready, method=method)))
-
-    def _forget_clouds(self) -> None:
-        """Poses and clouds that the method remembers, as `Tracker` and `Accumulator` do."""
-        if hasattr(self._ready.method, "reset"):
-            self._ready.method.reset()
 
     def _held(self) -> bool:
         return not self._host.parameters.continuous
@@ -170,6 +169,12 @@ class Session:
         return 1.0 / max_rate if max_rate > 0.0 else 0.0
 
     # --- out: the executor's thread again ---
+
+    def _count_left(self, collected: bool, why: str) -> None:
+        self._host.counters.leave(collected)
+        if not collected:
+            text = f"a cloud is not registered with the newer ones: {why}"
+            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
 
     def _conclude(self, outcome: Outcome) -> None:
         """Decide on an outcome of the worker and answer."""
@@ -199,15 +204,16 @@ class Session:
             self._track.miss()
             return
         try:
-            self._judge(outcome.pose, outcome.header)
+            self._judge(outcome.pose, outcome)
         except RefusedError as refusal:
             outcome.refuse(refusal.reason, refusal.text)
 
-    def _judge(self, T_frame_model: Array, header: Header) -> None:
+    def _judge(self, T_frame_model: Array, outcome: Outcome) -> None:
         """Let a pose go out, or refuse it."""
-        points_m = wire.to_metres(self.model.points_mm)
+        header, points_m = outcome.header, wire.to_metres(self.model.points_mm)
         self._timeline.check_answer(T_frame_model, header, points_m)
-        self._track.judge(T_frame_model, header.frame_id, points_m.mean(axis=0), self._host.parameters)
+        cloud = timeline.stamp_ns(header) or hash(outcome.job.cloud)  # while no clock runs
+        self._track.judge(T_frame_model, header.frame_id, points_m.mean(axis=0), cloud, self._host.parameters)
         self._timeline.note_answer(T_frame_model, header)
         self._seed = None
 
@@ -216,10 +222,10 @@ class Session:
     def reset(self) -> None:
         """Forget track, seed, all clouds so far, their stamps on /tf too, and the pose that late listeners get."""
         self._timeline.forget()
-        self._clear()
+        self._clear("a reset")
 
-    def _clear(self) -> None:
-        self._begin_again()
+    def _clear(self, why: str) -> None:
+        self._begin_again(why)
         self.worker.outdate(self._epoch)
         self._publishers.withdraw_pose()
         self._frames.forget()
@@ -232,24 +238,24 @@ class Session:
 
     def _restart(self, why: str) -> None:
         self._host.ros.get_logger().warning(f"{why}: time starts over and the track is cleared")
-        self._clear()
+        self._clear(why)
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
         if self._reading != (reading := _reading(self._host.parameters)):
             self._reading = reading
-            self.worker.run(self._forget_clouds)
+            self._forget_clouds("clouds are read in another way")
         if self._limits != (limits := _limits(self._host.parameters)):
             self._limits = limits
-            if self._host.parameters.accumulate > 1:
+            if self._accumulates:
                 self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)
         self.worker.wake()
 
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
+        self._begin_again("another bone")
         self._ready, self._limits = ready, _limits(ready.parameters)
-        self._begin_again()
         self.worker.outdate(self._epoch)
         self.parameters_changed()
         self._publishers.withdraw_pose()
@@ -260,21 +266,38 @@ class Session:
         self._publishers.send_model(self.model)
 
     def stop_waiting(self, why: str) -> None:
-        """Drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way."""
-        self._begin_again()
+        """A pause: drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way.
+
+        What was collected stays, with that cloud, and so do the poses against which jumps are measured.
+        """
+        self._refuse_all()
         waiting = self.worker.clear()
         if waiting is not None:
-            self._host.counters.dropped += 1
             outcome = Outcome(waiting)
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.tell()
+        if self._accumulates:
+            if waiting is not None:
+                self.worker.run(partial(self._registration.collect, waiting))
+            return
+        self._host.counters.dropped += waiting is not None
+        self._forget_clouds(why)
 
-    def _begin_again(self) -> None:
+    def _begin_again(self, why: str) -> None:
         """Forget track, seed and collected clouds; clouds on their way will be refused."""
-        self._epoch += 1
-        self.worker.run(self._forget_clouds)
+        self._refuse_all()
+        self._oldest = self._epoch
+        self._forget_clouds(why)
         self._track.clear()
+
+    def _refuse_all(self) -> None:
+        """Clouds on their way will be refused, and say nothing about those to come."""
+        self._epoch += 1
+        self._track.miss()
         self._seed = None
+
+    def _forget_clouds(self, why: str) -> None:
+        self.worker.run(partial(forget, self._ready.method, why))
 
 
 def _reading(parameters: NodeParameters) -> tuple[Any, ...]:

@@ -14,7 +14,10 @@ Array = NDArray[np.float64]
 
 
 class Track:
-    """The poses of one bone over time, in one frame. Used by one thread only, but for `place`, which any may read.
+    """The poses of one bone over time. Used by one thread only, but for `place`, which any may read.
+
+    A row of good poses is in one frame. The last pose that went out is kept for every frame: neither clouds in another
+    one nor a pause take away what a jump is measured against. Poses in two frames are not compared.
 
     Attributes:
         place: where the bone was with the last cloud; None when that was refused.
@@ -22,53 +25,60 @@ class Track:
 
     def __init__(self) -> None:
         self.place: Place | None = None
-        self._frame, self._streak = "", 0
+        self._frame = ""
+        self._row: set[object] = set()  # the clouds of the good poses in a row
         self._candidate: Array | None = None
-        self._accepted: Array | None = None
+        self._accepted: dict[str, Array] = {}  # by frame
 
     def clear(self) -> None:
         """Forget everything."""
         self.__init__()  # type: ignore[misc]
 
-    def judge(self, T_frame_model: Array, frame: str, centre_m: Array, parameters: NodeParameters) -> None:
+    def judge(
+        self, T_frame_model: Array, frame: str, centre_m: Array, cloud: object, parameters: NodeParameters
+    ) -> None:
         """Let a good pose pass, or refuse it.
 
         Args:
             T_frame_model: (4, 4), metres.
-            frame: its parent; another one than before starts a new track.
+            frame: its parent; another one than before starts a new row of good poses.
             centre_m: (3,) of the bone, in its own frame, where a jump is measured.
+            cloud: what distinguishes its cloud from others, such as the stamp: one cloud counts once, however often it
+                is registered.
             parameters: `max_jump_*` and `require_consecutive`.
 
         Raises:
             RefusedError: jump, or low_confidence while there are too few good poses in a row.
         """
         if frame != self._frame:
-            self.clear()
+            self.miss()
             self._frame = frame
         self._check_jump(T_frame_model, centre_m, parameters)
-        self._count(T_frame_model, centre_m, parameters)
-        if self._streak < parameters.require_consecutive:
-            text = f"{self._streak} of {parameters.require_consecutive} good poses in a row (require_consecutive)"
+        self._count(T_frame_model, centre_m, cloud, parameters)
+        if len(self._row) < parameters.require_consecutive:
+            text = f"{len(self._row)} of {parameters.require_consecutive} good poses in a row (require_consecutive)"
             raise RefusedError(Reason.LOW_CONFIDENCE, text)
-        self._accepted, self.place = T_frame_model, Place(T_frame_model, frame)
+        self._accepted[frame], self.place = T_frame_model, Place(T_frame_model, frame)
 
     def miss(self) -> None:
-        """A cloud was refused: the row of good poses ends, and the bone may be elsewhere."""
-        self._streak, self._candidate, self.place = 0, None, None
+        """A cloud was refused, or none was looked at: the row of good poses ends, and the bone may be elsewhere."""
+        self._row, self._candidate, self.place = set(), None, None
 
     def _check_jump(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
-        if self._accepted is None:
+        accepted = self._accepted.get(self._frame)
+        if accepted is None:
             return
-        why = jump(self._accepted, T_frame_model, centre_m, parameters)
+        why = jump(accepted, T_frame_model, centre_m, parameters)
         if why:
             self.miss()
             raise RefusedError(Reason.JUMP, f"{why}; call ~/reset if the bone really moved")
 
-    def _count(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
+    def _count(self, T_frame_model: Array, centre_m: Array, cloud: object, parameters: NodeParameters) -> None:
         if self._candidate is not None and jump(self._candidate, T_frame_model, centre_m, parameters):
-            self._streak = 0
+            self._row = set()
         self._candidate = T_frame_model
-        self._streak += 1
+        if len(self._row) < parameters.require_consecutive:  # more say no more
+            self._row.add(cloud)
 
 
 def jump(T_before: Array, T_now: Array, centre_m: Array, parameters: NodeParameters) -> str:

@@ -25,7 +25,9 @@ from gapr_core import Accumulator
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import frames
+from gapr_ros.node.collection import MOST_LATE, Late
 from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.worker import Job
 from msg_adapters import cloud_to_xyz, list_to_covariance, pose_to_matrix, transform_to_matrix, xyz_to_cloud
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
@@ -193,6 +195,104 @@ def test_clouds_from_before_a_reset_are_not_merged(blob_path, client):
         wait_until(lambda: node.counters.received == 4)
         assert client.call("register").success
         np.testing.assert_allclose(method.kept, [GOOD * 9 * 1000.0], atol=1e-3)
+
+
+def test_a_pause_keeps_what_was_collected_and_a_log_line_says_what_ends_a_collection(blob_path, client, capfd):
+    made = []
+    options = {"factory": lambda _: made.append(Collecting()) or made[-1], "accumulate": 9, "continuous": False}
+    with node_in_thread(None, blob_path, **options) as node:
+        client.wait_for_state("active")
+        (method,) = made
+        for i in range(4):
+            client.send(GOOD * (i + 1))
+            wait_until(lambda i=i: node.counters.received == i + 1)
+        for enabled in (False, True):
+            assert client.call("set_enabled", SetBool.Request(data=enabled)).success
+        wait_until(lambda: node.counters.merged == 4, what=node.counters)
+        assert [len(points) for points in method.kept] == [1000] * 4 and node.counters.dropped == 0
+        assert "are forgotten" not in capfd.readouterr().err
+        assert client.call("reset").success
+        wait_until(lambda: not method.kept)
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 5)
+        assert client.call("register").success
+        wait_until(client.seeds.get_subscription_count)
+        client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="probe")))
+        wait_until(lambda: not method.kept)
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 6)
+        assert client.call("register").success
+        assert client.call("reload_model").success
+        wait_until(lambda: not method.kept and node.session._ready.method is made[1])
+    lines = capfd.readouterr().err
+    for why, count in (("a reset", 4000), ("an initialpose", 1000), ("another bone", 1000)):
+        assert f"{why}: the {count} points collected so far are forgotten" in lines
+
+
+def test_clouds_whose_transform_comes_later_are_collected_then(blob_path, client, monkeypatch):
+    """Their transforms lag behind the clouds, and many come while one is registered."""
+    tf2, method = LaggingTf2(), Collecting()
+    monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
+    options = {"output_frame": "tracker", "accumulate": 20, "tf_timeout": 60.0}
+    with node_in_thread(method, blob_path, **options) as node:
+        client.wait_for_state("active")
+        method.gate.clear()
+        calls, tf2.known_s = len(method.calls), 100.0
+        client.send(GOOD, stamp_s=100.0)
+        wait_until(lambda: len(method.calls) > calls)
+        for i in range(1, 9):
+            client.send(GOOD * (1.0 + 0.01 * i), stamp_s=100.0 + i)
+            wait_until(lambda i=i: node.counters.received == i + 1)
+        method.gate.set()
+        wait_until(lambda: node.counters.accepted == 1)
+        time.sleep(0.3)  # the newest waits for its transform now
+        assert (node.counters.merged, node.counters.dropped) == (0, 0)
+        tf2.known_s = 109.0
+        wait_until(lambda: node.counters.merged + node.counters.accepted == 9, what=node.counters)
+        assert node.counters.dropped == 0
+        assert [round(float(points[0, 0] / GOOD[0, 0])) for points in method.kept] == [1000] + [
+            round(1000 + 10 * i) for i in range(1, 9)
+        ]
+
+
+def test_clouds_whose_transform_never_comes_are_dropped_counted_and_logged(blob_path, client, monkeypatch, capfd):
+    tf2, method = LaggingTf2(), Collecting()
+    monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
+    with node_in_thread(method, blob_path, output_frame="tracker", accumulate=20, tf_timeout=0.05) as node:
+        client.wait_for_state("active")
+        method.gate.clear()
+        calls, tf2.known_s = len(method.calls), 100.5
+        client.send(GOOD, stamp_s=100.0)
+        wait_until(lambda: len(method.calls) > calls)
+        for i in range(3):
+            client.send(GOOD, stamp_s=100.6 + 0.1 * i)
+            wait_until(lambda i=i: node.counters.received == i + 2)
+        method.gate.set()
+        wait_until(lambda: node.counters.accepted + node.counters.refused == 2)
+        time.sleep(0.1)
+        assert client.ask(GOOD * 1.1, stamp_s=100.3)["level"] == 0
+        wait_until(lambda: node.counters.dropped == 2)
+        assert (node.counters.merged, node.counters.accepted, len(method.kept)) == (0, 2, 2)
+    assert "a cloud is not registered with the newer ones: tf_missing: tracker <- probe" in capfd.readouterr().err
+
+
+def test_few_clouds_wait_for_their_transforms_and_those_of_before_a_reset_do_not():
+    tries, left = [], []
+
+    def collect(job):
+        tries.append(job)
+        raise RefusedError(Reason.TF_MISSING if job.epoch else Reason.SUPERSEDED_BY_RESET, "for the test")
+
+    late = Late(collect, lambda collected, why: left.append(why))
+    for epoch in (0, *[1] * (MOST_LATE + 2)):
+        late.add(Job(b"", epoch, 0))
+        late.take(60.0)
+    assert left == ["superseded_by_reset: for the test", *["more than 100 clouds wait for their transforms"] * 2]
+    late.take(0.0)
+    assert left[3:] == ["tf_missing: for the test"] * MOST_LATE
+    tries.clear()
+    late.take(0.0)
+    assert not tries
 
 
 def test_clouds_that_are_metres_away_are_left_out_until_they_are_three_in_a_row(blob_path, client, method):
@@ -543,6 +643,27 @@ class FakeTf2:
                 return TransformStamped(transform=matrix_to_transform(T))
 
         return Buffer()
+
+
+class LaggingTf2(FakeTf2):
+    """Knows transforms up to a time."""
+
+    def __init__(self):
+        super().__init__(np.eye(4))
+        self.known_s = 0.0
+
+    def Buffer(self, node):
+        buffer, fake = super().Buffer(node), self
+        known = buffer.lookup_transform
+        buffer.can_transform = lambda parent, child, stamp: stamp.nanoseconds <= fake.known_s * 1e9
+
+        def lookup_transform(parent, child, stamp):
+            if not buffer.can_transform(parent, child, stamp):
+                raise fake.TransformException("into the future")
+            return known(parent, child, stamp)
+
+        buffer.lookup_transform = lookup_transform
+        return buffer
 
 
 def test_with_tf_poses_go_to_the_output_frame_and_to_tf_once_for_each_newer_stamp(

@@ -11,6 +11,7 @@ from harness import StandIn, accepted, node_in_thread, pose_mm, wait_until
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
+from std_srvs.srv import SetBool
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -264,6 +265,43 @@ def test_a_pose_goes_out_after_enough_good_ones_in_a_row(live):
     assert "2 of 3" in client.ask(GOOD)["last_refusal"]
     assert client.ask(GOOD)["level"] == 0
     wait_until(lambda: client.confidences == [0.0] * 5 + [0.9] and len(client.poses) == 1)
+
+
+def test_one_cloud_is_one_good_pose_however_often_it_is_registered(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("require_consecutive", value=3)])
+    assert "1 of 3" in client.ask(GOOD)["last_refusal"]
+    for _ in range(4):
+        assert "1 of 3" in client.call("register").message
+    assert "2 of 3" in client.ask(GOOD)["last_refusal"]
+    assert "2 of 3" in client.call("register").message
+    assert client.ask(GOOD)["level"] == 0
+    assert client.call("register").success
+
+
+def test_neither_another_frame_nor_a_pause_takes_the_limit_of_jumps_away(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("max_jump_translation", value=0.01)])
+    expect_good(live)
+    moved = accepted(pose_mm([0, 0, 0], [50.0, 0, 0]))
+    assert client.ask(GOOD, frame="other")["level"] == 0
+    method.answer = moved
+    assert client.ask(GOOD)["last_refusal"].startswith("jump: moved 0.05 m")
+    for enabled in (False, True):
+        assert client.call("set_enabled", SetBool.Request(data=enabled)).success
+    assert client.ask(GOOD)["last_refusal"].startswith("jump: moved 0.05 m")
+    assert client.ask(GOOD, frame="other")["last_refusal"].startswith("jump: moved 0.05 m")
+    method.answer = accepted()
+    assert client.ask(GOOD)["level"] == 0
+
+
+def test_a_pause_ends_the_row_of_good_poses(live):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("require_consecutive", value=2)])
+    assert "1 of 2" in client.ask(GOOD)["last_refusal"]
+    for enabled in (False, True):
+        assert client.call("set_enabled", SetBool.Request(data=enabled)).success
+    assert "1 of 2" in client.ask(GOOD)["last_refusal"]
 
 
 def test_a_reset_refuses_the_cloud_on_its_way(live):

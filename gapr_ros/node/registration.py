@@ -218,13 +218,22 @@ def _check(result: RegistrationResult, seconds: float, parameters: NodeParameter
         raise RefusedError(Reason.TIMEOUT, f"took {seconds:.3g} s, timeout is {parameters.timeout:g} s")
     if not result.ok:
         raise RefusedError(OF_STATUS[result.status], result.reason)
+    check_limits(result, parameters)
+    for name, value in (("pose", result.T_target_source), ("covariance", result.covariance)):
+        if value is None or not np.isfinite(value).all():
+            raise RefusedError(Reason.NOT_CONVERGED, f"{result.method} gave no finite {name}")
+
+
+def check_limits(result: RegistrationResult, parameters: NodeParameters) -> None:
+    """Refuse what is not sure or not precise enough, by the limits of this moment.
+
+    Raises:
+        RefusedError: low_confidence or imprecise.
+    """
     if not result.confidence >= parameters.min_confidence:
         text = f"confidence {result.confidence:.2f}, min_confidence is {parameters.min_confidence:g}"
         raise RefusedError(Reason.LOW_CONFIDENCE, text)
     _check_precision(result, parameters.max_tre)
-    for name, value in (("pose", result.T_target_source), ("covariance", result.covariance)):
-        if value is None or not np.isfinite(value).all():
-            raise RefusedError(Reason.NOT_CONVERGED, f"{result.method} gave no finite {name}")
 
 
 def _check_precision(result: RegistrationResult, most_m: float) -> None:

@@ -22,7 +22,7 @@ from gapr_ros.node.model import Model, Ready
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.publishers import Publishers
 from gapr_ros.node.refusal import Reason, RefusedError
-from gapr_ros.node.registration import Registration, Seed, Situation, needs_frames
+from gapr_ros.node.registration import Registration, Seed, Situation, check_limits, needs_frames
 from gapr_ros.node.shared_frame import SharedFrame
 from gapr_ros.node.shared_name import SharedName
 from gapr_ros.node.timeline import Timeline
@@ -204,9 +204,18 @@ class Session:
             self._track.miss()
             return
         try:
+            self._check_limits(outcome)
             self._judge(outcome.pose, outcome)
         except RefusedError as refusal:
             outcome.refuse(refusal.reason, refusal.text)
+
+    def _check_limits(self, outcome: Outcome) -> None:
+        """Limits may have been set while the cloud was on its way."""
+        try:
+            check_limits(outcome.result, self._host.parameters)
+        except RefusedError:
+            self._track.miss()
+            raise
 
     def _judge(self, T_frame_model: Array, outcome: Outcome) -> None:
         """Let a pose go out, or refuse it."""

@@ -20,7 +20,7 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
 
 CHANGED = ("max_cloud_age", "timeout", "min_confidence", "cloud_unit", "max_jump_translation", "max_jump_rotation",
-           "require_consecutive", "range_min", "range_max")  # fmt: skip
+           "require_consecutive", "range_min", "range_max", "max_tre")  # fmt: skip
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 
 
@@ -203,6 +203,25 @@ def test_an_exception_of_the_method_is_a_refusal(live, error, reason, text):
     expect_refusal(live, GOOD, reason, text)
     live[2].error = None
     expect_good(live)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "reason"),
+    [("min_confidence", 0.95, "low_confidence: confidence 0.90"), ("max_tre", 0.001, "imprecise: the 95 % bound")],
+)
+def test_a_limit_that_is_set_while_a_cloud_is_on_its_way_holds_for_it(live, name, limit, reason):
+    node, client, method = live
+    expect_good(live)
+    poses, before = len(client.poses), len(method.calls)
+    method.answer = accepted(tre95_mm=2.0)
+    method.gate.clear()
+    client.send(GOOD)
+    wait_until(lambda: len(method.calls) > before)
+    refused = node.counters.refused
+    assert node.set_parameters_atomically([Parameter(name, value=limit)]).successful
+    method.gate.set()
+    wait_until(lambda: node.counters.refused > refused and client.values()["last_refusal"].startswith(reason))
+    assert len(client.poses) == poses
 
 
 def test_a_jump_beyond_the_limit_is_refused_until_a_reset(live):

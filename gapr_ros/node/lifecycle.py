@@ -31,7 +31,7 @@ from gapr_ros.node import frames
 from gapr_ros.node.diagnostics import Counters, Input, Snapshot
 from gapr_ros.node.guard import RosLogHandler, guarded, transition
 from gapr_ros.node.loader import Loader
-from gapr_ros.node.method import default_method
+from gapr_ros.node.method import ShippedMethod
 from gapr_ros.node.model import make_ready
 from gapr_ros.node.reporter import Reporter
 from gapr_ros.node.services import Services
@@ -46,18 +46,19 @@ class RegisterNode(LifecycleNodeMixin, Node):
     """Lifecycle, parameters and clock of the node; a `Session` does the rest.
 
     Args:
-        method_factory: makes the registration method from the parameters when the node is configured.
+        method_factory: makes the registration method from the parameters, when the node is configured and when limits
+            or the bone change; GAPR as it ships by default.
         kwargs: of rclpy's Node (context, parameter_overrides, ...).
 
     Raises:
         ParameterError: a parameter of the wrong type or out of range; the text says what to write.
     """
 
-    def __init__(self, method_factory: Callable[[NodeParameters], Any] = default_method, **kwargs: Any) -> None:
+    def __init__(self, method_factory: Callable[[NodeParameters], Any] | None = None, **kwargs: Any) -> None:
         Node.__init__(self, "register_node", **kwargs)
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())  # one that waits stops no other
         self.parameters = parameters.declare(self)
-        self._method_factory = method_factory
+        self._method_factory = method_factory or ShippedMethod()
         self.counters, self.failure = Counters(), ""
         self.session: Session | None = None
         self.subscriptions_in: Subscriptions | None = None
@@ -67,7 +68,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
         self._watch_clock()
         self._forward_logs()
         self._reporter = Reporter(self, self._look)
-        self._loader, self._loaded = Loader(self, method_factory), None
+        self._loader, self._loaded = Loader(self, self._method_factory), None
         self._services_offered = Services(self, self._loader, lambda: self.state, lambda: self.session)
         self._load_before_configuring()
         self._diagnosing = self.create_timer(self.parameters.diagnostics_period, self.report, clock=_steady_clock())
@@ -126,12 +127,21 @@ class RegisterNode(LifecycleNodeMixin, Node):
             if self._is_to_configure(request.transition):
                 if self._loader.busy:
                     raise RuntimeError(f"{self._loader}: one bone at a time")
-                self._loaded = await self._loader.load()
+                self._loaded = await self._load_to_configure()
             return change(request, response)
         except Exception as error:  # rclpy raises where the state does not allow the transition
             self.get_logger().error(f"a change of state was refused: {error}")
             response.success = False
             return response
+
+    def _load_to_configure(self) -> Future:
+        """Read the bone, and the settings of the method too."""
+        self._forget_settings()
+        return self._loader.load()
+
+    def _forget_settings(self) -> None:
+        if isinstance(self._method_factory, ShippedMethod):
+            self._method_factory.read_again()
 
     def _is_to_configure(self, asked: Transition) -> bool:
         named = asked.label == "configure" if asked.label else asked.id == Transition.TRANSITION_CONFIGURE
@@ -145,6 +155,8 @@ class RegisterNode(LifecycleNodeMixin, Node):
         frames.check_names(self.parameters)
         if isinstance(loaded, BaseException):
             raise loaded
+        if loaded is None:
+            self._forget_settings()
         ready = loaded or make_ready(self._method_factory, self.parameters)
         self.session = Session(self, ready, self._method_factory)
         for sentence in parameters.remarks(self.parameters):
@@ -188,7 +200,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
 
     @guarded
     def _autostart(self) -> None:
-        self._loader.load().add_done_callback(self._start)
+        self._load_to_configure().add_done_callback(self._start)
 
     @guarded
     def _start(self, loading: Future) -> None:
@@ -221,9 +233,14 @@ class RegisterNode(LifecycleNodeMixin, Node):
             source=Input() if listening is None else listening.describe(),
             listening=listening is not None,
             conflicts=() if session is None else session.conflicts.texts,
-            hardware_id=Path(self.parameters.model_path).name or "no model",
+            hardware_id=self._hardware_id(),
             child_frame=self.parameters.model_frame if self.parameters.publish_tf else "",
         )
+
+    def _hardware_id(self) -> str:
+        """The bone in use, which is not the one that the parameters name before it is read, or when it cannot be."""
+        path = self.parameters.model_path if self.session is None else self.session.model.path
+        return Path(path).name or "no model"
 
     # --- what the node watches ---
 

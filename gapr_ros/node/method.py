@@ -12,17 +12,37 @@ if TYPE_CHECKING:
     from gapr_core import RegistrarConfig
 
 
-def default_method(parameters: NodeParameters) -> Any:
-    """GAPR as it ships: a `Tracker`, with `track: false` the `Registrar`; an `Accumulator` of either on demand."""
-    from gapr_core import Accumulator, Registrar, Tracker
+class ShippedMethod:
+    """GAPR as it ships: a `Tracker`, with `track: false` the `Registrar`; an `Accumulator` of either on demand.
 
-    registrar = Registrar.from_pretrained(configured(parameters), parameters.device)
-    method = Tracker(registrar) if parameters.track else registrar
-    return Accumulator(method, parameters.accumulate) if parameters.accumulate > 1 else method
+    `settings_file` is read once. A method with other limits, or for another bone, has the settings of before, whatever
+    has become of the file.
+    """
+
+    def __init__(self) -> None:
+        self._settings: RegistrarConfig | None = None
+
+    def read_again(self) -> None:
+        """Read the file with the next method: the node is configured again."""
+        self._settings = None
+
+    def __call__(self, parameters: NodeParameters) -> Any:
+        """Make a method.
+
+        Raises:
+            ConfigError: the file cannot be read, or holds what no setting is.
+        """
+        from gapr_core import Accumulator, Registrar, Tracker
+
+        if self._settings is None:
+            self._settings = read_settings(parameters.settings_file)
+        registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device)
+        method = Tracker(registrar) if parameters.track else registrar
+        return Accumulator(method, parameters.accumulate) if parameters.accumulate > 1 else method
 
 
-def configured(parameters: NodeParameters) -> RegistrarConfig:
-    """The library's settings: those of `settings_file`, with the node's own parameters over them.
+def read_settings(path: str) -> RegistrarConfig:
+    """The library's settings in a file; no path: its own.
 
     Raises:
         ConfigError: the file cannot be read, or holds what no setting is.
@@ -30,7 +50,11 @@ def configured(parameters: NodeParameters) -> RegistrarConfig:
     from gapr_core import RegistrarConfig
     from gapr_core.runtime import settings
 
-    config = settings.load(RegistrarConfig, parameters.settings_file or None)
+    return settings.load(RegistrarConfig, path or None)
+
+
+def configured(config: RegistrarConfig, parameters: NodeParameters) -> RegistrarConfig:
+    """The library's settings with the node's own parameters over them."""
     sensor = config.sensor if parameters.sensor == "unknown" else replace(config.sensor, kind=parameters.sensor)
     if parameters.standoff:
         sensor = replace(sensor, standoff_mm=parameters.standoff * MM_PER_M)

@@ -15,6 +15,8 @@ from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from gapr_ros.node.method import ShippedMethod
+
 LIMIT_S = 2.0  # of CPU time
 SIGNALS = [  # one of them every day: each needs a node of its own, which takes seconds to start
     signal.SIGTERM,
@@ -39,6 +41,23 @@ def slow():
     made = Slow()
     made.gate.clear()
     return made
+
+
+def test_the_settings_file_is_read_when_configuring_and_limits_hold_whatever_has_become_of_it(tmp_path, client):
+    path, factory = tmp_path / "settings.yaml", ShippedMethod()
+    path.write_text("refinement: {rounds: 11}\n")
+    bone = bones.save(bones.bone(), tmp_path / "bone.npz")
+    with node_in_thread(None, bone, factory=factory, settings_file=str(path), track=False) as node:
+        client.wait_for_state("active")
+        assert node.session._ready.method.config.refinement.rounds == 11
+        path.write_text("nonsense: [\n")
+        assert node.set_parameters([Parameter("min_confidence", value=0.7)])[0].successful
+        wait_until(lambda: node.session._ready.method.config.min_confidence == 0.7, PATIENCE_S, "the new limit")
+        assert node.session._ready.method.config.refinement.rounds == 11
+        assert client.call("reload_model").success
+        for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+            assert client.change_state(transition)
+        assert not client.change_state(Transition.TRANSITION_CONFIGURE), "now it is read again"
 
 
 def state_of(client):

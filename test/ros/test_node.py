@@ -416,6 +416,7 @@ def test_reload_keeps_the_old_bone_until_the_new_one_is_ready(live, tmp_path, bl
     answer = client.call("reload_model")
     assert not answer.success and answer.message.startswith("the old bone stays: expected a file that exists")
     assert client.ask(GOOD)["model_path"] == str(blob_path)
+    assert {entry.hardware_id for entry in client.diagnostics[-1].status} == {"blob.npy"}
 
     np.save(tmp_path / "new.npy", np.random.default_rng(5).normal(size=(700, 3)) * 40.0)
     node.set_parameters([Parameter("model_path", value=str(tmp_path / "new.npy"))])

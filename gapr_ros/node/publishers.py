@@ -99,7 +99,7 @@ class Publishers:
             self._topics["aligned"].publish(xyz_to_cloud(points.astype("f4"), outcome.header))
 
     def _send_seen(self, outcome: Outcome) -> None:
-        """What people look at: with refusals above all."""
+        """What users look at: with refusals above all."""
         if self._host.parameters.publish_hypotheses:
             self._topics["hypotheses"].publish(messages.hypotheses(outcome))
         if outcome.result is None:
@@ -108,6 +108,7 @@ class Publishers:
         if residuals is not None and self._is_heard("residuals"):
             self._topics["residuals"].publish(messages.residuals(residuals, outcome.header))
         if guidance is not None and guidance.patches:
-            header = self._of_model(outcome.header.stamp)  # tf2 has the bone at the stamp of the cloud, not later
+            # tf2 has the bone at the stamp of an accepted cloud; of a refused one, where it was last: at stamp 0
+            header = self._of_model(outcome.header.stamp if outcome.ok else Time())
             self._topics["guidance"].publish(messages.guidance(guidance, header))
             self._topics["next_view"].publish(messages.next_view(guidance, header))

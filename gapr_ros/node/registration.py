@@ -179,7 +179,7 @@ class Registration:
         if not frame:
             return np.eye(4)
         stamp = Time.from_msg(outcome.header.stamp)
-        return self._frames.lookup(frame, outcome.cloud_frame, stamp, now.parameters.tf_timeout)
+        return self._frames.lookup(intake.plain_frame(frame), outcome.cloud_frame, stamp, now.parameters.tf_timeout)
 
 
 def needs_frames(parameters: NodeParameters) -> bool:

@@ -95,7 +95,7 @@ class Session:
                 self._admit(header, now_ns)
         except RefusedError as refusal:
             job = Job(b"", self._epoch, now_ns)
-            self._answer(Outcome.refused(job, header, refusal.reason, refusal.text))
+            self._answer(Outcome.refused(job, timeline.normal(header), refusal.reason, refusal.text))
             return
         self._put(Job(data, self._epoch, now_ns))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.time import Time
 from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
@@ -20,6 +21,13 @@ ALIKE_M = 1e-5  # two poses of one stamp that move no point of the bone by more 
 def stamp_ns(header: Header) -> int:
     """The stamp, ns; 0 when there is none."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def normal(header: Header) -> Header:
+    """The header with a stamp whose nanoseconds are less than a second; stamp 0 where it is no time."""
+    stamp = stamp_ns(header)
+    known = stamp if 0 <= stamp < LAST_NS else 0
+    return Header(frame_id=header.frame_id, stamp=Time(nanoseconds=known).to_msg())
 
 
 def check_stamp(stamp: int) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import time
 import types
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Pose, PoseArray, PoseStamped, PoseWithCovariance, Vector3
 from harness import NODE, accepted, node_in_thread, pose_mm, wait_until
@@ -128,6 +130,11 @@ def test_residuals_and_guidance_are_sent_in_metres(live):
     np.testing.assert_allclose(T[:3, 3], [0.1, 0.0, 0.0])
     np.testing.assert_allclose(T[:3, 0], [0.0, 0.0, 1.0], atol=1e-12, err_msg="x leaves the bone")
     assert isinstance(view, PoseStamped) and isinstance(sent, PointCloud2)
+    assert gain.header.stamp == view.header.stamp == TimeMessage(), "refused: tf2 has no bone at the cloud's stamp"
+    method.answer = accepted(guidance=guidance)
+    client.ask(GOOD, stamp_s=time.time())
+    wait_until(lambda: len(heard["next_view"]) == 2 and client.poses)
+    assert heard["next_view"][1].header.stamp == client.poses[-1].header.stamp
 
 
 def records(cloud):

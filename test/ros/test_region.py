@@ -104,7 +104,7 @@ def test_the_box_is_looked_up_in_its_frame_and_a_missing_frame_is_a_refusal(blob
     monkeypatch.setattr(frames, "_import_tf2", Tf2)
     middle = se3.apply(T_BOX_PROBE, GOOD.mean(axis=0)[None])[0]
     options = {"crop_min": (middle - 1.0).tolist(), "crop_max": (middle + 1.0).tolist(), "tf_timeout": 0.0}
-    with node_in_thread(method, blob_path, crop_frame="table", **options):
+    with node_in_thread(method, blob_path, crop_frame="/table", **options):
         client.wait_for_state("active")
         values = client.ask(np.vstack([GOOD, FAR]), frame="probe")
         assert values["level"] == 0 and values["points_used"] == "1000"

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import TransformStamped
 from harness import accepted, node_in_thread, pose_mm, wait_until
 from hypothesis import given, settings
@@ -16,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
-from gapr_ros.node import frames
+from gapr_ros.node import frames, timeline
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.timeline import BACK_NS, Timeline
 from gapr_ros.parameters import NodeParameters
@@ -81,6 +82,15 @@ def test_small_steps_back_do_not_add_up():
     judged(timeline, 100.0)
     answers = [judged(timeline, 100.0 - 0.6 * i) for i in range(4)]
     assert answers == [False, False, Reason.STALE, Reason.STALE]
+
+
+LAST = 2**31 - 1, 2**32 - 1
+
+
+@pytest.mark.parametrize(("given", "normal"), [((5, 2000000003), (7, 3)), ((-1, 0), (0, 0)), (LAST, (0, 0))])
+def test_the_stamp_of_a_refusal_is_normal(given, normal):
+    stamp = timeline.normal(Header(stamp=TimeMessage(sec=given[0], nanosec=given[1]))).stamp
+    assert (stamp.sec, stamp.nanosec) == normal
 
 
 def answered(timeline, stamp_s, x_m=0.0, frame="probe"):

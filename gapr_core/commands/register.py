@@ -92,10 +92,10 @@ def run(args: Namespace) -> int:
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
+    checks.check_method(args)
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
     method = methods.make(args.method, config)
-    checks.check_method(args)
     plan, hints = _plan(args), _hints(args, method)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
     checks.warn_of_axes(args)

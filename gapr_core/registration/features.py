@@ -126,8 +126,7 @@ def scale_of(fit: Fit, config: CovarianceConfig, prior: ScaleConfig) -> tuple[fl
     """
     if np.count_nonzero(fit.weights) < prior.fewest_points:
         return 0.0, 1.0
-    outward = np.einsum("ni,ni->n", fit.gradients, fit.moved - fit.moved.mean(axis=0))
-    growth = outward - np.nan_to_num(fit.signed_mm)  # of the foot points: the points' own noise is in the residuals
+    growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # the points hold the noise too
     more = np.column_stack([growth, np.ones_like(growth)])
     bias = config.correlation_mm, config.centres
     equations = equations_of(fit, *bias).extended(fit, fields(fit, *bias), more, (prior.widest, prior.standoff_mm))

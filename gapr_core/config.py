@@ -106,7 +106,7 @@ class CovarianceConfig(Settings):
     smallest_share: float = setting(0.03, "least information of a usable field, over the largest", low=0, high=1)
     bias_gain: float = setting(2.1, "bias over what the residuals of a robust fit show of it", low=0, high=100)
     no_bias_mm: float = setting(0.035, "bias that residuals without any show on average", low=0, high=10, unit="mm")
-    bias_spread: float = setting(1.5, "log standard deviation of the bias before the residuals", low=0.01, high=10)
+    bias_spread: float = setting(1.0, "log standard deviation of the bias before the residuals", low=0.01, high=10)
     long_share: float = setting(0.5, "of the bias that all points share, over its size", low=0, high=10)
     linear_share: float = setting(
         0.6, "relative strain of the source times its root mean square radius, over the bias", low=0, high=10

@@ -3,7 +3,8 @@
 The field has correlation exp(-d^2 / 2 l^2) and is spanned by a few dozen of the inliers (Nystrom). It is a function of
 the foot points: at the points themselves it would change along the normal with their own noise, which then passes for a
 bias. Its size follows from the residuals by restricted maximum likelihood, in which the pose is integrated out
-(Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
+(Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7). Errors that only near points share, such as the
+windows of a stereo camera, are no such field: they make the noise of sums larger, by a design effect (Kish 1965).
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ from gapr_core.registration.refinement import Fit
 
 Array = NDArray[np.float64]
 
+DESIGN_EFFECTS = np.geomspace(0.25, 20.0, 16)  # to choose from
+EFFECT_SPREAD = 0.7  # log standard deviation of the design effect about 1 before the scores are seen
+BIASES_MM = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0])
+DETERMINED = 1e-5  # information of a field over the largest, below which its score is rounding
 POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
 ROUNDED = 6  # digits after the point, mm, by which centres are chosen: where two are as good, rounding must not choose
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
@@ -61,6 +66,7 @@ class NormalEquations:
 
     Attributes:
         JJ, JF, FF, Jy, Fy: J^T W J and so on; W is the inverse variance of the points.
+        design_effect: by which W is divided, since near points err alike (see `with_design_effect`).
     """
 
     JJ: Array
@@ -68,6 +74,7 @@ class NormalEquations:
     FF: Array
     Jy: Array
     Fy: Array
+    design_effect: float = 1.0
 
     @classmethod
     def of(cls, fit: Fit, fields: Array) -> NormalEquations:
@@ -81,6 +88,28 @@ class NormalEquations:
         P = R.T @ R  # the rows carry the root of W: a symmetric product takes half the time
         return cls(P[m:-1, m:-1] + POSE_PRIOR, P[m:-1, :m], P[:m, :m], P[m:-1, -1], P[:m, -1])
 
+    def with_design_effect(self, effect: float) -> NormalEquations:
+        """The same where errors that near points share make sums of points vary `effect` times as much (Kish 1965)."""
+        JJ, JF, FF, Jy, Fy = (each / effect for each in (self.JJ, self.JF, self.FF, self.Jy, self.Fy))
+        return NormalEquations(JJ, JF, FF, Jy, Fy, self.design_effect * effect)
+
+    def expected_design_effect(self) -> float:
+        """Geometric mean of the design effect under the scores, with a smooth bias of any size.
+
+        A score s of a field with information i varies by k i under errors of design effect k, and by b^2 i^2 more under
+        a bias b: the rough fields, of little information, say how large k is, the smooth ones how large b is.
+        """
+        information, score = self._fields_alone
+        determined = information > DETERMINED * max(information[-1], 0.0)
+        i, s = information[determined], score[determined]
+        k, b = DESIGN_EFFECTS[:, None, None], BIASES_MM[:, None]
+        variances = k * i + b**2 * i**2
+        log_likelihood = -0.5 * (s**2 / variances + np.log(variances)).sum(axis=-1)
+        log_k = np.log(DESIGN_EFFECTS)
+        log_posterior = log_likelihood - 0.5 * (log_k[:, None] / EFFECT_SPREAD) ** 2
+        posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
+        return float(np.exp(posterior @ log_k / posterior.sum()))
+
     def extended(self, fit: Fit, fields: Array, more: Array, sizes: ArrayLike) -> NormalEquations:
         """The same with further unknowns, after the six of the motion.
 
@@ -90,11 +119,11 @@ class NormalEquations:
             more: (N, k) derivatives of the residuals by the further unknowns.
             sizes: (k,) standard deviations of these before the residuals are seen.
         """
-        weighted = fit.weights[:, None] / fit.sigma_mm**2 * more
+        weighted = fit.weights[:, None] / (self.design_effect * fit.sigma_mm**2) * more
         across, y = fit.jacobian.T @ weighted, np.nan_to_num(fit.signed_mm)
         JJ = np.block([[self.JJ, across], [across.T, more.T @ weighted + np.diag(1.0 / np.square(sizes))]])
         JF, Jy = np.vstack([self.JF, weighted.T @ fields]), np.append(self.Jy, weighted.T @ y)
-        return NormalEquations(JJ, JF, self.FF, Jy, self.Fy)
+        return NormalEquations(JJ, JF, self.FF, Jy, self.Fy, self.design_effect)
 
     def log_likelihood(self, sizes_mm: Array, smallest_share: float) -> Array:
         """(K,) restricted log likelihood of standard deviations (K,) of the bias; 0 without a bias.
@@ -132,8 +161,9 @@ class NormalEquations:
 
 @lru_cache(maxsize=4)  # as `fields`
 def equations_of(fit: Fit, correlation_mm: float, centres: int) -> NormalEquations:
-    """`NormalEquations.of` a fit and its own `fields`."""
-    return NormalEquations.of(fit, fields(fit, correlation_mm, centres))
+    """`NormalEquations.of` a fit and its own `fields`, with the design effect that their scores show."""
+    equations = NormalEquations.of(fit, fields(fit, correlation_mm, centres))
+    return equations.with_design_effect(equations.expected_design_effect())
 
 
 def root_mean_square(sizes_mm: Array, log_posterior: Array) -> float:

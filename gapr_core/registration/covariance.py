@@ -82,7 +82,8 @@ def estimate(
     spanned = fields(fit, config.correlation_mm, config.centres)
     equations = equations_of(fit, config.correlation_mm, config.centres)
     bias_mm = config.bias_gain * expected_bias_mm(equations, known.bias_mm, config)
-    noise_mm = expected_noise_mm(fit.sigma_mm, count, known.noise_mm, config.noise_points)
+    sigma_mm = float(np.sqrt(equations.design_effect)) * fit.sigma_mm
+    noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, config.noise_points)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
     covariance = sandwich(fit, spanned, expected, config)
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)

@@ -65,7 +65,7 @@ def corrected_fit(
     equations = equations_of(fit, config.correlation_mm, config.centres)
     for number in range(config.iterations):
         if number:
-            equations = NormalEquations.of(corrected, spanned)
+            equations = NormalEquations.of(corrected, spanned).with_design_effect(equations.design_effect)
         size_mm = believed_size_mm(equations, config)
         if size_mm == 0.0:
             break

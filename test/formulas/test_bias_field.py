@@ -4,10 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from gapr_core.registration import bias_field
-from gapr_core.registration.bias_field import NormalEquations, fields, root_mean_square, smooth_correlation
+from gapr_core.registration.bias_field import (
+    NormalEquations,
+    equations_of,
+    fields,
+    root_mean_square,
+    smooth_correlation,
+)
 from gapr_core.registration.refinement import Fit
 
 COUNT, FIELDS, SIGMA_MM = 24, 4, 0.6
@@ -174,3 +180,65 @@ def test_the_size_is_the_posterior_root_mean_square():
 
 def test_the_prior_of_a_motion_is_weak():
     assert np.array_equal(np.diag(bias_field.POSE_PRIOR), [1e-6] * 3 + [1e-3] * 3)
+
+
+def by_hand(information, score):
+    """Geometric mean of k under scores of variance k i + b^2 i^2, b one of the sizes, k log-normal about 1."""
+    log_k, chance = np.log(bias_field.DESIGN_EFFECTS), np.zeros(len(bias_field.DESIGN_EFFECTS))
+    for place, k in enumerate(bias_field.DESIGN_EFFECTS):
+        for b in bias_field.BIASES_MM:
+            sds = np.sqrt(k * information + b**2 * information**2)
+            chance[place] += np.exp(norm.logpdf(score, 0.0, sds).sum() + norm.logpdf(log_k[place], 0.0, 0.7))
+    return np.exp((chance * log_k).sum() / chance.sum())
+
+
+@pytest.mark.parametrize("times", [0.3, 1.0, 4.0])
+def test_the_design_effect_is_the_posterior_mean_over_scores_of_rough_and_smooth_fields(times):
+    information = np.array([0.02, 0.3, 1.0, 5.0, 40.0])
+    score = times * np.sqrt(information) * np.array([1.0, -0.7, 1.2, 2.0, -6.0])
+    found = hand_made(information, score).expected_design_effect()
+    assert found == pytest.approx(by_hand(information, score), rel=1e-6)
+
+
+@pytest.mark.parametrize("effect", [0.5, 1.0, 4.0, 10.0])
+@pytest.mark.parametrize("bias_mm", [0.0, 1.0])
+def test_the_design_effect_is_found_whatever_the_bias(effect, bias_mm):
+    rng, information = np.random.default_rng(5), np.geomspace(1e-3, 1e3, 70)
+    sds = np.sqrt(effect * information + bias_mm**2 * information**2)
+    found = [hand_made(information, sds * rng.normal(size=70)).expected_design_effect() for _ in range(30)]
+    assert np.exp(np.mean(np.log(found))) == pytest.approx(effect, rel=0.25)
+
+
+def test_fields_that_the_points_hardly_determine_say_nothing_of_the_design_effect():
+    information, score = np.array([1.0, 4.0]), np.array([1.0, -3.0])
+    wanted = hand_made(information, score).expected_design_effect()
+    rounding = hand_made([3e-5, *information], [0.5, *score]), hand_made([5e-5, *information], [0.5, *score])
+    assert rounding[0].expected_design_effect() == wanted != rounding[1].expected_design_effect()
+    assert hand_made([0.0, 0.0], [0.0, 0.0]).expected_design_effect() == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_design_effect_is_a_variance_of_all_points(fit, spanned):
+    """Sums of points vary as if each point had sqrt(k) times its standard deviation; further unknowns too."""
+    more, sizes = np.random.default_rng(4).normal(size=(COUNT, 2)), (0.3, 0.05)
+    alike, rough = replace(fit, sigma_mm=3.0 * SIGMA_MM), NormalEquations.of(fit, spanned)
+    found, wanted = rough.with_design_effect(2.0).with_design_effect(4.5), NormalEquations.of(alike, spanned)
+    for name in ("JF", "FF", "Jy", "Fy"):
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name))
+    assert found.JJ == pytest.approx(wanted.JJ, abs=1e-3)  # the prior of the motion
+    found, wanted = found.extended(fit, spanned, more, sizes), wanted.extended(alike, spanned, more, sizes)
+    assert found.step(0.4) == pytest.approx(wanted.step(0.4), rel=1e-3) and found.design_effect == pytest.approx(9.0)
+    assert found.step_covariance(0.4) == pytest.approx(wanted.step_covariance(0.4), rel=1e-3)
+
+
+@pytest.mark.parametrize(("clump", "least", "most"), [(1, 0.7, 1.2), (8, 5.0, 9.0)])
+def test_points_that_err_alike_in_clumps_have_a_design_effect(clump, least, most):
+    """n points with one error vary as n^2 in a sum, where n independent ones vary as n."""
+    rng = np.random.default_rng(8)
+    middles = rng.uniform(-40.0, 40.0, (3200 // clump, 2))
+    places = np.repeat(middles, clump, axis=0) + rng.uniform(-0.5, 0.5, (3200, 2))
+    x, y = places.T / 60.0
+    normals = np.column_stack([x, y, np.sqrt(1.0 - x**2 - y**2)])
+    signed = np.repeat(rng.normal(0.0, 0.5, len(middles)), clump)
+    moved = (60.0 + signed[:, None]) * normals
+    cap = Fit(np.eye(4), 0.5, signed, np.ones(3200), normals, np.zeros(3200, dtype=np.int64), moved)
+    assert least < equations_of(cap, 20.0, 80).design_effect < most

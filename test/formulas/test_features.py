@@ -9,6 +9,7 @@ import pytest
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import features
+from gapr_core.registration.bias_field import equations_of
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
@@ -127,7 +128,9 @@ def test_the_size_is_that_of_least_squares_with_a_standoff_beside_it(points, pri
     growth = (fit.gradients * (fit.moved - fit.moved.mean(axis=0))).sum(axis=1)
     fit = replace(fit, signed_mm=-0.04 * growth + 0.2 + rng.normal(0.0, 0.3, COUNT))
     scale, sd = features.scale_of(fit, SURE_OF_NO_BIAS, prior)
-    assert (scale, sd) == pytest.approx(dense_scale(fit, prior), rel=1e-3) and abs(scale) > 0.01
+    effect = equations_of(fit, SURE_OF_NO_BIAS.correlation_mm, SURE_OF_NO_BIAS.centres).design_effect
+    alike = replace(fit, sigma_mm=np.sqrt(effect) * fit.sigma_mm)
+    assert (scale, sd) == pytest.approx(dense_scale(alike, prior), rel=1e-3) and abs(scale) > 0.01 and effect != 1.0
 
 
 @pytest.mark.parametrize(("inliers", "is_known"), [(7, False), (8, True)])

@@ -31,10 +31,14 @@ class Equations:
     """Evidence for a bias in the first rounds, the same step in each."""
 
     def __init__(self, believed):
-        self.believed, self.seen = list(believed), []
+        self.believed, self.seen, self.effects, self.design_effect = list(believed), [], [], 3.0
 
     def of(self, fit, spanned):
         self.seen.append(fit.T)
+        return self
+
+    def with_design_effect(self, effect):
+        self.effects.append(effect)
         return self
 
     def log_likelihood(self, sizes_mm, share):
@@ -77,6 +81,7 @@ def test_each_round_steps_about_the_centroid_of_where_the_source_lies(steps, rou
     found = corrected(fit_of(np.eye(4)), replace(CONFIG, iterations=rounds))
     assert found.T == pytest.approx(moved_by(rounds, np.eye(4)), abs=1e-12) and len(equations.seen) == rounds
     assert found.bias_mm == pytest.approx(0.5)
+    assert equations.effects == [3.0] * (rounds - 1)  # that of the first round stays
 
 
 def test_a_round_without_evidence_is_the_last(steps):

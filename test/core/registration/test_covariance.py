@@ -347,7 +347,27 @@ def test_a_share_of_the_bias_moves_all_points_together():
     noise = np.random.default_rng(0).normal(0.0, 0.5, 400)
     fit = replace(fit, signed_mm=0.6 * fields @ np.random.default_rng(1).normal(size=fields.shape[1]) + noise)
     without, with_it = (covariance.estimate(fit, replace(CONFIG, long_share=share)) for share in (0.0, 2.0))
-    noise_mm = covariance.expected_noise_mm(0.5, np.count_nonzero(fit.weights), 0.5, CONFIG.noise_points)
+    effect = bias_field.equations_of(fit, CONFIG.correlation_mm, CONFIG.centres).design_effect
+    sigma_mm = np.sqrt(effect) * 0.5
+    noise_mm = covariance.expected_noise_mm(sigma_mm, np.count_nonzero(fit.weights), 0.5, CONFIG.noise_points)
     together = covariance.gain_of(fit, fields, noise_mm)[0].sum(axis=1)
     expected = (2.0 * without.bias_mm) ** 2 * np.outer(together, together)
     np.testing.assert_allclose(with_it.covariance - without.covariance, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_points_that_err_alike_make_the_noise_of_the_pose_larger():
+    """The variance of a pose under the noise alone grows by the design effect."""
+    config = replace(CONFIG, bias_gain=0.0, noise_points=0.0)
+    sensor = SensorConfig(standoff_mm=0.0, known_standoff_mm=1e-3, scale=0.0)
+    fit = curved_fit(2000, sigma_mm=0.5)
+    rng = np.random.default_rng(3)
+    effects, sizes = [], []
+    for clump in (1, 10):
+        near = np.lexsort(fit.moved.T.round(-1))  # along one side after another: neighbours in a row
+        signed = np.empty(2000)
+        signed[near] = np.repeat(rng.normal(0.0, 0.5, 2000 // clump), clump)
+        alike = replace(fit, signed_mm=signed, moved=fit.moved + signed[:, None] * fit.gradients)
+        effects.append(bias_field.equations_of(alike, CONFIG.correlation_mm, CONFIG.centres).design_effect)
+        sizes.append(np.trace(covariance.estimate(alike, config, sensor).covariance[:3, :3]))
+    assert effects[1] > 2.0 * effects[0]
+    assert sizes[1] / sizes[0] == pytest.approx(effects[1] / effects[0], rel=0.05)

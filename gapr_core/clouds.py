@@ -15,9 +15,10 @@ from gapr_core.surface import Array, Surface, as_points
 
 log = logging.getLogger(__name__)
 
-MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
 BEYOND = 1e12  # no coordinate, whatever its unit, but bytes that were read as one; its square may be infinite
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
+WHOLE_BONE_MM = (60.0, 700.0)  # smaller are a patella, bones of hand and foot, the neck's vertebrae; larger is no bone
 
 
 def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: ReadOptions | None = None) -> Surface:
@@ -27,7 +28,7 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         source: path to a mesh or cloud (PLY, PCD, STL, OBJ, VTK, VTP, XYZ, CSV, NPY, or NPZ with `points` and `faces`),
             a label map (NIfTI, NRRD, MHA, DICOM SEG), markups or tracked slices; an (N, 3) array of floats (rows that
             are not finite are dropped); or a `Surface`.
-        units: what the numbers are, "mm" or "m"; "auto" guesses from the extent and logs a warning.
+        units: what the numbers are, "mm", "cm" or "m"; "auto" guesses mm or m from the extent and logs a warning.
             Files in patient coordinates (label maps, markups) are in mm, whatever is named here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
 
@@ -67,7 +68,7 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
 
     Args:
         extent_mm: its diagonal.
-        unit: that it was read as, "mm" or "m".
+        unit: that it was read as, "mm", "cm" or "m".
         name: what it is called in the message.
         where: the unit stands, if not in a call: "in its header".
     """
@@ -77,7 +78,7 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
     hint = "check the file and its unit"
     if other:
-        option = f"pass units={other!r} (--units {other}, of both files; model_unit)"
+        option = f"pass units={other!r} (--units {other}, of both files{'' if other == 'cm' else '; model_unit'})"
         how = f"correct the unit {where}" if where else f"{option}, or convert to {unit}"
         hint = f"it looks like {other}: {how}"
     raise InvalidPointCloudError(
@@ -87,12 +88,35 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
     )
 
 
+def warn_of_size(path: Path, extent_mm: float) -> None:
+    """Warn of a whole bone of an uncommon size: it and a source in the same wrong unit fit each other.
+
+    Args:
+        path: the file that was read.
+        extent_mm: the diagonal of what is in it.
+    """
+    low, high = WHOLE_BONE_MM
+    if low <= extent_mm <= high:
+        return
+    in_header = reading.format_of(path).in_patient
+    how = (
+        "correct the unit in its header"
+        if in_header
+        else "name the unit, such as units='cm' (--units cm, of both files)"
+    )
+    if extent_mm < low:
+        said = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"
+    else:
+        said = "longer than any human bone. If this is one bone"
+    log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, said, how)
+
+
 def _mm_per_unit(surface: Surface, units: str, name: str) -> float:
     if units == "auto":
         units = "m" if surface.extent_mm < EXTENT_LIMITS_MM[0] else "mm"
         log.warning("%s is %.3g across: taken to be in %s; name the unit to be sure", name, surface.extent_mm, units)
     if units not in MM_PER_UNIT:
-        raise InvalidPointCloudError("units 'mm', 'm' or 'auto'", repr(units), "name one of them")
+        raise InvalidPointCloudError("units 'mm', 'cm', 'm' or 'auto'", repr(units), "name one of them")
     check_extent(surface.extent_mm * MM_PER_UNIT[units], units, name)
     return MM_PER_UNIT[units]
 

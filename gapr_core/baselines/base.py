@@ -87,7 +87,7 @@ class Baseline(ABC):
         Args:
             target: path, (M, 3) array, `Surface`, or anything with `.points` (and `.normals`) in mm, such as a
                 target that another method prepared. Meshes are sampled with 8192 points, always the same ones.
-            units: unit of a path or an array, "mm" or "m".
+            units: unit of a path or an array, "mm", "cm" or "m".
 
         Raises:
             InvalidPointCloudError: for what cannot be a target.

@@ -44,7 +44,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--source", required=True, type=Path, help="partial cloud, markups, recording, folder of slices, bag"
     )
     parser.add_argument("--target", required=True, type=Path, help="full bone: mesh, cloud or label map")
-    parser.add_argument("--units", choices=("mm", "m"), help="of meshes and clouds (default: mm; clouds of a bag: m)")
+    parser.add_argument(
+        "--units", choices=("mm", "cm", "m"), help="of meshes and clouds (default: mm; clouds of a bag: m)"
+    )
     parser.add_argument("--topic", default="", help="of the clouds in a bag; may be left out where it has one")
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
@@ -89,6 +91,7 @@ def run(args: Namespace) -> int:
     Raises:
         GaprError: options or files that cannot be used, before the work; what a method did not say, at the end.
     """
+    from gapr_core import clouds
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
@@ -98,6 +101,7 @@ def run(args: Namespace) -> int:
     method = methods.make(args.method, config)
     plan, hints = _plan(args), _hints(args, method)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
+    clouds.warn_of_size(args.target, target.extent_mm)
     checks.warn_of_axes(args)
     whole = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds)
     if whole.faces is not None and target.faces is None:

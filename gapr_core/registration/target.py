@@ -82,7 +82,7 @@ def prepare(
 
     Args:
         target: path, `Surface` or (M, 3) array (see `clouds.load`).
-        units: "mm", "m" or "auto".
+        units: "mm", "cm", "m" or "auto".
         config: sizes; the defaults suit bones from a cartilage to a pelvis.
         num_threads: 0 for all cores; the answer does not depend on it.
 
@@ -91,6 +91,8 @@ def prepare(
     """
     config = config or TargetConfig()
     surface = clouds.load(target, units)
+    if isinstance(target, str | Path):
+        clouds.warn_of_size(Path(target), surface.extent_mm)
     points, normals = _surface_elements(surface, config, num_threads)
     _check_is_a_body(points, config)
     spacing_mm = quadrics.spacing(points, num_threads=num_threads)

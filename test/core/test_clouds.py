@@ -5,6 +5,7 @@ import pytest
 
 from gapr_core import clouds
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.registration import target
 from gapr_core.surface import Surface
 
 VERTICES = np.array([[0, 0, 0], [40, 0, 0], [0, 30, 0], [0, 0, 20]], dtype=float)
@@ -101,6 +102,29 @@ def test_metres_read_as_millimetres_are_refused_with_the_way_to_fix_it():
 def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
     with pytest.raises(InvalidPointCloudError, match="it looks like mm"):
         clouds.load(VERTICES, units="m")
+
+
+def test_centimetres_become_millimetres_and_are_asked_for():
+    assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
+    with pytest.raises(
+        InvalidPointCloudError, match=r"it looks like cm: pass units='cm' \(--units cm, of both files\)"
+    ):
+        clouds.load(VERTICES / 10.0, units="mm")
+
+
+@pytest.mark.parametrize(("extent_mm", "said"), [
+    (45.0, "45 mm across, as small as a patella"), (61.0, ""), (690.0, ""), (900.0, "900 mm across, longer than any"),
+])  # fmt: skip
+def test_a_target_of_an_uncommon_size_is_warned_of(tmp_path, caplog, extent_mm, said):
+    """A bone in cm and a source in cm, both read as mm, fit each other: only the size can show it."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(400, 3))
+    np.save(tmp_path / "bone.npy", points * extent_mm / Surface(points).extent_mm)
+    target.prepare(tmp_path / "bone.npy")
+    assert said in caplog.text and ("bone.npy is" in caplog.text) == bool(said)
+    caplog.clear()
+    target.prepare(np.load(tmp_path / "bone.npy"))
+    assert not caplog.text, "arrays come from programs, which may register small things"
 
 
 def test_auto_guesses_the_unit_and_warns(caplog):

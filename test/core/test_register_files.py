@@ -84,6 +84,14 @@ def test_files_in_lps_of_a_bone_that_is_turned_to_ras_are_refused(folder, capsys
     assert f"--axes lps or ras with {option.split()[0]}, which is LPS" in capsys.readouterr().err
 
 
+def test_a_target_in_centimetres_that_is_read_as_millimetres_is_warned_of(folder, caplog):
+    np.save("s.npy", POINTS / 10.0)
+    np.save("t.npy", POINTS / 10.0)
+    assert register("", "t.npy") == 0 and "t.npy is 33.8 mm across, as small as a patella" in caplog.text
+    caplog.clear()
+    assert register("--units cm", "t.npy") == 0 and "across" not in caplog.text
+
+
 def test_residuals_as_json_say_no_axes(folder, caplog):
     assert register("--residuals r.json --axes lps_to_ras") == 0 and register("--residuals r.json") == 0
     assert "in LPS: " not in caplog.text

@@ -7,15 +7,21 @@ from argparse import Namespace
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import files
 
 log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
 Named = tuple[str, Path]  # an option, and what it names
 
 TARGETS = "targets.mrk.json"
 SCENE = ("target.vtk", "source.vtk", "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `scene.write_slicer`
+FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
+MUCH_NEARER = 0.3  # share of that distance that is left when the axes are turned, and were wrong
 
 
 def check_outputs(args: Namespace) -> None:
@@ -129,11 +135,42 @@ def files_in_lps(args: Namespace) -> dict[str, Path]:
 
 
 def warn_of_axes(args: Namespace) -> None:
-    """Warn where files are LPS by definition and the target may be anything; it can be read."""
+    """Warn where files are LPS by definition and the cloud in their frame may be anything; both can be read."""
     from gapr_core.formats import axes, reading
 
     names = ", ".join(path.name for path in files_in_lps(args).values())
-    if not names or args.target.is_dir() or reading.format_of(args.target).in_patient:
-        return
-    if args.axes == "as_is" or (args.axes == "auto" and axes.stated(args.target) is None):
+    is_known = args.target.is_dir() or reading.says_axes(args.target)
+    if names and (args.axes == "as_is" or (args.axes == "auto" and not is_known)):
         log.warning("in LPS: %s. If %s is RAS, give --axes ras", names, args.target.name)
+    if args.landmarks and not reading.says_axes(args.source):
+        name = args.landmarks[0].name
+        how = "save it from 3D Slicer, as PLY or markups, which say their axes"
+        log.warning("in LPS: %s. If %s is RAS, %s", name, args.source.name, how)
+    if args.viewpoint and args.source.is_file() and axes.stated(args.source) == "ras":
+        log.warning("%s is turned from RAS to LPS: --viewpoint is taken to be in LPS", args.source.name)
+
+
+def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:
+    """Warn of landmarks that are far from their cloud, source or target (N, 3), mm, and near it with other axes."""
+    from gapr_core.formats import markups
+
+    files = zip(args.landmarks or (), (args.source, args.target), (source, target), strict=False)
+    for path, cloud, points in files:
+        apart_mm, turned_mm = _apart_mm(markups.load(path).points, points)
+        if apart_mm > FAR_LANDMARKS_MM and turned_mm < MUCH_NEARER * apart_mm:
+            log.warning(
+                "%s is %.0f mm from %s, and %.0f mm with x and y negated: one of them is in RAS and read as LPS, or "
+                "the other way round. Correct what the file says of its axes (SPACE=, coordinateSystem)",
+                path.name, apart_mm, cloud.name, turned_mm,
+            )  # fmt: skip
+
+
+def _apart_mm(landmarks: Array, cloud: Array) -> tuple[float, float]:
+    """Median distance, mm, of landmarks (K, 3) to a cloud (N, 3): as they are, and with x and y negated."""
+    from scipy.spatial import cKDTree
+
+    from gapr_core.formats.axes import LPS_RAS
+
+    tree = cKDTree(cloud)
+    as_is, turned = (float(np.median(tree.query(points)[0])) for points in (landmarks, landmarks * LPS_RAS))
+    return as_is, turned

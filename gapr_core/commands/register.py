@@ -102,12 +102,13 @@ def run(args: Namespace) -> int:
     plan, hints = _plan(args), _hints(args, method)
     target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
-    checks.warn_of_axes(args)
     whole = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds)
     if whole.faces is not None and target.faces is None:
         log.warning(
             "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
         )
+    checks.warn_of_axes(args)
+    checks.warn_of_landmarks(args, whole.points, target.points)
     result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()

@@ -25,7 +25,7 @@ class Plugin:
     """A kind of file that another package reads; as `reading.Format` to those who use it."""
 
     entry: EntryPoint
-    in_patient = False
+    in_patient = is_tracked = False
 
     @property
     def unit(self) -> str:

@@ -32,6 +32,11 @@ class Format:
     unit: str = "mm"
     uses: tuple[str, ...] = ()
 
+    @property
+    def is_tracked(self) -> bool:
+        """Whether it may be a recording in the frame of a tracker, whose axes are those of no patient."""
+        return "tip_mm" in self.uses
+
     def read(self, path: Path, options: ReadOptions) -> Surface:
         """The surface, in LPS mm for patient data, otherwise in the file's unit with its axes turned as asked."""
         self._check(path, options)
@@ -124,6 +129,14 @@ def format_of(path: Path) -> Format | plugins.Plugin:
     if not path.is_file():
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
     return FORMATS[ending]
+
+
+def says_axes(path: Path) -> bool:
+    """Whether a file says that it is in LPS or RAS: a label map, markups, or a mesh or cloud with a comment."""
+    kind = format_of(path)
+    if kind.in_patient:
+        return not kind.is_tracked
+    return path.is_file() and axes.stated(path) is not None
 
 
 def unreadable(path: Path, why: str) -> InvalidPointCloudError:

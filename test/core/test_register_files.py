@@ -70,18 +70,64 @@ IN_LPS = ["--out p.tfm", "--slicer scene", "--residuals r.ply", "--targets p.mrk
 @pytest.mark.parametrize("option", IN_LPS)
 def test_files_in_lps_of_a_bone_without_axes_are_warned_of(folder, caplog, option):
     said = f"in LPS: {option.split()[-1]}. If bone.ply is RAS, give --axes ras"
-    assert register(option) == 0 and said in caplog.text
+    assert register(option, source="lps.ply") == 0 and said in caplog.text
     caplog.clear()
-    assert register(f"{option} --axes as_is") == 0 and said in caplog.text
+    assert register(f"{option} --axes as_is", source="lps.ply") == 0 and said in caplog.text
     for target, more in (("bone.ply", "--axes ras"), ("bone.ply", "--axes lps"), ("lps.ply", ""), ("ras.ply", "")):
         caplog.clear()
-        assert register(f"{option} {more}", target) == 0 and "in LPS: " not in caplog.text
+        assert register(f"{option} {more}", target, "lps.ply") == 0 and "in LPS: " not in caplog.text
 
 
 @pytest.mark.parametrize("option", IN_LPS)
 def test_files_in_lps_of_a_bone_that_is_turned_to_ras_are_refused(folder, capsys, option):
     assert register(f"{option} --axes lps_to_ras") == 1 and Known.asked == 0
     assert f"--axes lps or ras with {option.split()[0]}, which is LPS" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("source", "is_known"), [
+    ("s.npy", False), ("bone.ply", False), ("sweep", False), ("lps.ply", True), ("ras.ply", True), ("p.mrk.json", True),
+])  # fmt: skip
+def test_landmarks_of_a_source_without_axes_are_warned_of(folder, caplog, source, is_known):
+    (folder / "sweep").mkdir()
+    np.savetxt(folder / "sweep" / "0.txt", POINTS)
+    save(folder / "q.mrk.json", Markups(POINTS[:4], ("a", "b", "c", "d")))
+    line = "--landmarks q.mrk.json p.mrk.json"
+    assert register(line, "lps.ply", source) == 0
+    assert (f"in LPS: q.mrk.json. If {source} is RAS, save it from 3D Slicer" in caplog.text) == (not is_known)
+    caplog.clear()
+    assert register("", "lps.ply", source) == 0 and "in LPS: " not in caplog.text
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("turned", [True, False])
+def test_landmarks_that_lie_on_their_cloud_only_with_other_axes_are_warned_of(folder, caplog, which, turned):
+    """The source in RAS coordinates, and landmarks that say LPS, 180 deg apart: their own residual never shows it."""
+    aside = POINTS + [300.0, 100.0, 0.0]
+    np.save("s.npy", aside)
+    head = (folder / "lps.ply").read_text().split("end_header\n")[0]
+    rows = [" ".join(map(str, point)) for point in aside] + [" ".join(map(str, (3, *face))) for face in FACES]
+    (folder / "lps.ply").write_text("\n".join([f"{head}end_header", *rows]) + "\n")
+    files = ["q.mrk.json", "p.mrk.json"]
+    for number, name in enumerate(files):
+        points = aside[:4] * ([-1.0, -1.0, 1.0] if turned and number == which else [1.0, 1.0, 1.0])
+        save(folder / name, Markups(points, ("a", "b", "c", "d")))
+    assert register(f"--landmarks {' '.join(files)}", "lps.ply") == 0
+    said = [f"{name} is " in caplog.text and "with x and y negated" in caplog.text for name in files]
+    assert said == [turned and number == which for number in range(2)]
+
+
+def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkeypatch):
+    seen = SimpleNamespace(at=None)
+
+    def look(self, source, target, viewpoint=None):
+        seen.at = viewpoint
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
+
+    monkeypatch.setattr(Known, "register", look)
+    assert register("--viewpoint 1,2,3", source="ras.ply") == 0 and list(seen.at) == [1.0, 2.0, 3.0]
+    assert "--viewpoint is taken to be in LPS" in caplog.text
+    caplog.clear()
+    assert register("--viewpoint 1,2,3", source="lps.ply") == 0 and "--viewpoint" not in caplog.text
 
 
 def test_a_target_in_centimetres_that_is_read_as_millimetres_is_warned_of(folder, caplog):

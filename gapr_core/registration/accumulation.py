@@ -59,10 +59,10 @@ class Accumulator:
 
     def reset(self) -> None:
         """Forget all sources, and the track of a `Tracker`."""
-        self._kept: list[Array] = []  # looked at, or from before there was a pose
-        self._new: list[Array] = []
-        self._off: list[Array] = []  # in a row, off the bone under an accepted pose
-        self._far = 0  # in a row, metres away from the others
+        self._kept: list[Array] = []  # on the bone under an accepted pose, or from before there was one
+        self._new: list[Array] = []  # since the last registration; several, where `collect` is called in between
+        self._off_in_a_row: list[Array] = []  # off the bone under an accepted pose, and left out
+        self._far_in_a_row = 0  # how many sources were metres away from the others
         if isinstance(self.method, Tracker):
             self.method.reset()
 
@@ -84,15 +84,15 @@ class Accumulator:
         apart_mm = Surface(np.concatenate([self.collected, points])).extent_mm
         if apart_mm > EXTENT_LIMITS_MM[1]:
             self._leave_out(f"one that makes them {apart_mm:.0f} mm across")
-        self._far = 0
+        self._far_in_a_row = 0
         if not _is_among(points, self._kept + self._new):
             self._new = [*self._new, points][-self.most :]
 
     def _leave_out(self, given: str) -> None:
         """Raise for a source metres away from the others; with the last of `most_off` in a row, forget the others."""
-        self._far += 1
+        self._far_in_a_row += 1
         most_off = self.config.accumulation.most_off
-        if self._far < most_off:
+        if self._far_in_a_row < most_off:
             how = f"look at the transforms; {most_off} in a row restart the collection"
             raise InvalidPointCloudError("a source near the others, in one frame", given, how)
         log.warning("%d sources in a row are metres away from the others: the collection restarts", most_off)
@@ -133,32 +133,45 @@ class Accumulator:
         except Exception:
             self._new = [points for points in self._new if _is_among(points, before)]
             raise
-        return self._look_at_new(result, target)
+        return self._decide_on_new(result, target)
 
     def _last(self) -> list[Array]:
+        """The sources that are registered together, the newest last."""
         return (self._kept + self._new)[-self.most :]
 
-    def _look_at_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
-        """Keep the new sources that lie on the bone under the pose; without a pose, all."""
+    def _decide_on_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
+        """The answer, once the new sources that lie on the bone under its pose are kept; without a pose all are.
+
+        It is a refusal where the newest source lies off the bone, or so many in a row that the bone has moved.
+        """
         if result.T_target_source is None:  # it says nothing of any source, nor of a row of those off the bone
             self._kept, self._new = self._last(), []
             return result
-        newest, everything = self._new[-1:], _together(self._last())
-        seen = offset_surface(target, self.config.sensor)
-        off = [source for source in self._new if self._lies_off(source, everything, result.T_target_source, seen)]
-        newly_off = [source for source in off if not _is_among(source, self._off)]
-        self._off = [*self._off, *newly_off] if off and len(off) == len(self._new) else newly_off
-        self._kept = [s for s in self._kept + self._new if not _is_among(s, off)][-self.most :]
+        new, off = self._new, self._off_the_bone(result.T_target_source, target)
+        self._off_in_a_row = self._row_with(off)
+        self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
         self._new = []
-        if len(self._off) >= self.config.accumulation.most_off:
+        if len(self._off_in_a_row) >= self.config.accumulation.most_off:
             return self._restart(result)
-        if newest and _is_among(newest[0], off):
+        if new and _is_among(new[-1], off):
             count = len(self._kept)
             return _refused(result, f"the newest source lies off the bone where {count} others found it: left out")
         return result
 
+    def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
+        """Those of the new sources that lie off the bone under a pose (4, 4), mm."""
+        everything, seen = _together(self._last()), offset_surface(target, self.config.sensor)
+        return [source for source in self._new if self._lies_off(source, everything, T, seen)]
+
+    def _row_with(self, off: list[Array]) -> list[Array]:
+        """The sources in a row off the bone, now with those of the new ones that are; one on the bone ends the row."""
+        newly_off = [source for source in off if not _is_among(source, self._off_in_a_row)]
+        goes_on = bool(off) and len(off) == len(self._new)
+        return [*self._off_in_a_row, *newly_off] if goes_on else newly_off
+
     def _restart(self, result: RegistrationResult) -> RegistrationResult:
-        moved = self._off
+        """Refuse, and keep nothing but the sources in a row that lie off the bone: where it is now."""
+        moved = self._off_in_a_row
         self.reset()
         self._kept = moved[-self.most :]
         reason = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"

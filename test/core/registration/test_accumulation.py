@@ -189,7 +189,7 @@ def test_a_refusal_does_not_break_a_row_of_sources_off_the_bone(frames, prepared
     for number, result in enumerate((accepted, accepted, refused, accepted)):
         on_bone = number == 2
         collected._new = [np.full((30, 3), 0.0 if on_bone else 200.0 + number)]
-        answers.append(collected._look_at_new(result, prepared))
+        answers.append(collected._decide_on_new(result, prepared))
     assert answers[2] is refused
     assert "it has moved" in answers[3].reason
 
@@ -204,7 +204,7 @@ def test_a_source_is_compared_where_a_sensor_with_a_stand_off_sees_the_bone(femu
     collected = Accumulator(registrar, most=20)
     collected._kept = lifted
     collected._new = [target.points[7::40] + 4.0 * target.normals[7::40]]
-    result = collected._look_at_new(RegistrationResult(RegistrationStatus.OK, np.eye(4)), target)
+    result = collected._decide_on_new(RegistrationResult(RegistrationStatus.OK, np.eye(4)), target)
     assert ("left out" in result.reason) is lies_off
 
 

@@ -30,7 +30,7 @@ from gapr_core.runtime.parallel import in_pieces, in_threads
 Array = NDArray[np.float64]
 
 NAME = "scene"
-SMALLEST_SCORE = 1e-4  # share of the surface; a score below counts as this
+SMALLEST_SCORE = 1e-4  # a score below, and so one below 0, counts as this
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,8 @@ class Pool:
     Attributes:
         poses: (K, 4, 4) T_target_source, mm.
         region: (K,) index of the region that proposed each; -1 for a pose that was given.
-        scores: (K,) share of the target's surface, large is good; comparable within one stage.
+        scores: (K,) of lines of sight (`Visible.score`), large is good; 0 before the first stage, and comparable within
+            one stage, since each has tolerances of its own.
     """
 
     poses: Array
@@ -93,15 +94,21 @@ def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterC
 
 
 def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Candidates:
-    """From all hypotheses to a few distinct ones, refined and ranked.
-
-    Their scores are 1 / the share of the surface, so that small is good, as for `verification.verify`.
-    """
+    """From all hypotheses to a few distinct ones, refined and ranked; the best comes first."""
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
     best = refine_on_all(best, scene, target, config, num_threads)
     shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
-    return Candidates(best.poses, 1.0 / np.maximum(best.scores, SMALLEST_SCORE), shares)
+    return Candidates(best.poses, small_is_good(best.scores), shares)
+
+
+def small_is_good(scores: Array) -> Array:
+    """(K,) scores of lines of sight as those of `Candidates`, where mean squares stand for other sources: 1 / score.
+
+    What reads them, a rule or a feature, compares a rival with the best by their ratio. A pose that explains half as
+    much of the bone is a rival of twice the score, just as one that leaves twice the mean square.
+    """
+    return np.asarray(1.0 / np.maximum(scores, SMALLEST_SCORE))
 
 
 def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Pool:

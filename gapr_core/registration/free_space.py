@@ -62,7 +62,10 @@ class Visible:
 
     @property
     def score(self) -> Array:
-        """(K,) explained share, less what the camera saw otherwise and, dearer, what it saw through."""
+        """(K,) explained share, less what the camera saw otherwise and, dearer, what it saw through.
+
+        Large is good: 1 at most, and below 0 where the camera saw more against the pose than for it.
+        """
         otherwise = np.maximum(self.compared - self.explained, 0.0)
         return np.asarray(
             self.explained - self.config.misfit_costs * otherwise - self.config.violation_costs * self.violating

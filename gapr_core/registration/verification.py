@@ -22,8 +22,8 @@ class Candidates:
 
     Attributes:
         poses: (K, 4, 4) T_target_source, mm.
-        scores: (K,) mean squared distance of all source points, truncated, mm^2; of a camera's cloud 1 / the score of
-            lines of sight (`clutter.verify`). Small is good.
+        scores: (K,) small is good: mean squared distance of all source points, truncated, mm^2; of a camera's cloud
+            1 / the score of lines of sight (`clutter.small_is_good`).
         support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
     """
 

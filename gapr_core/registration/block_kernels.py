@@ -11,17 +11,23 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gapr_core.registration.surface_kernels import ELEMENT_RADIUS, FAST, distance, element_near, moved, tukey
+from gapr_core.registration.surface_kernels import ELEMENT_RADIUS, FAST, distance, element_near, moved, padded, tukey
 
-B = 128  # points of a block
-ROWS = 17 * B  # where its rows of the normal equations begin
+B = 128  # points of a block, and so the length of each of its columns; a multiple of `surface_kernels.WIDE`
+
+# Where a column of a block begins: a moved point, its offset from the element near it, this element (normal, shape,
+# variance: see `surface_kernels.residual`), the point's trust. The rows of the normal equations come behind: six
+# derivatives, and the residual.
+X, Y, Z, DX, DY, DZ, NX, NY, NZ, XX, XY, XZ, YY, YZ, ZZ, VARIANCE, TRUST, ROWS = (B * column for column in range(18))
+RESIDUAL = ROWS + 6 * B
+END = ROWS + 7 * B
 
 
 @numba.njit(**FAST)
 def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
     """Normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle of the source."""
     centre = moved(T, middle)
-    block, reach = np.empty(ROWS + 7 * B), ELEMENT_RADIUS * spacing
+    block, reach = np.empty(END), ELEMENT_RADIUS * spacing
     H[:], g[:] = 0.0, 0.0
     for start in range(0, len(points), B):
         stop = min(start + B, len(points))
@@ -36,7 +42,7 @@ def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, sp
 @numba.njit(**FAST)
 def mean_square(T, points, trust, elements, nearest, origin, per_cell, spacing, limit):
     """Mean squared distance of the moved points to the surface, truncated; `trust` does not count."""
-    block, reach, total = np.empty(ROWS + 7 * B), ELEMENT_RADIUS * spacing, 0.0
+    block, reach, total = np.empty(END), ELEMENT_RADIUS * spacing, 0.0
     for start in range(0, len(points), B):
         stop = min(start + B, len(points))
         count = gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, block)
@@ -57,12 +63,12 @@ def gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, b
         if q < 0:
             continue
         e = elements[q]
-        block[count], block[B + count], block[2 * B + count] = x, y, z
-        block[3 * B + count], block[4 * B + count], block[5 * B + count] = x - e[0], y - e[1], z - e[2]
-        block[6 * B + count], block[7 * B + count], block[8 * B + count] = e[3], e[4], e[5]
-        block[9 * B + count], block[10 * B + count], block[11 * B + count] = e[6], e[7], e[8]
-        block[12 * B + count], block[13 * B + count], block[14 * B + count] = e[9], e[10], e[11]
-        block[15 * B + count], block[16 * B + count] = e[12], trust[p]
+        block[X + count], block[Y + count], block[Z + count] = x, y, z
+        block[DX + count], block[DY + count], block[DZ + count] = x - e[0], y - e[1], z - e[2]
+        block[NX + count], block[NY + count], block[NZ + count] = e[3], e[4], e[5]
+        block[XX + count], block[XY + count], block[XZ + count] = e[6], e[7], e[8]
+        block[YY + count], block[YZ + count], block[ZZ + count] = e[9], e[10], e[11]
+        block[VARIANCE + count], block[TRUST + count] = e[12], trust[p]
         count += 1
     return count
 
@@ -71,10 +77,10 @@ def gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, b
 def distance_of(block, c, reach, variance):
     """`distance` of point c of a block."""
     return distance(
-        block[3 * B + c], block[4 * B + c], block[5 * B + c],
-        block[6 * B + c], block[7 * B + c], block[8 * B + c],
-        block[9 * B + c], block[10 * B + c], block[11 * B + c],
-        block[12 * B + c], block[13 * B + c], block[14 * B + c],
+        block[DX + c], block[DY + c], block[DZ + c],
+        block[NX + c], block[NY + c], block[NZ + c],
+        block[XX + c], block[XY + c], block[XZ + c],
+        block[YY + c], block[YZ + c], block[ZZ + c],
         reach, variance,
     )  # fmt: skip
 
@@ -89,15 +95,15 @@ def fill_rows(block, count, centre, reach, limit, variance):
     cx, cy, cz = centre
     for c in range(count):
         r, nx, ny, nz, aside = distance_of(block, c, reach, variance)
-        weight = block[16 * B + c] * tukey(r * r + aside * aside, limit) * noise / (noise + known * block[15 * B + c])
-        root = np.sqrt(weight)
+        total = noise + known * block[VARIANCE + c]
+        root = np.sqrt(block[TRUST + c] * tukey(r * r + aside * aside, limit) * noise / total)
         nx, ny, nz = root * nx, root * ny, root * nz
-        x, y, z = block[c] - cx, block[B + c] - cy, block[2 * B + c] - cz
+        x, y, z = block[X + c] - cx, block[Y + c] - cy, block[Z + c] - cz
         block[ROWS + c], block[ROWS + B + c], block[ROWS + 2 * B + c] = nx, ny, nz
         block[ROWS + 3 * B + c] = y * nz - z * ny
         block[ROWS + 4 * B + c] = z * nx - x * nz
         block[ROWS + 5 * B + c] = x * ny - y * nx
-        block[ROWS + 6 * B + c] = root * r
+        block[RESIDUAL + c] = root * r
 
 
 @numba.njit(**FAST)
@@ -106,18 +112,18 @@ def add_up(block, count, H, g):
 
     Rows are padded with zeros, so that the compiler takes several columns at a time.
     """
-    padded = (count + 15) // 16 * 16
+    columns = padded(count)
     for a in range(7):
-        for c in range(count, padded):
+        for c in range(count, columns):
             block[ROWS + a * B + c] = 0.0
     for a in range(6):
         total = 0.0
-        for c in range(padded):
-            total -= block[ROWS + a * B + c] * block[ROWS + 6 * B + c]
+        for c in range(columns):
+            total -= block[ROWS + a * B + c] * block[RESIDUAL + c]
         g[a] += total
         for b in range(a + 1):
             total = 0.0
-            for c in range(padded):
+            for c in range(columns):
                 total += block[ROWS + a * B + c] * block[ROWS + b * B + c]
             H[a, b] += total
 

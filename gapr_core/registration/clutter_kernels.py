@@ -7,7 +7,7 @@ import numba
 import numpy as np
 
 from gapr_core.registration.kernels import step
-from gapr_core.registration.surface_kernels import FAST, element_near, moved, residual, tukey
+from gapr_core.registration.surface_kernels import FAST, element_near, moved, padded, residual, tukey
 
 OFFSET, DEPTH, FRONT = 3, 4, 5  # columns of a pixel after its normal, as in `free_space.DepthImage`
 
@@ -72,7 +72,7 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
     """
     out = poses.copy()
     surface = elements, nearest, origin, per_cell, spacing
-    rows, H, g = np.empty((7, rows_for(len(points)))), np.empty((6, 6)), np.empty(6)
+    rows, H, g = np.empty((7, padded(len(points)))), np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
     for k in range(len(poses)):
         T = out[k]
@@ -128,21 +128,15 @@ def add_up(rows, count, H, g):
 
     One product of whole rows after the other, and padded, so that the compiler takes several columns at a time.
     """
-    padded = rows_for(count)
-    rows[:, count:padded] = 0.0
+    columns = padded(count)
+    rows[:, count:columns] = 0.0
     for a in range(6):
         total = 0.0
-        for p in range(padded):
+        for p in range(columns):
             total -= rows[a, p] * rows[6, p]
         g[a] = total
         for b in range(a + 1):
             total = 0.0
-            for p in range(padded):
+            for p in range(columns):
                 total += rows[a, p] * rows[b, p]
             H[a, b] = H[b, a] = total
-
-
-@numba.njit(inline="always", **FAST)
-def rows_for(count):
-    """Columns that `add_up` needs for `count` residuals."""
-    return (count + 15) // 16 * 16

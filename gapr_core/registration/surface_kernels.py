@@ -7,6 +7,7 @@ import numba
 import numpy as np
 
 ELEMENT_RADIUS = 2.0  # of a surface element, in point spacings; beyond it the quadric is not extrapolated
+WIDE = 16  # columns that a compiler may take at a time: sums go over a multiple of so many
 FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}  # a check of divisors is a branch
 
 
@@ -61,6 +62,12 @@ def distance(dx, dy, dz, nx, ny, nz, xx, xy, xz, yy, yz, zz, reach, variance):
     most = 0.5 * np.sqrt(variance)  # the expansion ends at sharp edges
     signed = (height - 0.5 * (sx * tx + sy * ty + sz * tz)) / length + min(max(lift, -most), most)
     return signed, nx / length, ny / length, nz / length, max(aside - reach, 0.0)
+
+
+@numba.njit(inline="always", **FAST)
+def padded(count):
+    """The next multiple of `WIDE`."""
+    return (count + WIDE - 1) // WIDE * WIDE
 
 
 @numba.njit(inline="always", **FAST)

@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.geometry.sampling import fibonacci_directions
-from gapr_core.registration.clutter_kernels import rows_for
+from gapr_core.registration.surface_kernels import padded
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.surface import Surface
 
@@ -67,4 +67,4 @@ def on_ellipsoid(count, seed=0, axes_mm=(30.0, 20.0, 12.0)):
 
 def rows(points) -> np.ndarray:
     """Room for the rows that the normal equations of points (N, 3) are summed from, full of what must not count."""
-    return np.full((7, rows_for(len(points))), 7.0)
+    return np.full((7, padded(len(points))), 7.0)

@@ -14,6 +14,7 @@ from gapr_core.runtime.parallel import in_pieces
 Array = NDArray[np.float64]
 
 FAR = -1  # index of cells farther than the reach
+FARTHEST = 255  # distance of these cells, in steps of the field: distances are bytes
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class DistanceField:
         origin: (3,) centre of cell (0, 0, 0), mm.
         cell_mm: edge of a cell.
         nearest: (X, Y, Z) int32 index of the target point nearest to the cell's centre; `FAR` beyond the reach.
-        distance: (X, Y, Z) uint8 distance of the centre to the surface in steps of `reach_mm` / 255, 255 beyond.
+        distance: (X, Y, Z) uint8 distance of the centre to the surface in steps of `reach_mm` / `FARTHEST`; beyond the
+            reach `FARTHEST`.
         reach_mm: distances are truncated here.
     """
 
@@ -49,12 +51,14 @@ def build(
     cell_mm = max(1.5, float(np.prod(high - low) / most_cells) ** (1.0 / 3.0))
     shape = np.ceil((high - low) / cell_mm).astype(int) + 1
     nearest = np.full(shape, FAR, dtype=np.int32)
-    distance = np.full(shape, 255, dtype=np.uint8)
+    distance = np.full(shape, FARTHEST, dtype=np.uint8)
 
     def work(slab: NDArray[np.int64]) -> None:
         part = slice(slab[0], slab[-1] + 1)
         _nearest_points(points, low, cell_mm, slab[0], nearest[part], reach_mm)
-        _distances(points, normals, low, cell_mm, slab[0], nearest[part], spacing_mm, 255.0 / reach_mm, distance[part])
+        _distances(
+            points, normals, low, cell_mm, slab[0], nearest[part], spacing_mm, FARTHEST / reach_mm, distance[part]
+        )
 
     in_pieces(work, np.arange(shape[0]), num_threads)
     return DistanceField(low, cell_mm, nearest, distance, reach_mm)
@@ -106,4 +110,4 @@ def _distances(points, normals, low, cell, first, nearest, spacing, per_mm, dist
                 height = (x * normals[q, 0] + z * normals[q, 2]) + y * normals[q, 1]  # in the order of NumPy's einsum
                 aside = np.sqrt(max((x * x + z * z) + y * y - height**2, 0.0))
                 gap = np.hypot(height, max(aside - spacing, 0.0))
-                distance[i, j, k] = min(np.rint(gap * per_mm), 254.0)
+                distance[i, j, k] = min(np.rint(gap * per_mm), FARTHEST - 1.0)

@@ -22,6 +22,7 @@ from gapr_core.runtime.parallel import in_pieces
 
 Array = NDArray[np.float64]
 
+SD_OF_MEDIAN = 1.4826  # standard deviation of normal residuals over the median of their absolute values
 PATCH_POINTS = SourceConfig().normal_neighbours  # of a source that was not prepared
 
 
@@ -142,13 +143,13 @@ def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfi
     """
     means = fit_kernels.patch_means(fit.signed_mm, fit.weights, neighbours)
     by_noise = fit.sigma_mm / np.sqrt(neighbours.shape[1])
-    limit_mm = config.patch_scale * max(1.4826 * _median_size(means), by_noise)
+    limit_mm = config.patch_scale * max(SD_OF_MEDIAN * _median_size(means), by_noise)
     return np.clip(1.0 - (means / limit_mm) ** 2, 0.0, 1.0) ** 2
 
 
 def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
-    """1.4826 x median absolute residual, those without a surface near counted as large; within the limits set."""
-    spread = 1.4826 * _median_size(signed)
+    """From the median absolute residual, those without a surface near counted as large; within the limits set."""
+    spread = SD_OF_MEDIAN * _median_size(signed)
     return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
 
 

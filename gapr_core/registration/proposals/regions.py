@@ -21,6 +21,8 @@ from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
+SPREAD_OUT = 64  # points of a region that are spread evenly, before the others in the order of the whole cloud
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -58,7 +60,7 @@ def _part(source: PreparedSource, members: NDArray[np.int64]) -> PreparedSource:
     rank[source.order] = np.arange(len(source.points))
     points = source.points[members]
     start = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
-    first = sampling.farthest_points(points, 64, start)
+    first = sampling.farthest_points(points, SPREAD_OUT, start)
     rest = np.setdiff1d(np.arange(len(points)), first)
     order = np.concatenate([first, rest[np.argsort(rank[members[rest]])]])
     return replace(

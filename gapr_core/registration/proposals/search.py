@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 from gapr_core.config import SearchConfig
 from gapr_core.geometry import quadrics, sampling
-from gapr_core.geometry.distance_field import DistanceField
+from gapr_core.geometry.distance_field import FARTHEST, DistanceField
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.runtime.parallel import in_threads
 
 Array = NDArray[np.float64]
+
+CANDIDATES = 8  # points of the spread order that each reference is chosen from
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class NormalAlignedSearch:
     def _score(
         self, local: NDArray[np.float32], anchors: NDArray[np.float32], axes: NDArray[np.float32], field: DistanceField
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        limit = self.config.first_limit_mm * 255.0 / field.reach_mm
+        limit = self.config.first_limit_mm * FARTHEST / field.reach_mm
         corner = (field.origin - 0.5 * field.cell_mm).astype(np.float32)
         same = anchors, axes, field.distance, corner, np.float32(1.0 / field.cell_mm)
         first = self.config.first_probes, np.float32(limit)
@@ -68,7 +70,7 @@ class NormalAlignedSearch:
 
 def _references(source: PreparedSource, count: int) -> NDArray[np.int64]:
     """Points far apart, of the half of the first ones in the spread order that has the flattest surroundings."""
-    candidates = source.order[: 8 * count]
+    candidates = source.order[: CANDIDATES * count]
     flat = candidates[np.argsort(source.flatness_mm[candidates], kind="stable")[: max(count, len(candidates) // 2)]]
     return flat[sampling.farthest_points(source.points[flat], count)]
 
@@ -124,7 +126,7 @@ def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):
     compilers turn into wide instructions; after the `first` probes only those within `limit` go on.
     """
     probes, _, spins = local.shape
-    worst = 255 * probes
+    worst = FARTHEST * probes
     most = limit * np.float32(first) if first < probes else np.float32(worst)
     first = min(first, probes)
     score, best = np.empty(len(anchors), dtype=np.float32), np.zeros(len(anchors), dtype=np.int32)
@@ -156,7 +158,7 @@ def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _add_probes(totals, count, local, place, m, distance, cells):  # type: ignore[no-untyped-def]
-    """Add to the first `count` totals the field's value at every probe (probes, 3, spins), 255 outside of it."""
+    """Add to the first `count` totals the field's value at every probe (probes, 3, spins), `FARTHEST` outside of it."""
     nx, ny, nz = distance.shape
     flat = distance.ravel()
     for k in range(len(local)):
@@ -168,4 +170,4 @@ def _add_probes(totals, count, local, place, m, distance, cells):  # type: ignor
             inside = (i >= 0) & (j >= 0) & (h >= 0) & (i < nx) & (j < ny) & (h < nz)
             cells[s] = (i * ny + j) * nz + h if inside else -1
         for s in range(count):
-            totals[s] += flat[cells[s]] if cells[s] >= 0 else 255
+            totals[s] += flat[cells[s]] if cells[s] >= 0 else FARTHEST

@@ -66,7 +66,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--anatomy", type=Path, help="folder of corresponded meshes with splits.json")
     where.add_argument("--meshes", type=Path, help="folder of your own meshes, one per subject, or a folder per bone")
-    parser.add_argument("--units", default="mm", choices=("mm", "m"), help="of --meshes")
+    parser.add_argument("--units", default="mm", choices=("mm", "cm", "m"), help="of --meshes")
     parser.add_argument(
         "--split", required=True, choices=(*anatomy.SPLITS, "all"),
         help="whose bones: test to judge what was trained here, all where nobody has trained on these subjects",

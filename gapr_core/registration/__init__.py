@@ -1,1 +1,17 @@
-"""The algorithm: prepare, propose, verify, refine, assess."""
+"""The algorithm: prepare, propose, verify, refine, assess.
+
+Where to read on, in the order in which a source passes:
+
+- `registrar` has the five steps on one screen, and asks one proposer after the other.
+- `target`, `source`: what is known of both before the first pose. `sensor`: what is known of its errors.
+- `proposals.search` and `proposals.network` propose poses, `proposals.consensus` makes them of correspondences.
+- `verification` keeps a few distinct poses, `refinement` makes the best one exact. `surface_kernels` has the residual
+  of one point, `block_kernels` the normal equations of many, `kernels` a Gauss-Newton step, `fit_kernels` the weights.
+- `assessment` puts the answer together, of: `covariance` (with `bias_field`), `features` (with `mirror`, `other_size`,
+  `roughness`), `confidence` (an `additive` model of the features), `rules` (what refuses a pose, however probable).
+- `smooth_bias`, `precision` and `precision_model` correct what is accepted: its pose, and the error that is expected.
+- `guidance`: where to look next. `cortices`: bones whose model has an inner surface.
+
+A camera's cloud goes another way: `clutter` (with `proposals.regions`, `free_space`, `clutter_kernels`), `explained`.
+Streams: `tracking` (with `evidence`, `shared_misfit`), `accumulation`; `crop` cuts a cloud before.
+"""

@@ -219,7 +219,7 @@ class Registrar:
         return a.refused(rules.by_mirror(found, config.rules), config.rules)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
-        """The mirror image of a source, registered in full."""
+        """The mirror image of a source, registered in full; `tracking` asks proposers without a track instead."""
         return self._in_rounds(flipped, target, NO_POSES, clock)
 
     def _in_rounds(

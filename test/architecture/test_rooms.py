@@ -1,8 +1,11 @@
 """The street: few files stand next to the rooms."""
 
+import re
 from pathlib import Path
 
 import pytest
+
+import gapr_core.registration
 
 ROOT = Path(__file__).parents[2]
 
@@ -11,3 +14,10 @@ ROOT = Path(__file__).parents[2]
 def test_few_files_stand_next_to_the_folders_of(package, most):
     files = sorted(path.name for path in (ROOT / package).glob("*.py"))
     assert len(files) <= most, files
+
+
+def test_the_map_of_the_registration_names_all_of_its_files():
+    room = ROOT / "gapr_core/registration"
+    files = {".".join(path.relative_to(room).with_suffix("").parts) for path in room.rglob("*.py")}
+    named = set(re.findall(r"`([a-z_.]+)`", gapr_core.registration.__doc__))
+    assert named == {name for name in files if not name.endswith("__init__")} - {"proposals.base"}

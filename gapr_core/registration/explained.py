@@ -25,6 +25,7 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
+NO_RIVAL = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTar
     """What lines of sight say: shares of the surface, and the margin to the best distinct rival."""
     explained, violating, compared = (float(x[0]) for x in (seen.explained, seen.violating, seen.compared))
     area_mm2 = explained * len(target.points) * target.spacing_mm**2
-    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else 1.0
+    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else NO_RIVAL
     return {
         "free_space_score": float(seen.score[0]),
         "log_explained_mm2": float(np.log(area_mm2 + 1.0)),

@@ -42,6 +42,8 @@ SIGNS = {
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
 LEAST_NOISE_MM = 0.1  # a source without roughness counts as so rough
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
+NO_RIVAL = 2.0  # a pose alone counts as having a rival of so many times its mean square
+LEAST_MARGIN = 1e-3  # added to the share by which the rival is worse, so that its logarithm is finite
 
 
 def measure(
@@ -62,11 +64,11 @@ def measure(
         target: the bone.
         config: how a mirrored source is refined, and how far a smooth bias reaches.
     """
-    second = candidates.scores[1] if len(candidates.scores) > 1 else 2.0 * candidates.scores[0]
+    second = candidates.scores[1] if len(candidates.scores) > 1 else NO_RIVAL * candidates.scores[0]
     values = of_the_fit(fit, candidates, uncertainty, source, source.noise_mm, target, config) | {
         "inlier_ratio": float((fit.weights > 0.0).mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
-        "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + 1e-3)),
+        "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + LEAST_MARGIN)),
     }
     return {name: values[name] for name in FEATURES}
 

@@ -23,6 +23,7 @@ from gapr_core.runtime.parallel import in_pieces
 Array = NDArray[np.float64]
 
 SD_OF_MEDIAN = 1.4826  # standard deviation of normal residuals over the median of their absolute values
+FAR_SIGMAS = 3.0  # beyond so many standard deviations lies an outlier, or noise with a long tail
 PATCH_POINTS = SourceConfig().normal_neighbours  # of a source that was not prepared
 
 
@@ -159,6 +160,6 @@ def _median_size(residuals: Array) -> float:
 
 
 def _tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
-    """Where Tukey's weight ends, mm: far out, and so more efficient, where almost nothing lies beyond 3 sigma."""
-    beyond = fit_kernels.share_beyond(signed, 3.0 * sigma_mm)
+    """Where Tukey's weight ends, mm: far out, and so more efficient, where almost no residual is beyond."""
+    beyond = fit_kernels.share_beyond(signed, FAR_SIGMAS * sigma_mm)
     return sigma_mm * (config.clean_tukey_scale if beyond < config.clean_share else config.tukey_scale)

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neighbours
 
 SPREAD_OUT = 512  # points that are spread evenly, before the others in any order
+TRUSTED_SHARE = 0.8  # of the points, those most in the middle of their neighbours: of them the spread-out ones are
+SMALLEST_MM = 1.0  # across: less is a cloud in metres, and not too short a piece
 SPARE_NEIGHBOURS = 6  # of a point, for means over those that lie on the bone
 
 
@@ -98,7 +100,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None, num_threads: 
             f"{len(points)} distinct finite points, at least {config.fewest_points} are needed",
         )
     extent_mm = float(np.linalg.norm(np.ptp(points, axis=0)))
-    if extent_mm > clouds.EXTENT_LIMITS_MM[1] or extent_mm < 1.0:
+    if extent_mm > clouds.EXTENT_LIMITS_MM[1] or extent_mm < SMALLEST_MM:
         clouds.check_extent(extent_mm, "mm", "the source")
     width_mm = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(points.T))[1], 0.0)))  # of a line -1e-13 or so
     if width_mm < config.smallest_width_mm:
@@ -178,7 +180,7 @@ def _around_count(count: int, config: SourceConfig) -> int:
 
 def _spread_order(points: Array, isolation: Array) -> NDArray[np.int64]:
     """Points in the middle of their neighbours first, farthest-point order among them; then the rest, shuffled."""
-    trusted = np.flatnonzero(isolation <= np.quantile(isolation, 0.8))
+    trusted = np.flatnonzero(isolation <= np.quantile(isolation, TRUSTED_SHARE))
     start = int(np.linalg.norm(points[trusted] - points[trusted].mean(axis=0), axis=1).argmin())
     spread_out = sampling.farthest_points(points[trusted], SPREAD_OUT, start)
     first = trusted[spread_out[np.sort(np.unique(spread_out, return_index=True)[1])]]  # some may lie on each other

@@ -20,6 +20,9 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+DENSER = 4  # times as many points are drawn on a mesh as are kept, so that they can be kept evenly
+FLAT = 1e-3  # spread along an axis over that along the longest, below which there is no extent
+LEAST_SHELL = 0.5  # share of the points that are seen from outside; with fewer, no shell is believed
 DOUBLES_MM = 0.02  # points of a cloud that are this close are one: the spacing is that of the surface
 
 
@@ -133,7 +136,7 @@ def _described(
 def _surface_elements(surface: Surface, config: TargetConfig, num_threads: int) -> tuple[Array, Array]:
     """Evenly thinned points (M, 3) with unit normals of arbitrary sign."""
     if surface.faces is not None and len(surface.faces):
-        points, normals = surface.sample(4 * config.most_points, np.random.default_rng(0))
+        points, normals = surface.sample(DENSER * config.most_points, np.random.default_rng(0))
         keep = sampling.thin(points, config.most_points)
         return points[keep], normals[keep]
     unique = sampling.distinct(surface.points)
@@ -148,8 +151,8 @@ def _check_is_a_body(points: Array, config: TargetConfig) -> None:
         given = f"{len(points)} distinct points"
         raise InvalidPointCloudError(f"a target of at least {config.fewest_points} points", given, "export it denser")
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
-    if spread[0] < 1e-3 * spread[2]:
-        shape = "line" if spread[1] < 1e-3 * spread[2] else "plane"
+    if spread[0] < FLAT * spread[2]:
+        shape = "line" if spread[1] < FLAT * spread[2] else "plane"
         raise InvalidPointCloudError("a bone with extent in three directions", f"a {shape}", "check the file")
 
 
@@ -162,7 +165,7 @@ def _outer_shell(
     )
     normals = quadrics.orient(normals, votes)
     shell = counts > 0
-    return (points[shell], normals[shell]) if shell.mean() > 0.5 else (points, normals)
+    return (points[shell], normals[shell]) if shell.mean() > LEAST_SHELL else (points, normals)
 
 
 def _outer_cortex(

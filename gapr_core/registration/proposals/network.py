@@ -23,6 +23,7 @@ from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 METHODS = ("local_to_global", "ransac")
+RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # a correspondence agrees with a pose within so many first voxels
 SHIPPED = Path(__file__).parents[2] / "weights" / "gapr_net.safetensors"
 
 
@@ -69,7 +70,7 @@ class NetworkProposer:
         except InvalidPointCloudError:
             return Proposals(np.empty((0, 4, 4)), np.empty(0))
         found = self.match(moving, cloud, features)
-        radius_mm = 1.5 * max(5.0, frame.voxel * frame.scale_mm)
+        radius_mm = RADIUS_VOXELS * max(SMALLEST_VOXEL_MM, frame.voxel * frame.scale_mm)
         return Proposals(*consensus(self.method, found, radius_mm, rng, self.count))
 
     def prepare(self, target: PreparedTarget) -> tuple[Frame, Cloud, Features]:

@@ -150,6 +150,15 @@ def warn_of_axes(args: Namespace) -> None:
         log.warning("%s is turned from RAS to LPS: --viewpoint is taken to be in LPS", args.source.name)
 
 
+def warn_of_units(args: Namespace) -> None:
+    """Warn of a unit that neither file takes, since both are of a kind that is in mm."""
+    from gapr_core.formats import reading
+
+    if args.units and all(reading.format_of(path).in_patient for path in (args.source, args.target)):
+        names = f"{args.source.name} and {args.target.name}"
+        log.warning("--units %s changes nothing: %s are in mm, as all files of their kinds", args.units, names)
+
+
 def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:
     """Warn of landmarks that are far from their cloud, source or target (N, 3), mm, and near it with other axes."""
     from gapr_core.formats import markups

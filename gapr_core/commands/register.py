@@ -107,6 +107,7 @@ def run(args: Namespace) -> int:
         log.warning(
             "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
         )
+    checks.warn_of_units(args)
     checks.warn_of_axes(args)
     checks.warn_of_landmarks(args, whole.points, target.points)
     result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]

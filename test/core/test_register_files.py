@@ -138,6 +138,15 @@ def test_a_target_in_centimetres_that_is_read_as_millimetres_is_warned_of(folder
     assert register("--units cm", "t.npy") == 0 and "across" not in caplog.text
 
 
+def test_a_unit_that_no_file_takes_is_warned_of(folder, caplog):
+    assert register("--units cm", "p.mrk.json", "p.mrk.json") == 0
+    assert "--units cm changes nothing: p.mrk.json and p.mrk.json are in mm" in caplog.text
+    caplog.clear()
+    np.save("s.npy", POINTS / 10.0)
+    assert register("--units cm", "p.mrk.json") == 0 and "changes nothing" not in caplog.text
+    assert register("", "p.mrk.json", "p.mrk.json") == 0 and "changes nothing" not in caplog.text
+
+
 def test_residuals_as_json_say_no_axes(folder, caplog):
     assert register("--residuals r.json --axes lps_to_ras") == 0 and register("--residuals r.json") == 0
     assert "in LPS: " not in caplog.text

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import functools
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -14,6 +17,10 @@ from gapr_ros.node.guard import describe
 from gapr_ros.node.host import Host
 from gapr_ros.node.loader import Loader
 from gapr_ros.node.session import Session
+
+# calls that come while the executor is busy wait in the middleware, whose default drops the oldest of more than 10
+CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+PACE_S = 0.01  # between two answers: a client keeps 10 by default, and those to other clients are among them
 
 
 class NotNowError(Exception):
@@ -31,9 +38,44 @@ def answering(service: Callable[..., Any]) -> Callable[..., Any]:
             response.success, response.message = False, str(error)
         except Exception as error:
             response.success, response.message = False, describe(error)
+        await self._answers.in_turn()
         return response
 
     return callback
+
+
+class Answers:
+    """Lets answers go out one after the other, in the order in which they are known; rclpy's is the reverse.
+
+    Args:
+        host: the node.
+    """
+
+    def __init__(self, host: Host) -> None:
+        self._host, self._pause = host, None
+        self._waiting: deque[Future] = deque()
+
+    async def in_turn(self, known: Future | None = None) -> None:
+        """Wait until an answer is known, now or when a future is done, and those that were known before have gone."""
+        turn = Future()
+        if known is None:
+            self._line_up(turn)
+        else:
+            known.add_done_callback(lambda _: self._line_up(turn))
+        await turn
+
+    def _line_up(self, turn: Future) -> None:
+        self._waiting.append(turn)
+        if self._pause is None:
+            self._pause = self._host.ros.create_timer(PACE_S, self._next, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self._next()
+
+    def _next(self) -> None:
+        if self._waiting:
+            self._waiting.popleft().set_result(None)
+        else:
+            pause, self._pause = self._pause, None
+            self._host.ros.destroy_timer(pause)
 
 
 class Services:
@@ -50,10 +92,11 @@ class Services:
         self, host: Host, loader: Loader, state: Callable[[], str], session: Callable[[], Session | None]
     ) -> None:
         self._host, self._loader, self._state, self._configured = host, loader, state, session
+        self._answers = Answers(host)
         group = ReentrantCallbackGroup()  # a second call must not wait for the first
         for name in ("register", "reset", "reload_model"):
-            host.ros.create_service(Trigger, f"~/{name}", getattr(self, name), callback_group=group)
-        host.ros.create_service(SetBool, "~/set_enabled", self.set_enabled, callback_group=group)
+            self._offer(Trigger, name, group)
+        self._offer(SetBool, "set_enabled", group)
 
     @answering
     async def register(self, _: Trigger.Request) -> tuple[bool, str]:
@@ -65,7 +108,8 @@ class Services:
             raise NotNowError("the node is disabled: call ~/set_enabled")
         if not session.register_newest(waiter):
             raise NotNowError("no cloud has come yet, or none since the last reset or reload")
-        outcome = await waiter
+        await self._answers.in_turn(waiter)
+        outcome = waiter.result()
         return outcome.ok, str(outcome)
 
     @answering
@@ -98,6 +142,9 @@ class Services:
         if not request.data:
             session.stop_waiting("the node was disabled")
         return True, "enabled" if request.data else "disabled: clouds are counted as dropped"
+
+    def _offer(self, kind: Any, name: str, group: ReentrantCallbackGroup) -> None:
+        self._host.ros.create_service(kind, f"~/{name}", getattr(self, name), qos_profile=CALLS, callback_group=group)
 
     def _session(self) -> Session:
         session = self._configured()

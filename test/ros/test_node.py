@@ -15,7 +15,8 @@ from harness import Client, Collecting, accepted, node_in_thread, pose_mm, wait_
 from lifecycle_msgs.msg import Transition
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -357,6 +358,66 @@ def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(
         answer = client.call("register")
         assert not answer.success and answer.message.startswith("refused: empty_cloud")
         assert node.counters.dropped == 2
+
+
+def test_many_who_ask_at_once_all_get_an_answer_in_order_while_the_node_does_other_things(blob_path, client, method):
+    """More than the 10 that a service keeps by default, and rclpy resumes those that wait in the reverse order."""
+    deep = QoSProfile(depth=100)
+    asking = client.do(lambda: client.node.create_client(Trigger, "/register_node/register", qos_profile=deep))
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 1 and asking.service_is_ready())
+        method.gate.clear()
+        node.call_soon(lambda: time.sleep(1.0))  # the calls come while the executor is busy
+        answered, calls = [], [asking.call_async(Trigger.Request()) for _ in range(30)]
+        for number, call in enumerate(calls):
+            call.add_done_callback(lambda _, number=number: answered.append(number))
+        assert client.call("set_enabled", SetBool.Request(data=True)).success, "no answer waits for a registration"
+        seen = len(client.diagnostics)
+        wait_until(lambda: len(client.diagnostics) > seen + 2, what="diagnostics")
+        assert not answered
+        method.gate.set()
+        wait_until(lambda: len(answered) == len(calls), what=lambda: f"30 answers, {len(answered)} came")
+        assert answered == sorted(answered) and all(call.result().success for call in calls)
+
+
+def test_answers_of_one_moment_go_out_one_after_the_other(blob_path, client, method):
+    """A client keeps 10 by default, and those to other clients are among them."""
+    turns, at_once = [Future() for _ in range(3)], []
+    with node_in_thread(method, blob_path) as node:
+
+        def line_up():
+            for turn in turns:
+                node._services_offered._answers._line_up(turn)
+            at_once.extend(turn.done() for turn in turns)
+
+        node.call_soon(line_up)
+        wait_until(lambda: turns[-1].done() and node._services_offered._answers._pause is None)
+        assert at_once == [True, False, False]
+
+
+@pytest.mark.parametrize("end", ["reset", "deactivate"])
+def test_many_who_wait_get_an_answer_when_a_reset_or_a_pause_comes_first(blob_path, client, method, end):
+    deep = QoSProfile(depth=100)
+    asking = client.do(lambda: client.node.create_client(Trigger, "/register_node/register", qos_profile=deep))
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 1 and asking.service_is_ready())
+        method.gate.clear()
+        registered, worker = len(method.calls), node.session.worker
+        calls = [asking.call_async(Trigger.Request())]
+        wait_until(lambda: len(method.calls) > registered)
+        calls += [asking.call_async(Trigger.Request()) for _ in range(11)]
+        wait_until(lambda: worker._slot and len(worker._slot.waiters) == 11)
+        if end == "reset":
+            assert client.call("reset").success
+        else:
+            assert client.change_state(Transition.TRANSITION_DEACTIVATE)
+        method.gate.set()
+        wait_until(lambda: all(call.done() for call in calls))
+        assert {call.result().message.split(":")[1] for call in calls} == {" superseded_by_reset"}
 
 
 @pytest.mark.parametrize("service", ["reset", "reload_model"])

@@ -71,26 +71,6 @@ class Input:
     mismatch: str = ""
 
 
-class Gaps:
-    """Finds clouds that were sent and never came, from the numbers that each publisher gives to its messages.
-
-    Which publisher a message is from is not known: a number belongs to the one whose last number is nearest below.
-    """
-
-    MOST_PUBLISHERS = 8
-
-    def __init__(self) -> None:
-        self._last: list[int] = []  # of every publisher, the one heard last at the end
-
-    def note(self, number: int) -> int:
-        """How many numbers are missing before this one; 0 for the first of a publisher."""
-        before = max((last for last in self._last if last < number), default=None)
-        if before is not None:
-            self._last.remove(before)
-        self._last = [*self._last[1 - self.MOST_PUBLISHERS :], number]
-        return 0 if before is None else number - before - 1
-
-
 class RefusalLog:
     """Writes a refusal when its reason is new or the last line is 5 s old, with the number of those in between."""
 

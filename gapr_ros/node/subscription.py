@@ -11,7 +11,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
-from gapr_ros.node.diagnostics import Gaps, Input
+from gapr_ros.node.diagnostics import Input
+from gapr_ros.node.gaps import Gaps
 from gapr_ros.node.guard import guarded
 from gapr_ros.node.host import Host
 from gapr_ros.node.session import Session
@@ -92,7 +93,9 @@ class Subscriptions:
         if self._is_taken((info["source_timestamp"], number)):
             return
         if number is not None:
-            self._host.counters.lost += self._gaps.note(number)
+            self._host.counters.lost += self._gaps.note(
+                number, self._host.ros.count_publishers(self._clouds.topic_name)
+            )
         self._session.take_cloud(data)
 
     def _is_taken(self, key: tuple[int, int | None]) -> bool:

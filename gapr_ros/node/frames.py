@@ -32,13 +32,16 @@ class Frames:
         publish: send to /tf.
         listen: look up from the start; else from the first `listen()`.
         note_sent: is given every transform that goes to /tf.
+
+    Attributes:
+        behind: the last transform was not sent, because newer ones were.
     """
 
     def __init__(
         self, node: Node, publish: bool, listen: bool, note_sent: Callable[[TransformStamped], None] | None = None
     ) -> None:
         self._node, self._note_sent = node, note_sent
-        self._sent_ns = -1
+        self._sent_ns, self.behind = -1, False
         self._tf2 = _import_tf2() if publish or listen else None
         if self._tf2 is None and (publish or listen):
             node.get_logger().warning(f"{MISSING}: nothing goes to /tf and no other frame can be used")
@@ -81,6 +84,7 @@ class Frames:
         `Timeline` lets no other pose of an older or the same stamp pass; tf2 warns about repeated data.
         """
         is_new = stamp_ns > self._sent_ns or stamp_ns == 0 == self._sent_ns
+        self._note_behind(stamp_ns)
         if self._broadcaster is None or not is_new or not transform.header.frame_id:
             return False
         if self._note_sent is not None:
@@ -89,9 +93,14 @@ class Frames:
         self._sent_ns = stamp_ns
         return True
 
+    def _note_behind(self, stamp_ns: int) -> None:
+        """The same stamp once more is that of the same pose, or of another round."""
+        older = stamp_ns < self._sent_ns or (self.behind and stamp_ns == self._sent_ns)
+        self.behind = self._broadcaster is not None and older
+
     def forget(self) -> None:
-        """Time starts over: older stamps are news again."""
-        self._sent_ns = -1
+        """The listeners start over: older stamps are news again."""
+        self._sent_ns, self.behind = -1, False
 
     def close(self) -> None:
         """Give back what was subscribed and advertised."""

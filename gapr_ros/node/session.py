@@ -33,6 +33,11 @@ from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
 MOST_FRAMES = 5  # of clouds, that are named
+OVER, SHOWN_S = "time starts over and the track is cleared", 10.0  # shown in the diagnostics
+BEHIND = (
+    "/tf waits for stamps newer than those it had before, or tf2 would mix the poses of both rounds: "
+    "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
+)
 
 
 class Session:
@@ -82,8 +87,8 @@ class Session:
 
     # --- in: the executor's thread ---
 
-    def take_cloud(self, data: bytes) -> None:
-        """A serialised cloud arrived: into the mailbox, unless its time or its frame is refused."""
+    def take_cloud(self, data: bytes, alone: bool = False) -> None:
+        """A serialised cloud, from the only publisher or not: into the mailbox, unless time or frame is refused."""
         counters, now_ns = self._host.counters, self._host.now_ns()
         counters.receive()
         if not self.enabled:
@@ -92,19 +97,21 @@ class Session:
         header = intake.read_header(data)  # None: the worker says what is wrong with the bytes
         try:
             if header is not None:
-                self._admit(header, now_ns)
+                self._admit(header, now_ns, alone)
         except RefusedError as refusal:
             job = Job(b"", self._epoch, now_ns)
             self._answer(Outcome.refused(job, timeline.normal(header), refusal.reason, refusal.text))
             return
         self._put(Job(data, self._epoch, now_ns))
 
-    def _admit(self, header: Header, now_ns: int) -> None:
+    def _admit(self, header: Header, now_ns: int, alone: bool) -> None:
         """Judge frame and time of a cloud before it can push another one out of the mailbox."""
         frame = intake.plain_frame(header.frame_id)
         intake.check_frame(frame, self._host.parameters.model_frame)
-        if self._timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters):
-            self._restart("the stamps of the clouds went back")
+        if self._timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters, alone):
+            why = "the stamps of the clouds went back"
+            self.conflicts.note("time", f"{why}: {OVER}", SHOWN_S)
+            self._clear(why)
         self._note_frame(frame)
 
     def _put(self, job: Job) -> None:
@@ -190,6 +197,7 @@ class Session:
         try:
             if not self._closed:
                 self._publishers.send(outcome, self.model)
+                self.conflicts.note("/tf", BEHIND if self._frames.behind else "")
         finally:
             outcome.tell()
             self._host.report()
@@ -230,24 +238,28 @@ class Session:
 
     def reset(self) -> None:
         """Forget track, seed, all clouds so far, their stamps on /tf too, and the pose that late listeners get."""
-        self._timeline.forget()
+        self._forget_time()
         self._clear("a reset")
 
     def _clear(self, why: str) -> None:
         self._begin_again(why)
         self.worker.outdate(self._epoch)
         self._publishers.withdraw_pose()
-        self._frames.forget()
         self._cloud_frames = []
 
     def clock_jumped(self) -> None:
         """The node's clock went back."""
-        self._timeline.forget()
-        self._restart("the clock jumped back")
-
-    def _restart(self, why: str) -> None:
-        self._host.ros.get_logger().warning(f"{why}: time starts over and the track is cleared")
+        self._forget_time()
+        why = "the clock jumped back"
+        self._host.ros.get_logger().warning(f"{why}: {OVER}")
         self._clear(why)
+
+    def _forget_time(self) -> None:
+        """Whatever comes next is the newest, on /tf too: its listeners clear themselves with the clock."""
+        self._timeline.forget()
+        self._frames.forget()
+        for kind in ("time", "/tf"):
+            self.conflicts.note(kind, "")
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""

@@ -92,11 +92,10 @@ class Subscriptions:
         number = info["publication_sequence_number"]  # None where the middleware has none
         if self._is_taken((info["source_timestamp"], number)):
             return
+        publishers = self._host.ros.count_publishers(self._clouds.topic_name)
         if number is not None:
-            self._host.counters.lost += self._gaps.note(
-                number, self._host.ros.count_publishers(self._clouds.topic_name)
-            )
-        self._session.take_cloud(data)
+            self._host.counters.lost += self._gaps.note(number, publishers)
+        self._session.take_cloud(data, alone=publishers == 1)
 
     def _is_taken(self, key: tuple[int, int | None]) -> bool:
         """Whether the other subscription brought this cloud already."""

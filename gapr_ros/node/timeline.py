@@ -72,21 +72,24 @@ class Timeline:
     its latest one is that with the newest stamp. A stamp that went back, by more than a second or behind the last
     answer with a pose, is that of a straggler, or time has started over, as in a bag that is looped without simulated
     time. One cloud cannot say which: it is refused. Several in a row that arrive one after the other with stamps that
-    go forward among themselves can: with the last of them time starts over.
+    go forward among themselves can: with the last of them time starts over. So it does with one that has the very
+    stamp with which this round began, where all clouds come from one publisher: a bag that is played once more.
     """
 
     def __init__(self) -> None:
         self._newest_ns = 0
+        self._first_ns, self._count = 0, 0  # of this round
         self._answered_ns, self._answered_in, self._answer = 0, "", np.eye(4)  # the last pose that went out
         self._back_ns: list[int] = []  # stamps of the clouds in a row that went back
 
-    def admit(self, stamp: int, now_ns: int, parameters: NodeParameters) -> bool:
+    def admit(self, stamp: int, now_ns: int, parameters: NodeParameters, alone: bool = False) -> bool:
         """Let a cloud of now pass. True when time has started over with it.
 
         Args:
             stamp: of a cloud that has just arrived, ns; 0 for none.
             now_ns: the clock, ns; 0 while it does not run.
             parameters: `max_future` and `max_cloud_age`.
+            alone: all clouds come from one publisher.
 
         Raises:
             RefusedError: bad_fields, future or stale.
@@ -96,11 +99,12 @@ class Timeline:
         check_age(stamp, now_ns, parameters.max_cloud_age)
         stamp = stamp or now_ns
         if stamp >= max(self._newest_ns - BACK_NS, self._answered_ns):
+            self._first_ns, self._count = self._first_ns if self._count else stamp, self._count + 1
             self._newest_ns, self._back_ns = max(stamp, self._newest_ns), []
             return False
-        self._note_back(stamp)
+        first_ns = stamp if alone and self._begins_again(stamp) else self._note_back(stamp)
         self.forget()
-        self._newest_ns = stamp
+        self._newest_ns, self._first_ns, self._count = stamp, first_ns, 1
         return True
 
     def check_answer(self, T_frame_model: Array, header: Header, points_m: Array) -> None:
@@ -137,8 +141,12 @@ class Timeline:
     def _older(self, stamp: int) -> str:
         return f"the stamp is {(self._answered_ns - stamp) * 1e-9:.3g} s older than the last answer with a pose"
 
-    def _note_back(self, stamp: int) -> None:
-        """Count a stamp that went back; refuse it until there are enough of them."""
+    def _begins_again(self, stamp: int) -> bool:
+        """Whether a round of several clouds began with this stamp."""
+        return stamp == self._first_ns and self._count >= RESTART_AFTER
+
+    def _note_back(self, stamp: int) -> int:
+        """Count a stamp that went back, and refuse it until there are enough of them; the first of them."""
         goes_on = bool(self._back_ns) and stamp > self._back_ns[-1]
         self._back_ns = [*self._back_ns, stamp] if goes_on else [stamp]
         if len(self._back_ns) < RESTART_AFTER:
@@ -147,3 +155,4 @@ class Timeline:
             text = f"the stamp is {behind_s:.3g} s behind the newest cloud's" if far else self._older(stamp)
             count = f"{len(self._back_ns)} of {RESTART_AFTER} in a row that start time over"
             raise RefusedError(Reason.STALE, f"{text} ({count})")
+        return self._back_ns[0]

@@ -29,10 +29,10 @@ MOVED = pose_mm([0, 0, 0], [50.0, 0, 0])
 NEEDS_TF2 = "the real tf2 buffer comes with a ROS installation: apt install ros-jazzy-tf2-py"
 
 
-def judged(timeline, stamp_s, now_s=0.0, **parameters):
+def judged(timeline, stamp_s, now_s=0.0, alone=False, **parameters):
     """True for time that starts over, False for a cloud of now, the reason for a refusal."""
     try:
-        return timeline.admit(int(stamp_s * NS), int(now_s * NS), NodeParameters(**parameters))
+        return timeline.admit(int(stamp_s * NS), int(now_s * NS), NodeParameters(**parameters), alone)
     except RefusedError as refusal:
         return refusal.reason
 
@@ -82,6 +82,27 @@ def test_small_steps_back_do_not_add_up():
     judged(timeline, 100.0)
     answers = [judged(timeline, 100.0 - 0.6 * i) for i in range(4)]
     assert answers == [False, False, Reason.STALE, Reason.STALE]
+
+
+def test_the_stamp_with_which_a_round_began_starts_time_over_where_one_publisher_sends():
+    timeline = Timeline()
+    played = [judged(timeline, stamp_s, alone=True) for stamp_s in (100.0, 104.0, 108.0) * 3]
+    assert played == [False, False, False, True, False, False, True, False, False]
+    assert judged(timeline, 104.0, alone=True) is Reason.STALE, "another stamp of the round"
+    assert judged(timeline, 100.0, alone=False) is Reason.STALE, "of two publishers"
+    assert judged(timeline, 100.0, alone=True) is True
+
+
+def test_a_cloud_that_comes_twice_at_the_start_of_a_round_does_not_start_time_over():
+    timeline = Timeline()
+    assert [judged(timeline, stamp_s, alone=True) for stamp_s in (100.0, 104.0, 100.0)] == [False, False, Reason.STALE]
+
+
+def test_a_bag_that_was_heard_from_its_middle_loses_two_clouds_once():
+    timeline = Timeline()
+    judged(timeline, 108.0, alone=True)
+    rounds = [judged(timeline, stamp_s, alone=True) for stamp_s in (100.0, 104.0, 106.0, 108.0, 109.0) * 2]
+    assert rounds == [Reason.STALE, Reason.STALE, True, False, False, True, False, False, False, False]
 
 
 LAST = 2**31 - 1, 2**32 - 1
@@ -279,12 +300,22 @@ def test_an_older_cloud_that_was_let_in_before_the_newer_one_was_answered_gets_n
         assert tf2.sent == [1000.0]
 
 
-def test_a_short_bag_that_is_looped_without_simulated_time_goes_on(blob_path, client, method, tf2):
+def test_a_short_bag_that_is_looped_without_simulated_time_goes_on_and_tf2_never_mixes_its_rounds(
+    blob_path, client, method, tf2
+):
     with node_in_thread(method, blob_path, publish_tf=True):
         client.wait_for_state("active")
-        levels = [client.ask(GOOD, stamp_s=1000.0 + 0.25 * i)["level"] for _ in range(3) for i in range(4)]
-        assert levels == [0] * 4 + [1, 1, 0, 0] * 2
-        wait_until(lambda: tf2.sent == [1000.0, 1000.25, 1000.5, 1000.75] + [1000.5, 1000.75] * 2, what=tf2.sent)
+        stamps = [1000.0 + 0.25 * i for i in range(4)]
+        for _ in range(3):
+            assert [client.ask(GOOD, stamp_s=stamp_s)["level"] for stamp_s in stamps] == [0] * 4
+            method.answer = accepted(MOVED)  # with an old transform of the same stamp, tf2 would give neither
+        assert [pose.header.stamp.sec + pose.header.stamp.nanosec * 1e-9 for pose in client.poses] == stamps * 3
+        assert tf2.sent == stamps and tf2.at(1000.25) == tf2.latest() == pytest.approx(0.0)
+        conflicts = client.values("input")["conflicts"]
+        assert "the stamps of the clouds went back: time starts over" in conflicts
+        assert "/tf waits for stamps newer than those it had before" in conflicts and "--clock" in conflicts
+        assert client.ask(GOOD, stamp_s=1001.0)["level"] == 0
+        wait_until(lambda: tf2.sent[-1] == 1001.0 and "/tf" not in client.values("input")["conflicts"])
 
 
 def test_clouds_without_stamp_and_clock_go_to_tf_like_their_poses(blob_path, client, method, tf2):
@@ -325,8 +356,11 @@ def test_a_bag_that_is_looped_without_simulated_time_clears_the_track_and_goes_o
         answers = [client.ask(GOOD, stamp_s=995.0 + i) for i in range(4)]
         assert [answer["level"] for answer in answers] == [1, 1, 0, 0]
         assert node.session._epoch == epoch + 1
-        assert tf2.sent == [1000.0, 1001.0, 997.0, 998.0]
-        assert tf2.at(1000.0) == pytest.approx(0.0) and tf2.at(997.0) == tf2.at(998.0) == pytest.approx(-0.05)
+        assert tf2.sent == [1000.0, 1001.0], "a buffer would give poses between those of both rounds"
+        assert client.call("reset").success
+        wait_until(lambda: not client.values("input")["conflicts"])
+        assert client.ask(GOOD, stamp_s=999.0)["level"] == 0
+        wait_until(lambda: tf2.sent == [1000.0, 1001.0, 999.0], what=tf2.sent)
 
 
 def test_stamps_of_before_go_to_tf_after_a_reset(blob_path, client, method, tf2):

@@ -176,8 +176,9 @@ class RegisterNode(LifecycleNodeMixin, Node):
 
     @transition
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listen no more; clouds on their way are refused."""
+        """Listen no more; clouds on their way are refused, and the last pose is withdrawn."""
         self._stop_listening()
+        self.session.withdraw()
         return super().on_deactivate(state)
 
     @transition

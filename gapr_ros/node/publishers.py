@@ -20,6 +20,7 @@ from msg_adapters import covariance_to_list, matrix_to_pose, matrix_to_transform
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPICS = {
+    "pose": (PoseWithCovarianceStamped, LATCHED),
     "transform": (TransformStamped, 10),
     "confidence": (Float64, 10),
     "status": (DiagnosticStatus, 10),
@@ -36,13 +37,11 @@ class Publishers:
     """The topics under `~/`, and /tf; silent while the node is not active."""
 
     def __init__(self, host: Host, frames: Frames) -> None:
-        self._host, self._frames = host, frames
-        advertise = host.ros.create_lifecycle_publisher
-        self._topics = {name: advertise(kind, f"~/{name}", qos) for name, (kind, qos) in TOPICS.items()}
-        self._vision = messages.vision_types()
+        self._host, self._frames, self._vision = host, frames, messages.vision_types()
+        self._kinds = dict(TOPICS)
         if self._vision is not None:
-            self._topics["detection"] = advertise(self._vision.Detection3DArray, "~/detection", 10)
-        self._pose = self._advertise_pose()
+            self._kinds["detection"] = self._vision.Detection3DArray, 10
+        self._topics = {name: self._advertise(name) for name in self._kinds}
 
     def send_model(self, model: Model) -> None:
         """The bone, latched, in its own frame."""
@@ -62,20 +61,22 @@ class Publishers:
             found = messages.detection(self._vision, outcome, model.name, model.points_mm)
             self._topics["detection"].publish(found)
 
-    def withdraw_pose(self) -> None:
-        """No late listener gets the last pose any more: the topic is given up and advertised again."""
-        old, self._pose = self._pose, self._advertise_pose()
-        if old.is_activated:
-            self._pose.on_activate(None)
-        self._host.ros.destroy_lifecycle_publisher(old)
+    def withdraw(self, *names: str) -> None:
+        """No late listener gets the last message of these any more: they are given up and advertised again."""
+        for name in names:
+            old, self._topics[name] = self._topics[name], self._advertise(name)
+            if old.is_activated:
+                self._topics[name].on_activate(None)
+            self._host.ros.destroy_lifecycle_publisher(old)
 
     def close(self) -> None:
         """Give the topics back."""
-        for publisher in (self._pose, *self._topics.values()):
+        for publisher in self._topics.values():
             self._host.ros.destroy_lifecycle_publisher(publisher)
 
-    def _advertise_pose(self) -> LifecyclePublisher:
-        return self._host.ros.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED)
+    def _advertise(self, name: str) -> LifecyclePublisher:
+        kind, qos = self._kinds[name]
+        return self._host.ros.create_lifecycle_publisher(kind, f"~/{name}", qos)
 
     def _of_model(self, stamp: Time) -> Header:
         return Header(frame_id=self._host.parameters.model_frame, stamp=stamp)
@@ -87,7 +88,7 @@ class Publishers:
         message = PoseWithCovarianceStamped(header=outcome.header)
         message.pose.pose = matrix_to_pose(outcome.pose)
         message.pose.covariance = covariance_to_list(outcome.covariance)
-        self._pose.publish(message)
+        self._topics["pose"].publish(message)
         transform = TransformStamped(header=outcome.header, child_frame_id=self._host.parameters.model_frame)
         transform.transform = matrix_to_transform(outcome.pose)
         self._topics["transform"].publish(transform)

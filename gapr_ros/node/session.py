@@ -33,6 +33,7 @@ from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
 MOST_FRAMES = 5  # of clouds, that are named
+OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
 OVER, SHOWN_S = "time starts over and the track is cleared", 10.0  # shown in the diagnostics
 BEHIND = (
     "/tf waits for stamps newer than those it had before, or tf2 would mix the poses of both rounds: "
@@ -197,6 +198,8 @@ class Session:
         try:
             if not self._closed:
                 self._publishers.send(outcome, self.model)
+                if self._host.counters.consecutive_refusals == OUTLIVED_AFTER:
+                    self._publishers.withdraw("pose")
                 self.conflicts.note("/tf", BEHIND if self._frames.behind else "")
         finally:
             outcome.tell()
@@ -244,7 +247,7 @@ class Session:
     def _clear(self, why: str) -> None:
         self._begin_again(why)
         self.worker.outdate(self._epoch)
-        self._publishers.withdraw_pose()
+        self._publishers.withdraw("pose")
         self._cloud_frames = []
 
     def clock_jumped(self) -> None:
@@ -279,12 +282,16 @@ class Session:
         self._ready, self._limits = ready, _limits(ready.parameters)
         self.worker.outdate(self._epoch)
         self.parameters_changed()
-        self._publishers.withdraw_pose()
+        self._publishers.withdraw("pose")
         self.send_model()
 
     def send_model(self) -> None:
         """Show the bone."""
         self._publishers.send_model(self.model)
+
+    def withdraw(self) -> None:
+        """Late listeners get nothing from a node that is not active: it does not know where the bone is."""
+        self._publishers.withdraw("pose", "model")
 
     def stop_waiting(self, why: str) -> None:
         """A pause: drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way.

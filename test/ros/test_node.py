@@ -28,6 +28,7 @@ from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import frames
 from gapr_ros.node.collection import MOST_LATE, Late
 from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.session import OUTLIVED_AFTER
 from gapr_ros.node.worker import Job
 from msg_adapters import cloud_to_xyz, list_to_covariance, pose_to_matrix, transform_to_matrix, xyz_to_cloud
 
@@ -109,6 +110,45 @@ def test_a_late_listener_does_not_get_a_pose_from_before_a_reset_or_of_another_b
     client.ask(GOOD)
     wait_until(lambda: late.poses and client.poses, what="the new pose, by old and new listeners")
     late.close()
+
+
+def latched_for_a_late_listener():
+    """How many poses and bones come without a cloud, while both topics are advertised."""
+    late = Client()
+    wait_until(lambda: all(late.node.count_publishers(f"/register_node/{name}") for name in ("pose", "model")))
+    time.sleep(0.5)
+    counts = len(late.poses), len(late.models)
+    late.close()
+    return counts
+
+
+def test_a_late_listener_gets_nothing_from_an_inactive_node_and_no_pose_of_before_when_it_is_active_again(live):
+    node, client, method = live
+    client.ask(GOOD)
+    assert latched_for_a_late_listener() == (1, 1)
+    assert client.change_state(Transition.TRANSITION_DEACTIVATE)
+    assert latched_for_a_late_listener() == (0, 0)
+    assert client.change_state(Transition.TRANSITION_ACTIVATE)
+    client.wait_for_state("active")
+    assert latched_for_a_late_listener() == (0, 1)
+    heard = len(client.poses), len(client.models)
+    assert client.ask(GOOD)["level"] == 0
+    wait_until(lambda: (len(client.poses), len(client.models)) == (heard[0] + 1, heard[1]), what="an earlier listener")
+
+
+def test_a_late_listener_does_not_get_a_pose_that_many_refusals_have_outlived(live):
+    node, client, method = live
+    client.ask(GOOD)
+    method.answer = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="for the test")
+    for _ in range(OUTLIVED_AFTER - 1):
+        client.ask(GOOD)
+    assert latched_for_a_late_listener() == (1, 1)
+    client.ask(GOOD)
+    assert latched_for_a_late_listener() == (0, 1)
+    method.answer = accepted()
+    client.ask(GOOD)
+    wait_until(lambda: len(client.poses) == 2, what="an earlier listener")
+    assert latched_for_a_late_listener() == (1, 1)
 
 
 def test_a_disabled_node_keeps_its_last_pose_for_late_listeners(live):

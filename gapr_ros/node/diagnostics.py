@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -72,19 +73,23 @@ class Input:
 
 
 class RefusalLog:
-    """Writes a refusal when its reason is new or the last line is 5 s old, with the number of those in between."""
+    """Writes a refusal when the last line of its reason is 5 s old, with the number of those in between."""
 
     def __init__(self, write: Callable[[str], None]) -> None:
-        self._write, self._reason, self._at, self._silent = write, None, float("-inf"), 0
+        self._write = write
+        self._at: dict[Reason | None, float] = {}
+        self._silent: Counter[Reason | None] = Counter()
 
     def __call__(self, outcome: Outcome) -> None:
         """Log one refusal, or count it."""
-        if outcome.reason == self._reason and time.monotonic() - self._at < THROTTLE_S:
-            self._silent += 1
+        reason, now = outcome.reason, time.monotonic()
+        if now - self._at.get(reason, float("-inf")) < THROTTLE_S:
+            self._silent[reason] += 1
             return
-        more = f" ({self._silent} more since the last line)" if self._silent else ""
+        silent = self._silent.pop(reason, 0)
+        more = f" ({silent} more of these since the last line)" if silent else ""
         self._write(f"cloud in '{outcome.cloud_frame}' {outcome}{more}")
-        self._reason, self._at, self._silent = outcome.reason, time.monotonic(), 0
+        self._at[reason] = now
 
 
 @dataclass(frozen=True)

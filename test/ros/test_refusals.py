@@ -15,7 +15,10 @@ from std_srvs.srv import SetBool
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.node import diagnostics
+from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason
+from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
 
@@ -352,3 +355,16 @@ def test_the_range_is_limited_on_both_sides(live):
 def direction(radius: float) -> np.ndarray:
     vectors = np.random.default_rng(3).normal(size=(300, 3))
     return radius * vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_refusals_whose_reasons_alternate_do_not_fill_the_log(monkeypatch):
+    lines, now = [], [0.0]
+    monkeypatch.setattr(diagnostics.time, "monotonic", lambda: now[0])
+    log = diagnostics.RefusalLog(lines.append)
+    for tenths in range(52):
+        now[0] = tenths / 10.0
+        log(Outcome(Job(b"", 0, 0), "probe", reason=[Reason.AMBIGUOUS, Reason.STALE][tenths % 2]))
+    assert [line.split(" refused: ")[1] for line in lines] == [
+        "ambiguous", "stale", "ambiguous (24 more of these since the last line)",
+        "stale (24 more of these since the last line)",
+    ]  # fmt: skip

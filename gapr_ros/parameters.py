@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import sys
 from array import array
 from collections.abc import Iterable, Mapping
@@ -181,7 +182,7 @@ def problem(setting_field: Field, value: Any) -> str:
     name, default = setting_field.name, setting_field.default
     value = plain(value)
     if type(default) is tuple and not _is_triple(value):
-        return f"parameter '{name}' must be three doubles, got {value!r}: write [0.0, 0.0, 0.1]"
+        return f"parameter '{name}' must be three finite doubles, got {value!r}: write [0.0, 0.0, 0.1]"
     if type(value) is not type(default):
         kind = ROS_TYPES[type(default)]
         return f"parameter '{name}' must be of type {kind}, got {value!r}: write {_example(default, value)}"
@@ -225,7 +226,7 @@ def _check_override(setting_field: Field, given: Parameter | None) -> None:
 
 
 def _is_triple(value: Any) -> bool:
-    return isinstance(value, tuple) and len(value) == 3 and all(type(number) is float for number in value)
+    return isinstance(value, tuple) and len(value) == 3 and all(type(x) is float and math.isfinite(x) for x in value)
 
 
 def _example(default: Any, value: Any) -> str:

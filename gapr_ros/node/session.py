@@ -33,8 +33,9 @@ from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
 MOST_FRAMES = 5  # of clouds, that are named
+NO_CLOCK = "use_sim_time is true and no /clock has come: neither max_future nor max_cloud_age is checked"
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
-OVER, SHOWN_S = "time starts over and the track is cleared", 10.0  # shown in the diagnostics
+OVER, SHOWN_S = "time starts over and the track is cleared", 10.0  # what lasts a moment is shown so long
 BEHIND = (
     "/tf waits for stamps newer than those it had before, or tf2 would mix the poses of both rounds: "
     "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
@@ -59,7 +60,8 @@ class Session:
         self.last_outcome: Outcome | None = None
         self.conflicts = Conflicts(host.ros.get_logger().warning)
         self._timeline, self._track = Timeline(), Track()
-        self._epoch, self._oldest, self._seed, self._cloud_frames = 0, 0, None, []
+        self._epoch, self._oldest, self._seed = 0, 0, None
+        self._cloud_frames, self._cloud_frame = [], ""
         self._log_refusal = RefusalLog(host.ros.get_logger().warning)
         publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
         self._shared = SharedFrame(host, self.conflicts) if publish else None
@@ -95,6 +97,7 @@ class Session:
         if not self.enabled:
             counters.dropped += 1
             return
+        self.conflicts.note("clock", "" if now_ns else NO_CLOCK)
         header = intake.read_header(data)  # None: the worker says what is wrong with the bytes
         try:
             if header is not None:
@@ -127,10 +130,12 @@ class Session:
         """Clouds in two frames move the bone's parent to and fro, unless there is one output_frame for all."""
         if frame not in self._cloud_frames and len(self._cloud_frames) < MOST_FRAMES:
             self._cloud_frames.append(frame)
-        many = len(self._cloud_frames) > 1 and not self._host.parameters.output_frame
+        before, self._cloud_frame = self._cloud_frame, frame
+        if before in ("", frame) or self._host.parameters.output_frame:
+            return
         names = ", ".join(self._cloud_frames)
         text = f"clouds come in {len(self._cloud_frames)} frames ({names}): the parent of the bone changes with them"
-        self.conflicts.note("cloud frames", f"{text}; set output_frame" if many else "")
+        self.conflicts.note("cloud frames", f"{text}; set output_frame", SHOWN_S)
 
     def take_seed(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
@@ -248,7 +253,8 @@ class Session:
         self._begin_again(why)
         self.worker.outdate(self._epoch)
         self._publishers.withdraw("pose")
-        self._cloud_frames = []
+        self._cloud_frames, self._cloud_frame = [], ""
+        self.conflicts.note("cloud frames", "")
 
     def clock_jumped(self) -> None:
         """The node's clock went back."""

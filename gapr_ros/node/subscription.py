@@ -65,15 +65,16 @@ class Subscriptions:
 
     @guarded
     def look(self) -> None:
-        """See who publishes: how many, and whether somebody still needs best effort."""
-        publishers = self._host.ros.get_publishers_info_by_topic(self._clouds.topic_name)
-        best_effort = [p for p in publishers if p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT]
+        """See who publishes: how many, what, and whether somebody still needs best effort."""
+        topic, kind = self._clouds.topic_name, self._host.parameters.cloud_type
+        publishers = self._host.ros.get_publishers_info_by_topic(topic)
+        others = {p.topic_type for p in publishers} - {_type_name(kind)}
+        text = f"a publisher of {topic} sends {', '.join(sorted(others))}, cloud_type is {kind}: nothing of it comes"
+        self._session.conflicts.note("type", text if others else "")
         names = ", ".join(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
-        many = (
-            f"{len(publishers)} publishers on {self._clouds.topic_name} ({names}): a node follows one source of clouds"
-        )
-        self._session.conflicts.note("publishers", many if len(publishers) > 1 else "")
-        if best_effort:
+        text = f"{len(publishers)} publishers on {topic} ({names}): a node follows one source of clouds"
+        self._session.conflicts.note("publishers", text if len(publishers) > 1 else "")
+        if any(p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for p in publishers):
             self._needed_at = time.monotonic()
         elif time.monotonic() - self._needed_at > GRACE_S:
             self._mismatch = ""
@@ -134,3 +135,9 @@ class Subscriptions:
         if second is not None:
             self.get_logger().info(f"every publisher of {self._clouds.topic_name} is reliable again")
             self._host.ros.destroy_subscription(second)
+
+
+def _type_name(cloud_type: str) -> str:
+    """As the graph has it: sensor_msgs/msg/PointCloud2."""
+    message = INPUTS[cloud_type].message
+    return f"{message.__module__.split('.')[0]}/msg/{message.__name__}"

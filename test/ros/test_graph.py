@@ -7,14 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import TransformStamped
-from harness import Client, Collecting, StandIn, node_in_thread, wait_until
+from geometry_msgs.msg import PoseArray, TransformStamped
+from harness import Client, Collecting, Spinner, StandIn, context, node_in_thread, wait_until
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gapr_core.errors import ConfigError
-from gapr_ros.node import frames, subscription
+from gapr_ros.node import frames, session, subscription
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.parameters import NodeParameters
 
@@ -118,6 +121,47 @@ def test_clouds_in_two_frames_are_a_conflict_unless_they_meet_in_an_output_frame
         wait_until(lambda: client.ask(GOOD) and not client.values("input")["conflicts"])
         assert not node.session.conflicts.texts
     assert capfd.readouterr().err.count("clouds come in 2 frames") == 1
+
+
+def test_clouds_of_another_frame_long_ago_are_no_conflict(blob_path, client, method, monkeypatch):
+    monkeypatch.setattr(session, "SHOWN_S", 0.2)
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        for frame in ("left_camera", "right_camera"):
+            client.ask(GOOD, frame=frame)
+        wait_until(lambda: client.ask(GOOD, frame="right_camera") and not node.session.conflicts.texts)
+
+
+def test_a_publisher_of_another_type_is_named_until_it_goes(blob_path, client, method):
+    """It counts as a publisher, and nothing of it ever comes."""
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        apart = Spinner(context())  # one participant cannot have two types of a topic
+        tracker = Node("tracker", context=apart.context)
+        apart.start(tracker)
+        poses = tracker.create_publisher(PoseArray, "points", 1)
+        text = (
+            "a publisher of /points sends geometry_msgs/msg/PoseArray, cloud_type is PointCloud2: nothing of it comes"
+        )
+        wait_until(lambda: text in client.values("input")["message"])
+        apart.do(lambda: tracker.destroy_publisher(poses))
+        wait_until(lambda: text not in client.values("input")["conflicts"])
+        apart.close()
+
+
+def test_simulated_time_without_a_clock_is_a_conflict_until_the_clock_comes(blob_path, client, method):
+    with node_in_thread(method, blob_path, use_sim_time=True) as node:
+        client.wait_for_state("active")
+        client.ask(GOOD)
+        wait_until(lambda: "no /clock has come" in client.values("input")["message"])
+        now = Clock(clock=node_time(1000))
+        wait_until(lambda: client.clock.publish(now) or node.now_ns())
+        client.ask(GOOD, stamp_s=1000.0)
+        wait_until(lambda: "/clock" not in client.values("input")["conflicts"])
+
+
+def node_time(seconds):
+    return Time(nanoseconds=seconds * 1_000_000_000).to_msg()
 
 
 def test_a_leading_slash_of_a_cloud_is_taken_away(blob_path, client, method):

@@ -32,6 +32,7 @@ from gapr_core.registration.additive import Additive
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.features import FEATURES_OF, STREAM
+from gapr_core.registration.memory import Memory
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals, Proposer
 from gapr_core.registration.proposals.network import NetworkProposer
@@ -39,7 +40,6 @@ from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.registration.tracking import Memory
 from gapr_core.results import Hypothesis
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.files import write_text

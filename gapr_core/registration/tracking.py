@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +16,9 @@ from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.evidence import Evidence
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
-from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.shared_misfit import SharedMisfit
-from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
 from gapr_core.runtime.clock import Clock
@@ -28,57 +26,6 @@ from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-
-
-class Memory:
-    """A proposer of what is remembered: the last pose, and the rivals that the last full registration gave it.
-
-    The rivals matter as much as the pose. Without them nothing would compete with it, and a pose that is merely the
-    only one looked at would count as sure.
-    """
-
-    name = "track"
-
-    def __init__(self) -> None:
-        self.poses: Array = np.empty((0, 4, 4))
-
-    def prepare(self, target: PreparedTarget) -> None:
-        """Nothing of a target is needed."""
-
-    def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """The pose first, then its rivals."""
-        return Proposals(self.poses, np.linspace(1.0, 0.0, len(self.poses)))
-
-    def keep(self, poses: Sequence[Array]) -> None:
-        """Remember the hypotheses of a full registration, best first: (4, 4) T_target_source, mm, each."""
-        self.poses = np.stack(poses)
-
-    def follow(self, pose: Array, source: Array) -> None:
-        """The source (N, 3), mm, has moved from the remembered pose nearest to `pose`, T_before to T_now.
-
-        All others move with it, R to R inv(T_before) T_now; the nearest one comes first.
-        """
-        nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in self.poses]))
-        moved = self.poses @ (se3.inverse(self.poses[nearest]) @ pose)
-        self.poses = np.concatenate([moved[nearest : nearest + 1], np.delete(moved, nearest, axis=0)])
-
-
-class Following(Registrar):
-    """Asks a memory first, then the proposers of another registrar.
-
-    Args:
-        memory: what is remembered of the last source.
-        calibration: the confidence model of its answers.
-        full: registers what the memory knows nothing of: the mirror image of a source.
-    """
-
-    def __init__(self, memory: Memory, calibration: Calibration, full: Registrar) -> None:
-        proposers, calibrations = (memory, *full.proposers), (calibration, *full.calibrations)
-        super().__init__(full.config, proposers, calibrations, precision=full.precision)
-        self._full = full
-
-    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
-        return self._full._of_image(flipped, target, clock)
 
 
 class Tracker:
@@ -114,7 +61,7 @@ class Tracker:
         self.registrar = registrar or Registrar.from_pretrained()
         self.recheck = recheck
         self._memory = Memory()
-        self._tracking = Following(self._memory, calibration or Calibration.shipped(Memory.name), self.registrar)
+        self._tracking = MemoryFirst(self._memory, calibration or Calibration.shipped(Memory.name), self.registrar)
         self._evidence = Evidence(self.registrar.config.evidence)
         self._stream = stream or Calibration.shipped(STREAM)
         self._shared: SharedMisfit | None = SharedMisfit(self.registrar.config.evidence.memory)

@@ -14,8 +14,8 @@ from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
 from gapr_core.registration.features import FEATURES
+from gapr_core.registration.memory import Memory
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.tracking import Memory
 from gapr_core.results import Hypothesis
 
 TASK = Task("folder", "train", 0, 1)

@@ -14,9 +14,9 @@ from gapr_core.geometry import se3
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.memory import Memory
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.tracking import Memory
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
 

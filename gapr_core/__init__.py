@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
     from gapr_core.registration.accumulation import Accumulator
     from gapr_core.registration.crop import crop_box, crop_to_pose
+    from gapr_core.registration.following import FollowedPose
     from gapr_core.registration.registrar import Registrar
     from gapr_core.registration.target import PreparedTarget
     from gapr_core.registration.tracking import Tracker
@@ -26,6 +27,7 @@ _HOMES = {
     "Registrar": "registration.registrar",
     "Tracker": "registration.tracking",
     "Accumulator": "registration.accumulation",
+    "FollowedPose": "registration.following",
     "RegistrarConfig": "config",
     "PreparedTarget": "registration.target",
     "RegistrationResult": "results",

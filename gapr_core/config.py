@@ -246,6 +246,20 @@ class EvidenceConfig(Settings):
 
 
 @dataclass(frozen=True)
+class FollowingConfig(Settings):
+    """How far a pose is followed without an assessment (`gapr_core.registration.following`)."""
+
+    points: int = setting(1000, "points of a source that are refined", low=100, high=1_000_000)
+    most_sources: int = setting(5, "sources in a row that are followed; then one is assessed", low=0, high=1000)
+    largest_tre95_mm: float = setting(
+        4.0, "largest bound of the error; that of a source whose view is weaker is larger", low=0, unit="mm"
+    )
+    largest_turn_deg: float = setting(2.5, "standard deviation of the least certain turn", low=0, unit="deg")
+    largest_residual: float = setting(1.2, "residual over that of the assessed source", low=1, high=100)
+    least_inliers: float = setting(0.9, "inlier ratio over that of the assessed source", low=0, high=1)
+
+
+@dataclass(frozen=True)
 class GuidanceConfig(Settings):
     """What a further look at the bone is assumed to give."""
 
@@ -357,6 +371,7 @@ class RegistrarConfig(Settings):
     cortices: CorticesConfig = field(default_factory=CorticesConfig)
     accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    following: FollowingConfig = field(default_factory=FollowingConfig)
     guide: bool = setting(False, "say with every answer where another look would help most")
     min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
     max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")

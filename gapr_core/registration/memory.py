@@ -24,32 +24,43 @@ class Memory:
 
     The rivals matter as much as the pose. Without them nothing would compete with it, and a pose that is merely the
     only one looked at would count as sure.
+
+    Attributes:
+        poses: (K, 4, 4) T_target_source of the last source that was assessed, mm, best first.
+        motion: (4, 4) how the source has moved since without an assessment, inv(T_then) T_now.
     """
 
     name = "track"
 
     def __init__(self) -> None:
         self.poses: Array = np.empty((0, 4, 4))
+        self.motion: Array = np.eye(4)
+
+    @property
+    def now(self) -> Array:
+        """(K, 4, 4) where the poses are after the motion."""
+        return self.poses @ self.motion
 
     def prepare(self, target: PreparedTarget) -> None:
         """Nothing of a target is needed."""
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """The pose first, then its rivals."""
-        return Proposals(self.poses, np.linspace(1.0, 0.0, len(self.poses)))
+        return Proposals(self.now, np.linspace(1.0, 0.0, len(self.poses)))
 
     def keep(self, poses: Sequence[Array]) -> None:
         """Remember the hypotheses of a full registration, best first: (4, 4) T_target_source, mm, each."""
-        self.poses = np.stack(poses)
+        self.poses, self.motion = np.stack(poses), np.eye(4)
 
     def follow(self, pose: Array, source: Array) -> None:
         """The source (N, 3), mm, has moved from the remembered pose nearest to `pose`, T_before to T_now.
 
         All others move with it, R to R inv(T_before) T_now; the nearest one comes first.
         """
-        nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in self.poses]))
-        moved = self.poses @ (se3.inverse(self.poses[nearest]) @ pose)
-        self.poses = np.concatenate([moved[nearest : nearest + 1], np.delete(moved, nearest, axis=0)])
+        before = self.now
+        nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in before]))
+        moved = before @ (se3.inverse(before[nearest]) @ pose)
+        self.keep([moved[nearest], *np.delete(moved, nearest, axis=0)])
 
 
 class MemoryFirst(Registrar):

@@ -108,7 +108,7 @@ def refine_fully(
     fit = evaluate(T, points, target, config)
     for number in range(config.rounds):
         trust = patch_trust(fit, neighbours, config) if number >= config.free_rounds else np.ones(len(points))
-        limits = np.full(config.iterations, _tukey_limit(fit.signed_mm, fit.sigma_mm, config))
+        limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
         variances = np.full_like(limits, fit.sigma_mm**2)
         poses, _ = kernels.refine_batch(fit.T[None], points, trust, *target.kernel_view, limits, variances)
         step = se3.apply(poses[0], points) - fit.moved
@@ -122,7 +122,7 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
     """Residuals, scale and weights of a pose as it is; no patch is distrusted."""
     signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     sigma_mm = _robust_sigma(signed, config)
-    limit_mm = _tukey_limit(signed, sigma_mm, config)
+    limit_mm = tukey_limit(signed, sigma_mm, config)
     signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
     weights = fit_kernels.weights(signed, aside, elements, target.elements, sigma_mm**2, limit_mm)
     return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
@@ -159,7 +159,7 @@ def _median_size(residuals: Array) -> float:
     return float(np.median(np.nan_to_num(np.abs(residuals), nan=np.inf, posinf=np.inf)))
 
 
-def _tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
+def tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
     """Where Tukey's weight ends, mm: far out, and so more efficient, where almost no residual is beyond."""
     beyond = fit_kernels.share_beyond(signed, FAR_SIGMAS * sigma_mm)
     return sigma_mm * (config.clean_tukey_scale if beyond < config.clean_share else config.tukey_scale)

@@ -16,6 +16,7 @@ from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.evidence import Evidence
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.following import FollowedPose, Follower
 from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.shared_misfit import SharedMisfit
@@ -95,6 +96,7 @@ class Tracker:
         self._has_track = self._is_sure = False  # there are poses to follow; the last source was sure
         self._last: Array | None = None  # pose of the last source that no rule refused, (4, 4) T_target_source
         self._tracked = 0  # sources since the last full registration
+        self._follower: Follower | None = None  # of the last source, where that was sure
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target; see `Registrar.prepare`."""
@@ -117,14 +119,40 @@ class Tracker:
             self._bone = target
         if initial is not None:
             self._forget_track()
-        clock = Clock()
+        self._follower, clock = None, Clock()
         assessment = self._assess(source, target, initial, viewpoint, clock)
         if isinstance(assessment, Assessment):
             assessment = self._with_evidence(assessment)
         result = self.registrar.conclude(assessment, clock)
         if isinstance(assessment, Assessment):
             self._remember(result, assessment.source.points)
+            if self._is_sure and self._has_track and assessment.seen is None:
+                self._follower = Follower(assessment, source, self.registrar.config)
         return result
+
+    @single_threaded_libraries
+    def follow(self, source: ArrayLike, target: PreparedTarget) -> FollowedPose | None:
+        """Where the bone is now, by the last pose, in a fraction of the time of `register`, and not assessed.
+
+        None where `register` has to be asked, for this source and all after it: the last answer was refused, not sure
+        or of a cloud with a viewpoint; its error, which counts for more in a weaker view, is not well bounded; the
+        source fits worse, or lies elsewhere; or many were followed in a row (`FollowingConfig`, `evidence.agree_mm`).
+
+        What the sources said of the bone does not change, nor when one is registered in full again. The next
+        registration begins where the bone was followed to.
+
+        Args:
+            source: (N, 3), mm, in the same frame as those before.
+            target: from `prepare`.
+
+        Raises:
+            InvalidPointCloudError: wrong shape or type.
+        """
+        follower, self._follower = self._follower, None
+        found = follower.follow(source) if follower is not None and target is self._bone else None
+        if follower is not None and found is not None:
+            self._follower, self._memory.motion = follower, follower.motion()
+        return found
 
     def _assess(
         self,
@@ -139,7 +167,7 @@ class Tracker:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if viewpoint is None and self._tracked + 1 < self.recheck:
             return self._tracking.assess(source, target, clock=clock, enough=self._stands)
-        return self.registrar.assess(source, target, self._memory.poses[0], viewpoint, clock)
+        return self.registrar.assess(source, target, self._memory.now[0], viewpoint, clock)
 
     def _stands(self, assessment: Assessment) -> bool:
         """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""

@@ -39,14 +39,14 @@ def test_residuals_without_a_surface_count_as_large_and_the_scale_stays_within_i
 def test_the_weights_end_farther_out_where_almost_nothing_lies_beyond_three_sigma():
     clean, dirty = np.zeros(1000), np.zeros(1000)
     clean[:14], dirty[:15] = 4.0, -4.0
-    assert refinement._tukey_limit(clean, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.clean_tukey_scale)
-    assert refinement._tukey_limit(dirty, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.tukey_scale)
+    assert refinement.tukey_limit(clean, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.clean_tukey_scale)
+    assert refinement.tukey_limit(dirty, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.tukey_scale)
     dirty[:15] = np.nan
-    assert refinement._tukey_limit(dirty, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.tukey_scale)
+    assert refinement.tukey_limit(dirty, 1.2, CONFIG) == pytest.approx(1.2 * CONFIG.tukey_scale)
     dirty[:15] = 7.0  # beyond 3 sigma of 2 mm
-    assert refinement._tukey_limit(dirty, 2.0, CONFIG) == pytest.approx(2.0 * CONFIG.tukey_scale)
+    assert refinement.tukey_limit(dirty, 2.0, CONFIG) == pytest.approx(2.0 * CONFIG.tukey_scale)
     edge = np.r_[np.full(15, 3.0), np.zeros(985)]  # 3 sigma itself is not beyond
-    assert refinement._tukey_limit(edge, 1.0, CONFIG) == pytest.approx(CONFIG.clean_tukey_scale)
+    assert refinement.tukey_limit(edge, 1.0, CONFIG) == pytest.approx(CONFIG.clean_tukey_scale)
 
 
 def test_the_weights_of_a_fit_are_tukeys_times_the_share_of_the_noise_in_the_variance(target, points):
@@ -57,7 +57,7 @@ def test_the_weights_of_a_fit_are_tukeys_times_the_share_of_the_noise_in_the_var
     fit = refinement.evaluate(T, dirty, target, CONFIG)
     plain, *_ = kernels.residuals_at(T, dirty, *target.kernel_view, 0.0)
     sigma = refinement._robust_sigma(plain, CONFIG)
-    limit = refinement._tukey_limit(plain, sigma, CONFIG)
+    limit = refinement.tukey_limit(plain, sigma, CONFIG)
     signed, gradients, aside, elements = kernels.residuals_at(T, dirty, *target.kernel_view, sigma**2)
     assert fit.sigma_mm == sigma
     assert np.array_equal(fit.signed_mm, signed, equal_nan=True) and np.array_equal(fit.gradients, gradients)
@@ -81,7 +81,7 @@ def test_a_point_beside_the_surface_weighs_less_by_how_far_aside_it_lies():
     plate = tiny.plane(size_mm=40.0, step_mm=2.0)
     points = np.array([[27.0, 0.0, 0.1], [24.5, 0.0, 0.1], *([x, 0.0, 0.1] for x in np.linspace(-10.0, 10.0, 9))])
     fit = refinement.evaluate(np.eye(4), points, plate, replace(CONFIG, smallest_sigma_mm=1.0))
-    limit = refinement._tukey_limit(fit.signed_mm, 1.0, CONFIG)
+    limit = refinement.tukey_limit(fit.signed_mm, 1.0, CONFIG)
     aside = np.r_[27.0 - 24.0, 24.5 - 24.0, np.zeros(9)]
     expected = np.clip(1.0 - (0.1**2 + aside**2) / limit**2, 0.0, 1.0) ** 2
     assert fit.weights == pytest.approx(expected) and 0.0 < expected[0] < expected[1] < expected[2]
@@ -173,7 +173,7 @@ def test_rounds_end_when_the_points_rest_and_not_before(target, points, monkeypa
     assert all((call[2] == 1.0).all() for call in calls[: CONFIG.free_rounds])  # trust of all at first
     assert all((call[2] < 1.0).any() for call in calls[CONFIG.free_rounds :])
     fit = refinement.evaluate(start, points, target, CONFIG)
-    assert calls[0][8] == pytest.approx(refinement._tukey_limit(fit.signed_mm, fit.sigma_mm, CONFIG))
+    assert calls[0][8] == pytest.approx(refinement.tukey_limit(fit.signed_mm, fit.sigma_mm, CONFIG))
     assert calls[0][9] == pytest.approx(fit.sigma_mm**2)
     calls.clear()
     refinement.refine_fully(np.eye(4), points, target, replace(CONFIG, rest_mm=1.0, rounds=5))

@@ -157,7 +157,7 @@ def test_the_loops_and_numpy_weigh_residuals_alike(femur, target):
     pose = se3.exp([0.4, -0.3, 0.2, 0.004, -0.003, 0.002], source.mean(axis=0))
     fit = refinement.evaluate(pose, source, target, CONFIG)
     signed, *_ = kernels.residuals_at(pose, source, *target.kernel_view, 0.0)
-    limit_mm = refinement._tukey_limit(signed, fit.sigma_mm, CONFIG)
+    limit_mm = refinement.tukey_limit(signed, fit.sigma_mm, CONFIG)
     H, g = np.empty((6, 6)), np.empty(6)
     ones, middle = np.ones(len(source)), source.mean(axis=0)
     kernels.accumulate(pose, source, ones, middle, *target.kernel_view, limit_mm, fit.sigma_mm**2, H, g)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,37 +18,15 @@ from gapr_ros.node import intake, region, timeline, wire
 from gapr_ros.node.collection import Late, forget
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.guard import describe
-from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import OF_STATUS, Reason, RefusedError
-from gapr_ros.node.region import Crop, Place
+from gapr_ros.node.region import Crop
+from gapr_ros.node.situation import Situation
 from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import INPUTS
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Seed:
-    """A pose that somebody gave: T_frame_model (4, 4), metres, in `frame` (empty: that of the cloud)."""
-
-    T_frame_model: Array
-    frame: str
-
-
-@dataclass(frozen=True)
-class Situation:
-    """What holds at the moment when a cloud is taken in hand: `oldest` is the first epoch of what may be collected."""
-
-    method: Any
-    model: Model
-    parameters: NodeParameters
-    epoch: int
-    oldest: int
-    seed: Seed | None
-    place: Place | None
-    now_ns: int
 
 
 class Registration:

@@ -22,9 +22,10 @@ from gapr_ros.node.model import Model, Ready
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.publishers import Publishers
 from gapr_ros.node.refusal import Reason, RefusedError
-from gapr_ros.node.registration import Registration, Seed, Situation, check_limits, needs_frames
+from gapr_ros.node.registration import Registration, check_limits, needs_frames
 from gapr_ros.node.shared_frame import SharedFrame
 from gapr_ros.node.shared_name import SharedName
+from gapr_ros.node.situation import Seed, Situation
 from gapr_ros.node.timeline import Timeline
 from gapr_ros.node.track import Track
 from gapr_ros.node.worker import Job, Worker

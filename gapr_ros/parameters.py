@@ -81,6 +81,8 @@ class NodeParameters(Settings):
     )
     continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register")
     track: bool = setting(True, "start where the last pose was; false: every cloud by itself", live=False)
+    assess_every: int = setting(1, "of so many clouds one is assessed; the others may go to ~/followed_pose alone",
+                                low=1, high=1000)  # fmt: skip
     accumulate: int = setting(0, "clouds registered as one; the bone must rest in output_frame; 0: as the sensor needs",
                               low=0, high=10_000, live=False)  # fmt: skip
     max_rate: float = setting(0.0, "most registrations a second; 0: as many as possible", low=0.0, high=1000.0)
@@ -142,10 +144,23 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
     if parameters.viewpoint != "none" and parameters.accumulate > 1:
         sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
+    if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
+        sentences.append(f"assess_every is not used: {why}")
     low, high = parameters.crop_min, parameters.crop_max
     if low != high and any(least >= most for least, most in zip(low, high, strict=True)):
         sentences.append(f"crop_min {low} is not below crop_max {high}: every cloud is refused until it is")
     return sentences
+
+
+def why_all_assessed(parameters: NodeParameters) -> str:
+    """Why no cloud can be followed with these parameters, whatever `assess_every` is; empty where some can."""
+    if not parameters.track:
+        return "track is off, so there is no pose to follow"
+    if parameters.accumulate > 1:
+        return "a cloud that is registered with others says little alone"
+    if parameters.viewpoint != "none":
+        return "with a viewpoint nobody knows which part of a cloud is bone before it is assessed"
+    return ""
 
 
 def _together(parameters: NodeParameters) -> int:

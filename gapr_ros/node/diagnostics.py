@@ -19,7 +19,7 @@ THROTTLE_S = 5.0
 
 @dataclass
 class Counters:
-    """Every cloud that was received is accepted, refused, dropped, merged with a newer one, or still on its way.
+    """Every cloud that was received is accepted, refused, followed, dropped, merged with a newer one, or on its way.
 
     One that ~/register asks for again is accepted or refused again.
 
@@ -30,6 +30,7 @@ class Counters:
     dropped: int = 0
     accepted: int = 0
     refused: int = 0
+    followed: int = 0
     merged: int = 0
     lost: int = 0
     consecutive_refusals: int = 0
@@ -45,6 +46,11 @@ class Counters:
         """A cloud that was pushed out is registered with a newer one, or could not be."""
         self.merged += merged
         self.dropped += not merged
+
+    def show(self, shown: bool) -> None:
+        """A cloud was followed; where its pose may not be shown any more, it is dropped."""
+        self.followed += shown
+        self.dropped += not shown
 
     def answered(self, outcome: Outcome) -> None:
         """A cloud was answered."""
@@ -140,7 +146,7 @@ def registration_status(now: Snapshot) -> DiagnosticStatus:
     values |= {
         "frames_received": counters.received, "frames_dropped": counters.dropped,
         "frames_accepted": counters.accepted, "frames_refused": counters.refused, "frames_merged": counters.merged,
-        "frames_lost": counters.lost,
+        "frames_followed": counters.followed, "frames_lost": counters.lost,
         "consecutive_refusals": counters.consecutive_refusals, "last_refusal": counters.last_refusal,
         "cloud_qos": source.qos, "publishers_on_points": source.publishers,
     }  # fmt: skip

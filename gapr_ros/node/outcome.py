@@ -27,6 +27,7 @@ class Outcome:
         text: the reason in full.
         pose: (4, 4) T_frame_model, metres; None when refused.
         covariance: (6, 6) of that pose, metres and radians, fixed axes of the frame.
+        followed: (4, 4) T_frame_model, metres, of a cloud that was not assessed; it then has no pose and no reason.
         confidence: of the registration, 0 to 1, whatever was decided later.
         points_in, points_used: of the message; given to registration, those of clouds that are registered with it too.
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
@@ -43,6 +44,7 @@ class Outcome:
     text: str = ""
     pose: Array | None = None
     covariance: Array | None = None
+    followed: Array | None = None
     confidence: float = 0.0
     points_in: int = 0
     points_used: int = 0
@@ -66,7 +68,8 @@ class Outcome:
 
     def refuse(self, reason: Reason, text: str) -> None:
         """Take the pose away."""
-        self.reason, self.text, self.pose, self.covariance = reason, text, None, None
+        self.reason, self.text = reason, text
+        self.pose = self.covariance = self.followed = None
 
     @classmethod
     def refused(cls, job: Job, header: Header, reason: Reason, text: str) -> Outcome:

@@ -22,6 +22,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 TOPICS = {
     "pose": (PoseWithCovarianceStamped, LATCHED),
     "transform": (TransformStamped, 10),
+    "followed_pose": (PoseStamped, 10),
     "confidence": (Float64, 10),
     "status": (DiagnosticStatus, 10),
     "hypotheses": (PoseArray, 10),
@@ -60,6 +61,10 @@ class Publishers:
         if self._vision is not None:
             found = messages.detection(self._vision, outcome, model.name, model.points_mm)
             self._topics["detection"].publish(found)
+
+    def send_followed(self, outcome: Outcome) -> None:
+        """Where the bone is by a cloud that was not assessed: to be shown."""
+        self._topics["followed_pose"].publish(PoseStamped(header=outcome.header, pose=matrix_to_pose(outcome.followed)))
 
     def withdraw(self, *names: str) -> None:
         """No late listener gets the last message of these any more: they are given up and advertised again."""

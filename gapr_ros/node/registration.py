@@ -16,6 +16,7 @@ from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_ros.node import intake, region, timeline, wire
 from gapr_ros.node.collection import Late, forget
+from gapr_ros.node.following import Following
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.guard import describe
 from gapr_ros.node.outcome import Outcome
@@ -42,6 +43,7 @@ class Registration:
     def __init__(self, frames: Frames, situation: Callable[[], Situation], left: Callable[[bool, str], None]) -> None:
         self._frames, self._situation = frames, situation
         self._late = Late(self._collect, left)
+        self._following = Following()
         self._pushed_out: Job | None = None
         self._frame = ""  # of the last answer; what the method remembers holds there only
 
@@ -86,6 +88,11 @@ class Registration:
         if now.parameters.accumulate > 1:
             self._late.take(now.parameters.tf_timeout)  # the transform of this cloud has come: so have those of before
             _check_together(points_mm, outcome, now)
+        frame, urgent = outcome.header.frame_id, outcome.job.urgent
+        outcome.followed = self._following.follow(points_mm, frame, urgent, now)
+        if outcome.followed is not None:
+            _check_time(time.monotonic() - start, now.parameters)
+            return
         result = self._register(points_mm, outcome, now)
         _check(result, time.monotonic() - start, now.parameters)
         _note_pose(outcome, result, points_mm, now.parameters)
@@ -192,14 +199,18 @@ def _note_header(outcome: Outcome, cloud: Any, now: Situation) -> None:
 
 def _check(result: RegistrationResult, seconds: float, parameters: NodeParameters) -> None:
     """Refuse what the method refused, what took too long and what is not sure enough."""
-    if seconds > parameters.timeout:
-        raise RefusedError(Reason.TIMEOUT, f"took {seconds:.3g} s, timeout is {parameters.timeout:g} s")
+    _check_time(seconds, parameters)
     if not result.ok:
         raise RefusedError(OF_STATUS[result.status], result.reason)
     check_limits(result, parameters)
     for name, value in (("pose", result.T_target_source), ("covariance", result.covariance)):
         if value is None or not np.isfinite(value).all():
             raise RefusedError(Reason.NOT_CONVERGED, f"{result.method} gave no finite {name}")
+
+
+def _check_time(seconds: float, parameters: NodeParameters) -> None:
+    if seconds > parameters.timeout:
+        raise RefusedError(Reason.TIMEOUT, f"took {seconds:.3g} s, timeout is {parameters.timeout:g} s")
 
 
 def check_limits(result: RegistrationResult, parameters: NodeParameters) -> None:

@@ -16,6 +16,7 @@ from gapr_ros.node import intake, timeline, wire
 from gapr_ros.node.collection import forget
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.node.diagnostics import THROTTLE_S, RefusalLog
+from gapr_ros.node.following import continues
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model, Ready
@@ -192,8 +193,22 @@ class Session:
 
     def _conclude(self, outcome: Outcome) -> None:
         """Decide on an outcome of the worker and answer."""
+        if outcome.followed is not None:
+            self._show(outcome)
+            return
         self._decide(outcome)
         self._answer(outcome)
+
+    def _show(self, outcome: Outcome) -> None:
+        """Send a pose that was followed where what it rests on still stands. It is no answer and changes nothing."""
+        T_frame_model, header, points_m = outcome.followed, outcome.header, wire.to_metres(self.model.points_mm)
+        stands = continues(self._track.place, T_frame_model, header.frame_id, self.model, self._host.parameters)
+        is_now = outcome.job.epoch == self._epoch and not self._closed
+        shown = stands and is_now and self._timeline.is_next(T_frame_model, header, points_m)
+        self._host.counters.show(shown)
+        if shown:
+            self._publishers.send_followed(outcome)
+        self._host.report()
 
     def _answer(self, outcome: Outcome) -> None:
         """Count an outcome, send it, and tell who waits for it."""

@@ -80,6 +80,7 @@ class Timeline:
         self._newest_ns = 0
         self._first_ns, self._count = 0, 0  # of this round
         self._answered_ns, self._answered_in, self._answer = 0, "", np.eye(4)  # the last pose that went out
+        self._shown_ns = 0  # of the last pose that was followed
         self._back_ns: list[int] = []  # stamps of the clouds in a row that went back
 
     def admit(self, stamp: int, now_ns: int, parameters: NodeParameters, alone: bool = False) -> bool:
@@ -128,6 +129,16 @@ class Timeline:
     def note_answer(self, T_frame_model: Array, header: Header) -> None:
         """This pose goes out."""
         self._answered_ns, self._answered_in, self._answer = stamp_ns(header), header.frame_id, T_frame_model
+
+    def is_next(self, T_frame_model: Array, header: Header, points_m: Array) -> bool:
+        """Whether a pose that was followed is newer than all that went out; it is then the last one that is shown."""
+        try:
+            self.check_answer(T_frame_model, header, points_m)
+        except RefusedError:
+            return False
+        is_next = stamp_ns(header) > self._shown_ns or not self._shown_ns
+        self._shown_ns = max(self._shown_ns, stamp_ns(header))
+        return is_next
 
     def forget(self) -> None:
         """Time starts over: whatever comes next is the newest."""

@@ -293,6 +293,7 @@ class Session:
             self._forget_clouds("clouds are read in another way")
         if self._limits != (limits := _limits(self._host.parameters)):
             self._limits = limits
+            self._track.place = None  # no cloud is followed before one was assessed with these limits
             if self._accumulates:
                 self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)

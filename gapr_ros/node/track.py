@@ -20,7 +20,8 @@ class Track:
     one nor a pause take away what a jump is measured against. Poses in two frames are not compared.
 
     Attributes:
-        place: where the bone was with the last cloud; None when that was refused.
+        place: where the bone was with the last cloud; None when that was refused, or `min_confidence` or `max_tre` have
+            changed since.
     """
 
     def __init__(self) -> None:

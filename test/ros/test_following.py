@@ -164,6 +164,12 @@ def test_nor_after_a_cloud_that_could_not_be_read(watch, cloud):
     assert live.heard(2) == [11, 14] and live.counts["refused"] == 1
 
 
+def test_a_cloud_that_is_refused_for_its_stamp_changes_nothing(watch):
+    live = watch(assess_every=9)
+    live.send(10, 11, 5, 12)
+    assert live.heard(2) == [11, 12] and live.node.counters.last_refusal.startswith("stale")
+
+
 def test_nor_after_an_error_of_the_method_and_the_error_is_a_refusal(watch):
     live = watch(assess_every=9)
     live.send(10)
@@ -211,6 +217,7 @@ def test_nor_in_another_frame_nor_after_a_guess(watch):
 
 
 END = {
+    "other limits": lambda live: live.node.set_parameters([Parameter("min_confidence", value=0.95)]),
     "a reset": lambda live: live.client.call("reset"),
     "another bone": lambda live: live.node.session.replace(live.node.session._ready),
     "a pause": lambda live: live.client.call("set_enabled", SetBool.Request(data=False)),
@@ -231,6 +238,7 @@ def test_a_pose_that_is_being_followed_does_not_go_out_after(watch, end):
         wait_until(lambda: live.node.session._track.place is None)
     else:
         END[end](live)
+    assert live.node.session._track.place is None
     live.method.gate.set()
     wait_until(lambda: live.counts["dropped"] == 1, what=lambda: live.counts)
     assert live.counts["followed"] == 1 and live.heard(1) == [11]

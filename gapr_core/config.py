@@ -255,8 +255,8 @@ class FollowingConfig(Settings):
         4.0, "largest bound of the error; that of a source whose view is weaker is larger", low=0, unit="mm"
     )
     largest_turn_deg: float = setting(2.5, "standard deviation of the least certain turn", low=0, unit="deg")
-    largest_residual: float = setting(1.2, "residual over that of the assessed source", low=1, high=100)
-    least_inliers: float = setting(0.9, "inlier ratio over that of the assessed source", low=0, high=1)
+    largest_residual: float = setting(1.1, "residual over that of the assessed source", low=1, high=100)
+    least_inliers: float = setting(0.95, "inlier ratio over that of the assessed source", low=0, high=1)
 
 
 @dataclass(frozen=True)

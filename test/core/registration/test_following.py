@@ -138,8 +138,8 @@ def test_a_source_with_larger_residuals_is_not_followed(registrar, frames, asses
 def test_residuals_below_the_least_noise_are_no_larger_ones(registrar, frames, assessed, look):
     of, least_mm = follower(registrar, frames, assessed), registrar.config.refinement.smallest_sigma_mm
     of._assessed = replace(of._assessed, residual_mm=0.01 * least_mm)
-    assert of.why_not(replace(look, residual_mm=1.19 * least_mm)) == ""
-    assert of.why_not(replace(look, residual_mm=1.21 * least_mm)) == "the residuals are larger"
+    assert of.why_not(replace(look, residual_mm=1.09 * least_mm)) == ""
+    assert of.why_not(replace(look, residual_mm=1.11 * least_mm)) == "the residuals are larger"
 
 
 def test_a_pose_whose_error_is_not_bounded_is_not_followed(registrar, frames, assessed, look):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
@@ -25,7 +26,7 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, Tracker
 from gapr_core.baselines import make
-from gapr_core.config import SourceConfig
+from gapr_core.config import FollowingConfig, SourceConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
@@ -45,6 +46,7 @@ TARGET, OPEN3D = "prepare a target of 200 000 triangles", "Open3D: read it, and 
 FULL = {protocol: f"register ({protocol})" for protocol in ("paper", "L1", "L2")}
 KISS = {protocol: f"KISS-Matcher and refinement, of that pair ({protocol})" for protocol in FULL}
 TRACK, GICP = "track a frame of 4000 points", "small_gicp: thin and align that frame"
+FOLLOW = "follow a frame of 4000 points, not assessed"
 STAGED = FULL["paper"], TRACK  # whose stages are printed too
 
 
@@ -107,6 +109,7 @@ def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -
         "register, both rounds (paper)": lambda: twice.register(clean.source, target),
         "register a scene (C2)": lambda: registrar.register(scene.source, of_scene, viewpoint=scene.viewpoint),
         TRACK: tracked(frames, registrar),
+        FOLLOW: followed(frames, registrar),
         GICP: aligned(frames, threads),
     }
 
@@ -115,6 +118,27 @@ def tracked(frames: Sequence[Pair], registrar: Registrar) -> Case:
     """Each call registers the next frame of a stream, to and fro, from the track."""
     tracker, target, turn = Tracker(registrar, recheck=10**9), registrar.prepare(frames[0].target), to_and_fro(frames)
     return lambda: tracker.register(next(turn)[1].source, target)
+
+
+def followed(frames: Sequence[Pair], registrar: Registrar) -> Case:
+    """The same without an assessment, after one of the first frame.
+
+    Raises:
+        RuntimeError: of a frame that has to be assessed.
+    """
+    following = FollowingConfig(most_sources=10**3, largest_tre95_mm=np.inf, largest_turn_deg=np.inf)
+    config = replace(registrar.config, following=following)
+    tracker = Tracker(Registrar(config, registrar.proposers, registrar.calibrations))
+    target, turn = registrar.prepare(frames[0].target), to_and_fro(frames)
+    tracker.register(frames[0].source, target)
+
+    def call() -> object:
+        found = tracker.follow(next(turn)[1].source, target)
+        if found is None:
+            raise RuntimeError("a frame has to be assessed")
+        return found
+
+    return call
 
 
 def aligned(frames: Sequence[Pair], threads: int) -> Case:
@@ -157,7 +181,7 @@ def parts(stages: dict[str, list[dict[str, float]]]) -> str:
 
 def ratios(wall: dict[str, np.ndarray]) -> str:
     """Our times over those of others, repetition by repetition."""
-    pairs = ((TRACK, GICP), *((FULL[name], KISS[name]) for name in FULL), (TARGET, OPEN3D))
+    pairs = ((TRACK, GICP), (FOLLOW, GICP), *((FULL[name], KISS[name]) for name in FULL), (TARGET, OPEN3D))
     rows = [markdown.row((ours, other, f"{np.median(wall[ours] / wall[other]):.2f}")) for ours, other in pairs]
     return "\n".join([markdown.head(("ours", "over", "median ratio of wall times")), *rows])
 

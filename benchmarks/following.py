@@ -1,6 +1,7 @@
 """Poses that are followed between two assessments against assessed ones of the same frames.
 
     python benchmarks/following.py --anatomy DIR [--split val] [--count 4] [--bones femur,tibia,pelvis] [--every 3]
+        [--kinds NAME ...]
 
 One tracker assesses every frame. Another one assesses one of `--every` frames and follows the others where that can be.
 The bone moves a little or much from frame to frame, while the view wanders over all of it; or it jumps every eighth
@@ -58,11 +59,12 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=4, help="streams per bone and kind")
     parser.add_argument("--bones", default="femur,tibia,pelvis", help="with commas")
     parser.add_argument("--every", type=int, default=3, help="of so many frames one is assessed")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="NAME", help="of streams")
     args = parser.parse_args()
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     bones = {bone: specimens(bone, args.split, SUBJECTS, args.anatomy) for bone in args.bones.split(",")}
-    tallies = {kind: Tally() for kind in KINDS}
-    runs = [(kind, bone, i) for kind in KINDS for bone in bones for i in range(args.count)]
+    tallies = {kind: Tally() for kind in args.kinds}
+    runs = [(kind, bone, i) for kind in args.kinds for bone in bones for i in range(args.count)]
     for kind, bone, i in tqdm(runs, "streams"):
         count(tallies[kind], stream(kind, bones[bone], i), registrar, args.every)
     names = ("stream", "frames", "followed", "asked in vain", "followed beyond 4 mm or 5 deg", "assessed, same frames",

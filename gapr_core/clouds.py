@@ -102,7 +102,7 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     how = (
         "correct the unit in its header"
         if in_header
-        else "name the unit, such as units='cm' (--units cm, of both files)"
+        else "name the unit, such as units='cm' (--units cm, of both files; model_unit, model_scale)"
     )
     if extent_mm < low:
         said = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"

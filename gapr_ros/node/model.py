@@ -65,6 +65,7 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     path = Path(parameters.model_path).expanduser()  # a shell leaves the ~ of model_path:=~/bone.stl as it is
     surface = clouds.load(path, units=parameters.model_unit, options=options)
     surface = Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
+    clouds.warn_of_size(path, surface.extent_mm)
     target = method.prepare(surface, units="mm")
     points_mm = _for_display(surface)
     return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm))

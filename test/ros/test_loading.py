@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from dataclasses import replace
 
 import bones
 import numpy as np
@@ -16,6 +17,8 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from gapr_ros.node.method import ShippedMethod
+from gapr_ros.node.model import load_model
+from gapr_ros.parameters import NodeParameters
 
 LIMIT_S = 2.0  # of CPU time
 SIGNALS = [  # one of them every day: each needs a node of its own, which takes seconds to start
@@ -41,6 +44,14 @@ def slow():
     made = Slow()
     made.gate.clear()
     return made
+
+
+@pytest.mark.parametrize(("scale", "is_odd"), [(1.0, False), (0.1, True)])
+def test_a_bone_of_an_uncommon_size_is_warned_of(tmp_path, caplog, scale, is_odd):
+    path = bones.save(bones.bone(), tmp_path / "bone.npz")
+    parameters = replace(NodeParameters(), model_path=str(path), model_scale=scale)
+    load_model(StandIn(), parameters)
+    assert ("as small as a patella" in caplog.text) is is_odd
 
 
 def test_the_settings_file_is_read_when_configuring_and_limits_hold_whatever_has_become_of_it(tmp_path, client):

@@ -25,7 +25,7 @@ def lines(data: bytes) -> Iterator[str]:
 def check_end(data: bytes) -> None:
     """Raise `ValueError` where the last line does not end: whether its last number is whole cannot be known."""
     if not data.rstrip(b" \t").endswith((b"\n", b"\r")):
-        raise ValueError("the last line does not end: the file is cut, or lacks its final line break")
+        raise ValueError("the last line does not end: the file is cut, or it is whole and lacks a line break")
 
 
 def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None = None) -> Array:

@@ -66,7 +66,7 @@ class Answers:
 
     def _line_up(self, turn: Future) -> None:
         self._waiting.append(turn)
-        if self._pause is None:
+        if self._pause is None and self._host.ros.context.ok():  # a node that ends answers nobody
             self._pause = self._host.ros.create_timer(PACE_S, self._next, clock=Clock(clock_type=ClockType.STEADY_TIME))
             self._next()
 

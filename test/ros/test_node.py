@@ -435,6 +435,7 @@ def test_answers_of_one_moment_go_out_one_after_the_other(blob_path, client, met
         node.call_soon(line_up)
         wait_until(lambda: turns[-1].done() and node._services_offered._answers._pause is None)
         assert at_once == [True, False, False]
+    node._services_offered._answers._line_up(Future())  # of a node that has ended: nobody to answer, and no exception
 
 
 @pytest.mark.parametrize("end", ["reset", "deactivate"])

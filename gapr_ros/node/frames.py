@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 MISSING = "tf2_ros is not installed (it comes with a ROS installation, not with the wheels)"
 POLL_S = 0.005
+CACHE_NS = 10_000_000_000  # what a tf2 buffer keeps behind its newest transform, if nobody asked for more
 
 
 class Frames:
@@ -34,14 +35,14 @@ class Frames:
         note_sent: is given every transform that goes to /tf.
 
     Attributes:
-        behind: the last transform was not sent, because newer ones were.
+        behind: the last transform was not sent, because buffers still hold those of another round.
     """
 
     def __init__(
         self, node: Node, publish: bool, listen: bool, note_sent: Callable[[TransformStamped], None] | None = None
     ) -> None:
         self._node, self._note_sent = node, note_sent
-        self._sent_ns, self.behind = -1, False
+        self._sent_ns, self._held_ns, self.behind = -1, -1, False
         self._tf2 = _import_tf2() if publish or listen else None
         if self._tf2 is None and (publish or listen):
             node.get_logger().warning(f"{MISSING}: nothing goes to /tf and no other frame can be used")
@@ -83,8 +84,8 @@ class Frames:
 
         `Timeline` lets no other pose of an older or the same stamp pass; tf2 warns about repeated data.
         """
-        is_new = stamp_ns > self._sent_ns or stamp_ns == 0 == self._sent_ns
-        self._note_behind(stamp_ns)
+        is_new = stamp_ns > max(self._sent_ns, self._held_ns) or stamp_ns == 0 == self._sent_ns
+        self.behind = self._broadcaster is not None and stamp_ns <= self._held_ns
         if self._broadcaster is None or not is_new or not transform.header.frame_id:
             return False
         if self._note_sent is not None:
@@ -93,14 +94,14 @@ class Frames:
         self._sent_ns = stamp_ns
         return True
 
-    def _note_behind(self, stamp_ns: int) -> None:
-        """The same stamp once more is that of the same pose, or of another round."""
-        older = stamp_ns < self._sent_ns or (self.behind and stamp_ns == self._sent_ns)
-        self.behind = self._broadcaster is not None and older
+    def hold(self) -> None:
+        """Another round begins, and the listeners do not know: wait until their buffers have dropped this one."""
+        if self._sent_ns > 0:
+            self._held_ns = self._sent_ns + CACHE_NS
 
     def forget(self) -> None:
         """The listeners start over: older stamps are news again."""
-        self._sent_ns, self.behind = -1, False
+        self._sent_ns, self._held_ns, self.behind = -1, -1, False
 
     def close(self) -> None:
         """Give back what was subscribed and advertised."""

@@ -39,7 +39,7 @@ NO_CLOCK = "use_sim_time is true and no /clock has come: neither max_future nor 
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
 OVER, SHOWN_S = "time starts over and the track is cleared", 10.0  # what lasts a moment is shown so long
 BEHIND = (
-    "/tf waits for stamps newer than those it had before, or tf2 would mix the poses of both rounds: "
+    "/tf waits for stamps 10 s newer than those it had before, or tf2 would mix the poses of both rounds: "
     "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
 )
 
@@ -117,6 +117,7 @@ class Session:
         if self._timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters, alone):
             why = "the stamps of the clouds went back"
             self.conflicts.note("time", f"{why}: {OVER}", SHOWN_S)
+            self._frames.hold()
             self._clear(why)
         self._note_frame(frame)
 

@@ -26,6 +26,7 @@ DESIGN_EFFECTS = np.geomspace(0.25, 20.0, 16)  # to choose from
 EFFECT_SPREAD = 0.7  # log standard deviation of the design effect about 1 before the scores are seen
 BIASES_MM = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0])
 DETERMINED = 1e-5  # information of a field over the largest, below which its score is rounding
+UNKNOWNS = 6  # of a pose: as few points say nothing of their errors
 POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
 ROUNDED = 6  # digits after the point, mm, by which centres are chosen: where two are as good, rounding must not choose
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
@@ -163,6 +164,8 @@ class NormalEquations:
 def equations_of(fit: Fit, correlation_mm: float, centres: int) -> NormalEquations:
     """`NormalEquations.of` a fit and its own `fields`, with the design effect that their scores show."""
     equations = NormalEquations.of(fit, fields(fit, correlation_mm, centres))
+    if np.count_nonzero(fit.weights) <= UNKNOWNS:  # a motion takes up all that they say; what is left is rounding
+        return equations
     return equations.with_design_effect(equations.expected_design_effect())
 
 

@@ -217,6 +217,14 @@ def test_fields_that_the_points_hardly_determine_say_nothing_of_the_design_effec
     assert hand_made([0.0, 0.0], [0.0, 0.0]).expected_design_effect() == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("count", [0, 1, 3, 6, 7])
+def test_as_few_points_as_a_pose_has_unknowns_say_nothing_of_the_design_effect(fit, count):
+    """A motion fits them all: the scores that are left are rounding, and would pass for a very small noise."""
+    few = replace(fit, weights=np.where(np.cumsum(fit.weights > 0.0) <= count, fit.weights, 0.0))
+    assert np.count_nonzero(few.weights) == count
+    assert (equations_of(few, 20.0, 60).design_effect == 1.0) == (count <= 6)
+
+
 def test_a_design_effect_is_a_variance_of_all_points(fit, spanned):
     """Sums of points vary as if each point had sqrt(k) times its standard deviation; further unknowns too."""
     more, sizes = np.random.default_rng(4).normal(size=(COUNT, 2)), (0.3, 0.05)

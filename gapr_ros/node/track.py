@@ -57,6 +57,7 @@ class Track:
         self._check_jump(T_frame_model, centre_m, parameters)
         self._count(T_frame_model, centre_m, cloud, parameters)
         if len(self._row) < parameters.require_consecutive:
+            self.place = None  # there may be one, of before the limit was raised
             text = f"{len(self._row)} of {parameters.require_consecutive} good poses in a row (require_consecutive)"
             raise RefusedError(Reason.LOW_CONFIDENCE, text)
         self._accepted[frame], self.place = T_frame_model, Place(T_frame_model, frame)

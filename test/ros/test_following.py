@@ -155,6 +155,14 @@ def test_nothing_is_followed_after_a_refusal_until_a_cloud_is_accepted(watch):
     assert live.heard(2) == [11, 16]
 
 
+def test_nothing_is_followed_while_there_are_too_few_good_poses_in_a_row(watch):
+    live = watch(assess_every=3)
+    live.send(10, 11)
+    assert live.node.set_parameters([Parameter("require_consecutive", value=3)])[0].successful
+    live.send(12, 13, 14, 15)
+    assert live.heard(3) == [11, 12, 15] and live.counts == {"accepted": 2, "refused": 1, "followed": 3, "dropped": 0}
+
+
 @pytest.mark.parametrize("cloud", [np.zeros((5, 3)), np.full((500, 3), np.nan)])
 def test_nor_after_a_cloud_that_could_not_be_read(watch, cloud):
     live = watch(assess_every=9)

@@ -112,8 +112,21 @@ def test_centimetres_become_millimetres_and_are_asked_for():
         clouds.load(VERTICES / 10.0, units="mm")
 
 
+def test_what_may_be_in_metres_or_centimetres_is_taken_for_metres():
+    """Bones of 0.1 to 2.5 in the file may be either; metres are what scanners and ROS write."""
+    with pytest.raises(InvalidPointCloudError, match="it looks like m: pass units='m'"):
+        clouds.load(VERTICES / Surface(VERTICES).extent_mm * 1.5, units="mm")
+
+
+def test_a_label_map_of_an_uncommon_size_is_warned_of_its_header(tmp_path, caplog):
+    (tmp_path / "bone.nii.gz").touch()
+    clouds.warn_of_size(tmp_path / "bone.nii.gz", 45.0)
+    assert "correct the unit in its header" in caplog.text and "units=" not in caplog.text
+
+
 @pytest.mark.parametrize(("extent_mm", "said"), [
-    (45.0, "45 mm across, as small as a patella"), (61.0, ""), (690.0, ""), (900.0, "900 mm across, longer than any"),
+    (45.0, "45 mm across, as small as a patella"), (59.0, "59 mm across, as small as a patella"), (61.0, ""),
+    (690.0, ""), (710.0, "710 mm across, longer than any"), (900.0, "900 mm across, longer than any"),
 ])  # fmt: skip
 def test_a_target_of_an_uncommon_size_is_warned_of(tmp_path, caplog, extent_mm, said):
     """A bone in cm and a source in cm, both read as mm, fit each other: only the size can show it."""

@@ -2,12 +2,15 @@
 
 import json
 import sys
+from argparse import Namespace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gapr_core import cli
+from gapr_core.commands import checks
 from gapr_core.formats.markups import Markups, save
 from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
 
@@ -114,6 +117,17 @@ def test_landmarks_that_lie_on_their_cloud_only_with_other_axes_are_warned_of(fo
     assert register(f"--landmarks {' '.join(files)}", "lps.ply") == 0
     said = [f"{name} is " in caplog.text and "with x and y negated" in caplog.text for name in files]
     assert said == [turned and number == which for number in range(2)]
+
+
+@pytest.mark.parametrize(("at", "place", "is_warned"), [
+    ([200.0, 100.0, 0.0], [-200.0, -100.0, 0.0], True), ([20.0, 10.0, 0.0], [-20.0, -10.0, 0.0], False),
+    ([200.0, 100.0, 0.0], [0.0, 0.0, 300.0], False),
+])  # fmt: skip
+def test_landmarks_that_are_near_or_as_far_with_other_axes_are_not_warned_of(folder, caplog, at, place, is_warned):
+    save(folder / "q.mrk.json", Markups(np.tile(place, (4, 1)), ("a", "b", "c", "d")))
+    args = Namespace(landmarks=[Path("q.mrk.json")], source=Path("s.npy"), target=Path("t.npy"))
+    checks.warn_of_landmarks(args, np.array([at]), np.array([at]))
+    assert ("with x and y negated" in caplog.text) is is_warned
 
 
 def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkeypatch):

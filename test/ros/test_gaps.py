@@ -48,11 +48,18 @@ def test_a_gap_of_long_ago_is_not_doubted():
     assert sum(gaps.note(number, 2) for number in numbers) == 48
 
 
+def test_a_gap_that_was_none_is_taken_back_by_a_publisher_that_is_new_as_well():
+    gaps = Gaps()
+    assert [gaps.note(number, publishers) for number, publishers in ((1, 1), (50, 1), (20, 5))] == [0, 48, -48]
+
+
 def test_publishers_that_came_and_went_are_forgotten():
     gaps = Gaps()
     for start in range(1000, 0, -10):
         gaps.note(start, 100)
     assert len(gaps._heard) == Gaps.MOST_PUBLISHERS
+    gaps.note(0, 0)
+    assert len(gaps._heard) == 1, "the last one is gone before its last cloud is taken"
 
 
 def test_a_second_publisher_that_has_sent_more_before_is_no_gap(blob_path, client, method):

@@ -17,6 +17,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import frames, timeline
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.timeline import BACK_NS, Timeline
@@ -89,6 +90,7 @@ def test_the_stamp_with_which_a_round_began_starts_time_over_where_one_publisher
     played = [judged(timeline, stamp_s, alone=True) for stamp_s in (100.0, 104.0, 108.0) * 3]
     assert played == [False, False, False, True, False, False, True, False, False]
     assert judged(timeline, 104.0, alone=True) is Reason.STALE, "another stamp of the round"
+    assert judged(timeline, 90.0, alone=True) is Reason.STALE, "a stamp from before the round"
     assert judged(timeline, 100.0, alone=False) is Reason.STALE, "of two publishers"
     assert judged(timeline, 100.0, alone=True) is True
 
@@ -314,9 +316,23 @@ def test_a_short_bag_that_is_looped_without_simulated_time_goes_on_and_tf2_never
         conflicts = client.values("input")["conflicts"]
         assert "the stamps of the clouds went back: time starts over" in conflicts
         assert "/tf waits for stamps 10 s newer than those it had before" in conflicts and "--clock" in conflicts
-        for stamp_s in (1001.0, 1010.75, 1011.0):
+        for stamp_s in (1001.0, 1010.75):
             assert client.ask(GOOD, stamp_s=stamp_s)["level"] == 0
+            assert "/tf waits" in client.values("input")["conflicts"], "a buffer keeps what is just 10 s old"
+        assert client.ask(GOOD, stamp_s=1011.0)["level"] == 0
         wait_until(lambda: tf2.sent == [*stamps, 1011.0] and "/tf" not in client.values("input")["conflicts"])
+
+
+def test_a_round_without_a_pose_holds_nothing_back(blob_path, client, method, tf2):
+    """Stamps of the first seconds, as a simulator has them: no buffer holds anything of the round before."""
+    with node_in_thread(method, blob_path, publish_tf=True):
+        client.wait_for_state("active")
+        method.answer = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="for the test")
+        stamps = [2.0, 4.0, 6.0]
+        assert [client.ask(GOOD, stamp_s=stamp_s)["level"] for stamp_s in stamps] == [1] * 3
+        method.answer = accepted()
+        assert [client.ask(GOOD, stamp_s=stamp_s)["level"] for stamp_s in stamps] == [0] * 3
+        wait_until(lambda: tf2.sent == stamps, what=tf2.sent)
 
 
 def test_clouds_without_stamp_and_clock_go_to_tf_like_their_poses(blob_path, client, method, tf2):

@@ -168,6 +168,13 @@ def test_a_weaker_view_counts_for_a_larger_error(registrar, frames, assessed, lo
     assert of.why_not(of._look(piece, of._T)) == "the error over the bone is not bounded"
 
 
+def test_a_weaker_view_counts_for_a_larger_turn(registrar, frames, assessed, look):
+    limit_deg = 1.5 * assessed.uncertainty.largest_turn_deg
+    of = follower(registrar, frames, assessed, largest_tre95_mm=1e6, largest_turn_deg=limit_deg)
+    for times, why in ((1.4, ""), (1.6, "a turn is not observed")):
+        assert of.why_not(replace(look, spread_mm=times * of._assessed.spread_mm)) == why
+
+
 def test_only_so_many_sources_in_a_row_are_followed(registrar, frames, prepared):
     config = replace(registrar.config, following=replace(registrar.config.following, most_sources=2))
     tracker = Tracker(Registrar(config, registrar.proposers, registrar.calibrations))

@@ -99,6 +99,7 @@ class Follower:
         largest_mm = min(limits.largest_tre95_mm, self._config.max_tre_mm or np.inf)
         then_mm = max(then.residual_mm, self._config.refinement.smallest_sigma_mm)
         rules = {
+            "the assessed pose is left": then.inlier_ratio > 0.0 and then.moved_mm <= self._tre95_mm,
             "the bone moved too far": look.moved_mm <= self._config.evidence.agree_mm,
             "less of the source lies on the bone": look.inlier_ratio >= limits.least_inliers * then.inlier_ratio,
             "the residuals are larger": look.residual_mm <= limits.largest_residual * then_mm,

@@ -121,6 +121,26 @@ def test_a_bone_that_moved_too_far_is_not_followed(registrar, frames, assessed, 
     assert of.why_not(replace(look, moved_mm=1.01 * most_mm)) == "the bone moved too far"
 
 
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"moved_mm": 0.99}, ""),
+        ({"moved_mm": 1.01}, "the assessed pose is left"),
+        ({"inlier_ratio": 0.0}, "the assessed pose is left"),
+    ],
+)
+def test_nothing_is_followed_where_a_look_at_the_assessed_source_leaves_its_pose(
+    registrar, frames, assessed, look, change, why
+):
+    """What is followed is compared with that look: it must be of the pose that was assessed."""
+    of = follower(registrar, frames, assessed)
+    limit_mm = of._tre95_mm
+    of.__dict__["_assessed"] = replace(
+        of._assessed, **{name: value * (limit_mm if name == "moved_mm" else 1.0) for name, value in change.items()}
+    )
+    assert of.why_not(look) == why
+
+
 def test_a_source_with_fewer_inliers_is_not_followed(registrar, frames, assessed, look):
     of = follower(registrar, frames, assessed, least_inliers=0.8)
     then = of._assessed.inlier_ratio

@@ -8,11 +8,17 @@ import pytest
 
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.data.parametric import make_bone
+from gapr_core.data.specimen import Specimen
 
 
 @pytest.fixture(scope="session")
 def femur():
     return make_bone("femur", 3)
+
+
+@pytest.fixture(scope="session")
+def specimen(femur):
+    return Specimen(femur, "femur", "parametric-3", "parametric")
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -400,14 +401,21 @@ def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(
         assert node.counters.dropped == 2
 
 
-def test_many_who_ask_at_once_all_get_an_answer_in_order_while_the_node_does_other_things(blob_path, client, method):
-    """More than the 10 that a service keeps by default, and rclpy resumes those that wait in the reverse order."""
+@contextmanager
+def node_with_a_cloud(method, blob_path, client):
+    """A node that has a cloud and registers on request, and a client for many calls of ~/register at once."""
     deep = QoSProfile(depth=100)
     asking = client.do(lambda: client.node.create_client(Trigger, "/register_node/register", qos_profile=deep))
     with node_in_thread(method, blob_path, continuous=False) as node:
         client.wait_for_state("active")
         client.send(GOOD)
         wait_until(lambda: node.counters.received == 1 and asking.service_is_ready())
+        yield node, asking
+
+
+def test_many_who_ask_at_once_all_get_an_answer_in_order_while_the_node_does_other_things(blob_path, client, method):
+    """More than the 10 that a service keeps by default, and rclpy resumes those that wait in the reverse order."""
+    with node_with_a_cloud(method, blob_path, client) as (node, asking):
         method.gate.clear()
         node.call_soon(lambda: time.sleep(1.0))  # the calls come while the executor is busy
         answered, calls = [], [asking.call_async(Trigger.Request()) for _ in range(30)]
@@ -440,12 +448,7 @@ def test_answers_of_one_moment_go_out_one_after_the_other(blob_path, client, met
 
 @pytest.mark.parametrize("end", ["reset", "deactivate"])
 def test_many_who_wait_get_an_answer_when_a_reset_or_a_pause_comes_first(blob_path, client, method, end):
-    deep = QoSProfile(depth=100)
-    asking = client.do(lambda: client.node.create_client(Trigger, "/register_node/register", qos_profile=deep))
-    with node_in_thread(method, blob_path, continuous=False) as node:
-        client.wait_for_state("active")
-        client.send(GOOD)
-        wait_until(lambda: node.counters.received == 1 and asking.service_is_ready())
+    with node_with_a_cloud(method, blob_path, client) as (node, asking):
         method.gate.clear()
         registered, worker = len(method.calls), node.session.worker
         calls = [asking.call_async(Trigger.Request())]

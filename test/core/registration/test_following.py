@@ -19,11 +19,6 @@ ELSEWHERE = se3.exp([90.0, -60.0, 40.0, 1.2, -0.8, 2.0])
 
 
 @pytest.fixture(scope="module")
-def specimen(femur):
-    return Specimen(femur, "femur", "parametric-3", "parametric")
-
-
-@pytest.fixture(scope="module")
 def frames(specimen):
     return simulate(specimen, 1, MOTION)
 

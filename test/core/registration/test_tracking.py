@@ -7,7 +7,6 @@ import pytest
 from scipy.special import expit, logit
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
-from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -19,11 +18,6 @@ from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
-
-
-@pytest.fixture(scope="module")
-def specimen(femur):
-    return Specimen(femur, "femur", "parametric-3", "parametric")
 
 
 @pytest.fixture(scope="module")

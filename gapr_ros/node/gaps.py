@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+LOST_IN_A_ROW = 20  # a larger gap may be another publisher that was not heard before
 DOUBTED = 100  # numbers after a jump, in which one that was missed shows that it came from somebody else
 
 
@@ -23,9 +24,9 @@ class Sender:
 class Gaps:
     """Finds clouds that were sent and never came, from the numbers that each publisher gives to its messages.
 
-    Which publisher a message is from is not known: a number belongs to the one whose last number is nearest below, or
-    to one that was not heard before while there are more publishers than were heard. A number that comes after it was
-    missed shows that there are two publishers, and no gap.
+    Which publisher a message is from is not known: a number belongs to the one whose last number is nearest below, or,
+    where the gap is large and there are more publishers than were heard, to one that was not heard before. A number
+    that comes after it was missed shows that there are two publishers, and no gap.
     """
 
     MOST_PUBLISHERS = 8
@@ -43,7 +44,7 @@ class Gaps:
         mistaken = sum(self._part(sender) for sender in list(self._heard) if sender.jumped_over(number))
         before = max((sender for sender in self._heard if sender.last < number), key=lambda s: s.last, default=None)
         missing = 0 if before is None else number - before.last - 1
-        if before is None or (missing and len(self._heard) < publishers):
+        if before is None or (missing > LOST_IN_A_ROW and len(self._heard) < publishers):
             kept = min(max(publishers, 1), self.MOST_PUBLISHERS)
             self._heard = [*self._heard, Sender(number)][-kept:]
             return -mistaken

@@ -107,7 +107,7 @@ def test_one_of_three_clouds_is_assessed_and_the_others_go_to_followed_pose_alon
     live = watch(assess_every=3)
     live.send(*range(10, 17))
     assert live.heard(4) == [11, 12, 14, 15]
-    wait_until(lambda: len(live.client.poses) == len(live.client.confidences) == 3)
+    wait_until(lambda: len(live.client.poses) == len(live.client.confidences) == len(live.client.transforms) == 3)
     assert stamps(live.client.poses) == stamps(live.client.transforms) == live.on_tf == [10, 13, 16]
     assert live.client.confidences == [0.9] * 3 and len(live.method.follows) == 4
     assert live.counts == {"accepted": 3, "refused": 0, "followed": 4, "dropped": 0}

@@ -8,7 +8,7 @@ from harness import node_in_thread, wait_until
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from gapr_ros.node.gaps import DOUBTED, Gaps
+from gapr_ros.node.gaps import DOUBTED, LOST_IN_A_ROW, Gaps
 from msg_adapters import xyz_to_cloud
 
 GOOD = np.random.default_rng(1).normal(size=(300, 3)).astype("f4") * 0.02
@@ -30,11 +30,14 @@ GOOD = np.random.default_rng(1).normal(size=(300, 3)).astype("f4") * 0.02
         (1, [1, 50, 51, 1, 2, 3], [0, 48, 48, 48, 48, 48]),
         (2, [5, 80, 200, 6, 81, 201], [0, 0, 119, 119, 0, 0]),
         (1, [1, 50, 1, 2, 20], [0, 48, 48, 48, 65]),
+        (2, [1, 3, 4], [0, 1, 1]),
+        (2, [1, 2 + LOST_IN_A_ROW, 3 + LOST_IN_A_ROW], [0, 20, 20]),
+        (2, [1, 3 + LOST_IN_A_ROW, 2], [0, 0, 0]),
     ],
     ids=[
         "none", "joined late", "a gap", "every second", "two publishers", "two with gaps", "the lower number first",
         "the lower number first, with gaps", "a second one that is not known yet", "late", "started again", "three",
-        "again, with gaps",
+        "again, with gaps", "a gap, and a publisher that is silent", "a long one", "a longer one",
     ],
 )  # fmt: skip
 def test_missing_numbers_are_counted_for_each_publisher(publishers, numbers, lost):
@@ -50,7 +53,7 @@ def test_a_gap_of_long_ago_is_not_doubted():
 
 def test_a_gap_that_was_none_is_taken_back_by_a_publisher_that_is_new_as_well():
     gaps = Gaps()
-    assert [gaps.note(number, publishers) for number, publishers in ((1, 1), (50, 1), (20, 5))] == [0, 48, -48]
+    assert [gaps.note(number, publishers) for number, publishers in ((1, 1), (100, 1), (50, 5))] == [0, 98, -98]
 
 
 def test_publishers_that_came_and_went_are_forgotten():

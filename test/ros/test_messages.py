@@ -36,7 +36,8 @@ REFUSED = RegistrationResult(RegistrationStatus.AMBIGUOUS, hypotheses=RANKED, re
 
 def outcome(result=None, pose=None, reason=None):
     covariance = None if pose is None else np.diag([1e-6] * 6)
-    return Outcome(Job(b"", 0, 0), "probe", Header(frame_id="probe"), reason, "", pose, covariance, 0.9, result=result)
+    job, header = Job(b"", 0, 0), Header(frame_id="probe")
+    return Outcome(job, "probe", header, reason, "", pose, covariance, confidence=0.9, result=result)
 
 
 def test_every_status_of_the_core_but_ok_has_a_reason_of_the_same_name():

@@ -23,7 +23,14 @@ from scipy.spatial import cKDTree
 from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.registration import fit_kernels
 from gapr_core.registration import sensor as sensors
-from gapr_core.registration.bias_field import POSE_PRIOR, NormalEquations, equations_of, fields, root_mean_square
+from gapr_core.registration.bias_field import (
+    POSE_PRIOR,
+    UNKNOWNS,
+    NormalEquations,
+    equations_of,
+    fields,
+    root_mean_square,
+)
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.sensor import Errors
 
@@ -98,7 +105,7 @@ def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float
 
     The sensor's own noise counts as `worth` points: of a dozen points the residuals alone say little.
     """
-    freedom = max(worth + count - 6.0, 1.0)
+    freedom = max(worth + count - UNKNOWNS, 1.0)
     return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
 
 

@@ -12,32 +12,30 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from gapr_ros.node import intake, timeline, wire
+from gapr_ros.node import intake, timeline
+from gapr_ros.node.cloud_frames import SHOWN_S, CloudFrames
 from gapr_ros.node.collection import forget
 from gapr_ros.node.conflicts import Conflicts
+from gapr_ros.node.course import Course
 from gapr_ros.node.diagnostics import THROTTLE_S, RefusalLog
-from gapr_ros.node.following import continues
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model, Ready
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.publishers import Publishers
 from gapr_ros.node.refusal import Reason, RefusedError
-from gapr_ros.node.registration import Registration, check_limits, needs_frames
+from gapr_ros.node.registration import Registration, needs_frames
 from gapr_ros.node.shared_frame import SharedFrame
 from gapr_ros.node.shared_name import SharedName
 from gapr_ros.node.situation import Seed, Situation
-from gapr_ros.node.timeline import Timeline
-from gapr_ros.node.track import Track
 from gapr_ros.node.worker import Job, Worker
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
-MOST_FRAMES = 5  # of clouds, that are named
 NO_CLOCK = "use_sim_time is true and no /clock has come: neither max_future nor max_cloud_age is checked"
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
-OVER, SHOWN_S = "time starts over and the track is cleared", 10.0  # what lasts a moment is shown so long
+OVER = "time starts over and the track is cleared"
 BEHIND = (
     "/tf waits for stamps 10 s newer than those it had before, or tf2 would mix the poses of both rounds: "
     "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
@@ -61,9 +59,7 @@ class Session:
         self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
         self.conflicts = Conflicts(host.ros.get_logger().warning)
-        self._timeline, self._track = Timeline(), Track()
-        self._epoch, self._oldest, self._seed = 0, 0, None
-        self._cloud_frames, self._cloud_frame = [], ""
+        self.course, self._cloud_frames = Course(), CloudFrames(self.conflicts)
         self._log_refusal = RefusalLog(host.ros.get_logger().warning)
         publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
         self._shared = SharedFrame(host, self.conflicts) if publish else None
@@ -105,21 +101,21 @@ class Session:
             if header is not None:
                 self._admit(header, now_ns, alone)
         except RefusedError as refusal:
-            job = Job(b"", self._epoch, now_ns)
+            job = Job(b"", self.course.epoch, now_ns)
             self._answer(Outcome.refused(job, timeline.normal(header), refusal.reason, refusal.text))
             return
-        self._put(Job(data, self._epoch, now_ns))
+        self._put(Job(data, self.course.epoch, now_ns))
 
     def _admit(self, header: Header, now_ns: int, alone: bool) -> None:
         """Judge frame and time of a cloud before it can push another one out of the mailbox."""
         frame = intake.plain_frame(header.frame_id)
         intake.check_frame(frame, self._host.parameters.model_frame)
-        if self._timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters, alone):
+        if self.course.timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters, alone):
             why = "the stamps of the clouds went back"
             self.conflicts.note("time", f"{why}: {OVER}", SHOWN_S)
             self._frames.hold()
             self._clear(why)
-        self._note_frame(frame)
+        self._cloud_frames.note(frame, self._host.parameters.output_frame)
 
     def _put(self, job: Job) -> None:
         pushed_out = self.worker.put(job, leave=self._registration.collect if self._accumulates else None)
@@ -129,17 +125,6 @@ class Session:
     def _accumulates(self) -> bool:
         return self._host.parameters.accumulate > 1
 
-    def _note_frame(self, frame: str) -> None:
-        """Clouds in two frames move the bone's parent to and fro, unless there is one output_frame for all."""
-        if frame not in self._cloud_frames and len(self._cloud_frames) < MOST_FRAMES:
-            self._cloud_frames.append(frame)
-        before, self._cloud_frame = self._cloud_frame, frame
-        if before in ("", frame) or self._host.parameters.output_frame:
-            return
-        names = ", ".join(self._cloud_frames)
-        text = f"clouds come in {len(self._cloud_frames)} frames ({names}): the parent of the bone changes with them"
-        self.conflicts.note("cloud frames", f"{text}; set output_frame", SHOWN_S)
-
     def take_seed(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
         try:
@@ -147,8 +132,7 @@ class Session:
         except InvalidMessageError as error:
             self._host.ros.get_logger().warning(f"initialpose is ignored: {error}")
             return
-        self._begin_again("an initialpose")
-        self._seed = Seed(T_frame_model, intake.plain_frame(message.header.frame_id))
+        self._begin_again("an initialpose", Seed(T_frame_model, intake.plain_frame(message.header.frame_id)))
         if message.header.frame_id:
             self._frames.listen()
 
@@ -157,7 +141,7 @@ class Session:
 
         False when none has come, or none since the last reset or reload.
         """
-        return self.worker.ask(waiter, self._epoch)
+        return self.worker.ask(waiter, self.course.epoch)
 
     # --- the worker's thread ---
 
@@ -169,9 +153,9 @@ class Session:
         self._host.call_soon(partial(self._count_left, collected, why))
 
     def _situation(self) -> Situation:
-        host, ready = self._host, self._ready
-        epochs, place = (self._epoch, self._oldest), self._track.place
-        return Situation(ready.method, ready.model, host.parameters, *epochs, self._seed, place, host.now_ns())
+        host, ready, course = self._host, self._ready, self.course
+        since = course.epoch, course.oldest
+        return Situation(ready.method, ready.model, host.parameters, *since, course.seed, course.place, host.now_ns())
 
     def _renew_method(self) -> None:
         method = self._method_factory(self._host.parameters)
@@ -197,15 +181,12 @@ class Session:
         if outcome.followed is not None:
             self._show(outcome)
             return
-        self._decide(outcome)
+        self.course.decide(outcome, self.model, self._host.parameters)
         self._answer(outcome)
 
     def _show(self, outcome: Outcome) -> None:
         """Send a pose that was followed where what it rests on still stands. It is no answer and changes nothing."""
-        T_frame_model, header, points_m = outcome.followed, outcome.header, wire.to_metres(self.model.points_mm)
-        stands = continues(self._track.place, T_frame_model, header.frame_id, self.model, self._host.parameters)
-        is_now = outcome.job.epoch == self._epoch and not self._closed
-        shown = stands and is_now and self._timeline.is_next(T_frame_model, header, points_m)
+        shown = not self._closed and self.course.may_show(outcome, self.model, self._host.parameters)
         self._host.counters.show(shown)
         if shown:
             self._publishers.send_followed(outcome)
@@ -227,38 +208,6 @@ class Session:
             outcome.tell()
             self._host.report()
 
-    def _decide(self, outcome: Outcome) -> None:
-        if outcome.job.epoch != self._epoch:
-            outcome.refuse(Reason.SUPERSEDED_BY_RESET, "a reset came while the cloud was on its way")
-            return
-        if outcome.reason is Reason.STALE:  # it grew old in the mailbox, and changes nothing
-            return
-        if not outcome.ok:
-            self._track.miss()
-            return
-        try:
-            self._check_limits(outcome)
-            self._judge(outcome.pose, outcome)
-        except RefusedError as refusal:
-            outcome.refuse(refusal.reason, refusal.text)
-
-    def _check_limits(self, outcome: Outcome) -> None:
-        """Limits may have been set while the cloud was on its way."""
-        try:
-            check_limits(outcome.result, self._host.parameters)
-        except RefusedError:
-            self._track.miss()
-            raise
-
-    def _judge(self, T_frame_model: Array, outcome: Outcome) -> None:
-        """Let a pose go out, or refuse it."""
-        header, points_m = outcome.header, wire.to_metres(self.model.points_mm)
-        self._timeline.check_answer(T_frame_model, header, points_m)
-        cloud = timeline.stamp_ns(header) or hash(outcome.job.cloud)  # while no clock runs
-        self._track.judge(T_frame_model, header.frame_id, points_m.mean(axis=0), cloud, self._host.parameters)
-        self._timeline.note_answer(T_frame_model, header)
-        self._seed = None
-
     # --- state ---
 
     def reset(self) -> None:
@@ -268,10 +217,9 @@ class Session:
 
     def _clear(self, why: str) -> None:
         self._begin_again(why)
-        self.worker.outdate(self._epoch)
+        self.worker.outdate(self.course.epoch)
         self._publishers.withdraw("pose")
-        self._cloud_frames, self._cloud_frame = [], ""
-        self.conflicts.note("cloud frames", "")
+        self._cloud_frames.forget()
 
     def clock_jumped(self) -> None:
         """The node's clock went back."""
@@ -282,7 +230,7 @@ class Session:
 
     def _forget_time(self) -> None:
         """Whatever comes next is the newest, on /tf too: its listeners clear themselves with the clock."""
-        self._timeline.forget()
+        self.course.timeline.forget()
         self._frames.forget()
         for kind in ("time", "/tf"):
             self.conflicts.note(kind, "")
@@ -294,7 +242,7 @@ class Session:
             self._forget_clouds("clouds are read in another way")
         if self._limits != (limits := _limits(self._host.parameters)):
             self._limits = limits
-            self._track.place = None  # no cloud is followed before one was assessed with these limits
+            self.course.forget_place()
             if self._accumulates:
                 self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)
@@ -304,7 +252,7 @@ class Session:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self._begin_again("another bone")
         self._ready, self._limits = ready, _limits(ready.parameters)
-        self.worker.outdate(self._epoch)
+        self.worker.outdate(self.course.epoch)
         self.parameters_changed()
         self._publishers.withdraw("pose")
         self.send_model()
@@ -322,7 +270,7 @@ class Session:
 
         What was collected stays, with that cloud, and so do the poses against which jumps are measured.
         """
-        self._refuse_all()
+        self.course.refuse_all()
         waiting = self.worker.clear()
         if waiting is not None:
             outcome = Outcome(waiting)
@@ -335,18 +283,9 @@ class Session:
         self._host.counters.dropped += waiting is not None
         self._forget_clouds(why)
 
-    def _begin_again(self, why: str) -> None:
-        """Forget track, seed and collected clouds; clouds on their way will be refused."""
-        self._refuse_all()
-        self._oldest = self._epoch
+    def _begin_again(self, why: str, seed: Seed | None = None) -> None:
+        self.course.begin_again(seed)
         self._forget_clouds(why)
-        self._track.clear()
-
-    def _refuse_all(self) -> None:
-        """Clouds on their way will be refused, and say nothing about those to come."""
-        self._epoch += 1
-        self._track.miss()
-        self._seed = None
 
     def _forget_clouds(self, why: str) -> None:
         self.worker.run(partial(forget, self._ready.method, why))

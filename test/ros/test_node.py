@@ -487,7 +487,7 @@ def test_a_waiting_cloud_is_registered_with_a_seed_that_came_after_it(blob_path,
         wait_until(lambda: node.counters.received == 1 and client.seeds.get_subscription_count())
         seed = PoseWithCovarianceStamped(header=Header(frame_id="probe"))
         client.seeds.publish(seed)
-        wait_until(lambda: node.session._seed)
+        wait_until(lambda: node.session.course.seed)
         assert client.call("register").success
         np.testing.assert_allclose(method.calls[-1]["initial"], np.eye(4), atol=1e-12)
 
@@ -548,9 +548,9 @@ def test_a_seed_reaches_the_method_until_a_pose_is_accepted(live):
     seed = PoseWithCovarianceStamped(header=Header(frame_id="probe"))
     seed.pose.pose.position.x = 0.1
     wait_until(client.seeds.get_subscription_count)
-    epoch = node.session._epoch
+    epoch = node.session.course.epoch
     client.seeds.publish(seed)
-    wait_until(lambda: node.session._epoch > epoch)
+    wait_until(lambda: node.session.course.epoch > epoch)
     client.ask(np.empty((0, 3)))
     client.ask(GOOD)
     client.ask(GOOD)

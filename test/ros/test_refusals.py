@@ -261,7 +261,7 @@ def test_a_seed_in_a_frame_that_nobody_knows_is_named(live):
     seed = PoseWithCovarianceStamped(header=Header(frame_id="map"))
     wait_until(client.seeds.get_subscription_count)
     client.seeds.publish(seed)
-    wait_until(lambda: node.session._seed)
+    wait_until(lambda: node.session.course.seed)
     expect_refusal(live, GOOD, Reason.TF_MISSING, "the initialpose is in map")
     client.call("reset")
     expect_good(live)

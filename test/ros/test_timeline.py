@@ -262,9 +262,9 @@ def test_a_straggler_changes_neither_the_jump_guard_nor_the_epoch_nor_tf(blob_pa
     with node_in_thread(method, blob_path, publish_tf=True, max_jump_translation=0.01) as node:
         client.wait_for_state("active")
         client.ask(GOOD, stamp_s=1000.0)
-        epoch, calls = node.session._epoch, len(method.calls)
+        epoch, calls = node.session.course.epoch, len(method.calls)
         assert client.ask(GOOD, stamp_s=980.0)["last_refusal"].startswith("stale: the stamp is 20 s behind")
-        assert (node.session._epoch, len(method.calls), len(tf2.sent)) == (epoch, calls, 1)
+        assert (node.session.course.epoch, len(method.calls), len(tf2.sent)) == (epoch, calls, 1)
         method.answer = accepted(MOVED)
         assert client.ask(GOOD, stamp_s=1000.5)["last_refusal"].startswith("jump"), "the guard still stands"
 
@@ -368,11 +368,11 @@ def test_a_bag_that_is_looped_without_simulated_time_clears_the_track_and_goes_o
         client.wait_for_state("active")
         for stamp_s in (1000.0, 1001.0):
             assert client.ask(GOOD, stamp_s=stamp_s)["level"] == 0
-        epoch = node.session._epoch
+        epoch = node.session.course.epoch
         method.answer = accepted(MOVED)
         answers = [client.ask(GOOD, stamp_s=995.0 + i) for i in range(4)]
         assert [answer["level"] for answer in answers] == [1, 1, 0, 0]
-        assert node.session._epoch == epoch + 1
+        assert node.session.course.epoch == epoch + 1
         assert tf2.sent == [1000.0, 1001.0], "a buffer would give poses between those of both rounds"
         assert client.call("reset").success
         wait_until(lambda: not client.values("input")["conflicts"])

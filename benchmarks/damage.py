@@ -23,6 +23,7 @@ from gapr_core.benchmark import records
 from gapr_core.benchmark.judge import answer_of, judge, pair_facts
 from gapr_core.benchmark.record import Record
 from gapr_core.calibration.pairs import without_twins
+from gapr_core.config import SensorConfig
 from gapr_core.data.damage import CHANGES, DAMAGES, Site
 from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import pair_hash
@@ -51,6 +52,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=48, help="pairs of each damage, of three bones")
     parser.add_argument("--others", type=int, default=24, help="as many of another subject's femur or tibia")
     parser.add_argument("--damages", default=",".join(DAMAGES), help="with commas")
+    parser.add_argument("--sensor", default="unknown", help="what the user says of the sensor (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the records")
     args = parser.parse_args()
     bones = {bone: specimens(bone, args.split, 12, args.anatomy) for bone in BONES}
@@ -59,15 +61,17 @@ def main() -> int:
     cases = [(name, bone, number, False) for name in damages for bone in BONES for number in range(args.count // 3)]
     changed = [name for name in damages if name in CHANGES]
     cases += [(name, bone, number, True) for name in changed for bone in NEXT for number in range(args.others // 2)]
-    say(table(run(cases, bones, args.out / records.FILE), damages))
+    registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1, sensor=SensorConfig(args.sensor)))
+    say(table(run(cases, bones, args.out / records.FILE, registrar), damages))
     return 0
 
 
-def run(cases: Sequence[tuple[str, str, int, bool]], bones: dict[str, list[Specimen]], path: Path) -> list[Record]:
+def run(
+    cases: Sequence[tuple[str, str, int, bool]], bones: dict[str, list[Specimen]], path: Path, registrar: Registrar
+) -> list[Record]:
     """The records of these cases; those that the file does not hold are made, and appended."""
     records.discard_cut_line(path)
     done = {record.pair: record for record in records.read(path)}
-    registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
     found = []
     for case in tqdm(cases, unit="pair"):
         name = "_".join(map(str, case))

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.data.pair import TARGET_POINTS, Pair
+from gapr_core.data.sensors import depth_maps
+from gapr_core.data.sensors.acquired import View
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import extent, se3
 from gapr_core.geometry.sampling import random_directions
@@ -23,26 +25,19 @@ from gapr_core.geometry.sampling import random_directions
 Array = NDArray[np.float64]
 Random = np.random.Generator
 
-CARTILAGE_MM, ENDS, RIM = (
-    (1.5, 3.0),
-    0.1,
-    0.25,
-)  # layer; share of the length at either end; share of that where it thins out
-PLATE_MM, PLATE_SHARE = (
-    (80.0, 12.0, 4.0),
-    (0.1, 0.25),
-)  # length, width, height of its top over the bone; share of the points
+CARTILAGE_MM = (1.5, 3.0)
+ENDS, RIM = 0.1, 0.25  # share of the length at either end that has cartilage; share of that where it thins out
+PLATE_MM, PLATE_SHARE = (80.0, 12.0, 4.0), (0.1, 0.25)  # length, width, height of its top; share of the points
 TISSUE_SHARE, SHEETS = (0.3, 0.6), 3  # points of soft tissue for each of bone; sheets that hold them
 JOINT_SHARE, JOINT_MM = (0.2, 0.5), 40.0  # points of the next bone for each of bone; how far into it
-FRAGMENT, FRAGMENT_DEG, FRAGMENT_MM = (
-    (0.25, 0.4),
-    (4.0, 10.0),
-    (2.0, 6.0),
-)  # share of the points; how far it is turned, shifted
+FRAGMENT = (0.25, 0.4)  # share of the points
+FRAGMENT_DEG, FRAGMENT_MM = (4.0, 10.0), (2.0, 6.0)  # how far it is turned, and shifted
 TAIL_MM, FREEDOM = 1.2, 2.0  # scale and degrees of freedom of Student's t
 GRID_MM, STRETCH, SAG_MM, SMOOTH_MM = 2.0, 0.035, 3.0, 5.0
 LINES_MM = (1.0, 15.0)  # width of a line, and from line to line
 STITCH_MM = (1.0, 2.0)  # how far one half lies off the other
+RANGE = (0.005, 0.02)  # how far a camera's range is wrong
+PATCH_MM, ALIKE_MM = 1.0, 3.0  # error that near points share, and the standard deviation of the window that they share
 KEPT_LENGTH = 0.6  # of the bone, in a target that a source reaches beyond
 
 
@@ -161,6 +156,20 @@ def one_axis(points: Array, site: Site, rng: Random) -> Array:
     return np.asarray(((points - centre) @ R.T * stretch) @ R + centre)
 
 
+def wrong_range(points: Array, site: Site, rng: Random) -> Array:
+    """Everything is .5 to 2 % larger or smaller: of a camera whose range is wrong."""
+    centre = points.mean(axis=0)
+    return np.asarray(centre + (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*RANGE)) * (points - centre))
+
+
+def patches(points: Array, site: Site, rng: Random) -> Array:
+    """Near points share an error of 1 mm, as in the windows over which a stereo camera matches."""
+    outward = site.outward(points)
+    towards = outward.mean(axis=0) / np.linalg.norm(outward.mean(axis=0))
+    alike = depth_maps.windows(View(points, outward, towards, {}), ALIKE_MM).patchy(PATCH_MM, rng)
+    return np.asarray(points + alike[:, None] * outward)
+
+
 def lines(points: Array, site: Site, rng: Random) -> Array:
     """Only lines of 1 mm are seen, 15 mm apart."""
     return points[points @ random_directions(1, rng)[0] % LINES_MM[1] < LINES_MM[0]]
@@ -203,8 +212,8 @@ def beyond(pair: Pair, site: Site, specimen: Specimen, rng: Random) -> Pair:
 
 CHANGES: dict[str, Change] = {
     "cartilage": cartilage, "plate": plate, "soft tissue": tissue, "next bone": joint, "fracture": fracture,
-    "heavy tails": heavy_tails, "coarse grid": coarse_grid, "one axis": one_axis, "lines": lines, "stitched": stitched,
-    "bent": bent, "smoothed": smoothed,
+    "heavy tails": heavy_tails, "coarse grid": coarse_grid, "one axis": one_axis, "wrong range": wrong_range,
+    "patches": patches, "lines": lines, "stitched": stitched, "bent": bent, "smoothed": smoothed,
 }  # fmt: skip
 DAMAGES: dict[str, Callable[[Pair, Site, Specimen, Random], Pair]] = {
     **{name: partial(of_source, change) for name, change in CHANGES.items()},

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from gapr_core.data import degradation, views
 from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import derived
+from gapr_core.data.scenes.joint import joint_scene
 from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
 from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
@@ -80,18 +81,18 @@ def make_pair(
         protocol: a name of `PROTOCOLS`.
         specimen: the bone of the target (and of the source, but for `wrong`).
         seed: any non-negative integer.
-        others: bones that `wrong` draws its source from; other protocols ignore it.
+        others: bones that `wrong` draws its source from, and `scene-joint` its neighbour; other protocols ignore it.
         turn: which kind and degradation a `wrong` pair has (it goes through all eight); drawn from the seed if None.
 
     Raises:
-        ConfigError: an unknown protocol, or `wrong` without a fitting other bone.
+        ConfigError: an unknown protocol, or one of `WITH_OTHERS` without a fitting other bone.
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"a protocol of {', '.join(PROTOCOLS)}", repr(protocol), "choose one of these names")
     drawn_as = DERIVED[protocol][0] if protocol in DERIVED else protocol
     rng = np.random.default_rng([seed, crc32(drawn_as.encode()), crc32(f"{specimen.bone} {specimen.person}".encode())])
     make = PROTOCOLS[protocol]
-    pair = make(specimen, rng, others, turn) if protocol in STRANGERS else make(specimen, rng)
+    pair = make(specimen, rng, others, turn) if protocol in WITH_OTHERS else make(specimen, rng)
     name = f"{protocol}_{specimen.bone}_{specimen.person}_{seed}"
     metadata = {"cohort": specimen.cohort, "seed": seed, "family": protocol, **pair.metadata}
     return replace(pair, name=name, protocol=protocol, metadata=metadata)
@@ -232,7 +233,8 @@ def _crop_centre(cloud: Array, rng: np.random.Generator) -> int:
     return int(rng.choice(np.flatnonzero(end)))
 
 
-STRANGERS = {"wrong": wrong, "scene-wrong": wrong_scene}  # made with other bones; no pose is right
+STRANGERS = {"wrong": wrong, "scene-wrong": wrong_scene}  # no pose is right
+WITH_OTHERS = STRANGERS | {"scene-joint": joint_scene}  # made with other bones
 DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same seed
     **{f"scene-{level}-bone": (f"scene-{level}", derived.bone_alone) for level in ("C1", "C2", "C3")},
     **{
@@ -250,5 +252,5 @@ PROTOCOLS: dict[str, Callable[..., Pair]] = {
     **{name.replace("_", "-"): partial(acquired, sensor=name) for name in SENSORS | SPARSE},
     **{name: partial(scene, level=level) for name, level in SCENE_LEVELS.items()},
     **{name: partial(_derived, base=base, change=change) for name, (base, change) in DERIVED.items()},
-    **STRANGERS,
+    **WITH_OTHERS,
 }

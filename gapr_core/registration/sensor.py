@@ -44,7 +44,7 @@ KINDS = {
     "ultrasound": Errors(
         offset_mm=0.0, standoff_mm=0.6, noise_mm=0.5, bias_mm=0.2, scale=0.02, local_mm=0.3, along_beam=True
     ),
-    "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.0),
+    "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.01),
     "laser": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.15, bias_mm=0.15, scale=0.002),
     "structured_light": Errors(
         offset_mm=0.0, standoff_mm=0.1, noise_mm=0.2, bias_mm=0.15, scale=0.001, tracking_mm=0.2, tracking_deg=0.2
@@ -52,7 +52,7 @@ KINDS = {
 }
 """What is usual: a real pointer lies .34 to .62 mm outside, sound is 1 to 3 % faster or slower than assumed, a tracked
 slice lies .1 to .5 mm off, light enters wet bone before it comes back, a tracked scanner is placed to a fifth of a
-millimetre, pictures of unknown making are wrong by .3 % of their size."""
+millimetre, a depth camera's range is wrong by 1 %, pictures of unknown making are wrong by .3 % of their size."""
 
 
 def errors(sensor: SensorConfig, points: int) -> Errors:

@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 from gapr_core.data import anatomy, parametric
 from gapr_core.data.pair import TARGET_POINTS
 from gapr_core.data.pool import parametric_people, parametric_specimen
-from gapr_core.data.protocols import PROTOCOLS, STRANGERS, Pair, make_pair
+from gapr_core.data.protocols import PROTOCOLS, WITH_OTHERS, Pair, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
@@ -173,7 +173,7 @@ class TrainingPairs(Dataset[TrainingPair]):
 
 def check_mix(mix: Mapping[str, float]) -> None:
     """Raise `ConfigError` for a protocol that does not exist or has no true pose to learn from."""
-    known = [name for name in PROTOCOLS if name not in STRANGERS]
+    known = [name for name in PROTOCOLS if name not in WITH_OTHERS]
     unknown = [name for name in mix if name not in known]
     if unknown or not sum(mix.values()) > 0:
         given = ", ".join(unknown) or "shares that add up to 0"

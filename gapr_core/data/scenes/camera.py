@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ FLATTEST_COSINE = 0.2  # between a ray and the surface's normal; flatter hits gi
 NOISE_MM = 0.4
 NOISE_PER_MM = 1.2e-6  # times the squared distance
 SMOOTH_ERROR_MM = 0.4
+NOTHING = -1  # part of a point that is on no surface
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class View:
     """What a camera sees.
 
     Attributes:
-        points: (N, 3) mm, without error.
-        part: (N,) which of the surfaces each point is on.
+        points: (N, 3) mm, without error where `see` made it.
+        part: (N,) which of the surfaces each point is on; `NOTHING` where it is on none.
         camera: (3,) mm.
     """
 
@@ -93,6 +94,11 @@ def measured(view: View, rng: np.random.Generator) -> Array:
     sight /= distance
     random = rng.normal(size=distance.shape) * noise_mm(distance)
     return view.points + random * sight + bias_along_normals(view.points, sight, SMOOTH_ERROR_MM, rng)
+
+
+def seen_in_depth(view: View, rng: np.random.Generator) -> View:
+    """The view with the errors of `measured`."""
+    return replace(view, points=measured(view, rng))
 
 
 def noise_mm(distance: Array) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import limb, things
 from gapr_core.data.scenes import wound as wounds
-from gapr_core.data.scenes.camera import Camera, View, looking_at, measured, see
-from gapr_core.data.scenes.wound import Opening, Wound
+from gapr_core.data.scenes.camera import Camera, View, looking_at, see, seen_in_depth
+from gapr_core.data.scenes.judged import seen_in_stereo, seen_on_layers
+from gapr_core.data.scenes.wound import Shape, Wound
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -50,13 +52,15 @@ class SceneLevel:
         packed: the wound has walls and a floor of tissue; else the limb is a thin skin.
         things: what else lies there.
         whole_image: the source is all that the camera sees; else a region about the wound.
+        errors: of the camera, and of what lies on the bone.
     """
 
     bone_share: tuple[float, float] = (0.10, 0.90)
-    opening: Callable[[float, np.random.Generator], Opening] = wounds.lobed
+    opening: Shape = wounds.lobed
     packed: bool = False
     things: tuple[Thing, ...] = ()
     whole_image: bool = False
+    errors: Callable[[View, np.random.Generator], View] = seen_in_depth
 
 
 SCENE_LEVELS = {
@@ -69,6 +73,8 @@ SCENE_LEVELS = {
     "scene-hand": SceneLevel((0.10, 0.60), things=(things.hand,)),
     "scene-drape": SceneLevel((0.10, 0.60), things=(things.drape,)),
     "scene-image": SceneLevel((0.03, 0.12), things=(things.hand,), whole_image=True),
+    "scene-stereo": SceneLevel(errors=seen_in_stereo),
+    "scene-layers": SceneLevel(errors=seen_on_layers),
 }
 
 
@@ -89,9 +95,19 @@ def scene(specimen: Specimen, rng: np.random.Generator, level: SceneLevel) -> Pa
     Raises:
         ConfigError: a bone on which no wound shows that share of bone.
     """
+    return draw(specimen, rng, level, partial(arrange, specimen))
+
+
+def draw(
+    specimen: Specimen,
+    rng: np.random.Generator,
+    level: SceneLevel,
+    setting_of: Callable[[np.random.Generator, SceneLevel], Setting],
+) -> Pair:
+    """As `scene`, of wounds that are drawn by `setting_of` until one shows that share of bone."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     for _ in range(TRIES):
-        setting = arrange(specimen, rng, level)
+        setting = setting_of(rng, level)
         view = see(setting.parts, _camera(setting.wound, rng))
         chosen = shown(view, setting.wound.centre, level, rng)
         if chosen is not None:
@@ -103,10 +119,15 @@ def scene(specimen: Specimen, rng: np.random.Generator, level: SceneLevel) -> Pa
     )
 
 
-def arrange(specimen: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:
-    """A wound somewhere on the bone, in a limb of some thickness, with what lies around it."""
+def arrange(
+    specimen: Specimen,
+    rng: np.random.Generator,
+    level: SceneLevel,
+    place_of: Callable[[Specimen, np.random.Generator, Shape], Wound] = wounds.somewhere,
+) -> Setting:
+    """A wound on the bone, somewhere or where `place_of` says, in a limb of some thickness, with what lies around."""
     growth = int(rng.integers(limb.GROWTH_MM[0], limb.GROWTH_MM[1] + 1))
-    wound = wounds.somewhere(specimen, rng, level.opening)
+    wound = place_of(specimen, rng, level.opening)
     retractors = [things.retractor(wound, growth, rng) for _ in range(rng.integers(MOST_RETRACTORS + 1))]
     others = [thing(wound, growth, rng) for thing in level.things]
     if level.packed:
@@ -160,10 +181,11 @@ def _region(view: View, centre: Array, share: tuple[float, float], rng: np.rando
 def _as_pair(
     specimen: Specimen, target: Array, view: View, setting: Setting, level: SceneLevel, rng: np.random.Generator
 ) -> Pair:
+    view = level.errors(view, rng)
     is_bone = view.part == 0
     share = float(is_bone.mean())
     metadata = {**setting.facts, "is_bone": is_bone, "bone_share": share, "outlier_share": 1.0 - share}
-    pair = place(specimen, measured(view, rng), target, se3.random_rotation(rng), metadata, rng, view.camera)
+    pair = place(specimen, view.points, target, se3.random_rotation(rng), metadata, rng, view.camera)
     if level.whole_image:
         pair.metadata.update(_box_of_interest(pair, rng))
     return pair

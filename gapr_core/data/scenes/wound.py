@@ -15,6 +15,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 Opening = Callable[[Array], NDArray[np.bool_]]  # which points (N, 2) mm of the wound's plane lie in the opening
+Shape = Callable[[float, np.random.Generator], Opening]  # of a radius, mm
 RADIUS_MM = (25.0, 70.0)
 TRIES = 50
 NORMAL_OVER_MM = 12.0  # the wound's axis is the mean normal of the bone within this distance
@@ -45,9 +46,7 @@ class Wound:
         return self.centre + local @ self.axes
 
 
-def somewhere(
-    specimen: Specimen, rng: np.random.Generator, shape: Callable[[float, np.random.Generator], Opening]
-) -> Wound:
+def somewhere(specimen: Specimen, rng: np.random.Generator, shape: Shape) -> Wound:
     """A wound above a random point of the bone that can be seen along its normal."""
     centre, outward = _open_place(specimen, rng)
     radius = rng.uniform(*RADIUS_MM)

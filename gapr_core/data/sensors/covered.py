@@ -22,11 +22,7 @@ def covered(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     """300 to 5000 points of one side, parts of it up to 4 mm above the bone."""
     view = look(specimen, SHARE, "seen", 20_000, rng)
     view = view.only(rng.permutation(len(view.points))[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))])
-    above_mm = np.zeros(len(view.points))
-    for middle in rng.integers(len(above_mm), size=int(rng.integers(LAYERS[0], LAYERS[1] + 1))):
-        apart = np.linalg.norm(view.points - view.points[middle], axis=1)
-        inside = (np.quantile(apart, rng.uniform(*COVERED)) - apart) / rng.uniform(*RIM_MM)  # in widths of the rim
-        above_mm = np.maximum(above_mm, rng.uniform(*THICKNESS_MM) * np.clip(inside, 0.0, 1.0))
+    above_mm = layers(view.points, rng)
     bias_mm, bias = smooth_offsets(view.points, BIAS_MM, rng)
     noise_mm = rng.uniform(*NOISE_MM)
     points = view.points + (above_mm + bias_mm)[:, None] * view.outward
@@ -35,3 +31,13 @@ def covered(specimen: Specimen, rng: np.random.Generator) -> Acquired:
         "standoff_mm": float(above_mm.mean()), "covered_share": float((above_mm > 0.0).mean()),
     }  # fmt: skip
     return Acquired(points + rng.normal(0.0, noise_mm, points.shape), parameters)
+
+
+def layers(points: Array, rng: np.random.Generator) -> Array:
+    """(N,) mm of tissue over points (N, 3): one to three round layers that thin out at their rims."""
+    above_mm = np.zeros(len(points))
+    for middle in rng.integers(len(above_mm), size=int(rng.integers(LAYERS[0], LAYERS[1] + 1))):
+        apart = np.linalg.norm(points - points[middle], axis=1)
+        inside = (np.quantile(apart, rng.uniform(*COVERED)) - apart) / rng.uniform(*RIM_MM)  # in widths of the rim
+        above_mm = np.maximum(above_mm, rng.uniform(*THICKNESS_MM) * np.clip(inside, 0.0, 1.0))
+    return above_mm

@@ -95,6 +95,27 @@ def test_the_grid_is_of_2_mm_and_one_axis_is_longer_by_a_twenty_eighth(pair, sit
     np.testing.assert_allclose(np.sort(np.abs(sizes - 1.0)), [0.0, 0.0, 0.035], atol=1e-9)
 
 
+def test_a_wrong_range_changes_the_size_and_nothing_else(pair, site, specimen):
+    sizes = []
+    for seed in range(6):
+        before, after = damaged("wrong range", pair, site, specimen, seed)
+        before, after = before - before.mean(axis=0), after - after.mean(axis=0)
+        sizes.append(np.linalg.norm(after) / np.linalg.norm(before))
+        np.testing.assert_allclose(after, sizes[-1] * before, atol=1e-9)
+    off = np.array(sizes) - 1.0
+    assert (np.abs(off) >= 0.005).all() and (np.abs(off) <= 0.02).all() and off.min() < 0.0 < off.max()
+
+
+def test_patches_err_by_1_mm_along_the_normals_alike_where_points_are_near(pair, site, specimen):
+    before, after = damaged("patches", pair, site, specimen)
+    off_mm = np.einsum("ni,ni->n", after - before, site.outward(before))
+    np.testing.assert_allclose(np.linalg.norm(after - before, axis=1), np.abs(off_mm), atol=1e-9)
+    assert off_mm.std() == pytest.approx(1.0, rel=0.02)
+    apart, nearest = cKDTree(before).query(before, k=2)
+    near = apart[:, 1] < 1.5
+    assert np.corrcoef(off_mm[near], off_mm[nearest[near, 1]])[0, 1] > 0.7
+
+
 def test_lines_are_15_mm_apart(pair, site, specimen):
     before, after = damaged("lines", pair, site, specimen)
     assert 0.03 < len(after) / len(before) < 0.12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -186,3 +187,29 @@ def test_a_wrong_scene_is_of_somebody_else(turn):
     assert pair.metadata["wrong_kind"] == ("other_bone", "other_person")[turn % 2]
     assert pair.metadata["degraded_as"] == LEVELS[turn // 2]
     assert np.linalg.norm(pair.target, axis=1).max() == pytest.approx(60.0, abs=3.0)  # its own bone
+
+
+def test_a_wound_at_a_joint_holds_the_next_bone_of_the_same_subject():
+    """Two balls 10 mm apart, as two bones of one scan: both are seen, and only the first one is bone."""
+    bone, far = ball_specimen(40.0), ball_specimen(40.0, bone="far")
+    other = moved(ball_specimen(30.0, bone="other"), [80.0, 0.0, 0.0])
+    pair = make_pair("scene-joint", bone, 1, [moved(far, [300.0, 0.0, 0.0]), other, replace(other, person="p1")])
+    assert pair.metadata["neighbour"] == "other" and 0.1 <= pair.metadata["is_bone"].mean() <= 0.6
+    middle = bone.surface.points.mean(axis=0)
+    on_bone = np.linalg.norm(in_bone_frame(pair, pair.source) - middle, axis=1) - 40.0
+    on_other = np.linalg.norm(in_bone_frame(pair, pair.source) - middle - [80.0, 0.0, 0.0], axis=1) - 30.0
+    is_bone = pair.metadata["is_bone"]
+    assert np.abs(on_bone[is_bone]).max() < WORST_MM and (np.abs(on_other[~is_bone]) < WORST_MM).mean() > 0.05
+    centre = pair.metadata["wound_centre"][None]
+    assert max(bone.distance(centre)[0], other.distance(centre)[0]) <= 40.0
+    np.testing.assert_allclose(np.linalg.norm(pair.target, axis=1), 40.0, atol=2.0)  # the other one is no target
+
+
+@pytest.mark.parametrize("others", [[], [ball_specimen(person="p1")], [replace(ball_specimen(), cohort="parametric")]])
+def test_a_joint_needs_another_bone_of_the_same_scan(others):
+    with pytest.raises(ConfigError, match="another bone of p0 within 40 mm"):
+        make_pair("scene-joint", knob_specimen(), 0, others)
+
+
+def moved(specimen, shift):
+    return replace(specimen, surface=replace(specimen.surface, points=specimen.surface.points + np.asarray(shift)))

@@ -1,0 +1,72 @@
+"""A wound at a joint: the next bone of the same subject lies in it too, where the scan has it. To judge with only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import numpy as np
+
+from gapr_core.data.pair import Pair
+from gapr_core.data.scenes import wound as wounds
+from gapr_core.data.scenes.scene import SceneLevel, Setting, arrange, draw
+from gapr_core.data.scenes.wound import Shape, Wound
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError
+from gapr_core.surface import Surface
+
+LEVEL = SceneLevel((0.10, 0.60))
+NEAR_MM = 40.0  # of both bones: where a joint's wound is
+MADE = ("parametric", "drawn")  # cohorts whose bones were not scanned together
+TRIES = 500
+
+
+def joint_scene(
+    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None
+) -> Pair:
+    """A scene of a bone and its neighbour; `is_bone` is of the first.
+
+    Raises:
+        ConfigError: no other bone of this subject is near.
+    """
+    neighbour = _next_to(specimen, others)
+    pair = draw(specimen, rng, LEVEL, partial(_at_joint, specimen, neighbour))
+    return replace(pair, metadata=pair.metadata | {"neighbour": neighbour.bone})
+
+
+def _next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
+    own = [o for o in others if o.person == specimen.person and o.bone != specimen.bone and o.cohort not in MADE]
+    apart = [float(specimen.distance(other.surface.points).min()) for other in own]
+    if not own or min(apart) > NEAR_MM:
+        raise ConfigError(
+            f"another bone of {specimen.person} within {NEAR_MM:g} mm of the {specimen.bone}",
+            f"{', '.join(o.bone for o in own) or 'none'} among {len(others)} other bones",
+            "name the bones of one joint, as in --bones femur,tibia, of subjects that were scanned",
+        )
+    return own[int(np.argmin(apart))]
+
+
+def _at_joint(specimen: Specimen, neighbour: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:
+    setting = arrange(_together(specimen, neighbour), rng, level, partial(_between, specimen, neighbour))
+    return setting._replace(parts=[specimen.surface, *setting.parts[1:], neighbour.surface])
+
+
+@lru_cache(maxsize=32)
+def _together(specimen: Specimen, neighbour: Specimen) -> Specimen:
+    """Both bones as one, since one limb surrounds them."""
+    first, second = specimen.surface, neighbour.surface
+    faces = np.vstack([first.triangles, second.triangles + len(first.points)])
+    return replace(specimen, surface=Surface(np.vstack([first.points, second.points]), faces))
+
+
+def _between(specimen: Specimen, neighbour: Specimen, both: Specimen, rng: np.random.Generator, shape: Shape) -> Wound:
+    for _ in range(TRIES):
+        wound = wounds.somewhere(both, rng, shape)
+        if max(float(bone.distance(wound.centre[None])[0]) for bone in (specimen, neighbour)) <= NEAR_MM:
+            return wound
+    raise ConfigError(
+        f"a wound within {NEAR_MM:g} mm of both bones",
+        f"{specimen.bone} and {neighbour.bone} of {specimen.person}: none in {TRIES}",
+        "check that both meshes are in one frame and closed",
+    )

@@ -1,0 +1,69 @@
+"""Wounds as other cameras see them, with what `camera.measured` leaves out. To judge with only.
+
+A stereo camera matches depth over windows, so ridges are round, and near pixels err alike. Along edges pixels fly
+between what is before and behind. Wet spots give nothing. Depth comes in steps, and the range is about 1 % wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.data.scenes.camera import NOTHING, View, noise_mm, seen_in_depth
+from gapr_core.data.sensors import acquired, depth_maps
+from gapr_core.data.sensors.covered import layers
+
+Array = NDArray[np.float64]
+WINDOW_MM = (1.0, 3.0)  # standard deviation of the window over which depth is matched
+PATCHY = (0.3, 0.9)  # share of the noise's variance that is alike in a window
+STEP_MM = (0.05, 0.5)  # of depth
+EDGE_MM, BESIDE = 8.0, 7  # a step between a pixel's neighbours that is an edge, and how many neighbours there are
+FLYING = (0.0, 0.6)  # share of the pixels at an edge that fly
+SMOOTH_MM = 0.6  # largest smooth error
+WET, WET_MM = (0, 6), (2.0, 8.0)  # spots that give nothing: how many, and their radius
+
+
+def seen_in_stereo(view: View, rng: np.random.Generator) -> View:
+    """What a stereo camera makes of a view: fewer points, with errors; those that fly are on no surface."""
+    view = view.of(_dry(view, rng))
+    sight = view.points - view.camera
+    depth_mm = np.linalg.norm(sight, axis=1)
+    sight /= depth_mm[:, None]
+    towards = -sight.mean(axis=0) / np.linalg.norm(sight.mean(axis=0))
+    over = depth_maps.windows(acquired.View(view.points, -sight, towards, {}), rng.uniform(*WINDOW_MM))
+    patchy = rng.uniform(*PATCHY)
+    noise = over.patchy(np.sqrt(patchy), rng) + np.sqrt(1.0 - patchy) * rng.normal(size=len(depth_mm))
+    smooth_mm, _ = acquired.smooth_offsets(view.points, SMOOTH_MM, rng)
+    flies, between_mm = _flying(depth_mm, sight, rng)
+    measured = np.where(flies, between_mm, over.mean(depth_mm) + smooth_mm + noise * noise_mm(depth_mm))
+    step = rng.uniform(*STEP_MM)
+    points = view.camera + (np.round(measured / step) * step)[:, None] * sight
+    seen = depth_maps.wrong_range(points, rng)
+    return replace(view, points=seen.of(points), part=np.where(flies, NOTHING, view.part), camera=seen.of(view.camera))
+
+
+def seen_on_layers(view: View, rng: np.random.Generator) -> View:
+    """The bone under one to three layers of up to 4 mm, towards the camera; then the errors of `camera.measured`."""
+    bone, points = np.flatnonzero(view.part == 0), view.points.copy()
+    sight = points[bone] - view.camera
+    points[bone] -= layers(points[bone], rng)[:, None] * sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    return seen_in_depth(replace(view, points=points), rng)
+
+
+def _dry(view: View, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """(N,) which points are not in a wet spot."""
+    dry = np.ones(len(view.points), dtype=bool)
+    for middle in rng.integers(len(dry), size=int(rng.integers(WET[0], WET[1] + 1))):
+        dry &= np.linalg.norm(view.points - view.points[middle], axis=1) > rng.uniform(*WET_MM)
+    return dry
+
+
+def _flying(depth_mm: Array, sight: Array, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Array]:
+    """(N,) which pixels fly, and (N,) a depth between the nearest and the farthest one around each."""
+    around = depth_mm[cKDTree(sight).query(sight, k=min(BESIDE, len(sight)))[1]].reshape(len(sight), -1)
+    near, far = around.min(axis=1), around.max(axis=1)
+    flies = (far - near > EDGE_MM) & (rng.random(len(sight)) < rng.uniform(*FLYING))
+    return flies, near + rng.random(len(sight)) * (far - near)

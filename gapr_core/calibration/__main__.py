@@ -28,7 +28,7 @@ from gapr_core.calibration.fit import (
     of_unseen_families,
     of_unseen_people,
 )
-from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes
+from gapr_core.calibration.pairs import HELD_OUT, SCENES, Task, look_alikes
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
@@ -47,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
     parser.add_argument("--out", required=True, type=Path, help="folder for records, models and their card")
     parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
-    parser.add_argument("--scenes", type=int, default=0, help="more pairs that are scenes (default: %(default)s)")
+    parser.add_argument(
+        "--scenes", type=int, default=0, help="more pairs of each family of scenes (default: %(default)s)"
+    )
     parser.add_argument("--look-alikes", type=int, default=0,
                         help="more of subjects' femora and tibiae at L3, half of them against another subject's, and "
                         "as many seen by all other families (default: %(default)s)")  # fmt: skip
@@ -61,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     which = (str(args.anatomy), args.split, args.seed)
     tasks = [Task(*which, number) for number in range(args.count)]
-    tasks += [Task(*which, number, "scene") for number in range(args.scenes)]
+    tasks += [Task(*which, number, family) for family in SCENES for number in range(args.scenes)]
     tasks += look_alikes(*which, args.look_alikes)
     tasks += streams.tasks(*which, args.streams)
     records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)

@@ -122,12 +122,12 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
     """(round, what it answered and how right that is)."""
     rng = np.random.default_rng([task.seed, task.number, 17])
     registrars, viewpoint = _registrars(drawn.sensor), drawn.pair.viewpoint
-    if viewpoint is not None and (drawn.family == "scene" or task.number % LOOKED_AT == 0):
+    if viewpoint is not None and (drawn.family in pairs.SCENES or task.number % LOOKED_AT == 0):
         registrar = registrars["first round" if task.number % 2 else "search"]
         in_scene = registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
         if isinstance(in_scene, Assessment):
             yield clutter.NAME, judged_answer(in_scene, drawn.pair)
-    if drawn.family == "scene":
+    if drawn.family in pairs.SCENES:
         return
     of_round = {"network": "network", "search": "search alone" if task.number % ALONE == 0 else "search"}
     found = {name: registrars[used].assess(drawn.pair.source, target) for name, used in of_round.items()}

@@ -56,6 +56,11 @@ SEEN_AS = {
     "moving": {"moving": 4.0},
     "scene": {"scene-C1": 2.0, "scene-C2": 2.0, "scene-C3": 2.0},
 }  # family: how a bone is seen, and how often
+SCENES = {
+    "scene": SEEN_AS["scene"],
+    "scene-stereo": {"scene-stereo": 1.0},
+    "scene-layers": {"scene-layers": 1.0},
+}  # those of `SEEN_AS`, and families that only lists of their own have
 HELD_OUT = ("laser", "structured-light")  # families that no model is fitted on, only judged
 WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # whose bone the source is of
 SHAPE_SHARE = 0.02  # of all pairs
@@ -267,7 +272,7 @@ def _one_of(specimens: Sequence[Specimen], rng: np.random.Generator) -> Specimen
 
 def _choose_view(rng: np.random.Generator, only: str) -> tuple[str, str]:
     """(family, how the bone is seen); of one family where that is named."""
-    families = {only: SEEN_AS[only]} if only else SEEN_AS
+    families = {only: (SEEN_AS | SCENES)[only]} if only else SEEN_AS
     shares = {(family, name): share for family, views in families.items() for name, share in views.items()}
     return _choose(shares, rng)
 

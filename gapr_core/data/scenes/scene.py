@@ -19,7 +19,7 @@ from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import limb, things
 from gapr_core.data.scenes import wound as wounds
 from gapr_core.data.scenes.camera import Camera, View, looking_at, see, seen_in_depth
-from gapr_core.data.scenes.judged import seen_in_stereo, seen_on_layers
+from gapr_core.data.scenes.errors import seen_in_stereo, seen_on_layers
 from gapr_core.data.scenes.wound import Shape, Wound
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError

@@ -1,4 +1,4 @@
-"""Wounds as other cameras see them, with what `camera.measured` leaves out. To judge with only.
+"""Wounds as a stereo camera sees them, and bones under layers: what `camera.measured` leaves out.
 
 A stereo camera matches depth over windows, so ridges are round, and near pixels err alike. Along edges pixels fly
 between what is before and behind. Wet spots give nothing. Depth comes in steps, and the range is about 1 % wrong.

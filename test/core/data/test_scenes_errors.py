@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gapr_core.data.scenes import camera, judged
+from gapr_core.data.scenes import camera, errors
 from gapr_core.data.sensors import depth_maps
 
 CAMERA = np.array([0.0, 0.0, 500.0])
@@ -27,15 +27,15 @@ def only(monkeypatch):
 
     def switch(noise_mm=0.0, scale=0.0, **given):
         for name, value in {**EXACT, **given}.items():
-            monkeypatch.setattr(judged, name, value)
-        monkeypatch.setattr(judged, "noise_mm", lambda depth: np.full(len(depth), noise_mm))
+            monkeypatch.setattr(errors, name, value)
+        monkeypatch.setattr(errors, "noise_mm", lambda depth: np.full(len(depth), noise_mm))
         monkeypatch.setattr(depth_maps, "RANGE", scale)
 
     return switch
 
 
 def seen(view, seed=0):
-    return judged.seen_in_stereo(view, np.random.default_rng(seed))
+    return errors.seen_in_stereo(view, np.random.default_rng(seed))
 
 
 def off_mm(view):
@@ -114,9 +114,9 @@ def test_the_smooth_error_is_of_its_size(only):
 
 
 def test_layers_lie_over_the_bone_alone_towards_the_camera(monkeypatch):
-    monkeypatch.setattr(judged, "seen_in_depth", lambda view, rng: view)
+    monkeypatch.setattr(errors, "seen_in_depth", lambda view, rng: view)
     view = plate(part=lambda at: (at[:, 0] > 0.0).astype(int))
-    found = judged.seen_on_layers(view, np.random.default_rng(2))
+    found = errors.seen_on_layers(view, np.random.default_rng(2))
     above = np.linalg.norm(found.points - view.points, axis=1)
     assert above[view.part == 1].max() == 0.0
     assert 0.5 <= above.max() <= 4.0 and 0.05 < (above > 0.0).mean() < 0.5
@@ -128,5 +128,5 @@ def test_layers_lie_over_the_bone_alone_towards_the_camera(monkeypatch):
 def test_by_default_the_bone_under_layers_has_the_noise_of_the_depth_too():
     view = plate(part=lambda at: np.ones(len(at), dtype=int))
     view = camera.View(view.points, np.append(np.zeros(10, dtype=int), view.part[10:]), view.camera)
-    found = judged.seen_on_layers(view, np.random.default_rng(0))
+    found = errors.seen_on_layers(view, np.random.default_rng(0))
     assert off_mm(found)[10:].std() == pytest.approx(0.75, rel=0.3)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from gapr_core.data import degradation, views
 from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import derived
-from gapr_core.data.scenes.joint import joint_scene
+from gapr_core.data.scenes.joint import IN_THEATRE, joint_scene
 from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
 from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
@@ -81,7 +81,7 @@ def make_pair(
         protocol: a name of `PROTOCOLS`.
         specimen: the bone of the target (and of the source, but for `wrong`).
         seed: any non-negative integer.
-        others: bones that `wrong` draws its source from, and `scene-joint` its neighbour; other protocols ignore it.
+        others: bones that `wrong` draws its source from, and scenes at a joint their neighbour; other protocols ignore it.
         turn: which kind and degradation a `wrong` pair has (it goes through all eight); drawn from the seed if None.
 
     Raises:
@@ -234,7 +234,11 @@ def _crop_centre(cloud: Array, rng: np.random.Generator) -> int:
 
 
 STRANGERS = {"wrong": wrong, "scene-wrong": wrong_scene}  # no pose is right
-WITH_OTHERS = STRANGERS | {"scene-joint": joint_scene}  # made with other bones
+WITH_OTHERS = {  # made with other bones
+    **STRANGERS,
+    "scene-joint": joint_scene,
+    "scene-theatre": partial(joint_scene, level=IN_THEATRE),
+}
 DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same seed
     **{f"scene-{level}-bone": (f"scene-{level}", derived.bone_alone) for level in ("C1", "C2", "C3")},
     **{

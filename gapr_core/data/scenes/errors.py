@@ -1,7 +1,7 @@
 """Wounds as a stereo camera sees them, and bones under layers: what `camera.measured` leaves out.
 
 A stereo camera matches depth over windows, so ridges are round, and near pixels err alike. Along edges pixels fly
-between what is before and behind. Wet spots give nothing. Depth comes in steps, and the range is about 1 % wrong.
+between what is before and behind. Wet spots give nothing. Depth comes in steps.
 """
 
 from __future__ import annotations
@@ -41,16 +41,27 @@ def seen_in_stereo(view: View, rng: np.random.Generator) -> View:
     measured = np.where(flies, between_mm, over.mean(depth_mm) + smooth_mm + noise * noise_mm(depth_mm))
     step = rng.uniform(*STEP_MM)
     points = view.camera + (np.round(measured / step) * step)[:, None] * sight
-    seen = depth_maps.wrong_range(points, rng)
-    return replace(view, points=seen.of(points), part=np.where(flies, NOTHING, view.part), camera=seen.of(view.camera))
+    return replace(view, points=points, part=np.where(flies, NOTHING, view.part))
 
 
 def seen_on_layers(view: View, rng: np.random.Generator) -> View:
-    """The bone under one to three layers of up to 4 mm, towards the camera; then the errors of `camera.measured`."""
+    """The bone under layers, with the errors of `camera.measured`."""
+    return seen_in_depth(_under_layers(view, rng), rng)
+
+
+def seen_in_theatre(view: View, rng: np.random.Generator) -> View:
+    """The bone under layers as a stereo camera sees it whose range is about 1 % wrong."""
+    view = seen_in_stereo(_under_layers(view, rng), rng)
+    seen = depth_maps.wrong_range(view.points, rng)
+    return replace(view, points=seen.of(view.points), camera=seen.of(view.camera))
+
+
+def _under_layers(view: View, rng: np.random.Generator) -> View:
+    """One to three layers of up to 4 mm on the bone, towards the camera."""
     bone, points = np.flatnonzero(view.part == 0), view.points.copy()
     sight = points[bone] - view.camera
     points[bone] -= layers(points[bone], rng)[:, None] * sight / np.linalg.norm(sight, axis=1, keepdims=True)
-    return seen_in_depth(replace(view, points=points), rng)
+    return replace(view, points=points)
 
 
 def _dry(view: View, rng: np.random.Generator) -> NDArray[np.bool_]:

@@ -10,28 +10,34 @@ import numpy as np
 
 from gapr_core.data.pair import Pair
 from gapr_core.data.scenes import wound as wounds
+from gapr_core.data.scenes.errors import seen_in_theatre
 from gapr_core.data.scenes.scene import SceneLevel, Setting, arrange, draw
 from gapr_core.data.scenes.wound import Shape, Wound
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.surface import Surface
 
-LEVEL = SceneLevel((0.10, 0.60))
+AT_A_JOINT = SceneLevel((0.10, 0.60))
+IN_THEATRE = SceneLevel((0.10, 0.60), errors=seen_in_theatre)
 NEAR_MM = 40.0  # of both bones: where a joint's wound is
 MADE = ("parametric", "drawn")  # cohorts whose bones were not scanned together
 TRIES = 500
 
 
 def joint_scene(
-    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None
+    specimen: Specimen,
+    rng: np.random.Generator,
+    others: Sequence[Specimen],
+    turn: int | None = None,
+    level: SceneLevel = AT_A_JOINT,
 ) -> Pair:
-    """A scene of a bone and its neighbour; `is_bone` is of the first.
+    """A scene of a bone and its neighbour, one of `others`; `is_bone` is of the first.
 
     Raises:
         ConfigError: no other bone of this subject is near.
     """
     neighbour = _next_to(specimen, others)
-    pair = draw(specimen, rng, LEVEL, partial(_at_joint, specimen, neighbour))
+    pair = draw(specimen, rng, level, partial(_at_joint, specimen, neighbour))
     return replace(pair, metadata=pair.metadata | {"neighbour": neighbour.bone})
 
 

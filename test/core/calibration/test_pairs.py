@@ -141,6 +141,8 @@ def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     drawn = [pairs.draw(Task(FOLDER, "train", 3, number, "scene")) for number in range(40)]
     assert {each.seen_as for each in drawn} == set(pairs.SEEN_AS["scene"])
+    drawn = [pairs.draw(Task(FOLDER, "train", 3, number, "scene-stereo")) for number in range(3)]
+    assert {(each.seen_as, each.family) for each in drawn} == {("scene-stereo", "scene-stereo")}
     names = {collect._name(Task(FOLDER, "train", 3, 1, family)) for family in ("", "scene", "laser")}
     assert names == {"3-1", "3-scene-1", "3-laser-1"}
 

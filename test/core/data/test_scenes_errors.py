@@ -95,15 +95,19 @@ def test_depth_comes_in_steps(only):
     np.testing.assert_allclose(depth / 0.5, np.round(depth / 0.5), atol=1e-6)
 
 
-def test_a_wrong_range_makes_another_size_about_the_middle_and_no_ray_turns(only):
+def test_in_the_theatre_there_are_layers_and_a_wrong_range_too_and_no_ray_turns(only, monkeypatch):
     only()
-    exact = seen(plate())
+    monkeypatch.setattr(errors, "layers", lambda points, rng: np.full(len(points), 3.0))
+    exact = errors.seen_in_theatre(plate(), np.random.default_rng(0))
+    inner = np.abs(plate().points[:, :2]).max(axis=1) < 50.0
+    np.testing.assert_allclose(off_mm(exact)[inner], 3.0, atol=0.05)
     only(scale=0.05)
-    found = seen(plate())
+    found = errors.seen_in_theatre(plate(), np.random.default_rng(0))
     factor = np.linalg.norm(found.points[-1] - found.points[0]) / np.linalg.norm(exact.points[-1] - exact.points[0])
     assert abs(factor - 1.0) > 0.005
     np.testing.assert_allclose(found.points - found.camera, factor * (exact.points - exact.camera))
     np.testing.assert_allclose(found.points.mean(axis=0), exact.points.mean(axis=0), atol=1e-9)
+    assert errors.seen_in_stereo(plate(), np.random.default_rng(0)).camera == pytest.approx(CAMERA)
 
 
 def test_the_smooth_error_is_of_its_size(only):

@@ -5,7 +5,7 @@ L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gi
 the same of about half the size; L2-wave and so on have another smooth bias; sweep is the band that a probe covers on
 its way; pointer, ultrasound, depth-camera, laser, structured-light, stereo, photogrammetry, covered and moving are
 simulated sensors (see `sensors`), pointer-50 and ultrasound-4 the same with 50 dots and four slices; scene-C1 and so on
-are what a camera sees of a bone in a wound (see `scenes`); wrong and scene-wrong pairs have no pose.
+are what a camera sees of a bone in a wound (see `scenes`); wrong and scene-wrong ones have no pose.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def make_pair(
         protocol: a name of `PROTOCOLS`.
         specimen: the bone of the target (and of the source, but for `wrong`).
         seed: any non-negative integer.
-        others: bones that `wrong` draws its source from, and scenes at a joint their neighbour; other protocols ignore it.
+        others: bones that `wrong` draws its source from, and scenes at a joint their neighbour; not used by others.
         turn: which kind and degradation a `wrong` pair has (it goes through all eight); drawn from the seed if None.
 
     Raises:
@@ -165,12 +165,16 @@ def wrong(specimen: Specimen, rng: np.random.Generator, others: Sequence[Specime
 
 
 def wrong_scene(
-    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None
+    specimen: Specimen,
+    rng: np.random.Generator,
+    others: Sequence[Specimen],
+    turn: int | None = None,
+    levels: Sequence[str] = ("scene-C1", "scene-C2", "scene-C3"),
 ) -> Pair:
-    """A scene that is not of this bone: in turn of another bone type, of another subject's; each of three levels."""
-    turn = int(rng.integers(6)) if turn is None else turn
+    """A scene that is not of this bone: in turn of another bone type, of another subject's; each of the levels."""
+    turn = int(rng.integers(2 * len(levels))) if turn is None else turn
     source_of = _another(specimen, others, turn % 2, rng)
-    level = ("scene-C1", "scene-C2", "scene-C3")[turn // 2 % 3]
+    level = levels[turn // 2 % len(levels)]
     pair = PROTOCOLS[level](source_of, rng)
     target, _ = specimen.sample(TARGET_POINTS, rng)
     origin = target.mean(axis=0)
@@ -233,8 +237,12 @@ def _crop_centre(cloud: Array, rng: np.random.Generator) -> int:
     return int(rng.choice(np.flatnonzero(end)))
 
 
-STRANGERS = {"wrong": wrong, "scene-wrong": wrong_scene}  # no pose is right
-WITH_OTHERS = {  # made with other bones
+STRANGERS: dict[str, Callable[..., Pair]] = {  # no pose is right
+    "wrong": wrong,
+    "scene-wrong": wrong_scene,
+    "scene-wrong-stereo": partial(wrong_scene, levels=("scene-stereo", "scene-layers")),
+}
+WITH_OTHERS: dict[str, Callable[..., Pair]] = {  # made with other bones
     **STRANGERS,
     "scene-joint": joint_scene,
     "scene-theatre": partial(joint_scene, level=IN_THEATRE),

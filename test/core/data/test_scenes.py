@@ -189,6 +189,14 @@ def test_a_wrong_scene_is_of_somebody_else(turn):
     assert np.linalg.norm(pair.target, axis=1).max() == pytest.approx(60.0, abs=3.0)  # its own bone
 
 
+@pytest.mark.parametrize("turn", range(4))
+def test_a_wrong_scene_is_seen_by_a_stereo_camera_or_under_layers_too(turn):
+    others = [ball_specimen(person="p1"), knob_specimen(person="p2")]
+    pair = make_pair("scene-wrong-stereo", ball_specimen(person="p0"), 3, others, turn)
+    assert not pair.has_truth and pair.metadata["source_person"] == ("p2", "p1")[turn % 2]
+    assert pair.metadata["degraded_as"] == ("scene-stereo", "scene-layers")[turn // 2]
+
+
 def test_a_wound_at_a_joint_holds_the_next_bone_of_the_same_subject():
     """Two balls 10 mm apart, as two bones of one scan: both are seen, and only the first one is bone."""
     bone, far = ball_specimen(40.0), ball_specimen(40.0, bone="far")

@@ -28,7 +28,7 @@ from gapr_core.calibration.fit import (
     of_unseen_families,
     of_unseen_people,
 )
-from gapr_core.calibration.pairs import HELD_OUT, SCENES, Task, look_alikes
+from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     which = (str(args.anatomy), args.split, args.seed)
     tasks = [Task(*which, number) for number in range(args.count)]
-    tasks += [Task(*which, number, family) for family in SCENES for number in range(args.scenes)]
+    tasks += scenes(*which, args.scenes)
     tasks += look_alikes(*which, args.look_alikes)
     tasks += streams.tasks(*which, args.streams)
     records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)

@@ -21,6 +21,7 @@ from gapr_core.config import SENSOR_KINDS
 from gapr_core.data import anatomy, protocols, scans
 from gapr_core.data import pool as bone_pool
 from gapr_core.data.parametric import BONES as PARAMETRIC
+from gapr_core.data.scenes.joint import neighbours
 from gapr_core.data.specimen import Specimen
 from gapr_core.training.dataset import People
 
@@ -60,7 +61,9 @@ SCENES = {
     "scene": SEEN_AS["scene"],
     "scene-stereo": {"scene-stereo": 1.0},
     "scene-layers": {"scene-layers": 1.0},
+    "scene-joint": {"scene-joint": 1.0},
 }  # those of `SEEN_AS`, and families that only lists of their own have
+AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # how a bone is seen whose subject has another one near it; and else
 HELD_OUT = ("laser", "structured-light")  # families that no model is fitted on, only judged
 WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # whose bone the source is of
 SHAPE_SHARE = 0.02  # of all pairs
@@ -129,6 +132,12 @@ class Drawn:
     sensor: str = "unknown"
 
 
+def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
+    """So many scenes of each family; those at a joint are of subjects, of whom more than one bone is known."""
+    families = [(family, family == AT_A_JOINT) for family in SCENES for _ in range(count)]
+    return [Task(folder, split, seed, i % count, family, real=real) for i, (family, real) in enumerate(families)]
+
+
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
     """Subjects' femora and tibiae, every other one of another subject, twice as many as `count`.
 
@@ -154,7 +163,10 @@ def draw(task: Task) -> Drawn:
     family, seen_as = _choose_view(rng, task.family)
     what, stranger = source_of(task, setting, rng)
     seed = int(rng.integers(2**31))
-    pair = view(seen_as, stranger, seed)
+    around = [bone for group in bones_of(task.folder, task.split).values() for bone in group]
+    if seen_as == AT_A_JOINT and not neighbours(stranger, around):
+        seen_as = ELSEWHERE
+    pair = view(seen_as, stranger, seed, around)
     if what != "own" or seen_as not in OWN_TARGET:
         pair = before(setting, stranger, what, pair)
     sensor = family.replace("-", "_") if rng.random() < DESCRIBED else "unknown"
@@ -205,11 +217,11 @@ def first_of_twins(person: str) -> str:
     return next((min(group) for group in TWINS if person in group), person)
 
 
-def view(seen_as: str, specimen: Specimen, seed: int) -> protocols.Pair:
-    """A bone against itself, seen by a protocol or one of this file's views."""
+def view(seen_as: str, specimen: Specimen, seed: int, around: Sequence[Specimen] = ()) -> protocols.Pair:
+    """A bone against itself, seen by a protocol or one of this file's views; at a joint with one of those around it."""
     if seen_as in VIEWS:
         return replace(VIEWS[seen_as](specimen, np.random.default_rng([seed, 11])), protocol=seen_as)
-    return protocols.make_pair(seen_as, specimen, seed)
+    return protocols.make_pair(seen_as, specimen, seed, around)
 
 
 def before(setting: Setting, stranger: Specimen, what: str, pair: protocols.Pair) -> protocols.Pair:

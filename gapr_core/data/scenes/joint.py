@@ -1,4 +1,4 @@
-"""A wound at a joint: the next bone of the same subject lies in it too, where the scan has it. To judge with only."""
+"""A wound at a joint: the next bone of the same subject lies in it too, where the scan has it."""
 
 from __future__ import annotations
 
@@ -41,16 +41,25 @@ def joint_scene(
     return replace(pair, metadata=pair.metadata | {"neighbour": neighbour.bone})
 
 
-def _next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
-    own = [o for o in others if o.person == specimen.person and o.bone != specimen.bone and o.cohort not in MADE]
+def neighbours(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:
+    """Those of the others that are bones of the same scan within 40 mm, the nearest first."""
+    if specimen.cohort in MADE:
+        return []
+    own = [other for other in others if other.person == specimen.person and other.cohort == specimen.cohort]
+    own = [other for other in own if other.bone != specimen.bone]
     apart = [float(specimen.distance(other.surface.points).min()) for other in own]
-    if not own or min(apart) > NEAR_MM:
+    return [own[i] for i in np.argsort(apart) if apart[i] <= NEAR_MM]
+
+
+def _next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
+    found = neighbours(specimen, others)
+    if not found:
         raise ConfigError(
-            f"another bone of {specimen.person} within {NEAR_MM:g} mm of the {specimen.bone}",
-            f"{', '.join(o.bone for o in own) or 'none'} among {len(others)} other bones",
+            f"another bone of {specimen.person} within {NEAR_MM:g} mm of the {specimen.bone}, of the same scan",
+            f"none among {len(others)} other bones",
             "name the bones of one joint, as in --bones femur,tibia, of subjects that were scanned",
         )
-    return own[int(np.argmin(apart))]
+    return found[0]
 
 
 def _at_joint(specimen: Specimen, neighbour: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:

@@ -123,7 +123,7 @@ def test_a_solid_of_revolution_is_one():
 
 
 def test_the_shares_hold(people, monkeypatch):
-    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(seen_as))
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     monkeypatch.setattr(pairs, "setting_of", lambda *_: _NoView("none"))
     monkeypatch.setattr(pairs, "STRANGERS", dict.fromkeys(pairs.WHAT, lambda specimen, others, rng: specimen))
@@ -137,7 +137,7 @@ def test_the_shares_hold(people, monkeypatch):
 
 def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people, monkeypatch):
     monkeypatch.setattr(pairs, "SHAPE_SHARE", 1.0)
-    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(seen_as))
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     drawn = [pairs.draw(Task(FOLDER, "train", 3, number, "scene")) for number in range(40)]
     assert {each.seen_as for each in drawn} == set(pairs.SEEN_AS["scene"])
@@ -148,7 +148,7 @@ def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people
 
 
 def test_look_alikes_are_long_bones_at_l3_then_of_all_families_and_every_other_one_is_another_subjects(monkeypatch):
-    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(seen_as))
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     bones = {bone: [parametric_specimen(bone, number) for number in (0, 1)] for bone in ("femur", "tibia")}
     monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
@@ -167,7 +167,7 @@ def test_look_alikes_are_long_bones_at_l3_then_of_all_families_and_every_other_o
 
 
 def test_look_alikes_are_of_subjects_where_there_are_any(monkeypatch):
-    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed: _NoView(seen_as))
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(seen_as))
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     cohorts = ("ct", "drawn", "ct", "parametric", "ct")
     bones = {bone: [replace(parametric_specimen(bone, number), cohort=cohort) for number, cohort in enumerate(cohorts)]
@@ -207,3 +207,21 @@ def test_a_folder_that_is_none_is_one_line(tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith("python -m gapr_core.calibration: expected a folder with anatomy; got nowhere")
     assert done.stderr.count("\n") == 1
+
+
+def test_scenes_are_so_many_of_each_family_and_those_at_a_joint_are_of_subjects(monkeypatch):
+    tasks = pairs.scenes(FOLDER, "train", 3, 5)
+    assert [task.family for task in tasks] == [family for family in pairs.SCENES for _ in range(5)]
+    assert [task.number for task in tasks] == list(range(5)) * len(pairs.SCENES)
+    assert {task.family for task in tasks if task.real} == {"scene-joint"}
+
+
+def test_a_bone_without_a_neighbour_is_seen_alone_and_one_with_gets_it(people, monkeypatch):
+    monkeypatch.setattr(pairs, "SHAPE_SHARE", 1.0)
+    monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
+    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(f"{seen_as} of {len(around)}"))
+    everybody = sum(len(group) for group in pairs.bones_of(FOLDER, "train").values())
+    task = Task(FOLDER, "train", 3, 1, "scene-joint")
+    assert pairs.draw(task).pair.seen_as == f"scene-C2 of {everybody}"
+    monkeypatch.setattr(pairs, "neighbours", lambda specimen, around: around[:1])
+    assert pairs.draw(task).pair.seen_as == f"scene-joint of {everybody}"

@@ -21,8 +21,8 @@ from gapr_core.config import SENSOR_KINDS
 from gapr_core.data import anatomy, protocols, scans
 from gapr_core.data import pool as bone_pool
 from gapr_core.data.parametric import BONES as PARAMETRIC
-from gapr_core.data.scenes.joint import neighbours
 from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError
 from gapr_core.training.dataset import People
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ SCENES = {
     "scene-layers": {"scene-layers": 1.0},
     "scene-joint": {"scene-joint": 1.0},
 }  # those of `SEEN_AS`, and families that only lists of their own have
-AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # how a bone is seen whose subject has another one near it; and else
+AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # how a bone is seen with its neighbour, and where that cannot be
 HELD_OUT = ("laser", "structured-light")  # families that no model is fitted on, only judged
 WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # whose bone the source is of
 SHAPE_SHARE = 0.02  # of all pairs
@@ -164,9 +164,12 @@ def draw(task: Task) -> Drawn:
     what, stranger = source_of(task, setting, rng)
     seed = int(rng.integers(2**31))
     around = [bone for group in bones_of(task.folder, task.split).values() for bone in group]
-    if seen_as == AT_A_JOINT and not neighbours(stranger, around):
-        seen_as = ELSEWHERE
-    pair = view(seen_as, stranger, seed, around)
+    try:
+        pair = view(seen_as, stranger, seed, around)
+    except ConfigError:  # no neighbour, or no wound shows enough of both
+        if seen_as != AT_A_JOINT:
+            raise
+        pair = view(seen_as := ELSEWHERE, stranger, seed)
     if what != "own" or seen_as not in OWN_TARGET:
         pair = before(setting, stranger, what, pair)
     sensor = family.replace("-", "_") if rng.random() < DESCRIBED else "unknown"

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.data.pair import Pair
 from gapr_core.data.scenes import wound as wounds
@@ -17,11 +18,11 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.surface import Surface
 
+Array = NDArray[np.float64]
 AT_A_JOINT = SceneLevel((0.10, 0.60))
 IN_THEATRE = SceneLevel((0.10, 0.60), errors=seen_in_theatre)
 NEAR_MM = 40.0  # of both bones: where a joint's wound is
 MADE = ("parametric", "drawn")  # cohorts whose bones were not scanned together
-TRIES = 500
 
 
 def joint_scene(
@@ -34,32 +35,25 @@ def joint_scene(
     """A scene of a bone and its neighbour, one of `others`; `is_bone` is of the first.
 
     Raises:
-        ConfigError: no other bone of this subject is near.
+        ConfigError: no other bone of this subject is near, or no wound shows that share of bone.
     """
     neighbour = _next_to(specimen, others)
     pair = draw(specimen, rng, level, partial(_at_joint, specimen, neighbour))
     return replace(pair, metadata=pair.metadata | {"neighbour": neighbour.bone})
 
 
-def neighbours(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:
-    """Those of the others that are bones of the same scan within 40 mm, the nearest first."""
-    if specimen.cohort in MADE:
-        return []
-    own = [other for other in others if other.person == specimen.person and other.cohort == specimen.cohort]
-    own = [other for other in own if other.bone != specimen.bone]
-    apart = [float(specimen.distance(other.surface.points).min()) for other in own]
-    return [own[i] for i in np.argsort(apart) if apart[i] <= NEAR_MM]
-
-
 def _next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
-    found = neighbours(specimen, others)
-    if not found:
+    """The nearest bone of the same scan."""
+    same = () if specimen.cohort in MADE else (specimen.person, specimen.cohort)
+    own = [other for other in others if (other.person, other.cohort) == same and other.bone != specimen.bone]
+    apart = [float(specimen.distance(other.surface.points).min()) for other in own]
+    if not own or min(apart) > NEAR_MM:
         raise ConfigError(
             f"another bone of {specimen.person} within {NEAR_MM:g} mm of the {specimen.bone}, of the same scan",
             f"none among {len(others)} other bones",
             "name the bones of one joint, as in --bones femur,tibia, of subjects that were scanned",
         )
-    return found[0]
+    return own[int(np.argmin(apart))]
 
 
 def _at_joint(specimen: Specimen, neighbour: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:
@@ -76,12 +70,7 @@ def _together(specimen: Specimen, neighbour: Specimen) -> Specimen:
 
 
 def _between(specimen: Specimen, neighbour: Specimen, both: Specimen, rng: np.random.Generator, shape: Shape) -> Wound:
-    for _ in range(TRIES):
-        wound = wounds.somewhere(both, rng, shape)
-        if max(float(bone.distance(wound.centre[None])[0]) for bone in (specimen, neighbour)) <= NEAR_MM:
-            return wound
-    raise ConfigError(
-        f"a wound within {NEAR_MM:g} mm of both bones",
-        f"{specimen.bone} and {neighbour.bone} of {specimen.person}: none in {TRIES}",
-        "check that both meshes are in one frame and closed",
-    )
+    def near(points: Array) -> NDArray[np.bool_]:
+        return np.maximum(specimen.distance(points), neighbour.distance(points)) <= NEAR_MM
+
+    return wounds.somewhere(both, rng, shape, near)

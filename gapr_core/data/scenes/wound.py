@@ -16,6 +16,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 Opening = Callable[[Array], NDArray[np.bool_]]  # which points (N, 2) mm of the wound's plane lie in the opening
 Shape = Callable[[float, np.random.Generator], Opening]  # of a radius, mm
+Allowed = Callable[[Array], NDArray[np.bool_]]  # which of (N, 3) points on a bone may be the middle of a wound
 RADIUS_MM = (25.0, 70.0)
 TRIES = 50
 NORMAL_OVER_MM = 12.0  # the wound's axis is the mean normal of the bone within this distance
@@ -46,21 +47,26 @@ class Wound:
         return self.centre + local @ self.axes
 
 
-def somewhere(specimen: Specimen, rng: np.random.Generator, shape: Shape) -> Wound:
-    """A wound above a random point of the bone that can be seen along its normal."""
-    centre, outward = _open_place(specimen, rng)
+def everywhere(points: Array) -> NDArray[np.bool_]:
+    """(N,) all true: a wound may be anywhere."""
+    return np.ones(len(points), dtype=bool)
+
+
+def somewhere(specimen: Specimen, rng: np.random.Generator, shape: Shape, allowed: Allowed = everywhere) -> Wound:
+    """A wound above a random point of the bone that can be seen along its normal, where it is `allowed`."""
+    centre, outward = _open_place(specimen, rng, allowed)
     radius = rng.uniform(*RADIUS_MM)
     return Wound(centre, frame(outward, rng), radius, shape(radius, rng))
 
 
-def _open_place(specimen: Specimen, rng: np.random.Generator) -> tuple[Array, Array]:
+def _open_place(specimen: Specimen, rng: np.random.Generator, allowed: Allowed) -> tuple[Array, Array]:
     """A surface point (3,) and its outward normal, with nothing of the bone above it.
 
     Raises:
         ConfigError: there is none.
     """
     points, normals = specimen.sample(4000, rng)
-    for row in range(TRIES):
+    for row in np.flatnonzero(allowed(points))[:TRIES]:
         normal = _mean_normal(points, normals, row)
         for outward in (normal, -normal):
             if specimen.visible_from(points[row][None], outward)[0]:
@@ -69,7 +75,7 @@ def _open_place(specimen: Specimen, rng: np.random.Generator) -> tuple[Array, Ar
     raise ConfigError("a surface that can be seen from outside", given, "check that no closed mesh surrounds it")
 
 
-def _mean_normal(points: Array, normals: Array, row: int) -> Array:
+def _mean_normal(points: Array, normals: Array, row: np.intp) -> Array:
     """The mean of the normals about a point that look to its own side, as a unit vector (3,)."""
     close = ((points - points[row]) ** 2).sum(axis=1) < NORMAL_OVER_MM**2
     same_side = normals[close & (normals @ normals[row] > 0.0)]

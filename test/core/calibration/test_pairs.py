@@ -14,6 +14,7 @@ from gapr_core.calibration.pairs import Task
 from gapr_core.calibration.shapes import SHAPES, turned_pair
 from gapr_core.data import anatomy
 from gapr_core.data.pool import parametric_specimen
+from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 
 FOLDER = "folder"
@@ -219,9 +220,16 @@ def test_scenes_are_so_many_of_each_family_and_those_at_a_joint_are_of_subjects(
 def test_a_bone_without_a_neighbour_is_seen_alone_and_one_with_gets_it(people, monkeypatch):
     monkeypatch.setattr(pairs, "SHAPE_SHARE", 1.0)
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
-    monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(f"{seen_as} of {len(around)}"))
+    seen = []
+
+    def view(seen_as, specimen, seed, around=()):
+        seen.append((seen_as, len(around)))
+        if seen_as == "scene-joint" and len(seen) == 1:
+            raise ConfigError("a neighbour", "none", "name one")
+        return _NoView(seen_as)
+
+    monkeypatch.setattr(pairs, "view", view)
     everybody = sum(len(group) for group in pairs.bones_of(FOLDER, "train").values())
     task = Task(FOLDER, "train", 3, 1, "scene-joint")
-    assert pairs.draw(task).pair.seen_as == f"scene-C2 of {everybody}"
-    monkeypatch.setattr(pairs, "neighbours", lambda specimen, around: around[:1])
-    assert pairs.draw(task).pair.seen_as == f"scene-joint of {everybody}"
+    assert [pairs.draw(task).seen_as for _ in range(2)] == ["scene-C2", "scene-joint"]
+    assert seen == [("scene-joint", everybody), ("scene-C2", 0), ("scene-joint", everybody)]

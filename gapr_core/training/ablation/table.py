@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -37,31 +37,64 @@ def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recip
     trained = trained_as(plan, config.model_settings)
     folders = {v: [folder_of(out, trained[v.model], seed) for seed in range(seeds)] for v in plan}
     rows = [row(v, protocol, folders[v], recipe) for v in plan for protocol in _protocols(recipe)]
+    last = {v.table: v for v in plan}
+    rivals = [v for v in plan if v is not last[v.table]]
+    apart = [difference(v, last[v.table], protocol, folders) for v in rivals for protocol in _protocols(recipe)]
     made = provenance.summary([folder for found in folders.values() for folder in found])
     settings = {"train": config.to_dict(), "exam": asdict(recipe), "seeds": seeds, "made": made}
-    files.write_json(out / "table.json", {"settings": settings, "rows": rows})
+    files.write_json(out / "table.json", {"settings": settings, "rows": rows, "differences": apart})
     with (out / "table.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
     tables = list(dict.fromkeys(v.table for v in plan))
     pictures = {table: draw(out, {v: folders[v] for v in plan if v.table == table}) for table in tables}
-    files.write_text(out / "table.md", markdown(rows, pictures, settings))
+    files.write_text(out / "table.md", markdown(rows, apart, pictures, settings))
 
 
 def row(variant: Variant, protocol: str, folders: Sequence[Path], recipe: Recipe) -> Record:
     """Means over pairs and seeds with 95 % intervals over subjects; None where no seed is finished."""
-    exams = [json.loads((f / "exam.json").read_text())["records"] for f in folders if (f / "exam.json").exists()]
-    chosen = [r for records in exams for r in records if protocol in (ALL, r["protocol"])]
+    exams = [_records(folder, protocol) for folder in folders if (folder / "exam.json").exists()]
+    chosen = [r for records in exams for r in records]
     found: Record = {"table": variant.table, "network": variant.label, "model": variant.model.stem}
     on_paper = variant.paper if protocol == "paper" else None
     found |= {"protocol": protocol, "seeds": len(exams), "pairs": len(chosen), "paper_rr_percent": on_paper}
     for name in FIGURES:
-        values, people = [r[name] for r in chosen], [r["person"] for r in chosen]
-        numbers = (float(np.mean(values)), *metrics.interval(values, people)) if chosen else (None,) * 3
-        for end, value in zip(("", "_low", "_high"), numbers, strict=True):
-            found[name + end] = None if value is None else round(value, 4)
+        found |= _mean(name, [r[name] for r in chosen], [r["person"] for r in chosen])
     return found
+
+
+def difference(variant: Variant, last: Variant, protocol: str, folders: Mapping[Variant, Sequence[Path]]) -> Record:
+    """How much a network has more than the last one of its table, on the same pairs with the same seeds.
+
+    As `row`: means with 95 % intervals over subjects. Paired, so that what is hard for both says nothing.
+    """
+    both = [pair for pair in zip(folders[variant], folders[last], strict=True)
+            if all((folder / "exam.json").exists() for folder in pair)]  # fmt: skip
+    pairs = [_same(_records(own, protocol), _records(other, protocol)) for own, other in both]
+    chosen = [pair for found in pairs for pair in found]
+    found: Record = {"table": variant.table, "network": variant.label, "last": last.label, "protocol": protocol}
+    found |= {"seeds": len(both), "pairs": len(chosen)}
+    for name in FIGURES:
+        found |= _mean(name, [own[name] - other[name] for own, other in chosen], [own["person"] for own, _ in chosen])
+    return found
+
+
+def _records(folder: Path, protocol: str) -> list[Record]:
+    records = json.loads((folder / "exam.json").read_text())["records"]
+    return [r for r in records if protocol in (ALL, r["protocol"])]
+
+
+def _same(first: Sequence[Record], second: Sequence[Record]) -> list[tuple[Record, Record]]:
+    """Records of the same pairs."""
+    by_pair = {r["pair"]: r for r in second}
+    return [(r, by_pair[r["pair"]]) for r in first if r["pair"] in by_pair]
+
+
+def _mean(name: str, values: Sequence[float], people: Sequence[str]) -> Record:
+    numbers = (float(np.mean(values)), *metrics.interval(values, people)) if values else (None,) * 3
+    ends = zip(("", "_low", "_high"), numbers, strict=True)
+    return {name + end: None if value is None else round(value, 4) for end, value in ends}
 
 
 def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
@@ -73,7 +106,7 @@ def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
     return curves.draw(list(begun.values()), out / f"curves_{name}.png", list(begun)).name
 
 
-def markdown(rows: Sequence[Record], pictures: dict[str, str | None], settings: Record) -> str:
+def markdown(rows: Sequence[Record], apart: Sequence[Record], pictures: dict[str, str | None], settings: Record) -> str:
     """The tables as Markdown, the paper's numbers in a column of their own."""
     parts = ["# Ablations", _preamble(settings)]
     for table, picture in pictures.items():
@@ -85,6 +118,11 @@ def markdown(rows: Sequence[Record], pictures: dict[str, str | None], settings: 
             lines = [_cells(r, has_paper) for r in own if r["protocol"] == protocol]
             count = max(r["pairs"] for r in own if r["protocol"] == protocol)
             parts += [f"Protocol {protocol}, {count} pairs", table_of(head, lines)]
+            compared = [r for r in apart if (r["table"], r["protocol"]) == (table, protocol) and r["pairs"]]
+            if compared:
+                parts.append(f"Less the last row, on the same pairs with the same seeds ({compared[0]['last']}):")
+                lines = [[r["network"], r["seeds"], *_figures(r, "+.1f")] for r in compared]
+                parts.append(table_of(["network", "seeds", *FIGURES.values()], lines))
         parts += [f"![curves]({picture})"] if picture else []
     return "\n\n".join([*parts, *settings["made"]]) + "\n"
 
@@ -102,10 +140,15 @@ def _preamble(settings: Record) -> str:
 
 
 def _cells(r: Record, has_paper: bool) -> list[str]:
-    own = [f"{100 * r[n]:.1f} ({100 * r[n + '_low']:.1f} to {100 * r[n + '_high']:.1f})" if r["pairs"] else "–"
-           for n in FIGURES]  # fmt: skip
     on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
-    return [r["network"], *own, *(on_paper if has_paper else [])]
+    return [r["network"], *_figures(r, ".1f"), *(on_paper if has_paper else [])]
+
+
+def _figures(r: Record, form: str) -> list[str]:
+    """Means and intervals in %, as text."""
+    numbers = [[r[name + end] for end in ("", "_low", "_high")] for name in FIGURES]
+    texts = [[format(100 * value, form) for value in found if value is not None] for found in numbers]
+    return [f"{found[0]} ({found[1]} to {found[2]})" if found else "–" for found in texts]
 
 
 def _protocols(recipe: Recipe) -> list[str]:

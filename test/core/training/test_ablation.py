@@ -135,3 +135,31 @@ def test_the_command_wants_a_budget(capsys, tmp_path):
     with pytest.raises(SystemExit):
         cli.main(["ablate", "--out", str(tmp_path)])
     assert "--pairs" in capsys.readouterr().err
+
+
+def exam(folder, recalls):
+    folder.mkdir()
+    same = dict.fromkeys(ablation_table.FIGURES, 0.5) | {"protocol": "paper"}
+    records = [same | {"pair": name, "person": name[0], "rr_4_5": recall} for name, recall in recalls.items()]
+    (folder / "exam.json").write_text(json.dumps({"records": records}))
+    return folder
+
+
+def test_a_row_is_compared_with_the_last_one_on_the_same_pairs_of_the_same_seeds(plan, tmp_path):
+    first, last = read_plan(plan)[:2]
+    own = [exam(tmp_path / "a0", {"p1": 1.0, "q1": 0.0, "q2": 1.0}), exam(tmp_path / "a1", {"p1": 1.0})]
+    other = [exam(tmp_path / "b0", {"q2": 0.0, "p1": 0.0, "q1": 0.0, "q3": 1.0}), tmp_path / "b1"]  # b1 is not finished
+    found = ablation_table.difference(first, last, "paper", {first: own, last: other})
+    assert (found["network"], found["last"], found["seeds"], found["pairs"]) == ("standard", "ours", 1, 3)
+    assert found["rr_4_5"] == pytest.approx(2.0 / 3.0, abs=1e-4) and found["coarse"] == 0.0
+    assert found["rr_4_5_low"] == pytest.approx(0.5) and found["rr_4_5_high"] == pytest.approx(1.0)  # q alone, p alone
+    swapped = ablation_table.difference(last, first, "paper", {first: own, last: other})
+    assert swapped["rr_4_5"] == -found["rr_4_5"]
+    nothing = ablation_table.difference(first, last, "L2", {first: own, last: other})
+    assert nothing["pairs"] == 0 and nothing["rr_4_5"] is None
+
+
+def test_the_table_shows_the_differences(whole):
+    text = (whole / "table.md").read_text()
+    assert text.count("Less the last row, on the same pairs with the same seeds (ours):") == 3
+    assert {r["network"] for r in json.loads((whole / "table.json").read_text())["differences"]} == {"standard"}

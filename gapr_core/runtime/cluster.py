@@ -61,6 +61,9 @@ def outcomes(
         if not workers or max(workers.values()) > 1:
             given = f"{len(workers)} workers, threads {sorted(set(workers.values()))}"
             raise ConfigError("workers of one thread each", given, "start them with `--nthreads 1`, one for each core")
+        from gapr_core.runtime.short_profile import ShortProfile  # needs Dask
+
+        client.register_plugin(ShortProfile())
         more = () if shared is None else (client.scatter(shared, broadcast=True),)
         left, size = iter(tasks), 1
         again, alone = deque[Task](), deque[Task]()  # handed back; to be tried without others

@@ -78,6 +78,15 @@ def test_what_a_task_raises_is_its_outcome(dask_address):
     assert outcomes["1"] == 1 and isinstance(outcomes["one"], ValueError)
 
 
+def test_workers_keep_a_minute_of_their_profile_those_that_come_later_too(dask_cluster):
+    local = dask_cluster(processes=False)
+    assert [outcome for _, outcome in cluster.outcomes(local.scheduler_address, abs, [-1, -2])] == [1, 2]
+    local.scale(2)
+    local.wait_for_workers(2, timeout=30)
+    kept = [getattr(w, name) for w in local.workers.values() for name in ("profile_history", "profile_keys_history")]
+    assert [each.maxlen for each in kept] == 4 * [60]
+
+
 def test_workers_with_several_threads_are_refused(dask_cluster):
     address = dask_cluster(processes=False, threads_per_worker=2).scheduler_address
     with pytest.raises(ConfigError, match="--nthreads 1"):

@@ -3,7 +3,7 @@
     python benchmarks/real.py [--real DIR] [--sensor depth_camera]
 
 DIR is as for `gapr demo --real` (docs/real_data.md). Of every cloud with a stated pose: all of it, windows of 40, 75
-and 120 mm along it, and 12 to 200 points drawn from all of it, as a digitiser would take them.
+and 120 mm along it where it is longer, and 12 to 200 points drawn from all of it, as a digitiser would take them.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ def pieces(cloud: Array) -> Iterator[tuple[str, Array]]:
     """(what it is, its points) of every piece of a cloud (N, 3), mm."""
     yield "all", cloud
     along = cloud @ extent.principal(cloud).axes[0]
-    for width_mm in WINDOWS_MM:
+    for width_mm in (width_mm for width_mm in WINDOWS_MM if width_mm < np.ptp(along)):
         for place in np.linspace(along.min(), along.max() - width_mm, PLACES):
             inside = (along >= place) & (along <= place + width_mm)
             yield f"{width_mm:.0f} mm from {place - along.min():.0f} mm", cloud[inside]
     rng = np.random.default_rng(0)
-    for count in FEW:
+    for count in (count for count in FEW if count < len(cloud)):
         yield f"{count} points", cloud[rng.choice(len(cloud), count, replace=False)]
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import ast
 import logging
+import re
 import sys
 from collections.abc import Mapping
 from importlib import import_module
@@ -20,6 +21,7 @@ from typing import Any, NoReturn
 from gapr_core.errors import GaprError
 
 OK, BAD_INPUT, INTERRUPTED = 0, 1, 130
+NUMBERS_BELOW_0 = re.compile(r"-[\d.][^:]*,.*|-\d+:-?\d*")  # X,Y,Z and FIRST:LAST that begin with a minus
 COMMANDS = {
     "register": "gapr_core.commands.register",
     "evaluate": "gapr_core.commands.evaluate",
@@ -77,7 +79,18 @@ def _parser(arguments: list[str]) -> argparse.Namespace:
         command = commands.add_parser(name, help=_first_line(module))
         if arguments[:1] == [name]:
             _load(command, module)
-    return parser.parse_args(arguments)
+    return parser.parse_args(_joined(arguments))
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """`--tip -1,2,3` as `--tip=-1,2,3`: argparse takes what begins with a minus, other than a number, for an option."""
+    joined: list[str] = []
+    for word in arguments:
+        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and NUMBERS_BELOW_0.fullmatch(word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def modules() -> Mapping[str, str]:

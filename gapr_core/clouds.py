@@ -78,7 +78,8 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
     hint = "check the file and its unit"
     if other:
-        option = f"pass units={other!r} (--units {other}, of both files{'' if other == 'cm' else '; model_unit'})"
+        options = f"--units {other}, of both files; --source-units {other}, of the source"
+        option = f"pass units={other!r} ({options}{'' if other == 'cm' else '; model_unit'})"
         how = f"correct the unit {where}" if where else f"{option}, or convert to {unit}"
         hint = f"it looks like {other}: {how}"
     raise InvalidPointCloudError(

@@ -151,12 +151,16 @@ def warn_of_axes(args: Namespace) -> None:
 
 
 def warn_of_units(args: Namespace) -> None:
-    """Warn of a unit that neither file takes, since both are of a kind that is in mm."""
+    """Warn of a unit that no file takes, since those it is of are of a kind that is in mm."""
     from gapr_core.formats import reading
 
-    if args.units and all(reading.format_of(path).in_patient for path in (args.source, args.target)):
-        names = f"{args.source.name} and {args.target.name}"
-        log.warning("--units %s changes nothing: %s are in mm, as all files of their kinds", args.units, names)
+    for option, units, paths in (
+        ("--units", args.units, (args.source, args.target)),
+        ("--source-units", args.source_units, (args.source,)),
+    ):
+        if units and all(reading.format_of(path).in_patient for path in paths):
+            said = " and ".join(path.name for path in paths) + (" are" if len(paths) > 1 else " is")
+            log.warning("%s %s changes nothing: %s in mm, as all files of such kinds", option, units, said)
 
 
 def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:

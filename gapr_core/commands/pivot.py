@@ -25,8 +25,9 @@ def run(args: Namespace) -> int:
 
     tip = tracker.pivot(poses_in(args.recording, args.tool))
     say(f"--tip {','.join(f'{x:.3f}' for x in tip.tip_mm)}")
-    say(f"residual {tip.residual_mm:.3f} mm over {tip.poses} poses")
+    left_out = f", without {tip.left_out} of which the tip had left its place" if tip.left_out else ""
+    say(f"residual {tip.residual_mm:.3f} mm over {tip.poses} poses{left_out}")
     if args.json:
-        found = {"tip_mm": tip.tip_mm.tolist(), "pivot_mm": tip.pivot_mm.tolist()}
-        files.write_json(args.json, found | {"residual_mm": tip.residual_mm, "poses": tip.poses})
+        found = {"tip_mm": tip.tip_mm.tolist(), "pivot_mm": tip.pivot_mm.tolist(), "residual_mm": tip.residual_mm}
+        files.write_json(args.json, found | {"poses": tip.poses, "left_out": tip.left_out})
     return OK

@@ -44,9 +44,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--source", required=True, type=Path, help="partial cloud, markups, recording, folder of slices, bag"
     )
     parser.add_argument("--target", required=True, type=Path, help="full bone: mesh, cloud or label map")
-    parser.add_argument(
-        "--units", choices=("mm", "cm", "m"), help="of meshes and clouds (default: mm; clouds of a bag: m)"
-    )
+    units = ("mm", "cm", "m")
+    parser.add_argument("--units", choices=units, help="of meshes and clouds (default: mm; clouds of a bag: m)")
+    parser.add_argument("--source-units", choices=units, help="of the source, where it is in another unit")
     parser.add_argument("--topic", default="", help="of the clouds in a bag; may be left out where it has one")
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
@@ -100,9 +100,10 @@ def run(args: Namespace) -> int:
     config = replace(config, guide=config.guide or args.guide)
     method = methods.make(args.method, config)
     plan, hints = _plan(args), _hints(args, method)
-    target = _load(args, args.target, axes=args.axes, labels=tuple(args.label))
+    target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
-    whole = _load(args, args.source, tip_mm=args.tip, tool=args.tool, topic=args.topic, clouds=args.clouds)
+    how = {"tip_mm": args.tip, "tool": args.tool, "topic": args.topic, "clouds": args.clouds}
+    whole = _load(args.source, args.source_units or args.units, **how)
     if whole.faces is not None and target.faces is None:
         log.warning(
             "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
@@ -121,13 +122,13 @@ def run(args: Namespace) -> int:
     return code
 
 
-def _load(args: Namespace, path: Path, **how: Any) -> Surface:
+def _load(path: Path, units: str | None, **how: Any) -> Surface:
     """A file in the unit that is named, or that files of its kind usually have."""
     from gapr_core import clouds
     from gapr_core.formats import reading
     from gapr_core.formats.options import ReadOptions
 
-    return clouds.load(path, args.units or reading.format_of(path).unit, ReadOptions(**how))
+    return clouds.load(path, units or reading.format_of(path).unit, ReadOptions(**how))
 
 
 def _plan(args: Namespace) -> Any:

@@ -41,12 +41,12 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
     data = options.limits.read(path)
     header = next(text.lines(data), "")
     names = [name.strip().lower() for name in _words(header, ",")]
-    if "q0" in names and "tx" in names and options.tip_mm is not None:
+    if tracker.is_recording(names) and options.tip_mm is not None:
         return Surface(tracker.tips(tracker.read_poses(path, options.limits, options.tool), options.tip_mm))
-    if "q0" in names and "tx" in names:
+    if tracker.is_recording(names):
         raise tracker.needs_tip(path)
     if options.tip_mm is not None or options.tool is not None:
-        given = f"{path.name} without columns q0 and tx"
+        given = f"{path.name} without columns Q0 or Rz, and Tx"
         raise InvalidPointCloudError(
             "a recording by NDI Track for --tip and --tool", given, "leave both out for points"
         )

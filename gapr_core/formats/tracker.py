@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gapr_core.errors import InvalidPointCloudError
@@ -18,10 +19,13 @@ from gapr_core.formats.text import check_end
 
 Array = NDArray[np.float64]
 
-POSE = ("q0", "qx", "qy", "qz", "tx", "ty", "tz")
+QUATERNION, ANGLES, PLACE = ("q0", "qx", "qy", "qz"), ("rz", "ry", "rx"), ("tx", "ty", "tz")
+COLUMNS = "columns Q0 Qx Qy Qz or Rz Ry Rx, then Tx Ty Tz"
 SEEN = ("ok", "enabled", "valid")
 FEWEST_POSES = 10
 SMALLEST_TURN_DEG = 20.0
+SPREAD_MM, LIFTED_MM = 1.0, 3.0  # of tips in a dimple, about; a tip farther from the pivot had left it
+FEWEST_IN_PLACE = 0.5  # of the poses
 MOST_NAMES, LONGEST_NAME = 8, 40  # of the tools that an error lists, and characters of a name
 
 
@@ -34,19 +38,27 @@ class Tip:
         pivot_mm: (3,) the point it stood on, in the tracker's frame.
         residual_mm: root-mean-square distance of the tips to that point.
         poses: how many were used.
+        left_out: of how many the tip had left its place.
     """
 
     tip_mm: Array
     pivot_mm: Array
     residual_mm: float
     poses: int
+    left_out: int = 0
+
+
+def is_recording(names: Sequence[str]) -> bool:
+    """Whether these names of columns, in lower case, are those of a tool's poses by NDI Track."""
+    return PLACE[0] in names and (QUATERNION[0] in names or ANGLES[0] in names)
 
 
 def read_poses(path: Path, limits: FileLimits | None = None, tool: int | None = None) -> Array:
     """(N, 4, 4) poses of one tool in the tracker's frame, mm, of the rows in which it was seen.
 
     Args:
-        path: NDI Track's CSV: for each tool columns State, Q0 Qx Qy Qz (the scalar first) and Tx Ty Tz.
+        path: NDI Track's CSV: for each tool columns State, Q0 Qx Qy Qz (the scalar first) or Rz Ry Rx (degrees, the
+            rotation Rz Ry Rx), and Tx Ty Tz.
         limits: how large it may be.
         tool: which of the recorded tools, from 0; None where there is one.
 
@@ -58,22 +70,31 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int | None = 
     check_end(data)
     rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"))))
     names = [name.strip().lower() for name in rows[0]] if rows else []
-    starts = [i for i, name in enumerate(names) if name == "q0"]
+    starts = [i for i, name in enumerate(names) if name in (QUATERNION[0], ANGLES[0])]
     if not starts:
-        raise InvalidPointCloudError(f"columns {' '.join(POSE)}", f"{path.name} without", "export it from NDI Track")
-    tool = chosen(tool, [f"tool {i}" for i in range(len(starts))], path)
-    if [*names[starts[tool] : starts[tool] + 7]] != [*POSE]:
-        given = f"{path.name} with others"
-        raise InvalidPointCloudError(f"columns {' '.join(POSE)} of tool {tool}", given, "export it from NDI Track")
+        raise InvalidPointCloudError(COLUMNS, f"{path.name} without", "export it from NDI Track")
+    tool = chosen(tool, [_tool_name(rows[0][:start], i) for i, start in enumerate(starts)], path)
     start = starts[tool]
+    rotation = QUATERNION if names[start] == QUATERNION[0] else ANGLES
+    wanted = [*rotation, *PLACE]
+    if names[start : start + len(wanted)] != wanted:
+        given = f"{path.name} with others"
+        raise InvalidPointCloudError(f"{COLUMNS} of tool {tool}", given, "export it from NDI Track")
     state = max((i for i, name in enumerate(names[:start]) if name.startswith("state")), default=None)
-    seen = [row[start : start + 7] for row in rows[1:] if row and (state is None or _is_seen(*row[state : state + 1]))]
-    if any(len(row) < len(POSE) for row in seen):
+    seen = [row for row in rows[1:] if row and (state is None or _is_seen(*row[state : state + 1]))]
+    seen = [row[start : start + len(wanted)] for row in seen]
+    if any(len(row) < len(wanted) for row in seen):
         raise ValueError("a row that ends before its pose")
-    values = np.array([[float(value) for value in row] for row in seen]).reshape(-1, 7)
+    values = np.array([[float(value) for value in row] for row in seen]).reshape(-1, len(wanted))
     if len(values) == 0:
         raise InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
-    return poses_of(values[:, :4], values[:, 4:])
+    return poses_of(values[:, :-3], values[:, -3:])
+
+
+def _tool_name(before: Sequence[str], number: int) -> str:
+    """What NDI Track calls a tool: the title of its port, which stands before its columns."""
+    ports = [name.strip() for name in before if name.strip().lower().startswith("port ")]
+    return ports[-1] if ports else f"tool {number}"
 
 
 def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
@@ -102,16 +123,22 @@ def _is_seen(state: str = "") -> bool:
     return state.strip().lower() in SEEN
 
 
-def poses_of(quaternions: ArrayLike, translations: ArrayLike) -> Array:
-    """(N, 4, 4) of quaternions (N, 4), the scalar first, and translations (N, 3)."""
-    quaternions = np.asarray(quaternions, dtype=np.float64)
-    norms = np.linalg.norm(quaternions, axis=1)
-    if not np.allclose(norms, 1.0, atol=0.05):
-        raise ValueError(f"quaternions of length {norms.min():.2f} to {norms.max():.2f}")
-    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+def poses_of(rotations: ArrayLike, translations: ArrayLike) -> Array:
+    """(N, 4, 4) of quaternions (N, 4), the scalar first, or angles (N, 3) about z y x, deg, and translations (N, 3)."""
+    rotations = np.asarray(rotations, dtype=np.float64)
+    poses = np.tile(np.eye(4), (len(rotations), 1, 1))
+    poses[:, :3, :3] = _matrices(rotations)
     poses[:, :3, 3] = translations
     return poses
+
+
+def _matrices(rotations: Array) -> Array:
+    if rotations.shape[1] == len(ANGLES):
+        return np.asarray(Rotation.from_euler("ZYX", rotations, degrees=True).as_matrix())
+    norms = np.linalg.norm(rotations, axis=1)
+    if not np.allclose(norms, 1.0, atol=0.05):
+        raise ValueError(f"quaternions of length {norms.min():.2f} to {norms.max():.2f}")
+    return np.asarray(Rotation.from_quat(rotations[:, [1, 2, 3, 0]]).as_matrix())
 
 
 def tips(poses: Array, tip_mm: ArrayLike) -> Array:
@@ -122,22 +149,49 @@ def tips(poses: Array, tip_mm: ArrayLike) -> Array:
 def pivot(poses: Array) -> Tip:
     """The tip of a tool that was turned about it: least squares of R_i tip + t_i = pivot (Yaniv 2015, algebraic).
 
+    Poses before the tip stood in its place, or after it was lifted, are left out: a robust fit (Cauchy's loss) finds
+    them first.
+
     Args:
         poses: (N, 4, 4) of the tool's marker, mm.
 
     Raises:
-        InvalidPointCloudError: fewer than ten poses, or too little turning to know the tip.
+        InvalidPointCloudError: fewer than ten poses, too little turning to know the tip, or a tip that did not stay.
     """
     poses = np.asarray(poses, dtype=np.float64)
     if len(poses) < FEWEST_POSES:
         expected = f"at least {FEWEST_POSES} poses"
         raise InvalidPointCloudError(expected, f"{len(poses)}", "turn the tool on its tip longer")
     _check_turning(poses)
+    stayed = _in_place(poses)
+    if np.mean(stayed) < FEWEST_IN_PLACE or np.sum(stayed) < FEWEST_POSES:
+        given = f"{np.mean(stayed):.0%} of the poses within {LIFTED_MM:g} mm of one place"
+        raise InvalidPointCloudError("a tool turned on its tip", given, "record it in a dimple, from start to end")
+    used = poses[stayed]
+    _check_turning(used)
+    both = _least_squares(used)
+    residual_mm = float(np.sqrt((_distances(both, used) ** 2).mean()))
+    return Tip(both[:3], both[3:], residual_mm, len(used), len(poses) - len(used))
+
+
+def _least_squares(poses: Array) -> Array:
+    """(6,) the tip and the pivot."""
     A = np.hstack([poses[:, :3, :3].reshape(-1, 3), np.tile(-np.eye(3), (len(poses), 1))])
-    both = np.linalg.lstsq(A, -poses[:, :3, 3].reshape(-1), rcond=None)[0]
-    residual = np.linalg.norm(tips(poses, both[:3]) - both[3:], axis=1)
-    tip_mm, pivot_mm = np.asarray(both[:3]), np.asarray(both[3:])
-    return Tip(tip_mm, pivot_mm, float(np.sqrt((residual**2).mean())), len(poses))
+    return np.asarray(np.linalg.lstsq(A, -poses[:, :3, 3].reshape(-1), rcond=None)[0])
+
+
+def _in_place(poses: Array) -> NDArray[np.bool_]:
+    """(N,) whether the tip was where it was most of the time."""
+
+    def residuals(both: Array) -> Array:
+        return (tips(poses, both[:3]) - both[3:]).ravel()
+
+    robust = least_squares(residuals, _least_squares(poses), loss="cauchy", f_scale=SPREAD_MM)
+    return _distances(robust.x, poses) <= LIFTED_MM
+
+
+def _distances(both: Array, poses: Array) -> Array:
+    return np.asarray(np.linalg.norm(tips(poses, both[:3]) - both[3:], axis=1))
 
 
 def _check_turning(poses: Array) -> None:

@@ -152,6 +152,26 @@ def test_a_target_in_centimetres_that_is_read_as_millimetres_is_warned_of(folder
     assert register("--units cm", "t.npy") == 0 and "across" not in caplog.text
 
 
+def test_a_cloud_in_metres_meets_a_mesh_in_millimetres(folder, monkeypatch, capsys):
+    """As RealSense and ROS write clouds, and as meshes of CT come."""
+    seen = SimpleNamespace(source=None)
+
+    def look(self, source, target):
+        seen.source = source
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
+
+    monkeypatch.setattr(Known, "register", look)
+    np.save("s.npy", POINTS / 1000.0)
+    assert register("", "bone.ply") == 1 and "--source-units m, of the source" in capsys.readouterr().err
+    assert register("--source-units m", "bone.ply") == 0
+    np.testing.assert_allclose(seen.source, POINTS, atol=1e-9)
+
+
+def test_a_unit_of_the_source_that_it_does_not_take_is_warned_of(folder, caplog):
+    assert register("--source-units m", "bone.ply", "p.mrk.json") == 0
+    assert "--source-units m changes nothing: p.mrk.json is in mm" in caplog.text
+
+
 def test_a_unit_that_no_file_takes_is_warned_of(folder, caplog):
     assert register("--units cm", "p.mrk.json", "p.mrk.json") == 0
     assert "--units cm changes nothing: p.mrk.json and p.mrk.json are in mm" in caplog.text

@@ -196,3 +196,16 @@ def test_gapr_pivot_prints_what_register_takes(tmp_path, capsys):
     assert "--tip 1.000,2.000,150.000" in capsys.readouterr().out
     assert json.loads((tmp_path / "tip.json").read_text())["poses"] == 30
     assert main(["pivot", str(tmp_path / "none.csv")]) == 1
+
+
+@pytest.mark.parametrize("line", ["--tip -17.5,-0.7,-157.4", "--viewpoint -.5,2,3", "--clouds -3:", "--clouds -3:-1"])
+def test_numbers_that_begin_with_a_minus_are_no_options(monkeypatch, line):
+    """As `gapr pivot` prints them: the tips of real pointers are below 0."""
+    from gapr_core.commands import register
+
+    monkeypatch.setattr(register, "run", lambda args: [args.tip, args.viewpoint, args.clouds].count(wanted[line]) - 1)
+    wanted = {
+        "--tip -17.5,-0.7,-157.4": (-17.5, -0.7, -157.4), "--viewpoint -.5,2,3": (-0.5, 2.0, 3.0),
+        "--clouds -3:": (-3, None), "--clouds -3:-1": (-3, -1),
+    }  # fmt: skip
+    assert main(["register", "--source", "a.csv", "--target", "b.stl", *line.split()]) == 0

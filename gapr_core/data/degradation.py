@@ -12,13 +12,13 @@ from gapr_core.geometry.sampling import random_directions
 Array = NDArray[np.float64]
 
 
-def half_extent(points: Array) -> float:
+def half_edge_mm(points: Array) -> float:
     """Half the longest edge of the axis-aligned box of (N, 3): the paper's normalisation scale."""
     return float(np.ptp(points, axis=0).max() / 2.0)
 
 
 def vary_density(points: Array, scale: float, rng: np.random.Generator, rounds: int = 6) -> Array:
-    """Paper, section III: thin out or fill up balls of 0.10-0.15 x `scale` (the half extent) around random points.
+    """Paper, section III: thin out or fill up balls of 0.10-0.15 x `scale` (`half_edge_mm`) around random points.
 
     Thinning discards half of a ball, filling adds half as many points again, each alpha p1 + (1 - alpha) p2 of two
     points of the ball; either with even chance, `rounds` times (the paper says "multiple").

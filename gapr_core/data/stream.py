@@ -12,6 +12,7 @@ from gapr_core.data import degradation
 from gapr_core.data.pair import TARGET_POINTS, TRANSLATION_MM, Pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import extent, se3
+from gapr_core.geometry.sampling import random_directions
 
 Array = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> lis
     origin = target.mean(axis=0)
     points, normals = specimen.sample(20_000, rng)
     axis = extent.principal(points).axes[0]
-    towards = np.cross(axis, degradation.random_directions(1, rng)[0])
+    towards = np.cross(axis, random_directions(1, rng)[0])
     towards /= np.linalg.norm(towards)
     pose = _anywhere(rng)
     bias_mm = 0.0 if motion.bias_stays else motion.bias_mm
@@ -105,6 +106,6 @@ def _anywhere(rng: np.random.Generator) -> Array:
 
 
 def _step(motion: Motion, rng: np.random.Generator) -> Array:
-    turn = np.radians(rng.uniform(0.0, motion.step_deg)) * degradation.random_directions(1, rng)[0]
-    shift = rng.uniform(0.0, motion.step_mm) * degradation.random_directions(1, rng)[0]
+    turn = np.radians(rng.uniform(0.0, motion.step_deg)) * random_directions(1, rng)[0]
+    shift = rng.uniform(0.0, motion.step_mm) * random_directions(1, rng)[0]
     return se3.exp(np.concatenate([shift, turn]))

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gapr_core.benchmark.record import Record
+from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair
-from gapr_core.data.protocols import Pair
 from gapr_core.geometry import extent, se3
 from gapr_core.pages import palette
 

@@ -46,6 +46,12 @@ def test_after_a_jump_what_spoke_for_the_bone_is_forgotten_and_what_spoke_agains
     assert bad.add(0.9, agrees=False) < 0.5
 
 
+def test_after_a_jump_a_frame_is_no_surer_than_alone_although_those_before_spoke_less_against_the_bone():
+    evidence = Evidence()
+    evidence.add(0.2, agrees=True)
+    assert evidence.add(0.01, agrees=False) == 0.01
+
+
 def test_after_a_jump_a_frame_that_spoke_for_the_bone_is_as_if_it_had_not_been():
     seen, fresh = Evidence(), Evidence()
     seen.add(0.36, agrees=True)  # sqrt(0.36) = 0.6: a little more than even

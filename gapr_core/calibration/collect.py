@@ -237,14 +237,14 @@ def _registrars(sensor: str) -> dict[str, Registrar]:
     }
 
 
-_LAST: dict[int, tuple[Array, PreparedTarget]] = {}
+_last_target: list[tuple[Array, PreparedTarget]] = []  # the last cloud and what was prepared of it
 
 
 def _prepared(cloud: Array) -> PreparedTarget:
     """The prepared target; the last one is kept, since pairs in a row share a target."""
-    if 0 not in _LAST or _LAST[0][0] is not cloud:
-        _LAST[0] = cloud, _registrars("unknown")["search"].prepare(cloud)
-    return _LAST[0][1]
+    if not _last_target or _last_target[0][0] is not cloud:
+        _last_target[:] = [(cloud, _registrars("unknown")["search"].prepare(cloud))]
+    return _last_target[0][1]
 
 
 def _name(task: Task) -> str:

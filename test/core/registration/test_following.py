@@ -212,6 +212,13 @@ def test_the_spread_is_what_noise_does_to_the_pose(registrar, frames, assessed, 
     assert of._spread_mm(fit) == pytest.approx(np.sqrt(np.mean(squares)), rel=0.08)
     half = replace(fit, weights=0.5 * fit.weights)
     assert of._spread_mm(half) == pytest.approx(np.sqrt(2.0) * of._spread_mm(fit), rel=1e-3)
+    noisier = replace(assessed, fit=replace(assessed.fit, sigma_mm=3.0 * assessed.fit.sigma_mm))
+    assert follower(registrar, frames, noisier)._spread_mm(fit) == pytest.approx(3.0 * of._spread_mm(fit))
+
+
+def test_points_of_which_none_lies_on_the_bone_fit_infinitely_badly(registrar, frames, assessed):
+    far = follower(registrar, frames, assessed)._described(assessed.fit, 0.0, frames[0].source + 1e4)
+    assert (far.inlier_ratio, far.residual_mm) == (0.0, np.inf)
 
 
 # --- nothing leads away ---

@@ -264,7 +264,7 @@ class Registrar:
     ) -> Assessment | None:
         """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
         config, settings, threads = self.config, self.config.clutter, self.config.num_threads
-        scene, assessment = clutter.look(source, viewpoint, settings), None
+        scene, assessment = clutter.scene_from(source, viewpoint, settings), None
         for number in range(settings.rounds):
             scene = clutter.with_regions(scene, settings, number)
             pool = clutter.propose(scene, target, poses, settings, threads)

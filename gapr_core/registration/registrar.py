@@ -100,7 +100,7 @@ class Registrar:
             ConfigError: no such device.
         """
         config = config or RegistrarConfig()
-        return cls(config, (network(device), _search(config)))
+        return cls(config, (shipped_network(device), _search(config)))
 
     @cached_property
     def scene_calibration(self) -> Calibration:
@@ -284,7 +284,7 @@ class Registrar:
         return assessment
 
 
-def network(device: str = "cpu") -> Proposer:
+def shipped_network(device: str = "cpu") -> Proposer:
     """GAPR-Net with the shipped weights.
 
     Raises:

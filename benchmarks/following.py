@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, Tracker
 from gapr_core.calibration.pairs import without_twins
+from gapr_core.data.pair import Pair
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import Pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.geometry import se3

@@ -18,8 +18,8 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
+from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair
-from gapr_core.data.protocols import Pair
 from gapr_core.geometry import se3
 from gapr_core.pages import markdown
 from gapr_core.registration import source as sources

@@ -19,8 +19,8 @@ from tqdm import tqdm
 from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 from gapr_core.benchmark.judge import judge
 from gapr_core.calibration.pairs import without_twins
+from gapr_core.data.pair import Pair
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import Pair
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.pages import markdown
 from gapr_core.runtime.console import say

@@ -20,9 +20,10 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import SENSOR_KINDS, SensorConfig
+from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import Pair, make_pair
+from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist, nees
 from gapr_core.pages import markdown

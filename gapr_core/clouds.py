@@ -138,7 +138,7 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
 
 def _warn_of_several_bones(surface: Surface, name: str) -> None:
     """A rigid pose of two bones that move against each other is that of neither."""
-    from gapr_core.geometry.bones import separate_long_bones
+    from gapr_core.geometry.long_bones import separate_long_bones
 
     lengths = separate_long_bones(surface.points, surface.triangles, surface.face_areas_mm2)
     if lengths:

@@ -175,9 +175,9 @@ def target_points(target: Any, units: str = "mm") -> tuple[Array, Array | None]:
     return np.array(target.points, dtype=np.float64), None if normals is None else np.array(normals, dtype=np.float64)
 
 
-def truncated_residual(distance: ArrayLike, cap_mm: float = 5.0) -> float:
-    """Mean nearest-neighbour distance with every distance cut off at `cap_mm`: what `Refined` compares poses by, mm."""
-    return float(np.minimum(distance, cap_mm).mean())
+def truncated_residual(distance: ArrayLike) -> float:
+    """Mean nearest-neighbour distance with every distance cut off at 5 mm: what `Refined` compares poses by, mm."""
+    return float(np.minimum(distance, INLIER_MM).mean())
 
 
 def check_rigid(T: Array, identity_is_failure: bool) -> None:

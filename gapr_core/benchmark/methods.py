@@ -36,9 +36,9 @@ def _search_alone(config: RegistrarConfig) -> RegistrationMethod:
 
 
 def _network_alone(config: RegistrarConfig) -> RegistrationMethod:
-    from gapr_core.registration.registrar import Registrar, network
+    from gapr_core.registration.registrar import Registrar, shipped_network
 
-    return Registrar(config, [network()])
+    return Registrar(config, [shipped_network()])
 
 
 def _tracker(config: RegistrarConfig) -> RegistrationMethod:

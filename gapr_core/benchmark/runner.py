@@ -18,8 +18,8 @@ from gapr_core.benchmark import methods
 from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts, why_unusable
 from gapr_core.benchmark.record import Answer, Record, Verdict
 from gapr_core.config import RegistrarConfig
+from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_facts, load_pair, pair_hash
-from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import cluster

@@ -75,14 +75,14 @@ class Answers:
         chosen = [self.feature_names.index(name) for name in names]
         return replace(self, feature_names=names, features=self.features[:, chosen])
 
-    def people_folds(self, folds: int = FOLDS) -> Iterator[tuple[Mask, Mask]]:
+    def people_folds(self) -> Iterator[tuple[Mask, Mask]]:
         """(fitted on, judged) masks (N,): nobody of a judged target is in any pair that the model is fitted on."""
         people = [tuple(map(first_of_twins, group)) for group in self.people]
         everybody = sorted({person for group in people for person in group})
-        drawn = np.random.default_rng(0).permutation(len(everybody)) % folds
+        drawn = np.random.default_rng(0).permutation(len(everybody)) % FOLDS
         fold_of = dict(zip(everybody, drawn, strict=True))
         own = np.array([fold_of[group[0]] for group in people])
-        for number in range(folds):
+        for number in range(FOLDS):
             is_in = np.array([any(fold_of[person] == number for person in group) for group in people])
             yield ~is_in, own == number
 

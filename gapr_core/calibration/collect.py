@@ -24,9 +24,10 @@ from gapr_core.calibration import pairs, streams
 from gapr_core.calibration.answers import round_of
 from gapr_core.calibration.pairs import Drawn, Task
 from gapr_core.config import ClutterConfig, RegistrarConfig, RulesConfig, SensorConfig
-from gapr_core.data import degradation, protocols
+from gapr_core.data.pair import Pair
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.geometry.sampling import random_directions
 from gapr_core.registration import clutter
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.assessment import Assessment
@@ -142,7 +143,7 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
             yield memory.name, judged_answer(tracked, moved)
 
 
-def judged_answer(assessment: Assessment, pair: protocols.Pair) -> Record:
+def judged_answer(assessment: Assessment, pair: Pair) -> Record:
     """Features of an answer, what a rule says against it, and its errors where there is a truth."""
     features = {name: round(value, 6) for name, value in assessment.features.items()}
     refusal = assessment.refusal.status.value if assessment.refusal else None
@@ -163,19 +164,17 @@ def judged_answer(assessment: Assessment, pair: protocols.Pair) -> Record:
     }
 
 
-def moved_on(
-    pair: protocols.Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Generator
-) -> tuple[protocols.Pair, Memory]:
+def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Generator) -> tuple[Pair, Memory]:
     """The next source of a stream, and what a `Tracker` remembers of the last one.
 
     A part of the view is lost at one side, and the source has moved by up to 10 mm and 10 deg about its centroid. In
     one case of four the best pose is forgotten: the tracker followed a rival.
     """
-    along = pair.source @ degradation.random_directions(1, rng)[0]
+    along = pair.source @ random_directions(1, rng)[0]
     seen = pair.source[along <= np.quantile(along, rng.uniform(0.7, 1.0))]
     source = seen[rng.permutation(len(seen))[: round(rng.uniform(0.7, 1.0) * len(seen))]]
-    turn = np.radians(rng.uniform(0.0, STEP_DEG)) * degradation.random_directions(1, rng)[0]
-    shift = rng.uniform(0.0, STEP_MM) * degradation.random_directions(1, rng)[0]
+    turn = np.radians(rng.uniform(0.0, STEP_DEG)) * random_directions(1, rng)[0]
+    shift = rng.uniform(0.0, STEP_MM) * random_directions(1, rng)[0]
     memory = Memory()
     memory.keep([hypothesis.T_target_source for hypothesis in hypotheses])
     memory.poses = memory.poses @ se3.exp(np.concatenate([shift, turn]), source.mean(axis=0))
@@ -238,14 +237,14 @@ def _registrars(sensor: str) -> dict[str, Registrar]:
     }
 
 
-_LAST: dict[int, tuple[Array, PreparedTarget]] = {}
+_last_target: list[tuple[Array, PreparedTarget]] = []  # the last cloud and what was prepared of it
 
 
 def _prepared(cloud: Array) -> PreparedTarget:
     """The prepared target; the last one is kept, since pairs in a row share a target."""
-    if 0 not in _LAST or _LAST[0][0] is not cloud:
-        _LAST[0] = cloud, _registrars("unknown")["search"].prepare(cloud)
-    return _LAST[0][1]
+    if not _last_target or _last_target[0][0] is not cloud:
+        _last_target[:] = [(cloud, _registrars("unknown")["search"].prepare(cloud))]
+    return _last_target[0][1]
 
 
 def _name(task: Task) -> str:

@@ -20,6 +20,7 @@ from gapr_core.calibration.shapes import SHAPES
 from gapr_core.config import SENSOR_KINDS
 from gapr_core.data import anatomy, protocols, scans
 from gapr_core.data import pool as bone_pool
+from gapr_core.data.pair import TARGET_POINTS, Pair
 from gapr_core.data.parametric import BONES as PARAMETRIC
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
@@ -124,7 +125,7 @@ class Drawn:
         sensor: what the user says of the sensor: its kind, or "unknown".
     """
 
-    pair: protocols.Pair
+    pair: Pair
     family: str
     seen_as: str
     what: str
@@ -187,7 +188,7 @@ def setting_of(folder: str, split: str, seed: int, number: int, real: bool = Fal
     end = (rng.uniform(*SHORTEST), bool(rng.random() < 0.5)) if kind == "short" else None
     specimen = whole.end(*end) if end else whole
     scan = replace(specimen, surface=scans.drawn(rng)(specimen.surface)) if kind == "scanned" else specimen
-    cloud, _ = scan.sample(protocols.TARGET_POINTS, rng)
+    cloud, _ = scan.sample(TARGET_POINTS, rng)
     origin_mm = cloud.mean(axis=0)
     return Setting(specimen, whole, end, cloud - origin_mm, origin_mm)
 
@@ -220,14 +221,14 @@ def first_of_twins(person: str) -> str:
     return next((min(group) for group in TWINS if person in group), person)
 
 
-def view(seen_as: str, specimen: Specimen, seed: int, around: Sequence[Specimen] = ()) -> protocols.Pair:
+def view(seen_as: str, specimen: Specimen, seed: int, around: Sequence[Specimen] = ()) -> Pair:
     """A bone against itself, seen by a protocol or one of this file's views; at a joint with one of those around it."""
     if seen_as in VIEWS:
         return replace(VIEWS[seen_as](specimen, np.random.default_rng([seed, 11])), protocol=seen_as)
     return protocols.make_pair(seen_as, specimen, seed, around)
 
 
-def before(setting: Setting, stranger: Specimen, what: str, pair: protocols.Pair) -> protocols.Pair:
+def before(setting: Setting, stranger: Specimen, what: str, pair: Pair) -> Pair:
     """A source before the setting's target; of another subject's bone no pose is right."""
     truth = np.full((4, 4), np.nan)
     if what == "own" or (what == "mirrored" and setting.whole.bone in SYMMETRIC):
@@ -240,7 +241,7 @@ def before(setting: Setting, stranger: Specimen, what: str, pair: protocols.Pair
                    bone=setting.whole.bone, metadata=metadata)  # fmt: skip
 
 
-def patch_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
+def patch_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
     """A one-sided view of 1 to 12 % of the bone, of few points."""
     share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.01, 0.12), (60.0, 1500.0)))
     noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
@@ -248,7 +249,7 @@ def patch_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
     return protocols.one_sided(specimen, rng, level)
 
 
-def mixed_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
+def mixed_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
     """Between and beyond the protocols: from many clean points to tiny, noisy, biased, dirty views."""
     share = rng.uniform(0.1, 0.9)
     noise_mm, bias_mm, outliers = (rng.uniform(0.0, most) * (rng.random() < 0.7) for most in (2.0, 1.5, 0.25))
@@ -258,14 +259,14 @@ def mixed_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
     return protocols.one_sided(specimen, rng, level)
 
 
-def crop_view(specimen: Specimen, rng: np.random.Generator) -> protocols.Pair:
+def crop_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
     """Clean points of a region of the bone, from all sides, as a piece that was cut out of a model."""
-    cloud, _ = specimen.sample(2 * protocols.TARGET_POINTS, rng)
+    cloud, _ = specimen.sample(2 * TARGET_POINTS, rng)
     distance = ((cloud - cloud[rng.integers(len(cloud))]) ** 2).sum(axis=1)
     source = cloud[distance <= np.quantile(distance, rng.uniform(0.1, 0.9))]
     source = source[rng.permutation(len(source))[: rng.integers(300, 6000)]]
     metadata = {"origin_mm": np.zeros(3)}
-    return protocols.Pair(source, cloud, np.eye(4), "", specimen.bone, specimen.person, "crop", metadata)
+    return Pair(source, cloud, np.eye(4), "", specimen.bone, specimen.person, "crop", metadata)
 
 
 def _another_person(specimen: Specimen, others: Sequence[Specimen], rng: np.random.Generator) -> Specimen:
@@ -316,7 +317,7 @@ def _made(bone: str, folder: str, split: str) -> list[Specimen]:
     return anatomy.surfaces(folder, bone, split) + parametric + new
 
 
-VIEWS: dict[str, Callable[[Specimen, np.random.Generator], protocols.Pair]] = {
+VIEWS: dict[str, Callable[[Specimen, np.random.Generator], Pair]] = {
     "patch": patch_view,
     "mixed": mixed_view,
     "crop": crop_view,

@@ -8,18 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.data import protocols, scans
+from gapr_core.data.pair import Pair
+from gapr_core.data.scenes.things import BOX_FACES
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-BOX_FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-     [1, 5, 7], [1, 7, 3]]
-)  # fmt: skip
 
 
-def turned_pair(seed: int) -> protocols.Pair:
+def turned_pair(seed: int) -> Pair:
     """A solid of revolution, seen from one side: the spin about its axis cannot be known, so no pose is right."""
     rng = np.random.default_rng([seed, 7])
     length, radius, waist = rng.uniform(40.0, 300.0), rng.uniform(8.0, 35.0), rng.uniform(0.0, 0.4)
@@ -34,12 +32,10 @@ def turned_pair(seed: int) -> protocols.Pair:
     seen = seen[(seen[:, 0] > 0.0) & (np.abs(seen[:, 2]) < rng.uniform(0.2, 0.5) * length)]
     source = seen + rng.normal(0.0, rng.uniform(0.1, 1.5), seen.shape)
     nowhere = np.full((4, 4), np.nan)
-    return protocols.Pair(
-        source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned"
-    )
+    return Pair(source[: rng.integers(500, 3000)], draw(8192), nowhere, f"turned-{seed}", "none", "none", "turned")
 
 
-def box_pair(seed: int) -> protocols.Pair:
+def box_pair(seed: int) -> Pair:
     """A side or a corner of a box, smooth or of voxels: flat, straight, and alike in four poses: none is right."""
     rng = np.random.default_rng([seed, 43])
     sides_mm, turn = np.exp(rng.uniform(np.log(20.0), np.log(250.0), 3)), se3.random_rotation(rng)

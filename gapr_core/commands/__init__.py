@@ -1,1 +1,4 @@
-"""One module a command of `gapr`: each has `add_arguments(parser)` and `run(args) -> exit code`."""
+"""Commands of `gapr`, a module each with `add_arguments(parser)` and `run(args) -> exit code`; `cli` lists all of them.
+
+`options` and `checks` are no commands: what several share, and what `register` can know before the work.
+"""

@@ -18,8 +18,6 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Named = tuple[str, Path]  # an option, and what it names
 
-TARGETS = "targets.mrk.json"
-SCENE = ("target.vtk", "source.vtk", "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `scene.write_slicer`
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
 MUCH_NEARER = 0.3  # share of that distance that is left when the axes are turned, and were wrong
 
@@ -73,8 +71,13 @@ def _inputs(args: Namespace) -> list[Named]:
 def _outputs(args: Namespace) -> list[Named]:
     """The option and the path of every file that is written, those of a scene as well."""
     named = [(f"--{name}", getattr(args, name)) for name in ("out", "residuals", "report", "rerun", "json")]
-    scene = [name for name in SCENE if args.targets or name != TARGETS] if args.slicer else []
-    return [(option, path) for option, path in named if path] + [("--slicer", args.slicer / name) for name in scene]
+    outputs = [(option, path) for option, path in named if path]
+    if not args.slicer:
+        return outputs
+    from gapr_core.formats import scene
+
+    files_of_scene = [name for name in scene.FILES if args.targets or name != scene.TARGETS]
+    return outputs + [("--slicer", args.slicer / name) for name in files_of_scene]
 
 
 def _check_collisions(inputs: list[Named], outputs: list[Named]) -> None:

@@ -11,6 +11,7 @@ from gapr_core.geometry.sampling import random_directions
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+SHAPE_MM, TEXTURE_MM = 1.2, 0.25  # root-mean-square displacements
 
 
 def smooth_field(
@@ -23,8 +24,8 @@ def smooth_field(
     return np.sin(points @ wave_vectors.T + rng.uniform(0.0, 2.0 * np.pi, waves)) @ amplitudes
 
 
-def deform(surface: Surface, rng: np.random.Generator, large_mm: float = 1.2, small_mm: float = 0.25) -> Surface:
+def deform(surface: Surface, rng: np.random.Generator) -> Surface:
     """The surface moved by waves of 80-250 mm (shape) and 15-50 mm (texture); normals are dropped, faces kept."""
-    moved = surface.points + smooth_field(surface.points, rng, large_mm, (80.0, 250.0))
-    moved = moved + smooth_field(surface.points, rng, small_mm, (15.0, 50.0), waves=24)
+    moved = surface.points + smooth_field(surface.points, rng, SHAPE_MM, (80.0, 250.0))
+    moved = moved + smooth_field(surface.points, rng, TEXTURE_MM, (15.0, 50.0), waves=24)
     return replace(surface, points=moved, normals=None)

@@ -10,20 +10,21 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.geometry.sampling import random_directions
 
 Array = NDArray[np.float64]
+ROUNDS = 6  # balls whose density is changed
 
 
-def half_extent(points: Array) -> float:
+def half_edge_mm(points: Array) -> float:
     """Half the longest edge of the axis-aligned box of (N, 3): the paper's normalisation scale."""
     return float(np.ptp(points, axis=0).max() / 2.0)
 
 
-def vary_density(points: Array, scale: float, rng: np.random.Generator, rounds: int = 6) -> Array:
-    """Paper, section III: thin out or fill up balls of 0.10-0.15 x `scale` (the half extent) around random points.
+def vary_density(points: Array, scale: float, rng: np.random.Generator) -> Array:
+    """Paper, section III: thin out or fill up balls of 0.10-0.15 x `scale` (`half_edge_mm`) around random points.
 
     Thinning discards half of a ball, filling adds half as many points again, each alpha p1 + (1 - alpha) p2 of two
-    points of the ball; either with even chance, `rounds` times (the paper says "multiple").
+    points of the ball; either with even chance, `ROUNDS` times (the paper says "multiple").
     """
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         centre, radius = points[rng.integers(len(points))], scale * rng.uniform(0.10, 0.15)
         inside = np.flatnonzero(((points - centre) ** 2).sum(axis=1) < radius**2)
         if rng.random() < 0.5:

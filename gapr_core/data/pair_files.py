@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.data.protocols import Pair
+from gapr_core.data.pair import Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.runtime import files

@@ -28,16 +28,12 @@ from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
 from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
-from gapr_core.geometry import extent
+from gapr_core.geometry import extent, se3
 
 Array = NDArray[np.float64]
 Change = Callable[[Pair, np.random.Generator], Pair]
-ANOTHER_PERSON = {
-    "L1": 1,
-    "L2": 3,
-    "L3": 5,
-    "paper": 7,
-}  # of the turns of `wrong`: another subject's, as which level
+DEGRADED_AS = ("L1", "L2", "L3", "paper")  # of `wrong`, in turn, each with another bone type and another subject's
+ANOTHER_PERSON = {level: 2 * number + 1 for number, level in enumerate(DEGRADED_AS)}  # turns with another subject's
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,7 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
     )
     metadata |= {"noise_mm": level.noise_mm, "bias_mm": level.bias_mm, "outlier_share": level.outlier_share}
     metadata["bias"] = level.smooth_bias
-    rotation = Rotation.random(random_state=rng).as_matrix()  # uniform on SO(3)
+    rotation = se3.random_rotation(rng)
     return place(specimen, rng.permutation(dirty), target, rotation, metadata, rng)
 
 
@@ -141,7 +137,7 @@ def acquired(specimen: Specimen, rng: np.random.Generator, sensor: str) -> Pair:
     """What a simulated sensor of `data.sensors` measures of the bone; a camera's viewpoint is in the source's frame."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     found = (SENSORS | SPARSE)[sensor](specimen, rng)
-    rotation = Rotation.random(random_state=rng).as_matrix()
+    rotation = se3.random_rotation(rng)
     return place(specimen, rng.permutation(found.points), target, rotation, found.parameters, rng, found.viewpoint)
 
 
@@ -149,18 +145,9 @@ def wrong(specimen: Specimen, rng: np.random.Generator, others: Sequence[Specime
     """A source that is not of this bone: in turn another bone type, another subject's; each as L1, L2, L3 and paper."""
     turn = int(rng.integers(8)) if turn is None else turn
     source_of = _another(specimen, others, turn % 2, rng)
-    kind = "other_person" if source_of.bone == specimen.bone else "other_bone"
-    degraded_as = ("L1", "L2", "L3", "paper")[turn // 2 % 4]
+    degraded_as = DEGRADED_AS[turn // 2 % len(DEGRADED_AS)]
     other, own = (PROTOCOLS[degraded_as](who, rng) for who in (source_of, specimen))
-    metadata = {
-        **other.metadata,
-        "origin_mm": own.metadata["origin_mm"],
-        "overlap": 0.0,
-        "wrong_kind": kind,
-        "degraded_as": degraded_as,
-        "source_bone": source_of.bone,
-        "source_person": source_of.person,
-    }
+    metadata = _facts_of_wrong(specimen, source_of, other, degraded_as, own.metadata["origin_mm"]) | {"overlap": 0.0}
     return replace(own, source=other.source, T_target_source=np.full((4, 4), np.nan), metadata=metadata)
 
 
@@ -177,25 +164,24 @@ def wrong_scene(
     level = levels[turn // 2 % len(levels)]
     pair = PROTOCOLS[level](source_of, rng)
     target, _ = specimen.sample(TARGET_POINTS, rng)
-    origin = target.mean(axis=0)
-    metadata = {
+    origin_mm = target.mean(axis=0)
+    metadata = _facts_of_wrong(specimen, source_of, pair, level, origin_mm)
+    own = {"target": target - origin_mm, "bone": specimen.bone, "person": specimen.person}
+    return replace(pair, **own, T_target_source=np.full((4, 4), np.nan), metadata=metadata)
+
+
+def _facts_of_wrong(
+    specimen: Specimen, source_of: Specimen, pair: Pair, degraded_as: str, origin_mm: Array
+) -> dict[str, Any]:
+    """The metadata of a pair with the target of one bone and the source of another, which `pair` is of."""
+    return {
         **pair.metadata,
-        "origin_mm": origin,
+        "origin_mm": origin_mm,
         "wrong_kind": "other_person" if source_of.bone == specimen.bone else "other_bone",
-        "degraded_as": level,
+        "degraded_as": degraded_as,
         "source_bone": source_of.bone,
         "source_person": source_of.person,
     }
-    return Pair(
-        source=pair.source,
-        target=target - origin,
-        T_target_source=np.full((4, 4), np.nan),
-        name="",
-        bone=specimen.bone,
-        person=specimen.person,
-        protocol="",
-        metadata=metadata,
-    )
 
 
 def _another(specimen: Specimen, others: Sequence[Specimen], kind: int, rng: np.random.Generator) -> Specimen:
@@ -215,7 +201,7 @@ def _another(specimen: Specimen, others: Sequence[Specimen], kind: int, rng: np.
 def _finish_like_the_paper(
     specimen: Specimen, source: Array, target: Array, metadata: dict[str, Any], rng: np.random.Generator
 ) -> Pair:
-    scale = degradation.half_extent(source)
+    scale = degradation.half_edge_mm(source)
     source = degradation.vary_density(source, scale, rng)
     noise_mm = 0.01 * scale  # sigma 0.01 on the cloud scaled to [-1, 1]
     source = source + rng.normal(0.0, noise_mm, source.shape)

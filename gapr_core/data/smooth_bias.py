@@ -13,15 +13,15 @@ from gapr_core.geometry.sampling import random_directions
 Array = NDArray[np.float64]
 SmoothBias = Callable[[Array, float, np.random.Generator], Array]
 
-WAVELENGTH_MM = (60.0, 120.0)
+WAVES, WAVELENGTH_MM = 4, (60.0, 120.0)
 CORRELATION_MM = (15.0, 30.0)  # l of the process's correlation exp(-d^2 / 2 l^2)
 FEATURES = 200  # random Fourier features of the process (Rahimi and Recht 2007)
 
 
-def waves(points: Array, rng: np.random.Generator, count: int = 4) -> Array:
-    """(N,) sum of plane waves of 60 to 120 mm with normal weights, of variance `count` / 2, at points (N, 3), mm."""
-    wave_vectors = random_directions(count, rng) * (2.0 * np.pi / rng.uniform(*WAVELENGTH_MM, (count, 1)))
-    phases, weights = rng.uniform(0.0, 2.0 * np.pi, count), rng.normal(size=count)
+def waves(points: Array, rng: np.random.Generator) -> Array:
+    """(N,) sum of plane waves of 60 to 120 mm with normal weights, of variance `WAVES` / 2, at points (N, 3), mm."""
+    wave_vectors = random_directions(WAVES, rng) * (2.0 * np.pi / rng.uniform(*WAVELENGTH_MM, (WAVES, 1)))
+    phases, weights = rng.uniform(0.0, 2.0 * np.pi, WAVES), rng.normal(size=WAVES)
     return np.asarray(np.sin(points @ wave_vectors.T + phases) @ weights)
 
 

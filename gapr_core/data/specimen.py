@@ -16,6 +16,7 @@ from gapr_core.geometry import extent
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+CLEARANCE_MM = 0.1  # from a point to where its ray begins, or the ray would hit the point's own face
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +51,12 @@ class Specimen:
         """(count, 3) points and unit normals, uniform over the area, drawn again at every call."""
         return self.surface.sample(count, rng)
 
-    def visible_from(self, points: Array, direction: Array, clearance_mm: float = 0.1) -> NDArray[np.bool_]:
+    def visible_from(self, points: Array, direction: Array) -> NDArray[np.bool_]:
         """Which surface points (N, 3) see a far probe in `direction`, (3,) or (N, 3), with nothing in between.
 
         Orientation of the faces does not matter: a ray from the far side runs through the bone and hits it.
         """
-        start = points - self._centre + clearance_mm * direction
+        start = points - self._centre + CLEARANCE_MM * direction
         rays = np.hstack([start, np.broadcast_to(direction, start.shape)]).astype(np.float32)
         return ~self._scene.test_occlusions(rays).numpy()
 

@@ -12,6 +12,7 @@ from gapr_core.data import degradation
 from gapr_core.data.pair import TARGET_POINTS, TRANSLATION_MM, Pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import extent, se3
+from gapr_core.geometry.sampling import random_directions
 
 Array = NDArray[np.float64]
 
@@ -52,38 +53,32 @@ def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> lis
     rng = np.random.default_rng([seed, 23])
     target, _ = specimen.sample(TARGET_POINTS, rng)
     origin = target.mean(axis=0)
-    points, normals = specimen.sample(20_000, rng)
-    axis = extent.principal(points).axes[0]
-    towards = np.cross(axis, degradation.random_directions(1, rng)[0])
+    bone, normals = specimen.sample(20_000, rng)
+    points, axis = bone, extent.principal(bone).axes[0]
+    towards = np.cross(axis, random_directions(1, rng)[0])
     towards /= np.linalg.norm(towards)
     pose = _anywhere(rng)
-    bias_mm = 0.0 if motion.bias_stays else motion.bias_mm
-    tissue = np.zeros_like(points)
     if motion.bias_stays:
-        tissue = degradation.bias_along_normals(points, normals, motion.bias_mm, rng, motion.smooth_bias)
+        points = points + degradation.bias_along_normals(points, normals, motion.bias_mm, rng, motion.smooth_bias)
     pairs = []
     for frame in range(motion.frames):
         if frame:
-            jumps = motion.jump_every and frame % motion.jump_every == 0
-            pose = _anywhere(rng) if jumps else pose @ _step(motion, rng)
+            pose = _next_pose(pose, frame, motion, rng)
         at = frame / max(motion.frames - 1, 1)
-        kept = rng.permutation(_view(specimen, points, axis, towards, at, motion))
-        seen = kept[: motion.points]
-        measured = degradation.measured(
-            specimen,
-            points[seen] + tissue[seen],
-            normals[seen],
-            motion.noise_mm,
-            bias_mm,
-            motion.outlier_share,
-            rng,
-            motion.smooth_bias,
-        )
-        source = se3.apply(pose, measured - origin)
+        seen = rng.permutation(_view(specimen, bone, axis, towards, at, motion))[: motion.points]
+        source = se3.apply(pose, _measured(specimen, points[seen], normals[seen], motion, rng) - origin)
         name = f"stream_{specimen.bone}_{specimen.person}_{seed}_{frame:03d}"
         facts = specimen.bone, specimen.person, "stream", {"origin_mm": origin}
         pairs.append(Pair(source, target - origin, se3.inverse(pose), name, *facts))
     return pairs
+
+
+def _measured(specimen: Specimen, points: Array, normals: Array, motion: Motion, rng: np.random.Generator) -> Array:
+    """Points of one frame with its errors; a smooth bias that stays is in the points already."""
+    bias_mm = 0.0 if motion.bias_stays else motion.bias_mm
+    return degradation.measured(
+        specimen, points, normals, motion.noise_mm, bias_mm, motion.outlier_share, rng, motion.smooth_bias
+    )
 
 
 def _view(
@@ -104,7 +99,13 @@ def _anywhere(rng: np.random.Generator) -> Array:
     return se3.from_rotation_translation(se3.random_rotation(rng), rng.uniform(-TRANSLATION_MM, TRANSLATION_MM, 3))
 
 
+def _next_pose(pose: Array, frame: int, motion: Motion, rng: np.random.Generator) -> Array:
+    """T_source_target of a frame after `pose`, that of the one before: a step further, or somewhere else altogether."""
+    jumps = motion.jump_every and frame % motion.jump_every == 0
+    return _anywhere(rng) if jumps else pose @ _step(motion, rng)
+
+
 def _step(motion: Motion, rng: np.random.Generator) -> Array:
-    turn = np.radians(rng.uniform(0.0, motion.step_deg)) * degradation.random_directions(1, rng)[0]
-    shift = rng.uniform(0.0, motion.step_mm) * degradation.random_directions(1, rng)[0]
+    turn = np.radians(rng.uniform(0.0, motion.step_deg)) * random_directions(1, rng)[0]
+    shift = rng.uniform(0.0, motion.step_mm) * random_directions(1, rng)[0]
     return se3.exp(np.concatenate([shift, turn]))

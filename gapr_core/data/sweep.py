@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from gapr_core.data import degradation
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import extent, se3
+from gapr_core.geometry.sampling import random_directions
 
 Array = NDArray[np.float64]
 
@@ -91,6 +92,6 @@ def _measure(specimen: Specimen, points: Array, normals: Array, how: Acquisition
     dirty = points + rng.normal(0.0, how.noise_mm, points.shape)
     dirty += degradation.bias_along_normals(points, normals, how.bias_mm, rng)
     outlier = np.flatnonzero(rng.random(len(points)) < how.outlier_share)
-    off = rng.uniform(3.0, 15.0, (len(outlier), 1)) * degradation.random_directions(len(outlier), rng)
+    off = rng.uniform(3.0, 15.0, (len(outlier), 1)) * random_directions(len(outlier), rng)
     dirty[outlier] = points[outlier] + off
     return dirty

@@ -24,7 +24,7 @@ class Twins(NamedTuple):
     typical_mm: float
 
 
-def near_duplicates(subjects: Corresponded, suspicious: float = SUSPICIOUS) -> list[Twins]:
+def near_duplicates(subjects: Corresponded) -> list[Twins]:
     """Pairs of subjects who may be one and the same, scanned twice or mirrored, the most similar first."""
     if len(subjects.points) < 3:
         return []
@@ -36,7 +36,7 @@ def near_duplicates(subjects: Corresponded, suspicious: float = SUSPICIOUS) -> l
     typical = float(np.median(apart.min(axis=1)))
     found = [
         Twins(subjects.person[i], subjects.person[j], float(apart[i, j]), typical)
-        for i, j in combinations(range(len(points)), 2) if apart[i, j] < suspicious * typical
+        for i, j in combinations(range(len(points)), 2) if apart[i, j] < SUSPICIOUS * typical
     ]  # fmt: skip
     return sorted(found, key=lambda twins: twins.rms_mm)
 

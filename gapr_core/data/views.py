@@ -12,6 +12,7 @@ from gapr_core.errors import ConfigError
 from gapr_core.geometry import extent, sampling
 
 Array = NDArray[np.float64]
+TRIES = 8  # views that are drawn where each shows too little
 
 
 def best_view(
@@ -20,15 +21,14 @@ def best_view(
     share_of: str,
     rng: np.random.Generator,
     draws: int = 20_000,
-    tries: int = 8,
 ) -> tuple[Array, Array, dict[str, Any]]:
     """Surface points and normals that a probe sees of the bone around a random point.
 
     The probe looks from within 45 degrees of that point's normal. A view that shows too little (a look along a shaft,
-    into a fold) is no acquisition: another one is drawn, and the best of `tries` is taken.
+    into a fold) is no acquisition: another one is drawn, and the best of `TRIES` is taken.
     """
     best: tuple[float, Array, Array, dict[str, Any]] | None = None
-    for _ in range(tries):
+    for _ in range(TRIES):
         points, normals = specimen.sample(draws, rng)
         kept = rng.uniform(*share)
         direction = _probe_direction(specimen, points[:1], normals[0], rng)

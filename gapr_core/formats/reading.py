@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
-from gapr_core.formats import axes, kinds, plugins
+from gapr_core.formats import axes, plugins, signatures
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
@@ -146,7 +146,7 @@ def unreadable(path: Path, why: str) -> InvalidPointCloudError:
     ending = _ending(path)
     if path.is_file() and path.stat().st_size == 0:
         why = "0 bytes, an empty file"
-    other, how = kinds.ending_of(path), "export it again"
+    other, how = signatures.ending_of(path), "export it again"
     if other and other != ending:
         how = f"it looks like {other}: rename it, if that is what it is"
     return InvalidPointCloudError(f"a readable {ending.lstrip('.').upper()} file", f"{path.name} ({_short(why)})", how)

@@ -17,6 +17,8 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+TARGETS = "targets.mrk.json"
+FILES = ("target.vtk", "source.vtk", "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `write_slicer`
 FULL_COLOUR_MM = 3.0
 BLUE_TO_RED = "vtkMRMLColorTableNodeFileDivergingBlueRed.txt"  # of 3D Slicer; without one VTK's goes from red to blue
 GREY = np.array([150, 150, 150])
@@ -69,7 +71,7 @@ def write_slicer(folder: Path, target: Surface, result: RegistrationResult, erro
     write_coloured(folder / "registered.ply", se3.apply(result.T_target_source, residuals.points), residuals)
     transforms.write(folder / "pose.tfm", result.T_target_source)
     if errors:
-        planning.save_targets(folder / "targets.mrk.json", errors)
+        planning.save_targets(folder / TARGETS, errors)
     files.write_text(folder / "scene.mrml", _mrml(bool(errors)))
 
 
@@ -98,7 +100,7 @@ def _mrml(with_targets: bool) -> str:
     }  # fmt: skip
     _model(scene, "source", "0.9 0.2 0.2", shown, {"transformNodeRef": "vtkMRMLLinearTransformNodepose"})
     if with_targets:
-        _node(scene, "MarkupsFiducial", "MarkupsFiducial", "targets", "targets.mrk.json", {})
+        _node(scene, "MarkupsFiducial", "MarkupsFiducial", "targets", TARGETS, {})
     return ElementTree.tostring(scene, encoding="unicode", xml_declaration=False) + "\n"
 
 

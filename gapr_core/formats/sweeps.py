@@ -22,7 +22,6 @@ HEADER_BYTES = 64 << 20
 FRAME = re.compile(r"^Seq_Frame(\d+)_(\w+?)(Transform|TransformStatus)\s*=\s*(.+)$", re.MULTILINE)
 POSES = "poses.csv"
 NEAR_POSES = re.compile(r"(?<![a-z])poses?(?![a-z])")
-FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity, as of an initial pose
 SLICE_ENDINGS = (".csv", ".txt", ".xyz", ".npy")
 
 
@@ -134,7 +133,7 @@ def _check_rigid(T: Array, number: int) -> None:
     """Raise for a matrix that is transposed, scaled or reflected, or has a number that is not finite."""
     R = np.nan_to_num(T[:3, :3], posinf=0.0, neginf=0.0)
     off = np.abs([*(R.T @ R - np.eye(3)).ravel(), *(T[3] - [0.0, 0.0, 0.0, 1.0])]).max()
-    if not np.isfinite(T).all() or off > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
+    if not np.isfinite(T).all() or off > se3.FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
         row = " ".join(f"{value:.3g}" for value in T[3])
         given = f"pose {number} with last row {row} and determinant {np.linalg.det(R):.3g} of its 3x3 part"
         how = "write it row by row, in mm, with last row 0 0 0 1, without scale or reflection"

@@ -13,6 +13,7 @@ from gapr_core.runtime.parallel import in_pieces
 
 Array = NDArray[np.float64]
 
+SMALLEST_CELL_MM, MOST_CELLS = 1.5, 2_500_000  # cells are larger where there would be more of them
 FAR = -1  # index of cells farther than the reach
 FARTHEST = 255  # distance of these cells, in steps of the field: distances are bytes
 
@@ -42,13 +43,12 @@ def build(
     normals: Array,
     spacing_mm: float,
     reach_mm: float = 12.0,
-    most_cells: int = 2_500_000,
     num_threads: int = 1,
 ) -> DistanceField:
-    """The field of a target (N, 3), mm, with unit normals (N, 3); cells as fine as `most_cells` allows, >= 1.5 mm."""
+    """The field of a target (N, 3), mm, with unit normals (N, 3); cells as fine as the limits allow."""
     low, high = bounds(points)
     low, high = low - reach_mm, high + reach_mm
-    cell_mm = max(1.5, float(np.prod(high - low) / most_cells) ** (1.0 / 3.0))
+    cell_mm = max(SMALLEST_CELL_MM, float(np.prod(high - low) / MOST_CELLS) ** (1.0 / 3.0))
     shape = np.ceil((high - low) / cell_mm).astype(int) + 1
     nearest = np.full(shape, FAR, dtype=np.int32)
     distance = np.full(shape, FARTHEST, dtype=np.uint8)

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0  # a pose farther off at the source's centroid, or turned farther, is wrong
 LAST_ROW = 1e-6  # how far an entry of the last row may be from 0 0 0 1
+FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity: poses are often written with few digits
 
 
 class PoseError(NamedTuple):
@@ -62,17 +63,12 @@ def nearest_rigid(T: ArrayLike) -> Array:
     return from_rotation_translation(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, T[:3, 3])
 
 
-def why_not_rigid(T: Array, farthest: float = 1e-2) -> str:
-    """What keeps a finite T (4, 4) from being rigid, in words; empty where it is.
-
-    Args:
-        T: the transform.
-        farthest: an entry of R^T R may be from the identity: poses are often written with few digits.
-    """
+def why_not_rigid(T: Array) -> str:
+    """What keeps a finite T (4, 4) from being rigid, in words; empty where it is."""
     R, last = T[:3, :3], T[3]
     if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > LAST_ROW:
         return "last row is {:g} {:g} {:g} {:g}, not 0 0 0 1".format(*last)
-    if np.abs(R.T @ R - np.eye(3)).max() > farthest or np.linalg.det(R) < 0.0:
+    if np.abs(R.T @ R - np.eye(3)).max() > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
         return f"rotation part has determinant {np.linalg.det(R):.3g}"
     return ""
 

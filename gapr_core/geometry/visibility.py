@@ -142,17 +142,15 @@ def outward_votes(
     normals: Array,
     spacing_mm: float,
     directions: int = 96,
-    seen_from: View = seen_from,
     num_threads: int = 1,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Sum of the directions from which each point is seen, and their number.
+    """Sum of the directions from which `seen_from` sees each point, and their number.
 
     Args:
         points: (N, 3), mm.
         normals: (N, 3), unit; the sign does not matter.
         spacing_mm: typical distance between neighbouring points.
         directions: how many views, evenly spread.
-        seen_from: which depth buffer, `seen_from` or `unobstructed_from`.
         num_threads: 0 for all cores.
 
     Returns:
@@ -164,14 +162,14 @@ def outward_votes(
 
 
 def _views(
-    directions: Array, points: Array, normals: Array, spacing_mm: float, seen_from: View, num_threads: int
+    directions: Array, points: Array, normals: Array, spacing_mm: float, depth_buffer: View, num_threads: int
 ) -> NDArray[np.bool_]:
-    """(D, N) which points each of the directions (D, 3) sees."""
+    """(D, N) which points each of the directions (D, 3) sees, by `seen_from` or `unobstructed_from`."""
     pixel_mm = max(1.5 * spacing_mm, float(np.linalg.norm(np.ptp(points, axis=0))) / MOST_PIXELS)
     normals = np.ascontiguousarray(normals)  # rows of frames are not: they would be compiled for as well
 
     def view(direction: Array) -> NDArray[np.bool_]:
-        return seen_from(direction, points, normals, pixel_mm)
+        return depth_buffer(direction, points, normals, pixel_mm)
 
     return np.stack(in_threads(view, directions, num_threads=num_threads))
 

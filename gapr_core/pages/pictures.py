@@ -11,19 +11,20 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gapr_core.benchmark.record import Record
+from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair
-from gapr_core.data.protocols import Pair
 from gapr_core.geometry import extent, se3
 from gapr_core.pages import palette
 
 Array = NDArray[np.float64]
+MOST_CASES = 10
 MOST_TARGET_POINTS, MOST_SOURCE_POINTS = 5000, 1500
 
 
-def worst(records: Sequence[Record], method: str, count: int = 10) -> list[Record]:
+def worst(records: Sequence[Record], method: str) -> list[Record]:
     """False accepts first, the most confident of them first; then refused pairs that have a pose; then by RMSE."""
     own = [r for r in records if r.method == method and (r.has_truth or r.accepted)]
-    return sorted(own, key=_badness, reverse=True)[:count]
+    return sorted(own, key=_badness, reverse=True)[:MOST_CASES]
 
 
 def _badness(record: Record) -> tuple[float, float, float]:

@@ -165,9 +165,13 @@ class Accumulator:
 
     def _row_with(self, off: list[Array]) -> list[Array]:
         """The sources in a row off the bone, now with those of the new ones that are; one on the bone ends the row."""
-        newly_off = [source for source in off if not _is_among(source, self._off_in_a_row)]
-        goes_on = bool(off) and len(off) == len(self._new)
-        return [*self._off_in_a_row, *newly_off] if goes_on else newly_off
+        row = self._off_in_a_row
+        for source in self._new:
+            if not _is_among(source, off):
+                row = []
+            elif not _is_among(source, row):
+                row = [*row, source]
+        return row
 
     def _restart(self, result: RegistrationResult) -> RegistrationResult:
         """Refuse, and keep nothing but the sources in a row that lie off the bone: where it is now."""

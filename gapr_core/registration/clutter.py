@@ -66,7 +66,7 @@ class Pool:
     scores: Array
 
 
-def look(source: PreparedSource, viewpoint: Array, config: ClutterConfig) -> Scene:
+def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) -> Scene:
     """The scene that a camera at `viewpoint` (3,), mm, source frame, saw; no regions yet."""
     source = source.facing(viewpoint)
     around = source.points[source.neighbours[:, : config.levelled_by]].mean(axis=1) - source.points

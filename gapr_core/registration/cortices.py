@@ -6,8 +6,6 @@ model follows both; the residuals show it.
 
 from __future__ import annotations
 
-import numpy as np
-
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.refinement import evaluate
@@ -24,5 +22,5 @@ def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
         return False
     fit = evaluate(assessment.fit.T, assessment.source.points, both, config.refinement)
     limits, noise_mm = config.cortices, max(assessment.source.noise_mm, config.refinement.smallest_sigma_mm)
-    explains = fit.sigma_mm < limits.share * np.exp(assessment.features["log_sigma"])
-    return bool(explains and fit.sigma_mm < limits.noise * noise_mm)
+    explains = fit.sigma_mm < limits.share * assessment.fit.sigma_mm
+    return explains and fit.sigma_mm < limits.noise * noise_mm

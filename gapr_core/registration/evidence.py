@@ -34,8 +34,8 @@ class Evidence:
         self._sum, self._weight, self._agreeing = 0.0, 0.0, 0
 
     @property
-    def frames(self) -> float:
-        """How many independent frames the last ones count for."""
+    def effective_frames(self) -> float:
+        """How many independent frames those that agree, up to the last one, count for."""
         n = max(self._agreeing, 1)
         return n / (1.0 + (n - 1) * self.config.correlation)
 
@@ -55,5 +55,5 @@ class Evidence:
         self._sum = forget * self._sum + float(np.clip(logit(part), -MOST_LOGIT, MOST_LOGIT))
         self._weight = forget * self._weight + 1.0
         self._agreeing = self._agreeing + 1 if agrees else 1
-        combined = float(expit(self.frames * self._sum / self._weight)) * part
+        combined = float(expit(self.effective_frames * self._sum / self._weight)) * part
         return combined if agrees else min(combined, probability)

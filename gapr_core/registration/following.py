@@ -42,7 +42,7 @@ class FollowedPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class PartialFit:
     """How a part of a source lies on the target.
 
     Attributes:
@@ -82,27 +82,27 @@ class Follower:
         points = finite_points(source)
         if self._since >= self._config.following.most_sources or len(points) < self._config.source.fewest_points:
             return None
-        look = self._look(points, self._T)
-        if self.why_not(look):
+        fit = self._fit_part(points, self._T)
+        if self.why_not(fit):
             return None
-        self._T, self._since = look.T, self._since + 1
-        return FollowedPose(look.T, look.inlier_ratio, look.residual_mm, self._since)
+        self._T, self._since = fit.T, self._since + 1
+        return FollowedPose(fit.T, fit.inlier_ratio, fit.residual_mm, self._since)
 
     def motion(self) -> Array:
         """(4, 4) how the source has moved since it was assessed, inv(T_then) T_now, mm."""
         return se3.inverse(self._assessment.fit.T) @ self._T
 
-    def why_not(self, look: Look) -> str:
+    def why_not(self, fit: PartialFit) -> str:
         """Why the source has to be assessed; empty where its pose may be followed."""
         limits, then, a = self._config.following, self._assessed, self._assessment
-        looser = look.spread_mm / then.spread_mm
+        looser = fit.spread_mm / then.spread_mm
         largest_mm = min(limits.largest_tre95_mm, self._config.max_tre_mm or np.inf)
         then_mm = max(then.residual_mm, self._config.refinement.smallest_sigma_mm)
         rules = {
             "the assessed pose is left": then.inlier_ratio > 0.0 and then.moved_mm <= self._tre95_mm,
-            "the bone moved too far": look.moved_mm <= self._config.evidence.agree_mm,
-            "less of the source lies on the bone": look.inlier_ratio >= limits.least_inliers * then.inlier_ratio,
-            "the residuals are larger": look.residual_mm <= limits.largest_residual * then_mm,
+            "the bone moved too far": fit.moved_mm <= self._config.evidence.agree_mm,
+            "less of the source lies on the bone": fit.inlier_ratio >= limits.least_inliers * then.inlier_ratio,
+            "the residuals are larger": fit.residual_mm <= limits.largest_residual * then_mm,
             "the error over the bone is not bounded": looser * self._tre95_mm <= largest_mm,
             "a turn is not observed": looser * a.uncertainty.largest_turn_deg <= limits.largest_turn_deg,
         }
@@ -113,11 +113,11 @@ class Follower:
         return self._assessment.tre95_mm
 
     @cached_property
-    def _assessed(self) -> Look:
-        """The assessed source, looked at as those that follow."""
-        return self._look(self._source, self._assessment.fit.T)
+    def _assessed(self) -> PartialFit:
+        """The assessed source, refined as those that follow."""
+        return self._fit_part(self._source, self._assessment.fit.T)
 
-    def _look(self, source: Array, T: Array) -> Look:
+    def _fit_part(self, source: Array, T: Array) -> PartialFit:
         """Refine a pose on a part of a source (N, 3), mm: without neighbours, which take most of the time."""
         config, target = self._config, self._assessment.target
         points = self._thinned(source)
@@ -130,14 +130,14 @@ class Follower:
         some = source[:: 1 + len(source) // self._config.source.most_compared]
         return some[sampling.thin(some, self._config.following.points)]
 
-    def _described(self, fit: Fit, moved_mm: float, points: Array) -> Look:
+    def _described(self, fit: Fit, moved_mm: float, points: Array) -> PartialFit:
         """What the limits are set for, by the weights that the assessed source had."""
         a = self._assessment
         signed_mm, _, aside_mm, _ = kernels.residuals_at(fit.T, points, *a.target.kernel_view, 0.0)
         distance_mm = np.hypot(np.nan_to_num(signed_mm, nan=np.inf), aside_mm)
         on_bone = distance_mm[distance_mm < self._limit_mm]
         residual_mm = float(np.sqrt((on_bone**2).mean())) if len(on_bone) else np.inf
-        return Look(fit.T, moved_mm, len(on_bone) / len(points), residual_mm, self._spread_mm(fit))
+        return PartialFit(fit.T, moved_mm, len(on_bone) / len(points), residual_mm, self._spread_mm(fit))
 
     def _spread_mm(self, fit: Fit) -> float:
         """Expected error over the bone under s^2 (J^T W J + P)^-1, with the noise s of the assessed source."""

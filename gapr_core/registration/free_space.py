@@ -94,15 +94,23 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceCo
     seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
     turned = quadrics.orient(turned, -seen)
     rays = seen[:, :2] / seen[:, 2:]
-    tree = cKDTree(rays)
+    nearest, origin, pixel = _nearest_rays(rays, config)
+    return DepthImage(T, _pixels(nearest, seen, turned), origin, pixel, config)
+
+
+def _nearest_rays(rays: Array, config: FreeSpaceConfig) -> tuple[NDArray[np.int64], Array, float]:
+    """Of an image of all rays (N, 2), x / z and y / z: (rows, columns) the ray of each pixel, N for none.
+
+    And (2,) the middle of its first pixel, and the edge of a pixel: that of the rays' spacing, within the limits set.
+    """
+    tree, origin, size = cKDTree(rays), rays.min(axis=0), np.ptp(rays, axis=0)
     pixel = max(config.smallest_pixel, float(np.median(tree.query(rays, k=2)[0][:, 1])))
-    pixel = max(pixel, float(np.sqrt(np.prod(np.ptp(rays, axis=0)) / config.most_pixels)))
-    origin = rays.min(axis=0)
-    columns, rows = (int(n) for n in np.ceil(np.ptp(rays, axis=0) / pixel) + 1)
+    pixel = max(pixel, float(np.sqrt(np.prod(size) / config.most_pixels)))
+    columns, rows = (int(n) for n in np.ceil(size / pixel) + 1)
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     centres = origin + pixel * np.stack([x.ravel(), y.ravel()], axis=1)
     _, nearest = tree.query(centres, distance_upper_bound=max(config.reach, 1.5 * pixel))
-    return DepthImage(T, _pixels(nearest.reshape(rows, columns), seen, turned), origin, pixel, config)
+    return nearest.reshape(rows, columns), origin, pixel
 
 
 def _looking_at(eye: Array, points: Array) -> Array:

@@ -48,7 +48,7 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
         assessment: the best pose so far, its covariance and its rivals.
         config: size of a patch, points and bias of a look.
     """
-    target, best = assessment.target, assessment.hypotheses[0]
+    target = assessment.target
     rivals = sorted(assessment.hypotheses[1:], key=lambda rival: -rival.probability)[: config.rivals]
     patches = _unseen(_patches(target, config), assessment, config)
     if not len(patches.centres):
@@ -56,14 +56,10 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
     noise_mm = max(assessment.fit.sigma_mm, config.noise_mm)
     bias_mm = max(assessment.uncertainty.bias_mm, config.bias_mm)
     bounds = _bounds_mm(assessment, patches, config.points, noise_mm, bias_mm)
-    distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
-    weights = np.array([rival.probability for rival in rivals])
-    excluded = np.array([_excluded(assessment, rivals, members, noise_mm, bias_mm) for members in patches.members])
-    open_mm2 = (weights * distances**2) @ (1.0 - excluded).T if len(weights) else np.zeros(len(bounds))
-    now_mm = float(np.sqrt(assessment.tre95_mm**2 + weights @ distances**2))
-    after_mm = np.sqrt(bounds**2 + open_mm2)
+    now_mm2, left_mm2, share = _of_rivals(assessment, rivals, patches, noise_mm, bias_mm)
+    now_mm = float(np.sqrt(assessment.tre95_mm**2 + now_mm2))
+    after_mm = np.sqrt(bounds**2 + left_mm2)
     order = np.argsort(after_mm, kind="stable")
-    share = excluded @ weights / max(float(weights.sum()), 1e-12) if len(weights) else np.ones(len(bounds))
     ranked = tuple(
         Patch(target.points[i], target.normals[i], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k]))
         for k, i in zip(order, patches.centres[order], strict=True)
@@ -118,6 +114,20 @@ def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: 
         bound_mm = precision.bound_mm(covariance, target.points[target.anchors], centre)
         bounds.append(assessment.factor95 * bound_mm)
     return np.array(bounds)
+
+
+def _of_rivals(
+    assessment: Assessment, rivals: Sequence[Hypothesis], patches: Patches, noise_mm: float, bias_mm: float
+) -> tuple[float, Array, Array]:
+    """What rivals add to the squared bound, mm^2, now and (K,) after a look at each patch; (K,) share it excludes."""
+    if not rivals:
+        return 0.0, np.zeros(len(patches.centres)), np.ones(len(patches.centres))
+    target, best = assessment.target, assessment.hypotheses[0]
+    distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
+    weights = np.array([rival.probability for rival in rivals])
+    excluded = np.array([_excluded(assessment, rivals, members, noise_mm, bias_mm) for members in patches.members])
+    left_mm2 = (weights * distances**2) @ (1.0 - excluded).T
+    return float(weights @ distances**2), left_mm2, excluded @ weights / max(float(weights.sum()), 1e-12)
 
 
 def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> float:

@@ -42,10 +42,8 @@ def margin(
     Returns:
         Below 0 where the mirrored source fits better, about 0 where nothing tells left from right, at most 4.
     """
-    some, limits_mm = source.subset(config.middle_points), np.linspace(*config.middle_limits_mm)
-    reflections = np.array(_reflections(T, some, target))
-    own = refine_many(T[None], some, target, limits_mm, num_threads)[1][0]
-    poses, scores = refine_many(reflections @ T @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
+    reflections = np.array(_reflections(T, source.subset(config.middle_points), target))
+    poses, scores, own = _refined_images(reflections, T, source, target, config, num_threads)
     for number in np.argsort(scores):
         if not _is_own_image(poses[number] @ FLIP @ se3.inverse(T), target):
             return log_ratio(scores[number], own)
@@ -70,10 +68,27 @@ def image_margin(
     image = target.cache[key]
     if image is None:
         return LIMITS[1]
+    _, scores, own = _refined_images(image[None], T, source, target, config, num_threads)
+    return log_ratio(scores[0], own)
+
+
+def _refined_images(
+    reflections: Array,
+    T: Array,
+    source: PreparedSource,
+    target: PreparedTarget,
+    config: VerificationConfig,
+    num_threads: int,
+) -> tuple[Array, Array, float]:
+    """The flipped source, refined from where reflections (K, 4, 4) of the target frame put the source's image.
+
+    Returns:
+        (K, 4, 4) poses and (K,) their mean squares, mm^2, and that of the source itself, refined from T (4, 4).
+    """
     some, limits_mm = source.subset(config.middle_points), np.linspace(*config.middle_limits_mm)
     own = refine_many(T[None], some, target, limits_mm, num_threads)[1][0]
-    flipped = refine_many((image @ T @ FLIP)[None], some * FLIP.diagonal()[:3], target, limits_mm, num_threads)[1][0]
-    return log_ratio(flipped, own)
+    poses, scores = refine_many(reflections @ T @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
+    return poses, scores, float(own)
 
 
 def log_ratio(changed_mm2: float, own_mm2: float) -> float:

@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by itself needs no other proposer
 
 NO_POSES = np.empty((0, 4, 4))
-FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity: poses are often written with few digits
 
 
 def never(assessment: Assessment) -> bool:
@@ -101,7 +100,7 @@ class Registrar:
             ConfigError: no such device.
         """
         config = config or RegistrarConfig()
-        return cls(config, (network(device), _search(config)))
+        return cls(config, (shipped_network(device), _search(config)))
 
     @cached_property
     def scene_calibration(self) -> Calibration:
@@ -175,23 +174,34 @@ class Registrar:
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
         start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
-            assessment = self._in_rounds(prepared, target, start, clock, enough)
+            assessment = self._of_bone_alone(prepared, target, start, clock, enough)
         else:
             eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
             assessment = self._in_scene(prepared, target, start, eye, clock)
         if assessment is None:
             return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
-        if viewpoint is None and cortices.follows_both(assessment, self.config):
-            assessment = self._on_both_cortices(assessment, clock)
+        checked = self._checked_and_corrected(assessment, clock, enough)
+        if checked.refusal is None or checked.seen is not None:  # a part found in a scene has no size of its own
+            return checked
+        return replace(checked, refusal=rules.asking_the_unit(checked.refusal, prepared.points, target.points))
+
+    def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
+        """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
         if assessment.is_sure(self.config.may_pass):
             assessment = self._unless_mirrored(assessment, clock, enough)
         if assessment.is_sure(self.config.may_pass):
             assessment = bias_corrected(assessment, self.config)
             clock.lap("refine")
-        judged = assessment.corrected(self.precision)
-        if judged.refusal is None or judged.seen is not None:  # a part that was found in a scene has no size of its own
-            return judged
-        return replace(judged, refusal=rules.asking_the_unit(judged.refusal, prepared.points, target.points))
+        return assessment.corrected(self.precision)
+
+    def _of_bone_alone(
+        self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough
+    ) -> Assessment | None:
+        """A source of which all points may be bone: on the outer cortex, and on both where the residuals ask for it."""
+        assessment = self._in_rounds(source, target, poses, clock, enough)
+        if assessment is None or not cortices.follows_both(assessment, self.config):
+            return assessment
+        return self._on_both_cortices(assessment, clock)
 
     def _on_both_cortices(self, assessment: Assessment, clock: Clock) -> Assessment:
         """The source registered to the inner cortex as well; no more than so sure, as no such source was calibrated."""
@@ -211,15 +221,19 @@ class Registrar:
         is_sure = a.is_sure(config.rules.mirrored_below) or enough(a)
         by_chance = len(a.source.points) <= config.rules.mirrored_points or not is_sure
         if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
-            flipped = sources.prepare(a.source.points * [1.0, 1.0, -1.0], config.source, config.num_threads)
-            image = None if isinstance(flipped, Refusal) else self._of_image(flipped, a.target, clock)
-            if image is not None:
-                found = min(found, mirror.log_ratio(image.candidates.scores[0], a.candidates.scores[0]))
+            found = min(found, self._full_image_margin(a, clock))
         clock.lap("assess")
         return a.refused(rules.by_mirror(found, config.rules), config.rules)
 
+    def _full_image_margin(self, assessment: Assessment, clock: Clock) -> float:
+        """As `mirror.image_margin`, with the mirror image of the source registered in full; infinite without a pose."""
+        a, config = assessment, self.config
+        flipped = sources.prepare(a.source.points * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
+        image = None if isinstance(flipped, Refusal) else self._of_image(flipped, a.target, clock)
+        return np.inf if image is None else mirror.log_ratio(image.candidates.scores[0], a.candidates.scores[0])
+
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
-        """The mirror image of a source, registered in full; `tracking` asks proposers without a track instead."""
+        """The mirror image of a source, registered in full; `memory.MemoryFirst` leaves what it remembers out."""
         return self._in_rounds(flipped, target, NO_POSES, clock)
 
     def _in_rounds(
@@ -250,7 +264,7 @@ class Registrar:
     ) -> Assessment | None:
         """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
         config, settings, threads = self.config, self.config.clutter, self.config.num_threads
-        scene, assessment = clutter.look(source, viewpoint, settings), None
+        scene, assessment = clutter.scene_from(source, viewpoint, settings), None
         for number in range(settings.rounds):
             scene = clutter.with_regions(scene, settings, number)
             pool = clutter.propose(scene, target, poses, settings, threads)
@@ -270,7 +284,7 @@ class Registrar:
         return assessment
 
 
-def network(device: str = "cpu") -> Proposer:
+def shipped_network(device: str = "cpu") -> Proposer:
     """GAPR-Net with the shipped weights.
 
     Raises:
@@ -304,7 +318,7 @@ def _finite(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> A
 
 def _rigid(pose: ArrayLike) -> Array:
     T = _finite(pose, (4, 4), "initial pose", "pass T_target_source in mm")
-    if why := se3.why_not_rigid(T, FARTHEST_FROM_RIGID):
+    if why := se3.why_not_rigid(T):
         how = "no scale, no reflection, translation in the last column; lengths in mm"
         raise InvalidPointCloudError("a rigid (4, 4) initial pose", f"a matrix whose {why}", how)
     return se3.nearest_rigid(T)

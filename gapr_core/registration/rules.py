@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.clouds import MM_PER_UNIT
 from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
 from gapr_core.geometry import se3
 from gapr_core.registration.covariance import PoseUncertainty
@@ -25,7 +26,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 
 DEFAULT = RulesConfig()
-OTHER_UNITS = {"cm": 10.0, "m": 1000.0}  # mm in each that is taken for mm by mistake
+OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # that are taken for mm by mistake
 PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 
 

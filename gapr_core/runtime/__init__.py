@@ -1,1 +1,1 @@
-"""What every room needs of the machine: console, threads, where a result comes from."""
+"""What every package needs of the machine: console, files, threads, settings, where a result comes from."""

@@ -158,6 +158,13 @@ def test_an_illegal_layout_raises_the_typed_error(name):
     assert issubclass(InvalidMessageError, ValueError)
 
 
+def test_a_point_of_more_bytes_than_numpy_counts_raises_the_typed_error():
+    cloud = xyz_to_cloud(np.ones((1, 3)))
+    cloud.point_step = cloud.row_step = 2**31
+    with pytest.raises(InvalidMessageError, match="point_step must be at most 2147483647"):
+        cloud_to_xyz(cloud)
+
+
 @pytest.mark.parametrize("points", [np.ones(3), np.ones((4, 2)), np.ones((2, 2, 2, 3))])
 def test_arrays_of_another_shape_are_not_written(points):
     with pytest.raises(InvalidMessageError, match="N, 3"):

@@ -1,4 +1,4 @@
-"""The street: few files stand next to the rooms."""
+"""Few modules lie next to the packages, and the page of the registration names all of its modules."""
 
 import re
 from pathlib import Path

@@ -158,6 +158,26 @@ def test_a_point_is_free_when_no_highest_point_of_a_pixel_near_it_is_above_its_p
     assert 0.1 < free.mean() < 0.9
 
 
+def test_a_point_whose_surface_is_seen_edge_on_is_not_free():
+    points, normals = np.zeros((2, 3)), np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    points[1, 1] = 20.0
+    free = visibility.unobstructed_from(np.array([0.0, 0.0, 1.0]), points, normals, 2.0)
+    np.testing.assert_array_equal(free, [False, True])
+
+
+def test_an_outer_layer_grows_to_its_neighbours_on_the_surface_and_not_across_a_gap():
+    x, y = np.meshgrid(np.arange(8.0), np.arange(8.0))
+    patch = np.stack([x.ravel(), y.ravel(), np.zeros(64)], axis=1)
+    others = np.array(
+        [[8.0, 3.0, 0.0], [8.0, 3.0, 0.6], [30.0, 3.0, 0.0]]
+    )  # next to it, above it, far off in its plane
+    points, outer = np.vstack([patch, others]), np.arange(67) < 64
+    outward = np.tile([0.0, 0.0, 1.0], (67, 1)) * outer[:, None]
+    visibility._grow(outer, outward, points, 1.0, num_threads=1)
+    np.testing.assert_array_equal(outer[64:], [True, False, False])
+    assert outward[64:] == pytest.approx(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+
+
 def test_a_quadric_is_the_weighted_least_squares_fit_to_the_neighbours():
     points, normals, _ = bent_slab()
     neighbours = cKDTree(points).query(points, k=16)[1]
@@ -227,6 +247,8 @@ def test_the_field_holds_the_nearest_point_of_every_cell_within_reach():
     assert ((found >= 0) == (gap < 8.0)).mean() > 0.9999
     near = (found >= 0) & (gap < 7.99)
     assert np.linalg.norm(centres[near] - points[found[near]], axis=1) == pytest.approx(gap[near], abs=1e-3)
+    beyond = field.distance.ravel() == distance_field.FARTHEST
+    np.testing.assert_array_equal(beyond, found == distance_field.FAR)
 
 
 def test_a_cell_as_near_to_two_points_has_the_first_however_many_threads_fill_the_field():

@@ -188,7 +188,7 @@ def test_a_camera_sees_the_cloud_levelled_over_its_neighbours_along_the_normals(
     seen = []
     monkeypatch.setattr(clutter.free_space, "see", lambda *words: seen.append(words))
     eye = np.array([0.0, 0.0, 300.0])
-    scene = clutter.look(source, eye, CONFIG)
+    scene = clutter.scene_from(source, eye, CONFIG)
     ((levelled, normals, viewpoint, config),) = seen
     assert scene.source.oriented and viewpoint is eye and config is CONFIG.free_space and scene.regions == []
     for k in (0, 17, 60):

@@ -46,6 +46,12 @@ def test_after_a_jump_what_spoke_for_the_bone_is_forgotten_and_what_spoke_agains
     assert bad.add(0.9, agrees=False) < 0.5
 
 
+def test_after_a_jump_a_frame_is_no_surer_than_alone_although_those_before_spoke_less_against_the_bone():
+    evidence = Evidence()
+    evidence.add(0.2, agrees=True)
+    assert evidence.add(0.01, agrees=False) == 0.01
+
+
 def test_after_a_jump_a_frame_that_spoke_for_the_bone_is_as_if_it_had_not_been():
     seen, fresh = Evidence(), Evidence()
     seen.add(0.36, agrees=True)  # sqrt(0.36) = 0.6: a little more than even
@@ -65,7 +71,7 @@ def test_after_a_jump_a_frame_that_did_not_speak_for_the_bone_still_weighs(befor
 
 
 def test_a_stream_without_frames_counts_as_one():
-    assert Evidence().frames == 1.0
+    assert Evidence().effective_frames == 1.0
 
 
 def test_a_probability_that_is_no_number_is_not_counted():
@@ -86,9 +92,9 @@ def test_a_jump_makes_the_frames_count_for_one():
     for _ in range(20):
         before = evidence.add(0.8, agrees=True)
     assert evidence.add(0.8, agrees=False) == pytest.approx(0.8) and before > 0.85
-    assert evidence.frames == 1.0
+    assert evidence.effective_frames == 1.0
     evidence.add(0.8, agrees=True)
-    assert evidence.frames == pytest.approx(2 / 1.5)
+    assert evidence.effective_frames == pytest.approx(2 / 1.5)
 
 
 def test_old_frames_are_forgotten():

@@ -4,7 +4,7 @@ import numpy as np
 
 from gapr_core.benchmark.judge import answer_of, judge, pair_facts
 from gapr_core.benchmark.record import Record
-from gapr_core.data.protocols import Pair
+from gapr_core.data.pair import Pair
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime.settings import from_dict

@@ -20,6 +20,7 @@ def test_the_conformal_quantile_is_the_next_larger_score():
     assert conformal.conformal_quantile(scores, 0.9) == 18.0
     assert conformal.conformal_quantile(scores, 0.95) == 19.0
     assert conformal.conformal_quantile(scores[:5], 0.95) == 5.0  # too few: the largest
+    assert conformal.conformal_quantile(scores[:10], 0.5) == 6.0  # of the next, too: half of eleven
 
 
 def test_errors_three_times_the_predicted_ones_triple_the_scale():
@@ -67,6 +68,7 @@ def test_a_family_of_a_few_answers_does_not_decide_for_all():
     scores = np.r_[np.linspace(0.0, 1.0, 500), np.full(10, 9.0)]
     assert 0.0 < conformal.factor_in_each(scores, family) < 1.0
     assert conformal.factor_in_each(scores[:9], family[500:509]) == 0.0
+    assert conformal.factor_in_each(np.full(conformal.FEWEST, 9.0), np.full(conformal.FEWEST, "few")) == 9.0
 
 
 def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):

@@ -62,13 +62,13 @@ def test_overlap_k_keeps_that_share_of_the_surface(percent):
     assert covered == pytest.approx(percent / 100.0, abs=0.05)
 
 
-def test_the_noise_of_the_paper_is_one_percent_of_the_half_extent():
+def test_the_noise_of_the_paper_is_one_percent_of_half_the_longest_edge():
     pair = make_pair("overlap-70", ball_specimen(RADIUS), 0)
     off = np.linalg.norm(in_target_frame(pair) + pair.metadata["origin_mm"] - [300.0, -200.0, 900.0], axis=1) - RADIUS
-    half_extent = degradation.half_extent(in_target_frame(pair))
+    half_edge_mm = degradation.half_edge_mm(in_target_frame(pair))
     inner = np.abs(off) < 3.0  # interpolated points lie on chords below the surface
-    assert off[inner].std() == pytest.approx(0.01 * half_extent, rel=0.25)
-    assert pair.metadata["noise_mm"] == pytest.approx(0.01 * half_extent, rel=0.1)
+    assert off[inner].std() == pytest.approx(0.01 * half_edge_mm, rel=0.25)
+    assert pair.metadata["noise_mm"] == pytest.approx(0.01 * half_edge_mm, rel=0.1)
 
 
 def test_on_long_bones_the_paper_crops_at_an_end_and_on_round_ones_anywhere():

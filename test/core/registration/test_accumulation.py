@@ -150,6 +150,16 @@ def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registr
     np.testing.assert_array_equal(accumulator.collected, np.concatenate(distant))
 
 
+@pytest.mark.parametrize(("new", "off", "row"), [("ab", "ab", "xab"), ("ab", "b", "b"), ("ab", "a", ""), ("", "", "x"),
+                                                 ("xa", "xa", "xa")])  # fmt: skip
+def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(registrar, new, off, row):
+    sources = {name: np.full((30, 3), float(number)) for number, name in enumerate("abx")}
+    accumulator = Accumulator(registrar, most=9)
+    accumulator._off_in_a_row, accumulator._new = [sources["x"]], [sources[name] for name in new]
+    found = accumulator._row_with([sources[name] for name in off])
+    assert [source[0, 0] for source in found] == [sources[name][0, 0] for name in row]
+
+
 def test_one_viewpoint_for_clouds_of_many_views_is_refused(registrar, frames, prepared):
     with pytest.raises(ConfigError, match="without a viewpoint"):
         Accumulator(registrar, most=3).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])

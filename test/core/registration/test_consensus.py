@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gapr_core.geometry import se3
+from gapr_core.registration.proposals import consensus
 from gapr_core.registration.proposals.consensus import Correspondences, distinct, local_to_global, ransac, sharpened
 
 
@@ -48,6 +49,30 @@ def test_proposed_poses_are_rigid_and_distinct():
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1.0) and 1 < len(poses) <= 10
     again = distinct(poses, np.arange(len(poses), 0, -1.0), found.source.mean(0), 10)
     assert len(again) == len(poses)
+
+
+def test_poses_are_the_same_only_where_both_place_and_attitude_are():
+    turned, shifted, near = (
+        se3.exp(twist) for twist in ([0, 0, 0, 1.0, 0, 0], [100.0, 0, 0, 0, 0, 0], [3.0, 0, 0, 0.05, 0, 0])
+    )
+    poses = np.array([np.eye(4), near, turned, shifted])
+    assert distinct(poses, np.array([4.0, 3.0, 2.0, 1.0]), np.zeros(3), 9).tolist() == [0, 2, 3]
+
+
+def test_a_triple_of_points_too_near_each_other_says_nothing_of_an_attitude():
+    near = np.random.default_rng(0).uniform(-2.0, 2.0, (30, 3))
+    found = Correspondences(near, near, np.ones(30), np.arange(30))
+    assert len(ransac(found, 4.0, np.random.default_rng(0))[0]) == 0
+    assert len(ransac(found, 0.2, np.random.default_rng(0))[0]) > 0
+
+
+def test_a_pose_that_two_correspondences_agree_with_is_not_fitted_to_them():
+    source = np.array([[0.0, 0, 0], [50.0, 0, 0], [0, 50.0, 0], [0, 0, 50.0]])
+    far = np.array([[0.0, 0, 0], [1.0, 0, 0], [900.0, 0, 0], [0, 900.0, 0]])
+    found = Correspondences(source, source + far, np.ones(4), np.zeros(4, dtype=int))
+    poses, scores = consensus._converge(np.eye(4)[None], found, 4.0, 5)
+    np.testing.assert_array_equal(poses, np.eye(4)[None])
+    np.testing.assert_array_equal(scores, [2.0])
 
 
 def test_without_correspondences_there_are_no_poses():

@@ -17,6 +17,11 @@ def test_a_box_is_read_in_its_own_frame():
     assert kept == pytest.approx(np.array([[0.0, 95.0, 0.0]]))
 
 
+def test_the_faces_of_a_box_belong_to_it():
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 3.01]])
+    np.testing.assert_array_equal(crop_box(points, np.eye(4), [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]), points[:2])
+
+
 @pytest.mark.parametrize("corners", [([0, 0, 0], [1, 1, 0]), ([0, 0], [1, 1])])
 def test_a_box_without_volume_is_refused(corners):
     with pytest.raises(ConfigError, match="corners"):

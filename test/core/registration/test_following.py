@@ -11,7 +11,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.following import FollowedPose, Follower, Look
+from gapr_core.registration.following import FollowedPose, Follower, PartialFit
 from gapr_core.registration.refinement import refine_fully
 
 MOTION = Motion(frames=6, share=0.35, points=2000, swing_deg=10.0)
@@ -52,7 +52,7 @@ def follower(registrar, frames, assessed, **following):
 
 def seen(of, pair):
     """How the next frame looks to a follower."""
-    return of._look(pair.source, of._T)
+    return of._fit_part(pair.source, of._T)
 
 
 def is_right(T, pair):
@@ -106,7 +106,7 @@ def look(registrar, frames, assessed):
     """How the second frame looks, which may be followed."""
     of = follower(registrar, frames, assessed)
     found = seen(of, frames[1])
-    assert isinstance(found, Look) and of.why_not(found) == ""
+    assert isinstance(found, PartialFit) and of.why_not(found) == ""
     return found
 
 
@@ -180,7 +180,7 @@ def test_a_weaker_view_counts_for_a_larger_error(registrar, frames, assessed, lo
     assert of.why_not(weaker) == "the error over the bone is not bounded"
     source = frames[1].source
     piece = source[((source - source[0]) ** 2).sum(axis=1).argsort()[:300]]
-    assert of.why_not(of._look(piece, of._T)) == "the error over the bone is not bounded"
+    assert of.why_not(of._fit_part(piece, of._T)) == "the error over the bone is not bounded"
 
 
 def test_a_weaker_view_counts_for_a_larger_turn(registrar, frames, assessed, look):
@@ -212,6 +212,13 @@ def test_the_spread_is_what_noise_does_to_the_pose(registrar, frames, assessed, 
     assert of._spread_mm(fit) == pytest.approx(np.sqrt(np.mean(squares)), rel=0.08)
     half = replace(fit, weights=0.5 * fit.weights)
     assert of._spread_mm(half) == pytest.approx(np.sqrt(2.0) * of._spread_mm(fit), rel=1e-3)
+    noisier = replace(assessed, fit=replace(assessed.fit, sigma_mm=3.0 * assessed.fit.sigma_mm))
+    assert follower(registrar, frames, noisier)._spread_mm(fit) == pytest.approx(3.0 * of._spread_mm(fit))
+
+
+def test_points_of_which_none_lies_on_the_bone_fit_infinitely_badly(registrar, frames, assessed):
+    far = follower(registrar, frames, assessed)._described(assessed.fit, 0.0, frames[0].source + 1e4)
+    assert (far.inlier_ratio, far.residual_mm) == (0.0, np.inf)
 
 
 # --- nothing leads away ---

@@ -86,7 +86,8 @@ def test_the_bone_of_somebody_else_does_not_follow_both_cortices(registrar, holl
     ("both_mm", "outer_mm", "noise_mm", "follows"),
     [
         (0.50, 1.0, 0.4, True),
-        (0.62, 1.0, 0.4, False),  # the inner cortex leaves more than .6 of what the outer one leaves
+        (1.10, 2.0, 0.8, True),
+        (0.62, 1.0, 0.5, False),  # the inner cortex leaves more than .6 of what the outer one leaves
         (0.50, 1.0, 0.3, False),  # and more than 1.5 times the noise of the source
         (0.07, 1.0, 0.0, True),  # noise has a floor
         (0.08, 1.0, 0.0, False),
@@ -99,8 +100,7 @@ def test_each_rule_of_both_cortices_refuses_alone(monkeypatch, both_mm, outer_mm
     assessment = SimpleNamespace(
         target=SimpleNamespace(both_cortices="both"),
         source=SimpleNamespace(points=None, noise_mm=noise_mm),
-        fit=SimpleNamespace(T=np.eye(4)),
-        features={"log_sigma": np.log(outer_mm)},
+        fit=SimpleNamespace(T=np.eye(4), sigma_mm=outer_mm),
     )
     assert cortices.follows_both(assessment, config) is follows
 

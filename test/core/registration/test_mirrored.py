@@ -52,6 +52,18 @@ def test_nothing_but_this_rule_refuses_the_flipped_pelvis(target, pelvis):
     assert Registrar(without).register(seen(pelvis) * FLIP, target).ok
 
 
+def test_of_the_images_that_lie_on_the_bone_the_best_one_is_taken(target, monkeypatch):
+    begun = []
+
+    def refined(poses, *_):
+        begun.extend(poses)
+        return poses, np.array([3.0, 1.0, 2.0])
+
+    monkeypatch.setattr(mirror, "refine_many", refined)
+    monkeypatch.setattr(mirror, "_is_own_image", lambda image, target: True)
+    np.testing.assert_array_equal(mirror._own_image(target, CONFIG.verification, 1), begun[1] @ mirror.FLIP)
+
+
 def test_the_image_of_a_bone_is_a_reflection_and_found_once(registrar, target, monkeypatch):
     image = mirror._own_image(target, CONFIG.verification, 1)
     assert np.linalg.det(image[:3, :3]) == pytest.approx(-1.0)

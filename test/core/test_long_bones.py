@@ -5,7 +5,7 @@ import pytest
 
 from gapr_core import clouds
 from gapr_core.data.parametric import make_bone
-from gapr_core.geometry import bones
+from gapr_core.geometry import long_bones
 from gapr_core.surface import Surface
 
 
@@ -21,7 +21,7 @@ def moved(surface, by=(0.0, 0.0, 0.0), sizes=(1.0, 1.0, 1.0)):
 
 
 def lengths_of(surface):
-    return bones.separate_long_bones(surface.points, surface.faces, surface.face_areas_mm2)
+    return long_bones.separate_long_bones(surface.points, surface.faces, surface.face_areas_mm2)
 
 
 FEMUR, TIBIA, PELVIS = make_bone("femur", 0), make_bone("tibia", 0), make_bone("pelvis", 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 STL_HEADER_BYTES, STL_FACET_BYTES = 84, 50
-BEGINNINGS = {
+SIGNATURES = {
     b"ply": ".ply",
     b"solid": ".stl",
     b"# .PCD": ".pcd",
@@ -29,4 +29,4 @@ def ending_of(path: Path) -> str:
     facets = int.from_bytes(head[80:84], "little")
     if facets and size == STL_HEADER_BYTES + STL_FACET_BYTES * facets:
         return ".stl"
-    return next((ending for beginning, ending in BEGINNINGS.items() if head.startswith(beginning)), "")
+    return next((ending for beginning, ending in SIGNATURES.items() if head.startswith(beginning)), "")

@@ -8,12 +8,14 @@ image, and `image_margin` tells a scan that was flipped from one that was not.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import VerificationConfig
+from gapr_core.config import RegistrarConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.registration.refinement import refine_many
+from gapr_core.registration.refinement import evaluate, refine_many
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 
@@ -22,6 +24,7 @@ Array = NDArray[np.float64]
 LIMITS = (-1.5, 4.0)  # of the margin: what is clearer decides nothing more
 PLANES = 6  # through the bone's long axis, evenly turned
 OWN_IMAGE_SHARE = 0.02  # of the half extent: a bone whose image lies so near, as a median, is its own mirror image
+SYMMETRIC_MM = 0.5  # root mean square distance of a bone and its image; that of scanned ones is 1.1 mm or more
 POINTS = 400  # of the bone, for that
 LEAST_MM = 0.1
 FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
@@ -50,26 +53,63 @@ def margin(
     return LIMITS[1]
 
 
-def image_margin(
-    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
-) -> float:
-    """As `margin`, for the image of a bone that is nearly its own mirror image; 4 for any other bone.
+def image_margin(T: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig) -> float:
+    """Does the flipped source fit better, on the image of a bone that is nearly its own mirror image?
 
     Args:
         T: (4, 4) T_target_source of the pose, mm.
         source: what was registered.
         target: the bone; its image is found once, and kept with it.
         config: how hypotheses are refined.
-        num_threads: 0 for all cores.
+
+    Returns:
+        As `Misfit.log_ratio`; 4 for any other bone.
     """
-    key = "own image", target.offset_mm  # targets that differ in the stand-off alone share their cache
-    if key not in target.cache:
-        target.cache[key] = _own_image(target, config, num_threads)
-    image = target.cache[key]
+    image = _kept_image(target, config)
     if image is None:
         return LIMITS[1]
-    _, scores, own = _refined_images(image[None], T, source, target, config, num_threads)
-    return log_ratio(scores[0], own)
+    poses, scores, own_mm2 = _refined_images(image[None], T, source, target, config.verification, config.num_threads)
+    some = source.subset(config.verification.middle_points)
+    sigmas_mm = [
+        evaluate(pose, points, target, config.refinement).sigma_mm
+        for pose, points in ((poses[0], some * FLIP.diagonal()[:3]), (T, some))
+    ]
+    return Misfit(float(scores[0]), sigmas_mm[0]).log_ratio(Misfit(own_mm2, sigmas_mm[1]))
+
+
+def is_symmetric(target: PreparedTarget, config: RegistrarConfig) -> bool:
+    """True for a model whose halves are mirror images of each other: a flipped source of it is no mistake."""
+    image, key = _kept_image(target, config), ("symmetric", target.offset_mm)
+    if image is None:
+        return False
+    if key not in target.cache:
+        points, verification = _some_of(target), config.verification
+        flipped, limits_mm = points * FLIP.diagonal()[:3], np.linspace(*verification.middle_limits_mm)
+        mean_square = refine_many((image @ FLIP)[None], flipped, target, limits_mm, config.num_threads)[1][0]
+        target.cache[key] = bool(mean_square < SYMMETRIC_MM**2)
+    return bool(target.cache[key])
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How badly a source fits a bone: once with all its points, once without the gross ones.
+
+    Attributes:
+        mean_square_mm2: of the truncated distances of all points.
+        sigma_mm: robust standard deviation of the residuals, from their median.
+    """
+
+    mean_square_mm2: float
+    sigma_mm: float
+
+    def log_ratio(self, own: Misfit) -> float:
+        """Log of the mean square, and of the variance, over those of the source's own pose: the larger of the two.
+
+        Below 0 where both say that this one fits better. Of a cloud with gross points most of the mean square is
+        theirs, and chance lets a few more of them lie near one bone than near its image; the median does not see how
+        many points lie off.
+        """
+        return max(log_ratio(self.mean_square_mm2, own.mean_square_mm2), log_ratio(self.sigma_mm**2, own.sigma_mm**2))
 
 
 def _refined_images(
@@ -96,9 +136,22 @@ def log_ratio(changed_mm2: float, own_mm2: float) -> float:
     return float(np.clip(np.log((changed_mm2 + LEAST_MM**2) / (own_mm2 + LEAST_MM**2)), *LIMITS))
 
 
+def _kept_image(target: PreparedTarget, config: RegistrarConfig) -> Array | None:
+    """`_own_image`, found once for a target."""
+    key = "own image", target.offset_mm  # targets that differ in the stand-off alone share their cache
+    if key not in target.cache:
+        target.cache[key] = _own_image(target, config.verification, config.num_threads)
+    return target.cache[key]  # type: ignore[no-any-return]
+
+
+def _some_of(target: PreparedTarget) -> Array:
+    """(N, 3) points of the bone, as a sensor with a stand-off sees them."""
+    return target.elements[:: max(1, len(target.points) // POINTS), :3]
+
+
 def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: int) -> Array | None:
     """(4, 4) motion with a reflection that lays the bone on itself, target frame; None where there is none."""
-    some = target.elements[:: max(1, len(target.points) // POINTS), :3]  # as a sensor with a stand-off sees them
+    some = _some_of(target)
     centre, limits_mm = target.points.mean(axis=0), np.linspace(*config.middle_limits_mm)
     planes = np.array([_reflection(normal, centre) for normal in _axes(target.points)])
     poses, scores = refine_many(planes @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)

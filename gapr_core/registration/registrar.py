@@ -20,6 +20,7 @@ from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.guidance import guide
+from gapr_core.registration.mirror import Misfit
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
@@ -217,7 +218,9 @@ class Registrar:
         image of such a source is registered in full.
         """
         a, config = assessment, self.config
-        found = mirror.image_margin(a.fit.T, a.source, a.target, config.verification, config.num_threads)
+        if mirror.is_symmetric(a.target, config):
+            return a
+        found = mirror.image_margin(a.fit.T, a.source, a.target, config)
         is_sure = a.is_sure(config.rules.mirrored_below) or enough(a)
         by_chance = len(a.source.points) <= config.rules.mirrored_points or not is_sure
         if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
@@ -230,7 +233,10 @@ class Registrar:
         a, config = assessment, self.config
         flipped = sources.prepare(a.source.points * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
         image = None if isinstance(flipped, Refusal) else self._of_image(flipped, a.target, clock)
-        return np.inf if image is None else mirror.log_ratio(image.candidates.scores[0], a.candidates.scores[0])
+        if image is None:
+            return np.inf
+        flipped_one, own = (Misfit(float(each.candidates.scores[0]), each.fit.sigma_mm) for each in (image, a))
+        return flipped_one.log_ratio(own)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         """The mirror image of a source, registered in full; `memory.MemoryFirst` leaves what it remembers out."""

@@ -114,6 +114,16 @@ def test_a_source_whose_mirror_image_fits_better_refuses_alone(log_ratio, refuse
         assert "other side" in refusal.reason and "flipped" in refusal.reason
 
 
+@pytest.mark.parametrize(
+    ("mean_square_mm2", "sigma_mm", "ratio"),
+    [(0.99, 0.3, np.log(1.0 / 1.01)), (0.49, 0.4, np.log(0.17 / 0.26)), (0.49, 1.0, np.log(1.01 / 0.26))],
+)
+def test_an_image_fits_better_where_all_points_and_most_points_say_so(mean_square_mm2, sigma_mm, ratio):
+    """Of mean square 1 and deviation .5 mm: by mean squares, by variances, and by the larger of the two."""
+    found = mirror.Misfit(mean_square_mm2, sigma_mm).log_ratio(mirror.Misfit(1.0, 0.5))
+    assert found == pytest.approx(ratio)
+
+
 def test_the_ratio_of_a_mirrored_source_is_that_of_mean_squares_above_a_tenth_of_a_millimetre():
     assert mirror.log_ratio(0.03, 0.09) == pytest.approx(np.log(0.04 / 0.10))
     assert mirror.log_ratio(1e-9, 1e-12) == pytest.approx(0.0, abs=1e-6)  # both exact: no sign of either

@@ -77,27 +77,64 @@ def test_the_image_is_found_where_a_sensor_with_a_stand_off_sees_the_bone(pelvis
     target = Registrar(CONFIG).prepare(pelvis)
     raised = offset_surface(target, SensorConfig(standoff_mm=5.0))
     for each in (raised, target):
-        found = mirror.image_margin(np.eye(4), sources.prepare(seen(pelvis)), each, CONFIG.verification, 1)
+        found = mirror.image_margin(np.eye(4), sources.prepare(seen(pelvis)), each, CONFIG)
         assert found < mirror.LIMITS[1]
     assert {("own image", 0.0), ("own image", 5.0)} <= target.cache.keys()
 
 
+def test_gross_points_that_lie_near_the_image_are_no_sign_of_a_flip(target, pelvis, monkeypatch):
+    """Of the mean square most may be theirs; the other points lie on the bone itself."""
+    source, refined_images = sources.prepare(seen(pelvis)), mirror._refined_images
+    image_mm2 = []
+
+    def with_gross_points(*given):
+        poses, scores, own_mm2 = refined_images(*given)
+        image_mm2.append(float(scores[0]))
+        return poses, 0.8 * np.full_like(scores, own_mm2), own_mm2
+
+    monkeypatch.setattr(mirror, "_refined_images", with_gross_points)
+    assert mirror.image_margin(np.eye(4), source, target, CONFIG) > 0.0
+    monkeypatch.setattr(mirror, "evaluate", lambda *_: SimpleNamespace(sigma_mm=0.4))
+    assert mirror.image_margin(np.eye(4), source, target, CONFIG) == pytest.approx(0.0)
+    assert image_mm2[0] > 0.4**2
+
+
+def test_of_a_symmetric_model_no_source_is_refused_for_its_image(registrar, target, pelvis, monkeypatch):
+    points = pelvis.sample(20_000, np.random.default_rng(2))[0]
+    half = points[points[:, 0] > 0.0]
+    symmetric = registrar.prepare(np.concatenate([half, half * FLIP]))
+    assert mirror.is_symmetric(symmetric, CONFIG) and not mirror.is_symmetric(target, CONFIG)
+    monkeypatch.setattr(mirror, "image_margin", lambda *_: -1.0)
+    right_half = seen(pelvis)[seen(pelvis)[:, 0] > 0.0]
+    assert registrar.register(right_half, symmetric).ok
+    assert registrar.register(right_half * FLIP, symmetric).ok
+    assert "mirror image" in registrar.register(right_half, target).reason
+
+
+def test_a_bone_without_an_image_is_not_symmetric(target):
+    assert not mirror.is_symmetric(replace(target, cache={("own image", 0.0): None}), CONFIG)
+
+
 def test_a_bone_without_an_image_has_the_largest_margin(target):
     unlike = replace(target, cache={("own image", 0.0): None})
-    assert mirror.image_margin(np.eye(4), None, unlike, CONFIG.verification, 1) == mirror.LIMITS[1]
+    assert mirror.image_margin(np.eye(4), None, unlike, CONFIG) == mirror.LIMITS[1]
 
 
 @pytest.mark.parametrize(
-    ("count", "below", "better", "refused"),
+    ("count", "below", "better", "better_mostly", "refused"),
     [
-        (400, 0.0, 1.5, True),
-        (400, 0.0, 1.0, False),
-        (401, 0.0, 1.5, False),
-        (401, 1.0, 1.5, True),
-        (401, 1.0, 1.0, False),
+        (400, 0.0, 1.5, 1.5, True),
+        (400, 0.0, 1.0, 1.0, False),
+        (400, 0.0, 1.5, 0.9, False),  # gross points alone lie nearer to the image
+        (400, 0.0, 0.9, 1.5, False),
+        (401, 0.0, 1.5, 1.5, False),
+        (401, 1.0, 1.5, 1.5, True),
+        (401, 1.0, 1.0, 1.0, False),
     ],
 )
-def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(monkeypatch, count, below, better, refused):
+def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(
+    monkeypatch, count, below, better, better_mostly, refused
+):
     config = replace(CONFIG, rules=replace(CONFIG.rules, mirrored_below=below))
     registrar, femur = Registrar(config), make_bone("femur", 900_001)
     in_rounds, asked, own = Registrar._in_rounds, [], []
@@ -107,7 +144,8 @@ def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(monkeypat
         if len(asked) == 1:
             own.append(in_rounds(self, source, target, poses, clock, *enough))
             return own[0]
-        return SimpleNamespace(candidates=SimpleNamespace(scores=own[0].candidates.scores / better))
+        fit = SimpleNamespace(sigma_mm=own[0].fit.sigma_mm / np.sqrt(better_mostly))
+        return SimpleNamespace(candidates=SimpleNamespace(scores=own[0].candidates.scores / better), fit=fit)
 
     monkeypatch.setattr(Registrar, "_in_rounds", rounds)
     result = registrar.register(seen(femur, count), registrar.prepare(femur))

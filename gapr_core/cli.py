@@ -9,8 +9,9 @@ from __future__ import annotations
 import argparse
 import ast
 import logging
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -38,6 +39,7 @@ EXTRAS = {  # top-level module -> the extra of setup.py that installs it
     "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros",
     "SimpleITK": "medical", "skimage": "medical", "highdicom": "medical",
 }  # fmt: skip
+NEGATIVE = re.compile(r"-[.\d].*[,:].*")  # X,Y,Z and FIRST:LAST; a single number argparse knows itself
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -77,7 +79,18 @@ def _parser(arguments: list[str]) -> argparse.Namespace:
         command = commands.add_parser(name, help=_first_line(module))
         if arguments[:1] == [name]:
             _load(command, module)
-    return parser.parse_args(arguments)
+    return parser.parse_args(_joined(arguments))
+
+
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """Values that begin with a minus as --NAME=VALUE: argparse takes the -1 of `--tip -1,2,3` for an option."""
+    joined: list[str] = []
+    for word in arguments:
+        if joined and NEGATIVE.fullmatch(word) and joined[-1].startswith("--") and "=" not in joined[-1]:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def modules() -> Mapping[str, str]:

@@ -196,3 +196,14 @@ def test_gapr_pivot_prints_what_register_takes(tmp_path, capsys):
     assert "--tip 1.000,2.000,150.000" in capsys.readouterr().out
     assert json.loads((tmp_path / "tip.json").read_text())["poses"] == 30
     assert main(["pivot", str(tmp_path / "none.csv")]) == 1
+
+
+def test_a_tip_that_begins_with_a_minus_can_be_pasted(tmp_path, monkeypatch):
+    """What `gapr pivot` prints for half of all tools; argparse took it for an option."""
+    from gapr_core.commands import register
+
+    given = []
+    monkeypatch.setattr(register, "run", lambda args: given.append((args.tip, args.viewpoint, args.clouds)) or 0)
+    line = "register --source a.csv --target b.stl --tip -0.100,-2.000,150.000 --viewpoint -.5,1,2 --clouds -3:"
+    assert main([*line.split(), "--json", str(tmp_path / "o.json")]) == 0
+    assert given == [((-0.1, -2.0, 150.0), (-0.5, 1.0, 2.0), (-3, None))]

@@ -85,6 +85,8 @@ def test_damaged_and_empty_markups_are_refused_in_one_line(tmp_path, content):
     ("a.txt", "# from a probe\nx;y;z\n10;20;30\n-40;5;60\n7;-8;90\n"),
     ("a.csv", "10,20,30\n-40,5,60\n7,-8,90\n"),
     ("b.csv", "Time,Z,X,Y\n0,30,10,20\n1,60,-40,5\n2,90,7,-8\n"),
+    ("c.csv", "\ufeff10,20,30\r\n-40,5,60\r\n7,-8,90\r\n"),
+    ("d.xyz", "\ufeff# z x y\r\n30 10 20\r\n60 -40 5\r\n90 7 -8\r\n"),
 ])  # fmt: skip
 def test_text_clouds_have_a_point_a_line(tmp_path, name, content):
     (tmp_path / name).write_text(content)

@@ -179,7 +179,7 @@ def test_the_pose_is_written_though_nobody_reads_the_output(tmp_path, files, is_
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
 def test_names_that_the_output_cannot_hold_are_said_nevertheless(tmp_path, encoding):
-    """Of a planned target in Chinese, or of a file whose name is no UTF-8: a traceback after the work lost the files."""
+    """Of a planned target in Chinese, or a file whose name is no UTF-8: a traceback after the work lost files."""
     script = "from gapr_core.runtime.console import say; say('\\u9aa8: 1.2 mm \\udce9')"
     environment = os.environ | {"PYTHONIOENCODING": encoding}
     ended = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True)

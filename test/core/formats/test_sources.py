@@ -93,6 +93,17 @@ def test_text_clouds_have_a_point_a_line(tmp_path, name, content):
     np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
 
 
+@pytest.mark.parametrize("between", [" ", "\t", "   ", " \t"])
+def test_words_of_an_obj_file_may_have_tabs_between_them(tmp_path, between):
+    """A line that began with `v` and a tab was no vertex."""
+    rows = [("v", *point) for point in POINTS] + [("v", 0, 0, 0)]
+    rows += [("f", *corners) for corners in ((1, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4))]
+    (tmp_path / "a.obj").write_text("".join(between.join(map(str, row)) + "\n" for row in rows))
+    surface = reading.read(tmp_path / "a.obj")
+    np.testing.assert_allclose(surface.points, [*POINTS, [0, 0, 0]])
+    assert surface.faces.tolist() == [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+
+
 @pytest.mark.parametrize("content", ["", "1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "1 2 3\n4 5 6"])
 def test_cut_and_ragged_text_clouds_are_refused(tmp_path, content):
     (tmp_path / "a.xyz").write_text(content)

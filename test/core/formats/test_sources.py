@@ -69,7 +69,9 @@ def test_written_markups_come_back(tmp_path):
     assert np.array_equal(read.points, POINTS) and read.labels == ("a", "b", "c")
 
 
-DAMAGED = ["", "{}", "nonsense", '{"markups": []}', '{"markups": [{"coordinateSystem": "LPS"}]}']
+FLAT = {"coordinateSystem": "LPS", "controlPoints": [{"position": [1.0, 2.0]}] * 3}  # six numbers, no two points
+DAMAGED = ["", "{}", "nonsense", '{"markups": []}', '{"markups": [{"coordinateSystem": "LPS"}]}',
+           json.dumps({"markups": [FLAT]})]  # fmt: skip
 
 
 @pytest.mark.parametrize("content", DAMAGED)

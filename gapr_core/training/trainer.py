@@ -57,8 +57,12 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
         The averaged weights, ready for `NetworkProposer`.
 
     Raises:
+        ConfigError: fewer pairs than one batch, another run in `folder`, or see `begin`.
         FloatingPointError: step after step had gradients that are not finite.
     """
+    if config.pairs < config.batch:
+        given = f"{config.pairs} pairs"
+        raise ConfigError(f"a batch of {config.batch} or more", given, "raise --pairs, or lower batch and micro_batch")
     group = distributed.start(config.device)
     rank, world, device = group.rank, group.world, group.device
     model = config.network()

@@ -95,6 +95,13 @@ def test_a_run_that_was_refused_leaves_its_folder_to_the_next_one(settings, anat
         trainer.train(replace(settings, seed=1), tmp_path / "run", anatomy)
 
 
+def test_a_run_of_less_than_one_step_is_refused(settings, anatomy, tmp_path):
+    """It ended well and named weights that it had not written."""
+    with pytest.raises(ConfigError, match="a batch of 4 or more; got 3 pairs; raise --pairs"):
+        trainer.train(replace(settings, pairs=3), tmp_path / "run", anatomy)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_protocol_that_the_network_never_sees_is_named(settings, anatomy):
     """Points far away span many times the target: such a share of the mix would silently be drawn as something else."""
     model = trainer.ModelConfig.from_yaml(settings.model)

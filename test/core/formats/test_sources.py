@@ -394,6 +394,10 @@ UNCLEAR = {
         "x_ref,y_ref,z_ref,x_tip,y_tip,z_tip\n1,2,3,4,5,6\n",
         "one column each for x y z; got h.csv: .* x_ref .* z_tip",
     ),
+    "j.csv": (
+        "0,10,20,30\n1,-40,5,60\n2,7,-8,90\n",
+        "x y z in the first columns; got j.csv: a first column that counts",
+    ),
     "i.txt": ("x y z x y z\n1 2 3 4 5 6\n", "one column each for x y z; got i.txt: columns x y z x y z; name"),
 }
 

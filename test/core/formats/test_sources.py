@@ -324,27 +324,51 @@ def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title
     ("LPS", [1, 1, 1]), ("RAS", LPS_RAS), ("SCANNER", [1, 1, 1]), (None, [1, 1, 1]),
 ])  # fmt: skip
 def test_axes_of_a_vtp_file_come_from_its_array_space_however_it_is_written(tmp_path, mode, compressor, said, factors):
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    corners, faces, poly, writer = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkXMLPolyDataWriter()
-    corners.SetData(numpy_to_vtk(POINTS, deep=True))
-    faces.InsertNextCell(3, [0, 1, 2])
-    poly.SetPoints(corners)
-    poly.SetPolys(faces)
-    if said:
-        space = vtkStringArray()
-        space.SetName("SPACE")
-        space.InsertNextValue(said)
-        poly.GetFieldData().AddArray(space)
+    poly, writer = triangle_with(*[said] * bool(said)), vtkXMLPolyDataWriter()
     writer.SetFileName(str(tmp_path / "a.vtp"))
     getattr(writer, f"SetDataModeTo{mode}")()
     getattr(writer, f"SetCompressorTypeTo{compressor}")()
     writer.SetInputData(poly)
     assert writer.Write()
     np.testing.assert_allclose(reading.read(tmp_path / "a.vtp").points, POINTS * factors)
+
+
+@pytest.mark.parametrize("version", [42, 51])
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_texts_in_a_legacy_vtk_file_are_passed_over(tmp_path, version, is_binary):
+    """A binary text has its length before it, in one, two or four bytes."""
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    writer = vtkPolyDataWriter()
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    writer.SetFileType(2 if is_binary else 1)
+    writer.SetFileVersion(version)
+    writer.SetInputData(triangle_with(*("x" * length for length in (0, 5, 63, 64, 300, 16383, 16384))))
+    assert writer.Write()
+    surface = reading.read(tmp_path / "a.vtk")
+    np.testing.assert_allclose(surface.points, POINTS)
+    assert surface.faces.tolist() == [[0, 1, 2]]
+
+
+def triangle_with(*texts):
+    """Polygonal data with a field array SPACE, if there are texts for it."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    corners, faces, poly, space = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkStringArray()
+    corners.SetData(numpy_to_vtk(POINTS, deep=True))
+    faces.InsertNextCell(3, [0, 1, 2])
+    poly.SetPoints(corners)
+    poly.SetPolys(faces)
+    space.SetName("SPACE")
+    for text in texts:
+        space.InsertNextValue(text)
+    if texts:
+        poly.GetFieldData().AddArray(space)
+    return poly
 
 
 TABLES = {

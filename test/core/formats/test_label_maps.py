@@ -2,6 +2,7 @@
 
 import gzip
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -303,6 +304,15 @@ def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia"), layer
     )  # fmt: skip
     seg.save_as(tmp_path / "seg.dcm")
     return tmp_path / "seg.dcm"
+
+
+def test_letters_of_any_kind_may_be_in_a_name_and_bytes_that_are_none_are_said(tmp_path):
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    named = write(tmp_path / "a.nii.gz", voxels_of(affine, size), affine).rename(tmp_path / "F\u00e9mur \u9aa8.nii.gz")
+    assert np.abs(error_mm(clouds.load(named).points)).max() < 1.5
+    latin = named.rename(tmp_path / os.fsdecode(b"f\xe9mur.nii.gz"))
+    with pytest.raises(InvalidPointCloudError, match="a path in UTF-8; .*rename the file"):
+        clouds.load(latin)
 
 
 def test_specks_are_left_out_and_said(tmp_path, caplog):

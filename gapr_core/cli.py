@@ -11,7 +11,7 @@ import ast
 import logging
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -21,7 +21,6 @@ from typing import Any, NoReturn
 from gapr_core.errors import GaprError
 
 OK, BAD_INPUT, INTERRUPTED = 0, 1, 130
-NUMBERS_BELOW_0 = re.compile(r"-[\d.][^:]*,.*|-\d+:-?\d*")  # X,Y,Z and FIRST:LAST that begin with a minus
 COMMANDS = {
     "register": "gapr_core.commands.register",
     "evaluate": "gapr_core.commands.evaluate",
@@ -40,6 +39,7 @@ EXTRAS = {  # top-level module -> the extra of setup.py that installs it
     "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros",
     "SimpleITK": "medical", "skimage": "medical", "highdicom": "medical",
 }  # fmt: skip
+NEGATIVE = re.compile(r"-[.\d].*[,:].*")  # X,Y,Z and FIRST:LAST; a single number argparse knows itself
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -82,11 +82,11 @@ def _parser(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(_joined(arguments))
 
 
-def _joined(arguments: list[str]) -> list[str]:
-    """`--tip -1,2,3` as `--tip=-1,2,3`: argparse takes what begins with a minus, other than a number, for an option."""
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """Values that begin with a minus as --NAME=VALUE: argparse takes the -1 of `--tip -1,2,3` for an option."""
     joined: list[str] = []
     for word in arguments:
-        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and NUMBERS_BELOW_0.fullmatch(word):
+        if joined and NEGATIVE.fullmatch(word) and joined[-1].startswith("--") and "=" not in joined[-1]:
             joined[-1] += f"={word}"
         else:
             joined.append(word)

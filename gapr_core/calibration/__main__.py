@@ -34,6 +34,7 @@ from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
 from gapr_core.registration.precision_model import PRECISION_FEATURES
 from gapr_core.runtime import cluster, origin
+from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import say
 from gapr_core.runtime.files import write_json, write_text
 
@@ -58,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--jobs", type=at_least_one, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
     args = parser.parse_args(arguments)
     which = (str(args.anatomy), args.split, args.seed)
@@ -66,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tasks += scenes(*which, args.scenes)
     tasks += look_alikes(*which, args.look_alikes)
     tasks += streams.tasks(*which, args.streams)
+    if not tasks:
+        raise ConfigError("pairs, scenes or streams to collect", "none", "raise --count")
     records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
     given = sys.argv[1:] if arguments is None else arguments
     commits = sorted({str(record.get("commit")) for record in records})

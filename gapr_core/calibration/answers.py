@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.calibration.pairs import first_of_twins
+from gapr_core.errors import ConfigError
 from gapr_core.registration.features import FEATURES_OF
 
 Array = NDArray[np.float64]
@@ -132,7 +133,8 @@ def of_models_that_saw_no_subject(
     """(N,) predictions, each by a model that was fitted to the known answers (N,) without the pair's subject."""
     found = np.full(len(answers), np.nan)
     for fitted, judged in answers.people_folds():
-        found[judged] = predict(fit(answers.of(fitted & known)), answers.of(judged))
+        if judged.any():
+            found[judged] = predict(fit(_enough(answers.of(fitted & known))), answers.of(judged))
     return found
 
 
@@ -145,5 +147,17 @@ def of_models_that_saw_neither(
         of_it: Mask = answers.family == family
         for fitted, judged in answers.people_folds():
             if (judged & of_it).any():
-                found[judged & of_it] = predict(fit(answers.of(fitted & known & ~of_it)), answers.of(judged & of_it))
+                others = _enough(answers.of(fitted & known & ~of_it))
+                found[judged & of_it] = predict(fit(others), answers.of(judged & of_it))
     return found
+
+
+def _enough(answers: Answers) -> Answers:
+    """The answers that a model is fitted to, if there are any.
+
+    Raises:
+        ConfigError: none is of other subjects and other sensors than those that are judged.
+    """
+    if not len(answers):
+        raise ConfigError("answers of other subjects and sensors to fit to", "none", "collect more pairs (--count)")
+    return answers

@@ -58,7 +58,7 @@ def run(args: Namespace) -> int:
         folders = [Path(name) for name in args.merge[1:]]
         if args.merge[0] != "merge" or not folders:
             raise ConfigError("merge DIR...", " ".join(args.merge), "name the folders to merge after the word merge")
-        rows = merge(folders, args.out)
+        rows = merge(folders, args.out, args.ours)
     else:
         if args.pairs is None:
             raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
@@ -98,7 +98,7 @@ def benchmark(
 
     Raises:
         ConfigError: no pairs, an unknown method, settings without a method of ours, or results of other pairs or
-            settings in `out`; a pair without a truth.
+            settings in `out`; a pair without a truth; `ours` that is none of the methods.
         InvalidPointCloudError: a file that is no pair, or whose truth, landmarks or facts cannot be.
         MethodUnavailableError: a method whose library is not installed.
     """
@@ -137,17 +137,18 @@ def _begin(
     return plan, done
 
 
-def merge(folders: Sequence[Path], out: Path) -> list[Row]:
+def merge(folders: Sequence[Path], out: Path, ours: str | None = None) -> list[Row]:
     """Join the results of shards of one run.
 
     Raises:
-        ConfigError: a folder that is no output of a benchmark, or shards of different pairs or settings.
+        ConfigError: a folder that is no output of a benchmark, or shards of different pairs or settings; `ours` that
+            is none of their methods.
     """
-    _join(folders, out)
+    _join(folders, out, ours)
     return write(out, records.read_plan(out))
 
 
-def _join(folders: Sequence[Path], out: Path) -> None:
+def _join(folders: Sequence[Path], out: Path, ours: str | None) -> None:
     """The records and the plan of all shards in `out`."""
     plans = [records.read_plan(folder) for folder in folders]
     pairs: dict[str, str] = {}
@@ -157,10 +158,12 @@ def _join(folders: Sequence[Path], out: Path) -> None:
     joined = [record for folder in (out, *folders) for record in records.read(folder / records.FILE)]
     named = (*(name for plan in plans for name in plan.methods), *(record.method for record in joined))
     methods = list(dict.fromkeys(named))
+    _check_ours(ours, methods)
     _check_same_pairs(joined, pairs, out)
     records.done(joined, pairs, {record.method: record.settings for record in reversed(joined)})
     records.write(out / records.FILE, records.sort(joined, methods))
-    records.write_plan(out, replace(plans[0], pairs=pairs, methods=methods, command=_command()))
+    plan = replace(plans[0], ours=ours or plans[0].ours)
+    records.write_plan(out, replace(plan, pairs=pairs, methods=methods, command=_command()))
 
 
 def write(out: Path, plan: Plan) -> list[Row]:
@@ -177,6 +180,7 @@ def write(out: Path, plan: Plan) -> list[Row]:
 
 
 def _plan(pairs: Path, paths: Sequence[Path], methods: Sequence[str], threads: int, ours: str | None) -> Plan:
+    _check_ours(ours, methods)
     listed = listed_hashes(pairs)
     missing = [path for path in paths if path.stem not in listed]
     read = {path.stem: pair_hash(load_pair(path)) for path in tqdm(missing, desc="reading pairs", disable=None)}
@@ -206,6 +210,12 @@ def check_content(record: Record, plan: Plan) -> None:
     if record.sha256 != plan.pairs[record.pair]:
         wanted, given = f"the clouds that {MANIFEST} lists", f"others in {record.pair}.npz"
         raise ConfigError(wanted, given, "make the pairs again in another folder")
+
+
+def _check_ours(ours: str | None, methods: Sequence[str]) -> None:
+    """Raise for a method that nothing was compared with: the table would say that no other one beats it."""
+    if ours and ours not in methods:
+        raise ConfigError(f"--ours with one of {', '.join(methods)}", ours, "name a method of --methods")
 
 
 def _check_same_pairs(joined: Sequence[Record], pairs: dict[str, str], out: Path) -> None:

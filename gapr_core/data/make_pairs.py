@@ -78,10 +78,10 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Make the pairs that the arguments name; says what it made, or takes up what an earlier run left."""
     origin = "anatomy" if args.anatomy else "meshes" if args.meshes else "parametric"
-    named = args.bones.split(",") if args.bones else pool.bones_in(args.meshes) if args.meshes else anatomy.BONES
+    named = _names(args.bones) if args.bones else pool.bones_in(args.meshes) if args.meshes else anatomy.BONES
     made_of = anatomy.meshes_hash(args.meshes, named, args.split) if args.meshes else ""
     recipe = Recipe(
-        tuple(args.protocol.split(",")), tuple(named), args.count, args.seed, args.split, args.people, origin,
+        _names(args.protocol), tuple(named), args.count, args.seed, args.split, args.people, origin,
         args.units if args.meshes else "mm", made_of,
     )  # fmt: skip
     begin(recipe, args.out)
@@ -92,6 +92,11 @@ def run(args: Namespace) -> int:
         say(f"{bone}: {len(found)} subjects of split {recipe.split} ({cohorts})")
     say(f"{len(manifest['pairs'])} pairs in {args.out}, hash {manifest['hash'][:16]}")
     return 0
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Each name of a list with commas once: a pair stood twice in the manifest."""
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def write_pairs(

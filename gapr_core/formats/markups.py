@@ -95,6 +95,8 @@ def _of_json(content: Any) -> Markups:
         if "controlPoints" not in node:
             raise ValueError(f"a {node.get('type', 'node')} without points")
         placed = [p for p in node["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
+        if any(len(p["position"]) != 3 for p in placed):
+            raise ValueError("a position that is not x y z")
         positions = np.array([p["position"] for p in placed], dtype=np.float64).reshape(-1, 3)
         points.append(axes.to_lps(positions * mm, space))
         labels += [str(p.get("label", "")) for p in placed]

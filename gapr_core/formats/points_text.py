@@ -26,7 +26,8 @@ def read(path: Path, limits: FileLimits) -> Surface:
     """X y z, or x y z nx ny nz, in the first columns or where a line of names says.
 
     Raises:
-        InvalidPointCloudError: names that do not say which columns are x y z, or decimal commas.
+        InvalidPointCloudError: names that do not say which columns are x y z, numbers of the points in the first one,
+            or decimal commas.
     """
     return _surface(limits.read(path))
 
@@ -68,6 +69,8 @@ def _surface(data: bytes) -> Surface:
     has_normals = values.shape[1] == 6 and _are_units(values[:, 3:])
     if not (named or has_normals) and all(SPLIT_DECIMALS.fullmatch(row.strip()) for row in rows):
         raise _decimal_commas(rows[0])
+    if not (named or has_normals):
+        _check_first(names, values)
     columns = _columns(names, values.shape[1], delimiter, has_normals) if named else _said(names, values.shape[1])
     has_normals = has_normals and columns == [0, 1, 2]
     return Surface(values[:, columns], None, values[:, 3:] if has_normals else None)
@@ -123,6 +126,14 @@ def _said(names: list[str], count: int) -> list[int]:
     """Where x y z are by a comment that names every column, else the first three."""
     found = _places(names) if len(names) == count else None
     return found or [0, 1, 2]
+
+
+def _check_first(names: list[str], values: np.ndarray) -> None:
+    """Raise where the first column is no x, but the number of each point, and no comment says so."""
+    is_said = len(names) == values.shape[1] and _places(names) is not None
+    if not is_said and values.shape[1] > 3 and len(values) > 2 and (np.diff(values[:, 0]) == 1.0).all():
+        given = "a first column that counts the points"
+        raise InvalidPointCloudError("x y z in the first columns", given, "leave it out, or begin with a line of names")
 
 
 def _places(names: list[str]) -> list[int] | None:

@@ -13,13 +13,13 @@ Array = NDArray[np.float64]
 
 
 def lines(data: bytes) -> Iterator[str]:
-    """The lines of a text file, one at a time.
+    """The lines of a text file, one at a time, without the byte order mark that Windows puts before them.
 
     Raises:
         ValueError: the last line does not end.
     """
     check_end(data)
-    return iter(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace"))
+    return iter(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", errors="replace"))
 
 
 def check_end(data: bytes) -> None:

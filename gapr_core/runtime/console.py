@@ -7,9 +7,14 @@ import sys
 
 
 def say(text: str) -> None:
-    """One line on standard output; it goes nowhere, and the program goes on, where nobody reads it any more."""
+    """One line on standard output; it goes nowhere, and the program goes on, where nobody reads it any more.
+
+    Letters that the output cannot hold, in names of files and of planned targets, come out as their numbers.
+    """
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    shown = text.encode(encoding, "backslashreplace").decode(encoding)
     try:
-        sys.stdout.write(f"{text}\n")
+        sys.stdout.write(f"{shown}\n")
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

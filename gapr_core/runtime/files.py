@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, gettempdir
 from typing import Any
 
 from gapr_core.errors import ConfigError
@@ -17,23 +17,33 @@ from gapr_core.errors import ConfigError
 def replacing(path: str | Path) -> Iterator[Path]:
     """A hidden file in the folder of `path`, to be written; it takes the place of `path` when the block ends well.
 
-    After an error the old file is as it was. Missing folders are made.
+    After an error the old file is as it was. Missing folders are made. A link stays, and what it leads to is replaced;
+    a device or a pipe, such as /dev/null, gets the content.
 
     Raises:
         ConfigError: the file cannot be written: no such folder, no permission, a full disk.
     """
     path = Path(path)
     _refuse_folder(path)
-    scratch = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    into = Path(gettempdir()) / path.name if is_special(path) else Path(os.path.realpath(path))
+    scratch = into.with_name(f".{into.stem}.{os.getpid()}{into.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        into.parent.mkdir(parents=True, exist_ok=True)
         yield scratch
-        os.replace(scratch, path)
+        if is_special(path):
+            path.write_bytes(scratch.read_bytes())
+        else:
+            os.replace(scratch, into)
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
         with suppress(OSError):  # no such folder: the error above says more
             scratch.unlink(missing_ok=True)
+
+
+def is_special(path: Path) -> bool:
+    """Whether something is there that no file may replace: a device, a pipe, a socket."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @contextmanager
@@ -79,7 +89,9 @@ def check_writable(path: str | Path) -> None:
     """
     path = Path(path)
     _refuse_folder(path)
-    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    if is_special(path):
+        return
+    folder = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
     try:
         with TemporaryFile(dir=folder):
             pass

@@ -57,8 +57,12 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
         The averaged weights, ready for `NetworkProposer`.
 
     Raises:
+        ConfigError: fewer pairs than one batch, another run in `folder`, or see `begin`.
         FloatingPointError: step after step had gradients that are not finite.
     """
+    if config.pairs < config.batch:
+        given = f"{config.pairs} pairs"
+        raise ConfigError(f"a batch of {config.batch} or more", given, "raise --pairs, or lower batch and micro_batch")
     group = distributed.start(config.device)
     rank, world, device = group.rank, group.world, group.device
     model = config.network()
@@ -143,7 +147,8 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
 def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
     """A network to train: with the weights of `config.initial`, or random ones.
 
-    Where the bone head alone is trained, `config.initial` need not have one.
+    Where the bone head alone is trained, `config.initial` need not have one. A network without a head begins with
+    all but the head of `config.initial`.
 
     Raises:
         ConfigError: the tensors of `config.initial` are not those of this network, other settings may differ; or the
@@ -158,7 +163,9 @@ def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
     given = weights.load(config.initial)[0].state_dict()
     own = network.state_dict()
     if config.trained != "all":
-        given = {name: tensor for name, tensor in own.items() if name.startswith(f"{config.trained}.")} | given
+        given = tensors_of(own, config.trained) | given
+    elif model.bone_head == "none":
+        given = {name: given[name] for name in given.keys() - tensors_of(given, "bone_head").keys()}
     if {name: tensor.shape for name, tensor in given.items()} != {name: tensor.shape for name, tensor in own.items()}:
         raise ConfigError(
             "initial weights of the network that is trained",
@@ -167,6 +174,11 @@ def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
         )
     network.load_state_dict(given)
     return network.train()
+
+
+def tensors_of(state: dict[str, torch.Tensor], name: str) -> dict[str, torch.Tensor]:
+    """The tensors of one part of a network, such as `bone_head`."""
+    return {tensor: state[tensor] for tensor in state if tensor.startswith(f"{name}.")}
 
 
 def check_head(config: TrainConfig, model: ModelConfig) -> None:

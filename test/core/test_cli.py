@@ -175,3 +175,12 @@ def test_the_pose_is_written_though_nobody_reads_the_output(tmp_path, files, is_
     ended = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert "Transform" in (tmp_path / "pose.tfm").read_text() and "BrokenPipe" not in ended.stderr
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_names_that_the_output_cannot_hold_are_said_nevertheless(tmp_path, encoding):
+    """Of a planned target in Chinese, or a file whose name is no UTF-8: a traceback after the work lost files."""
+    script = "from gapr_core.runtime.console import say; say('\\u9aa8: 1.2 mm \\udce9')"
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    ended = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True)
+    assert ended.returncode == 0 and ended.stdout.endswith(b": 1.2 mm \\udce9\n"), ended.stderr

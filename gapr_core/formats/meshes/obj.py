@@ -28,7 +28,7 @@ def read(path: Path, limits: FileLimits) -> Surface:
     """
     vertices, corners, ends, announced = array("d"), array("q"), array("q", [0]), {}
     for line in text.lines(limits.read(path)):
-        kind, _, rest = line.strip().partition(" ")
+        kind, rest = (*line.split(None, 1), "", "")[:2]
         if kind == "v":
             vertices.extend(_coordinates(rest))
         elif kind == "f":

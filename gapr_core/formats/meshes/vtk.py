@@ -115,11 +115,20 @@ class _File:
         count = int(words[1]) * int(words[2])
         if words[3] != "string":
             self.numbers(count, words[3])
-        elif self._is_text:
-            for _ in range(min(count, len(self._data))):
+        for _ in range(min(count, len(self._data)) if words[3] == "string" else 0):
+            if self._is_text:
                 self.line()
-        else:
-            raise ValueError("binary text fields, which are not read")
+            else:
+                self._skip_string()
+
+    def _skip_string(self) -> None:
+        """Its length comes first, in as many bytes as the upper two bits of the first one say."""
+        kind = self._data[self._at] >> 6 if self._at < len(self._data) else 3
+        size = {3: 1, 2: 2, 1: 4, 0: 8}[kind]
+        length = int.from_bytes(self._data[self._at : self._at + size], "big") & ((1 << (8 * size - 2)) - 1)
+        self._at += size + length
+        if self._at > len(self._data):
+            raise ValueError("a text that ends beyond the file")
 
 
 def _indices(values: Array) -> NDArray[np.int64]:

@@ -30,8 +30,8 @@ def main(request: str, out: str) -> int:
     _limit_memory(limits)
     path = Path(asked["path"])
     try:
-        read = _read_dicom if path.suffix.lower() == ".dcm" else _read_itk
-        voxels, affine, named = read(path, limits)
+        is_dicom = path.suffix.lower() == ".dcm"
+        voxels, affine, named = _read_dicom(path, limits, asked["labels"]) if is_dicom else _read_itk(path, limits)
         present = {layer: {int(v) for v in np.unique(volume) if v} for layer, volume in enumerate(voxels)}
         chosen, notes = names.choose(asked["labels"], named, present)
         mask, start = _cropped(np.logical_or.reduce([voxels[s.layer] == s.value for s in chosen]))
@@ -91,22 +91,34 @@ def _check_axes(path: Path, metadata: dict[str, str]) -> None:
         raise InvalidPointCloudError("patient axes in the header", given, "export it with its affine, LPS or RAS")
 
 
-def _read_dicom(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:
-    """A DICOM segmentation: each segment is a layer, since segments may overlap."""
+def _read_dicom(
+    path: Path, limits: FileLimits, labels: list[str]
+) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:
+    """A DICOM segmentation: each segment is a layer, since segments may overlap; of many, those that are asked for.
+
+    The background of a label map, number 0, is no segment.
+    """
     import highdicom
 
     seg = highdicom.seg.segread(path)
-    named = [Segment(str(d.SegmentLabel), 1, layer) for layer, d in enumerate(seg.SegmentSequence)]
-    limits.check_unpacked(int(seg.Rows) * int(seg.Columns) * int(seg.get("NumberOfFrames", 1)) * 8)
-    numbers = [int(d.SegmentNumber) for d in seg.SegmentSequence]
+    numbers = [number for number in seg.segment_numbers if number > 0]
+    words = [str(seg.get_segment_description(number).SegmentLabel) for number in numbers]
+    named = [Segment(word, number, n) for n, (word, number) in enumerate(zip(words, numbers, strict=True))]
+    chosen = names.choose(labels, named, {s.layer: {s.value} for s in named})[0] if labels else named
+    named = [Segment(s.name, s.value, layer) for layer, s in enumerate(dict.fromkeys(chosen))]
+    geometry = seg.get_volume_geometry()
+    if geometry is None:
+        raise InvalidPointCloudError("slices of one volume, at one distance", "others", "resample the segmentation")
+    limits.check_unpacked(int(np.prod(geometry.spatial_shape)) * len(named) * 8)
+    numbers = [s.value for s in named]
     volume = seg.get_volume(segment_numbers=numbers, combine_segments=False, rescale_fractional=False)
     voxels = np.asarray(volume.array)
     threshold = 0.5 * int(seg.MaximumFractionalValue) if str(seg.SegmentationType) == "FRACTIONAL" else 0
-    layers = [voxels[..., n] > threshold for n in range(len(numbers))]
+    layers = [(voxels[..., s.layer] > threshold) * np.int64(s.value) for s in named]
     affine = np.array(volume.affine)  # of the axes in the order of the array: the first goes through the slices
     affine[:3, 3] -= MARGIN * affine[:3, 0]
     layers = [np.pad(layer, [(MARGIN, MARGIN), (0, 0), (0, 0)]) for layer in layers]  # empty slices are not written
-    return [layer.transpose(2, 1, 0).astype(np.int64) for layer in layers], affine, named
+    return [layer.transpose(2, 1, 0) for layer in layers], affine, named
 
 
 def _integers(voxels: NDArray[Any]) -> NDArray[np.int64]:

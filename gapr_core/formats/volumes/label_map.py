@@ -37,6 +37,8 @@ def read(path: Path, options: ReadOptions) -> Surface:
     """
     if missing := [name for name in NEEDS if find_spec(name) is None]:
         raise MethodUnavailableError("label maps", f"no {' '.join(missing)}", "pip install 'gapr_ros[medical]'")
+    if (shown := str(path).encode("utf-8", "backslashreplace").decode()) != str(path):  # ITK says nothing of the kind
+        raise InvalidPointCloudError("a path in UTF-8", Path(shown).name, "rename the file or its folder")
     if path.stat().st_size > options.limits.file_mb * (1 << 20):
         options.limits.read(path)
     with tempfile.TemporaryDirectory() as folder:

@@ -52,6 +52,19 @@ def test_merging_into_one_of_the_folders_keeps_its_records(pairs, fakes, tmp_pat
     assert len(both) == 7
 
 
+def test_others_are_compared_with_a_method_that_has_run(pairs, fakes, tmp_path, in_process):
+    """With a misspelt one the table said that no other method beats it."""
+    methods = fakes("good", "turned")
+    with pytest.raises(ConfigError, match="--ours with one of fakes:good, fakes:turned; got fakes:god"):
+        benchmark.benchmark(pairs, methods, tmp_path / "out", ours="fakes:god")
+    benchmark.benchmark(pairs, methods, tmp_path / "out", ours="fakes:turned")
+    assert "beats fakes:turned" in (tmp_path / "out" / "table.md").read_text()
+    benchmark.merge([tmp_path / "out"], tmp_path / "merged", ours="fakes:good")
+    assert "beats fakes:good" in (tmp_path / "merged" / "table.md").read_text()
+    with pytest.raises(ConfigError, match="--ours"):
+        benchmark.merge([tmp_path / "out"], tmp_path / "other", ours="icp")
+
+
 def test_worker_processes_give_the_same_table_in_any_number(pairs, fakes, tmp_path, no_report, request):
     pytest.importorskip("small_gicp", reason="gicp is an optional method: pip install '.[baselines]'")
     methods = [*fakes("good"), "point_to_plane"]

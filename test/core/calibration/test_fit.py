@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from answer_cases import made_answers
 
+from gapr_core.calibration import __main__ as calibration
 from gapr_core.calibration import fit as fits
 from gapr_core.calibration.answers import answers_of, together
 from gapr_core.calibration.pairs import HELD_OUT, TWINS
+from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.features import FEATURES
 
@@ -102,3 +104,17 @@ def test_records_become_the_answers_of_a_round():
     assert np.isnan(answers.true_mm[0]) and answers.tre95_mm[1] == 3.0
     assert answers.features[0].tolist() == list(range(len(FEATURES)))
     assert len(answers_of([shape], "track")) == 0
+
+
+@pytest.mark.parametrize("judged_by", [fits.of_unseen_people, fits.of_unseen_families])
+def test_too_few_pairs_for_a_fit_are_one_sentence(answers, judged_by):
+    """A first try with --count 2 ended with an IndexError."""
+    of_one = answers.of(np.arange(len(answers)) == 0)
+    with pytest.raises(ConfigError, match="answers of other subjects and sensors.*--count"):
+        judged_by(of_one)
+
+
+@pytest.mark.parametrize("line", ["--count 0", "--count -3"])
+def test_a_calibration_without_pairs_is_one_sentence(tmp_path, line):
+    with pytest.raises(ConfigError, match="pairs, scenes or streams"):
+        calibration.main(["--anatomy", str(tmp_path), "--out", str(tmp_path / "out"), *line.split()])

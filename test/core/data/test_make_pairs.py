@@ -35,6 +35,13 @@ def write_meshes(folder, count):
         o3d.io.write_triangle_mesh(str(folder / f"person{i}.stl"), mesh.compute_triangle_normals())
 
 
+def test_names_in_a_list_may_have_spaces_and_count_once(tmp_path):
+    write_meshes(tmp_path / "cone", 2)
+    words = ["make-pairs", "--split", "all", "--count", "1", "--meshes", str(tmp_path / "cone")]
+    assert main([*words, "--protocol", "L3, L2,L3,", "--bones", "cone, cone", "--out", str(tmp_path / "out")]) == 0
+    assert [pair["name"] for pair in read_manifest(tmp_path / "out")["pairs"]] == ["L3_cone_0000", "L2_cone_0000"]
+
+
 def test_a_pair_survives_the_way_through_a_file(tmp_path):
     pair = make_pair("L2", ball_specimen(), 4)
     save_pair(tmp_path / "pair.npz", pair)

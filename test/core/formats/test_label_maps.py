@@ -2,6 +2,7 @@
 
 import gzip
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -228,7 +229,35 @@ def test_a_dicom_segmentation_is_read_by_the_name_of_its_segment(tmp_path):
     assert np.sqrt((error_mm(surface.points, CENTRE + [0, 0, 20], [12, 12, 12]) ** 2).mean()) < 0.3
 
 
-def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia"), layers=None):
+@pytest.mark.parametrize("numbers", [(1, 2), (5, 77)])
+def test_a_dicom_label_map_is_read_as_binary_segments_are(tmp_path, numbers):
+    """Label Map Segmentation Storage: its list of segments begins with the background."""
+    path = dicom_seg(tmp_path, kind="LABELMAP", numbers=numbers)
+    assert mean_z(path, "femur") == pytest.approx(20.0, abs=0.3)
+    assert mean_z(path, str(numbers[1])) == pytest.approx(-20.0, abs=0.3)
+
+
+def test_a_segment_of_a_dicom_segmentation_has_its_number(tmp_path, caplog):
+    """Two of one name are told apart by their numbers, as the error says."""
+    path = dicom_seg(tmp_path, names=("bone", "bone"))
+    with pytest.raises(InvalidPointCloudError, match="2 of the name bone; rename one, or give its number"):
+        clouds.load(path, options=options("bone"))
+    assert mean_z(path, "2") == pytest.approx(-20.0, abs=0.3) and "label 2 is bone" in caplog.text
+    assert clouds.load(path, options=options("2", "2")).extent_mm < 60.0
+
+
+def test_of_many_segments_those_that_are_asked_for_are_unpacked(tmp_path, monkeypatch):
+    """All bones of a CT would be many gigabytes."""
+    path = dicom_seg(tmp_path)
+    columns, rows, _ = affine_of((1.5, 1.5, 2.0))[1]
+    both_mm = 2.0 * (20.0 + 12.0)
+    monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", str(1.5 * 8.0 * columns * rows * both_mm / 2.0 / (1 << 20)))
+    assert mean_z(path, "femur") == pytest.approx(20.0, abs=0.3)
+    with pytest.raises(InvalidPointCloudError, match="GAPR_MAX_UNPACKED_MB"):
+        clouds.load(path, options=options("femur", "tibia"))
+
+
+def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia"), layers=None, kind="BINARY", numbers=(1, 2)):
     """Balls of radius 12, or `layers` (affine, [k, j, i] of each name), written by highdicom against a CT of slices."""
     highdicom = pytest.importorskip(
         "highdicom", reason="it writes the DICOM segmentation to read: pip install highdicom"
@@ -264,14 +293,26 @@ def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia"), layer
         slices.append(s)
     from pydicom.sr.codedict import codes
 
-    kind = (codes.SCT.Bone, codes.SCT.Bone, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL)
-    segments = [highdicom.seg.SegmentDescription(n, name, *kind) for n, name in enumerate(names, start=1)]
+    bone = (codes.SCT.Bone, codes.SCT.Bone, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL)
+    numbers = numbers[: len(voxels)]
+    segments = [highdicom.seg.SegmentDescription(n, name, *bone) for n, name in zip(numbers, names, strict=True)]
+    pixels = np.stack(voxels, axis=-1)
+    pixels = pixels @ numbers if kind == "LABELMAP" else pixels
     seg = highdicom.seg.Segmentation(
-        slices, np.stack(voxels, axis=-1).astype(np.uint8), highdicom.seg.SegmentationTypeValues.BINARY, segments,
+        slices, pixels.astype(np.uint8), highdicom.seg.SegmentationTypeValues[kind], segments,
         generate_uid(), 2, generate_uid(), 1, "GAPR", "test", "1", "1",
     )  # fmt: skip
     seg.save_as(tmp_path / "seg.dcm")
     return tmp_path / "seg.dcm"
+
+
+def test_letters_of_any_kind_may_be_in_a_name_and_bytes_that_are_none_are_said(tmp_path):
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    named = write(tmp_path / "a.nii.gz", voxels_of(affine, size), affine).rename(tmp_path / "F\u00e9mur \u9aa8.nii.gz")
+    assert np.abs(error_mm(clouds.load(named).points)).max() < 1.5
+    latin = named.rename(tmp_path / os.fsdecode(b"f\xe9mur.nii.gz"))
+    with pytest.raises(InvalidPointCloudError, match="a path in UTF-8; .*rename the file"):
+        clouds.load(latin)
 
 
 def test_specks_are_left_out_and_said(tmp_path, caplog):

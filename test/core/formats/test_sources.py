@@ -69,7 +69,9 @@ def test_written_markups_come_back(tmp_path):
     assert np.array_equal(read.points, POINTS) and read.labels == ("a", "b", "c")
 
 
-DAMAGED = ["", "{}", "nonsense", '{"markups": []}', '{"markups": [{"coordinateSystem": "LPS"}]}']
+FLAT = {"coordinateSystem": "LPS", "controlPoints": [{"position": [1.0, 2.0]}] * 3}  # six numbers, no two points
+DAMAGED = ["", "{}", "nonsense", '{"markups": []}', '{"markups": [{"coordinateSystem": "LPS"}]}',
+           json.dumps({"markups": [FLAT]})]  # fmt: skip
 
 
 @pytest.mark.parametrize("content", DAMAGED)
@@ -85,10 +87,23 @@ def test_damaged_and_empty_markups_are_refused_in_one_line(tmp_path, content):
     ("a.txt", "# from a probe\nx;y;z\n10;20;30\n-40;5;60\n7;-8;90\n"),
     ("a.csv", "10,20,30\n-40,5,60\n7,-8,90\n"),
     ("b.csv", "Time,Z,X,Y\n0,30,10,20\n1,60,-40,5\n2,90,7,-8\n"),
+    ("c.csv", "\ufeff10,20,30\r\n-40,5,60\r\n7,-8,90\r\n"),
+    ("d.xyz", "\ufeff# z x y\r\n30 10 20\r\n60 -40 5\r\n90 7 -8\r\n"),
 ])  # fmt: skip
 def test_text_clouds_have_a_point_a_line(tmp_path, name, content):
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
+
+
+@pytest.mark.parametrize("between", [" ", "\t", "   ", " \t"])
+def test_words_of_an_obj_file_may_have_tabs_between_them(tmp_path, between):
+    """A line that began with `v` and a tab was no vertex."""
+    rows = [("v", *point) for point in POINTS] + [("v", 0, 0, 0)]
+    rows += [("f", *corners) for corners in ((1, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4))]
+    (tmp_path / "a.obj").write_text("".join(between.join(map(str, row)) + "\n" for row in rows))
+    surface = reading.read(tmp_path / "a.obj")
+    np.testing.assert_allclose(surface.points, [*POINTS, [0, 0, 0]])
+    assert surface.faces.tolist() == [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
 
 
 @pytest.mark.parametrize("content", ["", "1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 3\n4 5 x\n", "1 2 3\n4 5 6"])
@@ -353,27 +368,51 @@ def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title
     ("LPS", [1, 1, 1]), ("RAS", LPS_RAS), ("SCANNER", [1, 1, 1]), (None, [1, 1, 1]),
 ])  # fmt: skip
 def test_axes_of_a_vtp_file_come_from_its_array_space_however_it_is_written(tmp_path, mode, compressor, said, factors):
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    corners, faces, poly, writer = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkXMLPolyDataWriter()
-    corners.SetData(numpy_to_vtk(POINTS, deep=True))
-    faces.InsertNextCell(3, [0, 1, 2])
-    poly.SetPoints(corners)
-    poly.SetPolys(faces)
-    if said:
-        space = vtkStringArray()
-        space.SetName("SPACE")
-        space.InsertNextValue(said)
-        poly.GetFieldData().AddArray(space)
+    poly, writer = triangle_with(*[said] * bool(said)), vtkXMLPolyDataWriter()
     writer.SetFileName(str(tmp_path / "a.vtp"))
     getattr(writer, f"SetDataModeTo{mode}")()
     getattr(writer, f"SetCompressorTypeTo{compressor}")()
     writer.SetInputData(poly)
     assert writer.Write()
     np.testing.assert_allclose(reading.read(tmp_path / "a.vtp").points, POINTS * factors)
+
+
+@pytest.mark.parametrize("version", [42, 51])
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_texts_in_a_legacy_vtk_file_are_passed_over(tmp_path, version, is_binary):
+    """A binary text has its length before it, in one, two or four bytes."""
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    writer = vtkPolyDataWriter()
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    writer.SetFileType(2 if is_binary else 1)
+    writer.SetFileVersion(version)
+    writer.SetInputData(triangle_with(*("x" * length for length in (0, 5, 63, 64, 300, 16383, 16384))))
+    assert writer.Write()
+    surface = reading.read(tmp_path / "a.vtk")
+    np.testing.assert_allclose(surface.points, POINTS)
+    assert surface.faces.tolist() == [[0, 1, 2]]
+
+
+def triangle_with(*texts):
+    """Polygonal data with a field array SPACE, if there are texts for it."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    corners, faces, poly, space = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkStringArray()
+    corners.SetData(numpy_to_vtk(POINTS, deep=True))
+    faces.InsertNextCell(3, [0, 1, 2])
+    poly.SetPoints(corners)
+    poly.SetPolys(faces)
+    space.SetName("SPACE")
+    for text in texts:
+        space.InsertNextValue(text)
+    if texts:
+        poly.GetFieldData().AddArray(space)
+    return poly
 
 
 TABLES = {
@@ -422,6 +461,10 @@ UNCLEAR = {
     "h.csv": (
         "x_ref,y_ref,z_ref,x_tip,y_tip,z_tip\n1,2,3,4,5,6\n",
         "one column each for x y z; got h.csv: .* x_ref .* z_tip",
+    ),
+    "j.csv": (
+        "0,10,20,30\n1,-40,5,60\n2,7,-8,90\n",
+        "x y z in the first columns; got j.csv: a first column that counts",
     ),
     "i.txt": ("x y z x y z\n1 2 3 4 5 6\n", "one column each for x y z; got i.txt: columns x y z x y z; name"),
 }

@@ -1,6 +1,9 @@
 """Files appear whole or not at all."""
 
 import json
+import os
+import stat
+import threading
 
 import pytest
 
@@ -43,3 +46,29 @@ def test_what_is_no_json_is_one_sentence_that_names_the_file(tmp_path, content):
         (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(ConfigError, match="a plan.*a.json"):
         files.read_json(tmp_path / "a.json", "a plan")
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
+    (tmp_path / "run").mkdir()
+    for name in ("old", "none_yet"):
+        (tmp_path / name).symlink_to(tmp_path / "run" / name)
+    (tmp_path / "run" / "old").write_text("before")
+    for name in ("old", "none_yet"):
+        files.check_writable(tmp_path / name)
+        files.write_text(tmp_path / name, "after")
+        assert (tmp_path / name).is_symlink() and (tmp_path / "run" / name).read_text() == "after"
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["none_yet", "old"]
+
+
+def test_a_pipe_or_a_device_is_written_to_and_never_replaced(tmp_path):
+    """As root, a file took the place of /dev/null."""
+    pipe = tmp_path / "pipe.json"
+    os.mkfifo(pipe)
+    read = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text()), daemon=True)
+    reader.start()
+    files.check_writable(pipe)
+    files.write_json(pipe, {"a": 1})
+    reader.join(10.0)
+    assert json.loads(read[0]) == {"a": 1} and stat.S_ISFIFO(pipe.stat().st_mode)
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe.json"]

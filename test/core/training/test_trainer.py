@@ -18,11 +18,14 @@ from gapr_core.data import protocols
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.export import leaves
+from gapr_core.runtime.settings import load
 from gapr_core.surface import Surface
 from gapr_core.training import distributed, export, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
+
+REPOSITORY = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +95,13 @@ def test_a_run_that_was_refused_leaves_its_folder_to_the_next_one(settings, anat
         trainer.train(replace(settings, seed=1), tmp_path / "run", anatomy)
 
 
+def test_a_run_of_less_than_one_step_is_refused(settings, anatomy, tmp_path):
+    """It ended well and named weights that it had not written."""
+    with pytest.raises(ConfigError, match="a batch of 4 or more; got 3 pairs; raise --pairs"):
+        trainer.train(replace(settings, pairs=3), tmp_path / "run", anatomy)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_protocol_that_the_network_never_sees_is_named(settings, anatomy):
     """Points far away span many times the target: such a share of the mix would silently be drawn as something else."""
     model = trainer.ModelConfig.from_yaml(settings.model)
@@ -152,6 +162,29 @@ def test_a_head_trained_alone_leaves_the_network_under_it_as_it_is_bit_by_bit(se
     other = trainer.train(replace(settings, pairs=4, seed=9), tmp_path / "other", anatomy)
     with pytest.raises(WeightsError, match="and a head"):
         export.main([str(tmp_path / "alone"), "--under", str(other), "--out", str(shipped)])
+
+
+def test_a_network_without_a_head_begins_with_weights_that_have_one(settings, anatomy, tmp_path):
+    """Those that ship have one since it was trained, and training.md says to begin with them."""
+    with_head = replace(settings, model_settings={"bone_head": "mlp"}, mix={"scene-C2": 1.0}, validation_pairs=0)
+    first = trainer.train(replace(with_head, pairs=4), tmp_path / "first", anatomy)
+    begun = trainer.begin(replace(settings, initial=str(first)), trainer.ModelConfig.from_yaml(settings.model))
+    before, own = weights.load(first)[0].state_dict(), begun.state_dict()
+    assert own and all(torch.equal(tensor, before[name]) for name, tensor in own.items())
+    assert all(name.startswith("bone_head.") for name in before.keys() - own.keys())
+
+    headless = trainer.train(replace(settings, pairs=4), tmp_path / "headless", anatomy)
+    with pytest.raises(ConfigError, match="initial weights"):
+        trainer.train(replace(with_head, initial=str(headless)), tmp_path / "second", anatomy)
+
+
+@pytest.mark.parametrize("name", ["train", "train_longer", "train_uncentred", "train_bone_head"])
+def test_what_the_documentation_begins_with_the_shipped_weights_can_begin_with_them(name):
+    shipped = REPOSITORY / "gapr_core/weights/gapr_net.safetensors"
+    config = load(TrainConfig, REPOSITORY / f"config/{name}.yaml", [])
+    config = replace(config, initial=str(shipped), model=config.model and str(REPOSITORY / config.model))
+    begun, before = trainer.begin(config, config.network()).state_dict(), weights.load(shipped)[0].state_dict()
+    assert all(torch.equal(tensor, before[tensor_name]) for tensor_name, tensor in begun.items())
 
 
 def test_a_head_alone_needs_a_head_and_a_network_under_it(settings, anatomy, tmp_path):

@@ -115,6 +115,7 @@ class Session:
             self.conflicts.note("time", f"{why}: {OVER}", SHOWN_S)
             self._frames.hold()
             self._clear(why)
+        self._frames.note_cloud(timeline.stamp_ns(header))
         self._cloud_frames.note(frame, self._host.parameters.output_frame)
 
     def _put(self, job: Job) -> None:
@@ -224,6 +225,7 @@ class Session:
     def clock_jumped(self) -> None:
         """The node's clock went back."""
         self._forget_time()
+        self._frames.start_over()
         why = "the clock jumped back"
         self._host.ros.get_logger().warning(f"{why}: {OVER}")
         self._clear(why)

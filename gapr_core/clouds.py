@@ -78,7 +78,7 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
     hint = "check the file and its unit"
     if other:
-        option = f"pass units={other!r} (--units {other}, of both files{'' if other == 'cm' else '; model_unit'})"
+        option = f"pass units={other!r} (--units {other}, of both files; model_unit)"
         how = f"correct the unit {where}" if where else f"{option}, or convert to {unit}"
         hint = f"it looks like {other}: {how}"
     raise InvalidPointCloudError(
@@ -102,7 +102,7 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     how = (
         "correct the unit in its header"
         if in_header
-        else "name the unit, such as units='cm' (--units cm, of both files; model_unit, model_scale)"
+        else "name the unit, such as units='cm' (--units cm, of both files; model_unit)"
     )
     if extent_mm < low:
         said = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"

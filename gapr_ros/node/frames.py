@@ -131,10 +131,10 @@ class Frames:
 
 
 def check_names(parameters: NodeParameters) -> None:
-    """Frames of the node's own that tf2 would not take, or that are the same.
+    """Frames of the node's own that tf2 would not take, or that cannot be what they are meant for.
 
     Raises:
-        ConfigError: an empty model_frame, a leading slash, or the same name twice.
+        ConfigError: an empty model_frame or viewpoint, a leading slash, or the bone's own frame for something else.
     """
     for name in ("model_frame", "output_frame"):
         value = getattr(parameters, name)
@@ -142,11 +142,20 @@ def check_names(parameters: NodeParameters) -> None:
             raise ConfigError(f"{name} without a leading slash", f"'{value}'", f"write {value.lstrip('/')}")
     if not parameters.model_frame:
         raise ConfigError("a model_frame", "an empty one", "give the bone's frame a name, such as femur_preop")
-    if parameters.model_frame == parameters.output_frame:
-        given = f"'{parameters.model_frame}' for both"
-        raise ConfigError(
-            "an output_frame other than model_frame", given, "poses of the bone cannot be in its own frame"
-        )
+    if not parameters.viewpoint:
+        raise ConfigError("a viewpoint", "an empty one", "write none, origin, or the name of a frame")
+    _check_not_the_bones(parameters)
+
+
+def _check_not_the_bones(parameters: NodeParameters) -> None:
+    """Refuse frames that tf2 would have from the poses alone, which need those frames first."""
+    why = {"output_frame": "poses of the bone cannot be in its own frame"}
+    if parameters.publish_tf:  # else somebody else may
+        why["crop_frame"] = "the bone's frame is not known before its pose; crop_to_track crops near its last one"
+        why["viewpoint"] = "the bone's frame is not known before its pose; name the frame of the camera"
+    for name, text in why.items():
+        if getattr(parameters, name).lstrip("/") == parameters.model_frame:
+            raise ConfigError(f"a {name} other than model_frame", f"'{parameters.model_frame}' for both", text)
 
 
 def _import_tf2() -> Any | None:

@@ -226,6 +226,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
         return Snapshot(
             name=self.get_fully_qualified_name(),
             state=self.state,
+            enabled=session is None or session.enabled,
             loading=str(self._loader),
             failure=self.failure,
             counters=self.counters,
@@ -261,7 +262,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
             logging.getLogger(name).addHandler(self._log_handler)
 
     def _on_change(self, changes: list[Parameter]) -> SetParametersResult:
-        why = parameters.check_change(changes, configured=self.session is not None or self._loader.busy)
+        why = parameters.check_change(self, changes, configured=self.session is not None or self._loader.busy)
         return SetParametersResult(successful=not why, reason=why)
 
     @guarded

@@ -107,7 +107,7 @@ def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
 def test_centimetres_become_millimetres_and_are_asked_for():
     assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
     with pytest.raises(
-        InvalidPointCloudError, match=r"it looks like cm: pass units='cm' \(--units cm, of both files\)"
+        InvalidPointCloudError, match=r"it looks like cm: pass units='cm' \(--units cm, of both files; model_unit\)"
     ):
         clouds.load(VERTICES / 10.0, units="mm")
 

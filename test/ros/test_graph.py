@@ -179,11 +179,18 @@ def test_a_leading_slash_of_a_cloud_is_taken_away(blob_path, client, method):
         ({"model_frame": "/bone"}, "write bone"),
         ({"output_frame": "/tracker"}, "write tracker"),
         ({"output_frame": "bone_preop"}, "for both"),
+        ({"viewpoint": ""}, "expected a viewpoint; got an empty one; write none, origin"),
+        ({"viewpoint": "bone_preop"}, "name the frame of the camera"),
+        ({"crop_frame": "/bone_preop"}, "crop_to_track crops near its last one"),
     ],
 )
 def test_frames_that_tf2_would_not_take_fail_configure_with_what_to_write(given, hint):
     with pytest.raises(ConfigError, match=hint):
         frames.check_names(NodeParameters(**given))
+
+
+def test_a_box_may_be_in_the_frame_of_the_bone_where_somebody_else_publishes_it():
+    frames.check_names(NodeParameters(crop_frame="bone_preop", publish_tf=False))
 
 
 def test_a_conflict_is_said_once_and_ends_with_its_time(monkeypatch):

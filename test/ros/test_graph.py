@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gapr_core.errors import ConfigError
-from gapr_ros.node import frames, session, subscription
+from gapr_ros.node import admission, frames, subscription
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.parameters import NodeParameters
 
@@ -124,7 +124,7 @@ def test_clouds_in_two_frames_are_a_conflict_unless_they_meet_in_an_output_frame
 
 
 def test_clouds_of_another_frame_long_ago_are_no_conflict(blob_path, client, method, monkeypatch):
-    monkeypatch.setattr(session, "SHOWN_S", 0.2)
+    monkeypatch.setattr(admission, "SHOWN_S", 0.2)
     with node_in_thread(method, blob_path) as node:
         client.wait_for_state("active")
         for frame in ("left_camera", "right_camera"):

@@ -44,7 +44,7 @@ class Frames:
     ) -> None:
         self._node, self._note_sent = node, note_sent
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
-        self._newest_ns = -1  # stamp of the clouds of this round of time
+        self._newest_ns, self._any_older = -1, False  # stamp of the clouds of this round of time
         self._tf2 = _import_tf2() if publish or listen else None
         if self._tf2 is None and (publish or listen):
             node.get_logger().warning(f"{MISSING}: nothing goes to /tf and no other frame can be used")
@@ -89,10 +89,11 @@ class Frames:
             self._buffer.clear()  # not what is static
 
     def note_cloud(self, stamp_ns: int) -> None:
-        """A cloud was let in; one that is older than those of a round can be, as after a reset, begins another one."""
-        if 0 < stamp_ns < self._newest_ns - BACK_NS:
+        """A cloud was let in; one that is older than those of a round can be begins another one, as after a reset."""
+        oldest_ns = self._newest_ns - (0 if self._any_older else BACK_NS)
+        if 0 < stamp_ns < oldest_ns:
             self.start_over()
-        self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._newest_ns, self._any_older = max(self._newest_ns, stamp_ns), False
 
     def send(self, transform: TransformStamped, stamp_ns: int) -> bool:
         """To /tf, if it has frames, and a stamp newer than that of the last one or none (0).
@@ -117,6 +118,7 @@ class Frames:
 
     def forget(self) -> None:
         """The listeners start over: older stamps are news again."""
+        self._any_older = True
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
 
     def close(self) -> None:

@@ -78,8 +78,8 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
     hint = "check the file and its unit"
     if other:
-        options = f"--units {other}, of both files; --source-units {other}, of the source"
-        option = f"pass units={other!r} ({options}{'' if other == 'cm' else '; model_unit'})"
+        options = f"--units {other}, of both files; --source-units {other}, of the source; model_unit"
+        option = f"pass units={other!r} ({options})"
         how = f"correct the unit {where}" if where else f"{option}, or convert to {unit}"
         hint = f"it looks like {other}: {how}"
     raise InvalidPointCloudError(
@@ -103,7 +103,7 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     how = (
         "correct the unit in its header"
         if in_header
-        else "name the unit, such as units='cm' (--units cm, of both files; model_unit, model_scale)"
+        else "name the unit, such as units='cm' (--units cm, of both files; model_unit)"
     )
     if extent_mm < low:
         said = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.parameter import Parameter
 
-NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")  # declared by rclpy itself
+NOT_OURS = ("use_sim_time", "start_type_description_service")  # declared by rclpy itself
 LARGE = 1e9  # end of a range that has none: rclpy wants one
 ROS_TYPES = {float: "double", int: "integer", str: "string", bool: "bool", tuple: "double_array"}
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
@@ -42,8 +42,8 @@ class NodeParameters(Settings):
 
     model_path: str = setting("", "file of the pre-operative bone: a mesh, a cloud or a label map (docs/formats.md)")
     model_label: str = setting("", "name or number of the bone in a label map; several, with commas, are one bone")
-    model_unit: str = setting("auto", "unit of that file; auto guesses from the extent and warns",
-                              choices=("auto", "mm", "m"))  # fmt: skip
+    model_unit: str = setting("auto", "unit of that file; auto guesses mm or m from the extent and warns",
+                              choices=("auto", "mm", "cm", "m"))  # fmt: skip
     model_scale: float = setting(1.0, "the bone is multiplied by this", low=1e-6)
     model_axes: str = setting("as_is", "axes of a mesh file: auto is what it says of itself; ras is turned to LPS, "
                               "lps_to_ras to RAS", choices=("as_is", "auto", "lps", "ras", "lps_to_ras"))  # fmt: skip
@@ -168,21 +168,26 @@ def _together(parameters: NodeParameters) -> int:
 
 
 def unknown_names(node: Node) -> list[str]:
-    """One sentence for each name that was given but does not exist, with the nearest one that does."""
+    """One sentence for each name that was given and has no effect, with the nearest one that has."""
     sentences = []
     for name in node._parameter_overrides:
-        if name not in FIELDS and name.split(".")[0] not in NOT_OURS:
+        if name.startswith("qos_overrides"):
+            sentences.append(f"'{name}' is ignored: set cloud_reliability")
+        elif name not in FIELDS and name not in NOT_OURS:
             near = difflib.get_close_matches(name, FIELDS, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             sentences.append(f"unknown parameter '{name}' is ignored{hint}")
     return sentences
 
 
-def check_change(parameters: Iterable[Parameter], configured: bool) -> str:
-    """Why these changes cannot be made; empty when they can. rclpy has checked type and range already."""
+def check_change(node: Node, parameters: Iterable[Parameter], configured: bool) -> str:
+    """Why these changes cannot be made; empty when they can. rclpy has checked type and range already.
+
+    What is set to the value that it has is no change: `ros2 param load` sets all that `ros2 param dump` wrote.
+    """
     for parameter in parameters:
         setting_field = FIELDS.get(parameter.name)
-        if setting_field is None:
+        if setting_field is None or plain(parameter.value) == plain(node.get_parameter(parameter.name).value):
             continue
         if configured and not setting_field.metadata.get("live", True):
             return f"{parameter.name} is read when configuring: deactivate, clean up, set it, then configure again"

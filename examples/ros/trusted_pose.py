@@ -75,6 +75,8 @@ class TrustedPose(Node):
         if key < self.newest:
             self._forget(max(self.newest, *self.transforms, *self.waiting))
             self.held.clear()
+            if self.buffer is not None and not self.get_parameter("use_sim_time").value:  # with it, tf2 does so itself
+                self.buffer.clear()  # or tf2 interpolates between what it heard before and after
         self.newest = key
 
     def _leave(self, key: Stamp, its_transform_comes: bool) -> None:

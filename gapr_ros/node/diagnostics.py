@@ -105,6 +105,7 @@ class Snapshot:
     Attributes:
         name: of the node, with its namespace.
         state: of its lifecycle.
+        enabled: by ~/set_enabled.
         loading: which bone is being read, and for how long; empty when none is.
         failure: why the last transition failed; empty when it did not.
         counters: what became of every cloud.
@@ -119,6 +120,7 @@ class Snapshot:
 
     name: str
     state: str
+    enabled: bool
     loading: str
     failure: str
     counters: Counters
@@ -159,6 +161,8 @@ def _level(now: Snapshot) -> tuple[bytes, str]:
         return DiagnosticStatus.ERROR, now.failure
     if now.state != "active":
         return DiagnosticStatus.WARN, f"{now.state}, {now.loading}" if now.loading else now.state
+    if not now.enabled:
+        return DiagnosticStatus.WARN, "disabled: clouds are dropped until ~/set_enabled"
     if now.counters.consecutive_refusals:
         return DiagnosticStatus.WARN, f"refused: {now.counters.last_refusal}"
     return DiagnosticStatus.OK, f"{now.state}, {now.counters.accepted} accepted, {now.counters.refused} refused"

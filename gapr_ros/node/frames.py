@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError
 from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.timeline import BACK_NS
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, transform_to_matrix
 
@@ -43,6 +44,7 @@ class Frames:
     ) -> None:
         self._node, self._note_sent = node, note_sent
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
+        self._newest_ns, self._any_older = -1, False  # stamp of the clouds of this round of time
         self._tf2 = _import_tf2() if publish or listen else None
         if self._tf2 is None and (publish or listen):
             node.get_logger().warning(f"{MISSING}: nothing goes to /tf and no other frame can be used")
@@ -58,6 +60,7 @@ class Frames:
             self._tf2 = _import_tf2()
         if self._tf2 is not None and self._buffer is None:
             self._buffer = self._tf2.Buffer(node=self._node)
+            self._buffer.jump_handle.unregister()  # `start_over` clears it; that of Jazzy's first tf2_ros_py raises
             self._listener = self._tf2.TransformListener(self._buffer, self._node)
 
     def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float) -> Array:
@@ -79,6 +82,19 @@ class Frames:
         except (self._tf2.TransformException, InvalidMessageError) as error:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {error}") from error
 
+    def start_over(self) -> None:
+        """What was heard so far is of another round of time: between that and what comes tf2 would interpolate."""
+        self._newest_ns = -1
+        if self._buffer is not None:
+            self._buffer.clear()  # not what is static
+
+    def note_cloud(self, stamp_ns: int) -> None:
+        """A cloud was let in; one that is older than those of a round can be begins another one, as after a reset."""
+        oldest_ns = self._newest_ns - (0 if self._any_older else BACK_NS)
+        if 0 < stamp_ns < oldest_ns:
+            self.start_over()
+        self._newest_ns, self._any_older = max(self._newest_ns, stamp_ns), False
+
     def send(self, transform: TransformStamped, stamp_ns: int) -> bool:
         """To /tf, if it has frames, and a stamp newer than that of the last one or none (0).
 
@@ -95,31 +111,32 @@ class Frames:
         return True
 
     def hold(self) -> None:
-        """Another round begins, and the listeners do not know: wait until their buffers have dropped this one."""
+        """Another round begins, and other listeners do not know: wait until their buffers have dropped this one."""
+        self.start_over()
         if self._sent_ns > 0:
             self._held_ns = self._sent_ns + CACHE_NS
 
     def forget(self) -> None:
         """The listeners start over: older stamps are news again."""
+        self._any_older = True
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
 
     def close(self) -> None:
         """Give back what was subscribed and advertised."""
         if self._listener is not None:
             self._listener.unregister()
-        if self._buffer is not None:  # it offers a service and watches the clock for as long as the node lives
+        if self._buffer is not None:  # it offers a service for as long as the node lives
             self._node.destroy_service(self._buffer.srv)
-            self._buffer.jump_handle.unregister()
         if self._broadcaster is not None:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
         self._listener = self._buffer = self._broadcaster = None
 
 
 def check_names(parameters: NodeParameters) -> None:
-    """Frames of the node's own that tf2 would not take, or that are the same.
+    """Frames of the node's own that tf2 would not take, or that cannot be what they are meant for.
 
     Raises:
-        ConfigError: an empty model_frame, a leading slash, or the same name twice.
+        ConfigError: an empty model_frame or viewpoint, a leading slash, or the bone's own frame for something else.
     """
     for name in ("model_frame", "output_frame"):
         value = getattr(parameters, name)
@@ -127,11 +144,20 @@ def check_names(parameters: NodeParameters) -> None:
             raise ConfigError(f"{name} without a leading slash", f"'{value}'", f"write {value.lstrip('/')}")
     if not parameters.model_frame:
         raise ConfigError("a model_frame", "an empty one", "give the bone's frame a name, such as femur_preop")
-    if parameters.model_frame == parameters.output_frame:
-        given = f"'{parameters.model_frame}' for both"
-        raise ConfigError(
-            "an output_frame other than model_frame", given, "poses of the bone cannot be in its own frame"
-        )
+    if not parameters.viewpoint:
+        raise ConfigError("a viewpoint", "an empty one", "write none, origin, or the name of a frame")
+    _check_not_the_bones(parameters)
+
+
+def _check_not_the_bones(parameters: NodeParameters) -> None:
+    """Refuse frames that tf2 would have from the poses alone, which need those frames first."""
+    why = {"output_frame": "poses of the bone cannot be in its own frame"}
+    if parameters.publish_tf:  # else somebody else may
+        why["crop_frame"] = "the bone's frame is not known before its pose; crop_to_track crops near its last one"
+        why["viewpoint"] = "the bone's frame is not known before its pose; name the frame of the camera"
+    for name, text in why.items():
+        if getattr(parameters, name).lstrip("/") == parameters.model_frame:
+            raise ConfigError(f"a {name} other than model_frame", f"'{parameters.model_frame}' for both", text)
 
 
 def _import_tf2() -> Any | None:

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
@@ -28,7 +27,7 @@ from rclpy.task import Future
 
 from gapr_ros import parameters
 from gapr_ros.node import frames
-from gapr_ros.node.diagnostics import Counters, Input, Snapshot
+from gapr_ros.node.diagnostics import Counters
 from gapr_ros.node.guard import RosLogHandler, guarded, transition
 from gapr_ros.node.loader import Loader
 from gapr_ros.node.method import ShippedMethod
@@ -67,8 +66,8 @@ class RegisterNode(LifecycleNodeMixin, Node):
         self._watch_parameters()
         self._watch_clock()
         self._forward_logs()
-        self._reporter = Reporter(self, self._look)
         self._loader, self._loaded = Loader(self, self._method_factory), None
+        self._reporter = Reporter(self, self._loader)
         self._services_offered = Services(self, self._loader, lambda: self.state, lambda: self.session)
         self._load_before_configuring()
         self._diagnosing = self.create_timer(self.parameters.diagnostics_period, self.report, clock=_steady_clock())
@@ -221,28 +220,6 @@ class RegisterNode(LifecycleNodeMixin, Node):
         if session is not None:
             session.close()
 
-    def _look(self) -> Snapshot:
-        session, listening = self.session, self.subscriptions_in
-        return Snapshot(
-            name=self.get_fully_qualified_name(),
-            state=self.state,
-            loading=str(self._loader),
-            failure=self.failure,
-            counters=self.counters,
-            model=None if session is None else session.model,
-            last=None if session is None else session.last_outcome,
-            source=Input() if listening is None else listening.describe(),
-            listening=listening is not None,
-            conflicts=() if session is None else session.conflicts.texts,
-            hardware_id=self._hardware_id(),
-            child_frame=self.parameters.model_frame if self.parameters.publish_tf else "",
-        )
-
-    def _hardware_id(self) -> str:
-        """The bone in use, which is not the one that the parameters name before it is read, or when it cannot be."""
-        path = self.parameters.model_path if self.session is None else self.session.model.path
-        return Path(path).name or "no model"
-
     # --- what the node watches ---
 
     def _watch_parameters(self) -> None:
@@ -261,7 +238,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
             logging.getLogger(name).addHandler(self._log_handler)
 
     def _on_change(self, changes: list[Parameter]) -> SetParametersResult:
-        why = parameters.check_change(changes, configured=self.session is not None or self._loader.busy)
+        why = parameters.check_change(self, changes, configured=self.session is not None or self._loader.busy)
         return SetParametersResult(successful=not why, reason=why)
 
     @guarded

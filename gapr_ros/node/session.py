@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
-from std_msgs.msg import Header
 
 from gapr_ros.node import intake, timeline
-from gapr_ros.node.cloud_frames import SHOWN_S, CloudFrames
+from gapr_ros.node.admission import CLOCK_WENT_BACK, STAMPS_WENT_BACK, Admission
+from gapr_ros.node.changes import Changes
 from gapr_ros.node.collection import forget
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.node.course import Course
@@ -33,13 +33,7 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
-NO_CLOCK = "use_sim_time is true and no /clock has come: neither max_future nor max_cloud_age is checked"
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
-OVER = "time starts over and the track is cleared"
-BEHIND = (
-    "/tf waits for stamps 10 s newer than those it had before, or tf2 would mix the poses of both rounds: "
-    "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
-)
 
 
 class Session:
@@ -55,16 +49,17 @@ class Session:
 
     def __init__(self, host: Host, ready: Ready, method_factory: Callable[[NodeParameters], Any]) -> None:
         self._host, self._ready, self._method_factory = host, ready, method_factory
-        self._limits, self._reading = _limits(ready.parameters), _reading(host.parameters)
+        self._changes = Changes(ready.parameters, host.parameters)
         self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
         self.conflicts = Conflicts(host.ros.get_logger().warning)
-        self.course, self._cloud_frames = Course(), CloudFrames(self.conflicts)
+        self.course = Course()
         self._log_refusal = RefusalLog(host.ros.get_logger().warning)
         publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
         self._shared = SharedFrame(host, self.conflicts) if publish else None
         self._named = SharedName(host, self.conflicts)
         self._frames = Frames(host.ros, publish, listen, self._shared.note_own if self._shared else None)
+        self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
         self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation, self._left)
         self.worker = Worker(self._work, self._held, self._period_s)
@@ -95,27 +90,16 @@ class Session:
         if not self.enabled:
             counters.dropped += 1
             return
-        self.conflicts.note("clock", "" if now_ns else NO_CLOCK)
+        self._admission.note_clock(now_ns)
         header = intake.read_header(data)  # None: the worker says what is wrong with the bytes
         try:
-            if header is not None:
-                self._admit(header, now_ns, alone)
+            if header is not None and self._admission.admit(header, now_ns, alone):
+                self._clear(STAMPS_WENT_BACK)
         except RefusedError as refusal:
             job = Job(b"", self.course.epoch, now_ns)
             self._answer(Outcome.refused(job, timeline.normal(header), refusal.reason, refusal.text))
             return
         self._put(Job(data, self.course.epoch, now_ns))
-
-    def _admit(self, header: Header, now_ns: int, alone: bool) -> None:
-        """Judge frame and time of a cloud before it can push another one out of the mailbox."""
-        frame = intake.plain_frame(header.frame_id)
-        intake.check_frame(frame, self._host.parameters.model_frame)
-        if self.course.timeline.admit(timeline.stamp_ns(header), now_ns, self._host.parameters, alone):
-            why = "the stamps of the clouds went back"
-            self.conflicts.note("time", f"{why}: {OVER}", SHOWN_S)
-            self._frames.hold()
-            self._clear(why)
-        self._cloud_frames.note(frame, self._host.parameters.output_frame)
 
     def _put(self, job: Job) -> None:
         pushed_out = self.worker.put(job, leave=self._registration.collect if self._accumulates else None)
@@ -203,7 +187,7 @@ class Session:
                 self._publishers.send(outcome, self.model)
                 if self._host.counters.consecutive_refusals == OUTLIVED_AFTER:
                     self._publishers.withdraw("pose")
-                self.conflicts.note("/tf", BEHIND if self._frames.behind else "")
+                self._admission.note_tf()
         finally:
             outcome.tell()
             self._host.report()
@@ -212,36 +196,25 @@ class Session:
 
     def reset(self) -> None:
         """Forget track, seed, all clouds so far, their stamps on /tf too, and the pose that late listeners get."""
-        self._forget_time()
+        self._admission.forget()
         self._clear("a reset")
 
     def _clear(self, why: str) -> None:
         self._begin_again(why)
         self.worker.outdate(self.course.epoch)
         self._publishers.withdraw("pose")
-        self._cloud_frames.forget()
 
     def clock_jumped(self) -> None:
         """The node's clock went back."""
-        self._forget_time()
-        why = "the clock jumped back"
-        self._host.ros.get_logger().warning(f"{why}: {OVER}")
-        self._clear(why)
-
-    def _forget_time(self) -> None:
-        """Whatever comes next is the newest, on /tf too: its listeners clear themselves with the clock."""
-        self.course.timeline.forget()
-        self._frames.forget()
-        for kind in ("time", "/tf"):
-            self.conflicts.note(kind, "")
+        self._admission.start_over()
+        self._clear(CLOCK_WENT_BACK)
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
-        if self._reading != (reading := _reading(self._host.parameters)):
-            self._reading = reading
+        now = self._host.parameters
+        if self._changes.in_reading(now):
             self._forget_clouds("clouds are read in another way")
-        if self._limits != (limits := _limits(self._host.parameters)):
-            self._limits = limits
+        if self._changes.in_limits(now):
             self.course.forget_place()
             if self._accumulates:
                 self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
@@ -251,7 +224,8 @@ class Session:
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self._begin_again("another bone")
-        self._ready, self._limits = ready, _limits(ready.parameters)
+        self._ready = ready
+        self._changes = Changes(ready.parameters, self._host.parameters)
         self.worker.outdate(self.course.epoch)
         self.parameters_changed()
         self._publishers.withdraw("pose")
@@ -289,14 +263,3 @@ class Session:
 
     def _forget_clouds(self, why: str) -> None:
         self.worker.run(partial(forget, self._ready.method, why))
-
-
-def _reading(parameters: NodeParameters) -> tuple[Any, ...]:
-    """How clouds are read: what was collected under other settings cannot be registered with what comes."""
-    box = parameters.crop_min, parameters.crop_max
-    return parameters.cloud_unit, parameters.range_min, parameters.range_max, *box
-
-
-def _limits(parameters: NodeParameters) -> tuple[float, ...]:
-    """What the method itself refuses by."""
-    return parameters.min_confidence, parameters.max_tre

@@ -106,8 +106,8 @@ def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
 
 def test_centimetres_become_millimetres_and_are_asked_for():
     assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
-    asked = r"it looks like cm: pass units='cm' \(--units cm, of both files; --source-units cm, of the source\)"
-    with pytest.raises(InvalidPointCloudError, match=asked):
+    options = r"\(--units cm, of both files; --source-units cm, of the source; model_unit\)"
+    with pytest.raises(InvalidPointCloudError, match=rf"it looks like cm: pass units='cm' {options}"):
         clouds.load(VERTICES / 10.0, units="mm")
 
 

@@ -141,6 +141,28 @@ def test_the_pose_in_another_frame_is_that_of_the_status_whatever_tf2_has_of_the
     assert done == [(100, 1.5)] and set(asked) == {("world", "camera", 100 * 10**9)}
 
 
+def test_where_stamps_go_back_the_consumer_forgets_the_frames_of_before(consumer):
+    node, done = consumer
+    cleared = []
+
+    class Buffer:
+        def can_transform(self, target, source, stamp, return_debug_tuple):
+            return True, ""
+
+        def lookup_transform(self, target, source, stamp):
+            return transform_at(0, 1.0)
+
+        def clear(self):
+            cleared.append(len(done))
+
+    node.frame, node.buffer = "world", Buffer()
+    for stamp in (100, 101, 50, 51):
+        node._on_status(status(stamp, SURE))
+        node._on_transform(transform_at(stamp, 0.5))
+    assert [each[0] for each in done] == [100, 101, 50, 51]
+    assert cleared == [2], "before the pose at 50, and then no more"
+
+
 def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):
     bone = bones.bone()
     node = NodeProcess(tmp_path, model_path=bones.save(bone, tmp_path / "bone.npz"), model_unit="mm", timeout=60.0)

@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gapr_core.errors import ConfigError
-from gapr_ros.node import frames, session, subscription
+from gapr_ros.node import admission, frames, subscription
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.parameters import NodeParameters
 
@@ -124,7 +124,7 @@ def test_clouds_in_two_frames_are_a_conflict_unless_they_meet_in_an_output_frame
 
 
 def test_clouds_of_another_frame_long_ago_are_no_conflict(blob_path, client, method, monkeypatch):
-    monkeypatch.setattr(session, "SHOWN_S", 0.2)
+    monkeypatch.setattr(admission, "SHOWN_S", 0.2)
     with node_in_thread(method, blob_path) as node:
         client.wait_for_state("active")
         for frame in ("left_camera", "right_camera"):
@@ -179,11 +179,18 @@ def test_a_leading_slash_of_a_cloud_is_taken_away(blob_path, client, method):
         ({"model_frame": "/bone"}, "write bone"),
         ({"output_frame": "/tracker"}, "write tracker"),
         ({"output_frame": "bone_preop"}, "for both"),
+        ({"viewpoint": ""}, "expected a viewpoint; got an empty one; write none, origin"),
+        ({"viewpoint": "bone_preop"}, "name the frame of the camera"),
+        ({"crop_frame": "/bone_preop"}, "crop_to_track crops near its last one"),
     ],
 )
 def test_frames_that_tf2_would_not_take_fail_configure_with_what_to_write(given, hint):
     with pytest.raises(ConfigError, match=hint):
         frames.check_names(NodeParameters(**given))
+
+
+def test_a_box_may_be_in_the_frame_of_the_bone_where_somebody_else_publishes_it():
+    frames.check_names(NodeParameters(crop_frame="bone_preop", publish_tf=False))
 
 
 def test_a_conflict_is_said_once_and_ends_with_its_time(monkeypatch):

@@ -536,7 +536,8 @@ def test_a_disabled_node_counts_clouds_and_answers_none(live):
     node, client, method = live
     assert client.call("set_enabled", SetBool.Request(data=False)).success
     client.send(GOOD)
-    wait_until(lambda: int(client.values()["frames_dropped"]) == 1)
+    values = wait_until(lambda: client.values() if int(client.values()["frames_dropped"]) == 1 else None)
+    assert values["level"] == 1 and values["message"] == "disabled: clouds are dropped until ~/set_enabled"
     assert not client.call("register").success
     assert not client.confidences
     assert client.call("set_enabled", SetBool.Request(data=True)).success
@@ -816,14 +817,15 @@ def test_a_look_up_that_has_begun_goes_on_while_the_node_ends(monkeypatch):
     np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", None, 1.0), np.eye(4))
 
 
-def test_the_model_is_scaled_turned_and_converted_before_it_is_prepared(tmp_path, client, method):
-    points_m = np.random.default_rng(2).normal(size=(400, 3)) * [0.06, 0.02, 0.015]
-    np.save(tmp_path / "metres.npy", points_m)
-    options = {"model_unit": "m", "model_scale": 1.1, "model_axes": "lps_to_ras"}
-    with node_in_thread(method, tmp_path / "metres.npy", **options):
+@pytest.mark.parametrize(("unit", "mm"), [("m", 1000.0), ("cm", 10.0)])
+def test_the_model_is_scaled_turned_and_converted_before_it_is_prepared(tmp_path, client, method, unit, mm):
+    points_mm = np.random.default_rng(2).normal(size=(400, 3)) * [60.0, 20.0, 15.0]
+    np.save(tmp_path / "bone.npy", points_mm / mm)
+    options = {"model_unit": unit, "model_scale": 1.1, "model_axes": "lps_to_ras"}
+    with node_in_thread(method, tmp_path / "bone.npy", **options):
         client.wait_for_state("active")
         prepared = method.calls[0]["target"].points
-    np.testing.assert_allclose(prepared, points_m * 1000.0 * 1.1 * [-1.0, -1.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(prepared, points_mm * 1.1 * [-1.0, -1.0, 1.0], atol=1e-9)
 
 
 def test_a_guessed_model_unit_is_warned_about(tmp_path, client, method, capfd):

@@ -84,6 +84,28 @@ def test_a_parameter_file_with_an_unknown_name_is_warned_about(tmp_path):
     assert node.stop() == 0, node.log
 
 
+def test_overrides_of_qos_that_have_no_effect_are_warned_about(tmp_path):
+    override = "qos_overrides./points.subscription.reliability:=best_effort"
+    node = NodeProcess(tmp_path, "--ros-args", "-p", override, "-p", "autostart:=false")
+    name = override.partition(":=")[0]
+    wait_until(lambda: f"'{name}' is ignored: set cloud_reliability" in node.log, 60.0, lambda: node.log)
+    assert node.stop() == 0, node.log
+
+
+def test_what_is_set_to_the_value_that_it_has_is_accepted_while_the_node_runs(blob_path, client, method):
+    """`ros2 param load` sets all that `ros2 param dump` wrote, one after the other; others set all of it or nothing."""
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        same = [node.get_parameter(name) for name in FIELDS]
+        other = [Parameter("output_frame", value="tracker")]
+        ask = node.set_parameters, node.set_parameters_atomically
+        each, together, refused = (client.do(lambda: ask[0](same)), client.do(lambda: ask[1](same)),
+                                   client.do(lambda: ask[1](same + other)))  # fmt: skip
+        assert [result.reason for result in each] == [""] * len(FIELDS)
+        assert together.successful
+        assert not refused.successful and refused.reason.startswith("output_frame is read when configuring")
+
+
 def test_the_shipped_file_starts_the_node_without_a_warning(tmp_path):
     node = NodeProcess(tmp_path, "--ros-args", "--params-file", str(FILE), "-p", "autostart:=false")
     wait_until(lambda: list(tmp_path.glob("python*_*.log")), 60.0, "rclpy's log file")  # silent, but it runs

@@ -152,8 +152,8 @@ def _some_of(target: PreparedTarget) -> Array:
 def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: int) -> Array | None:
     """(4, 4) motion with a reflection that lays the bone on itself, target frame; None where there is none."""
     some = _some_of(target)
-    centre, limits_mm = target.points.mean(axis=0), np.linspace(*config.middle_limits_mm)
-    planes = np.array([_reflection(normal, centre) for normal in _axes(target.points)])
+    limits_mm = np.linspace(*config.middle_limits_mm)
+    planes = np.array([_reflection(normal, target.centre_mm) for normal in target.main_axes])
     poses, scores = refine_many(planes @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
     images = [poses[number] @ FLIP for number in np.argsort(scores)]
     return next((image for image in images if _is_own_image(image, target)), None)
@@ -161,7 +161,7 @@ def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: 
 
 def _reflections(T: Array, points: Array, target: PreparedTarget) -> list[Array]:
     """(4, 4) reflections, target frame: at planes through the bone's long axis and at the source's own main planes."""
-    axes, centre = _axes(target.points), target.points.mean(axis=0)
+    axes, centre = target.main_axes, target.centre_mm
     angles = np.arange(PLANES) * np.pi / PLANES
     of_bone = [np.cos(angle) * axes[0] + np.sin(angle) * axes[1] for angle in angles]
     moved = se3.apply(T, points)

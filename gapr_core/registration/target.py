@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +70,20 @@ class PreparedTarget:
         """Arguments that every loop of `kernels` takes."""
         return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
 
-    @property
+    @cached_property
     def half_extent_mm(self) -> float:
         """Largest distance of a point to the centroid: the one scale of a pair."""
         return extent.half_extent_mm(self.points)
+
+    @cached_property
+    def main_axes(self) -> Array:
+        """(3, 3) principal axes as rows, the longest last."""
+        return np.asarray(np.linalg.eigh(np.cov(self.points.T))[1].T)
+
+    @cached_property
+    def centre_mm(self) -> Array:
+        """(3,) mean of the points."""
+        return np.asarray(self.points.mean(axis=0))
 
 
 def prepare(

@@ -15,6 +15,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr pivot`."""
     parser.add_argument("recording", type=Path, help="NDI Track's CSV, or a PLUS sequence (.igs.mha)")
     parser.add_argument("--tool", type=int, help="which of several recorded tools, from 0")
+    parser.add_argument("--reference", type=int, metavar="TOOL", help="the tool that the dimple moves with, from 0")
     parser.add_argument("--json", type=Path, help="write tip, pivot and residual here as well")
 
 
@@ -23,7 +24,7 @@ def run(args: Namespace) -> int:
     from gapr_core.formats import tracker
     from gapr_core.formats.poses import poses_in
 
-    tip = tracker.pivot(poses_in(args.recording, args.tool))
+    tip = tracker.pivot(poses_in(args.recording, args.tool, args.reference))
     say(f"--tip {','.join(f'{x:.3f}' for x in tip.tip_mm)}")
     left_out = f", without {tip.left_out} of which the tip had left its place" if tip.left_out else ""
     say(f"residual {tip.residual_mm:.3f} mm over {tip.poses} poses{left_out}")

@@ -54,6 +54,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
     parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
+    parser.add_argument("--reference", type=int, metavar="TOOL",
+                        help="the tool on the bone, from 0: the source is in its frame, not the tracker's")  # fmt: skip
     parser.add_argument("--viewpoint", type=_point, help="X,Y,Z of the camera in the source's frame, mm")
     parser.add_argument(
         "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
@@ -102,7 +104,8 @@ def run(args: Namespace) -> int:
     plan, hints = _plan(args), _hints(args, method)
     target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
-    how = {"tip_mm": args.tip, "tool": args.tool, "topic": args.topic, "clouds": args.clouds}
+    how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
+    how |= {"topic": args.topic, "clouds": args.clouds}
     whole = _load(args.source, args.source_units or args.units, **how)
     if whole.faces is not None and target.faces is None:
         log.warning(

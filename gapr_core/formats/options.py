@@ -17,6 +17,7 @@ class ReadOptions:
         labels: names or numbers of the segments of a label map that make up one rigid target; none where it has one.
         tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.
         tool: which of the tools of a recording, from 0; None where it has one.
+        reference: the tool of a recording in whose frame the points are, from 0; None for the tracker's frame.
         topic: of the clouds in a bag; empty where it has one such topic.
         clouds: (first, last) of the clouds of that topic, as in a slice; all of them are joined.
         limits: how large the file may be.
@@ -26,6 +27,7 @@ class ReadOptions:
     labels: tuple[str, ...] = ()
     tip_mm: tuple[float, float, float] | None = None
     tool: int | None = None
+    reference: int | None = None
     topic: str = ""
     clouds: tuple[int | None, int | None] = (None, None)
     limits: FileLimits = field(default_factory=FileLimits.from_environment)

@@ -37,20 +37,20 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
 
     Raises:
         InvalidPointCloudError: a recording of a tracked tool without the tip, or of several tools and none chosen; a
-            tip or a tool for a file that is no such recording; columns as in `read`.
+            tip, a tool or a reference for a file that is no such recording; columns as in `read`.
     """
     data = options.limits.read(path)
     header = next(text.lines(data), "")
     names = [name.strip().lower() for name in _words(header, ",")]
     if tracker.is_recording(names) and options.tip_mm is not None:
-        return Surface(tracker.tips(tracker.read_poses(path, options.limits, options.tool), options.tip_mm))
+        poses = tracker.read_poses(path, options.limits, options.tool, options.reference)
+        return Surface(tracker.tips(poses, options.tip_mm))
     if tracker.is_recording(names):
         raise tracker.needs_tip(path)
-    if options.tip_mm is not None or options.tool is not None:
+    if (options.tip_mm, options.tool, options.reference) != (None, None, None):
         given = f"{path.name} without columns Q0 or Rz, and Tx"
-        raise InvalidPointCloudError(
-            "a recording by NDI Track for --tip and --tool", given, "leave both out for points"
-        )
+        expected = "a recording by NDI Track for --tip, --tool and --reference"
+        raise InvalidPointCloudError(expected, given, "leave them out for points")
     return _surface(data)
 
 

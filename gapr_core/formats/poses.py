@@ -12,17 +12,22 @@ from gapr_core.formats import sweeps, tracker
 from gapr_core.formats.reading import format_of, unreadable
 
 
-def poses_in(path: Path, tool: int | None = None) -> NDArray[np.float64]:
-    """(N, 4, 4) poses of one recorded tool, mm, of NDI Track's CSV or a PLUS sequence.
+def poses_in(path: Path, tool: int | None = None, reference: int | None = None) -> NDArray[np.float64]:
+    """(N, 4, 4) poses of one recorded tool, mm, in the frame of the tracker or of a reference.
+
+    Args:
+        path: NDI Track's CSV or a PLUS sequence.
+        tool, reference: which of the recorded tools, from 0; None where there is one, and for the tracker's frame.
 
     Raises:
-        InvalidPointCloudError: neither of them, no pose of that tool, or several tools and none chosen.
+        InvalidPointCloudError: neither of them, no pose of that tool, several tools and none chosen, or no such
+            reference.
     """
     format_of(path)
     try:
         if not path.name.lower().endswith(".igs.mha"):
-            return tracker.read_poses(path, tool=tool)
-        return sweeps.pose_of(sweeps.transforms(path), tool, path)
+            return tracker.read_poses(path, tool=tool, reference=reference)
+        return sweeps.pose_of(sweeps.transforms(path), tool, path, reference)
     except GaprError:
         raise
     except Exception as error:

@@ -59,9 +59,11 @@ CHOICES = {  # choice of `ReadOptions` -> the files that have it, and how a user
     "labels": ("a label map", "--label (model_label of the node)"),
     "tip_mm": ("a recording of a tracked tool", "--tip"),
     "tool": ("a recording of a tracked tool", "--tool"),
+    "reference": ("a recording of tracked tools", "--reference"),
     "topic": ("a bag", "--topic"),
     "clouds": ("a bag", "--clouds"),
 }
+TRACKED = ("tip_mm", "tool", "reference")
 LABEL_MAP = Format("volumes.label_map:read", in_patient=True, uses=("labels",))
 FORMATS = {
     ".ply": Format("meshes.ply:read"),
@@ -79,12 +81,12 @@ FORMATS = {
     ".dcm": LABEL_MAP,
     ".mrk.json": Format("markups:read", in_patient=True),
     ".fcsv": Format("markups:read", in_patient=True),
-    ".csv": Format("points_text:read_csv", with_options=True, uses=("tip_mm", "tool")),
+    ".csv": Format("points_text:read_csv", with_options=True, uses=TRACKED),
     ".txt": Format("points_text:read"),
     ".xyz": Format("points_text:read"),
-    ".igs.mha": Format("sweeps:read_igs", in_patient=True, uses=("tip_mm", "tool")),
+    ".igs.mha": Format("sweeps:read_igs", in_patient=True, uses=TRACKED),
 }
-FOLDER = Format("sweeps:read_folder", in_patient=True, uses=("tip_mm", "tool"))
+FOLDER = Format("sweeps:read_folder", in_patient=True, uses=TRACKED)
 LONGEST_REASON = 160
 
 

@@ -16,6 +16,7 @@ from gapr_core.geometry import se3
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+Frames = dict[int, Array]  # (4, 4) by the number of the frame
 log = logging.getLogger(__name__)
 
 HEADER_BYTES = 64 << 20
@@ -26,30 +27,44 @@ SLICE_ENDINGS = (".csv", ".txt", ".xyz", ".npy")
 
 
 def read_igs(path: Path, options: ReadOptions) -> Surface:
-    """Tips of the tracked tool of a sequence: one point for each valid frame, in the tracker's frame, mm.
+    """Tips of the tracked tool of a sequence: one point for each valid frame, in the frame of the tracker or of
+    a reference, mm.
 
     Raises:
-        InvalidPointCloudError: no tip is given, or several tools and none chosen.
+        InvalidPointCloudError: no tip is given, or as `pose_of`.
         ValueError: no frame is valid.
     """
     if options.tip_mm is None:
         raise tracker.needs_tip(path)
-    poses = pose_of(transforms(path, options), options.tool, path)
-    return Surface(poses[:, :3, :3] @ np.asarray(options.tip_mm) + poses[:, :3, 3])
+    poses = pose_of(transforms(path, options), options.tool, path, options.reference)
+    return Surface(tracker.tips(poses, options.tip_mm))
 
 
-def pose_of(poses: dict[str, Array], tool: int | None, path: Path) -> Array:
-    """(N, 4, 4) of one transform by its place in the list of their names.
+def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: int | None = None) -> Array:
+    """(N, 4, 4) of one transform by its place in the list of their names, in the frame of another one if it is named.
 
     Raises:
-        InvalidPointCloudError: none of them, or several and none chosen.
+        InvalidPointCloudError: none of them, several and none chosen, or two that are not valid together or do not
+            lead to one frame.
     """
-    names = list(poses)
-    return poses[names[tracker.chosen(tool, names, path)]]
+    names, valid = list(poses), [i for i, frames in enumerate(poses.values()) if frames]
+    if tool is None and len(valid) == 1:
+        tool = valid[0]
+    used = tracker.chosen_with(tool, reference, names, path)
+    ends = {names[i].rpartition("To")[2] for i in used if "To" in names[i]}
+    if len(ends) > 1:
+        given = f"{' and '.join(names[i] for i in used)} of {path.name}"
+        raise InvalidPointCloudError("a tool and a reference in one frame", given, "name another --reference")
+    both = [number for number in poses[names[used[0]]] if all(number in poses[names[i]] for i in used)]
+    if not both:
+        raise tracker.never_seen(used, names, path)
+    return tracker.relative([np.stack([poses[names[i]][number] for number in both]) for i in used])
 
 
-def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Array]:
-    """(N, 4, 4) poses of the valid frames by the transform's name, such as `ProbeToTracker` (PLUS sequence format).
+def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Frames]:
+    """Poses of the valid frames by the transform's name, such as `ProbeToTracker` (PLUS sequence format).
+
+    A transform that is never valid has no poses; the places of the others do not depend on it.
 
     Raises:
         ValueError: no transform in any valid frame, one with a number that is not finite, or a header that is cut.
@@ -67,11 +82,13 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Arra
         else:
             values[name, int(number)] = _matrix(value)
     names = sorted({name for name, _ in values})
-    poses = {name: [T for key, T in sorted(values.items()) if key[0] == name and key not in invalid] for name in names}
-    found = {name: np.stack(matrices) for name, matrices in poses.items() if matrices}
-    if not found:
+    poses: dict[str, Frames] = {name: {} for name in names}
+    for (name, number), T in sorted(values.items()):
+        if (name, number) not in invalid:
+            poses[name][number] = T
+    if not any(poses.values()):
         raise ValueError("no valid transform in its header")
-    return found
+    return poses
 
 
 def _matrix(numbers: str) -> Array:

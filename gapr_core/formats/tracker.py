@@ -35,7 +35,7 @@ class Tip:
 
     Attributes:
         tip_mm: (3,) the tip in the frame of the tool's marker.
-        pivot_mm: (3,) the point it stood on, in the tracker's frame.
+        pivot_mm: (3,) the point it stood on, in the frame of the poses: the tracker's or a reference's.
         residual_mm: root-mean-square distance of the tips to that point.
         poses: how many were used.
         left_out: of how many the tip had left its place.
@@ -53,17 +53,21 @@ def is_recording(names: Sequence[str]) -> bool:
     return PLACE[0] in names and (QUATERNION[0] in names or ANGLES[0] in names)
 
 
-def read_poses(path: Path, limits: FileLimits | None = None, tool: int | None = None) -> Array:
-    """(N, 4, 4) poses of one tool in the tracker's frame, mm, of the rows in which it was seen.
+def read_poses(
+    path: Path, limits: FileLimits | None = None, tool: int | None = None, reference: int | None = None
+) -> Array:
+    """(N, 4, 4) poses of one tool, mm, of the rows in which it was seen, in the frame of the tracker or of a reference.
 
     Args:
         path: NDI Track's CSV: for each tool columns State, Q0 Qx Qy Qz (the scalar first) or Rz Ry Rx (degrees, the
             rotation Rz Ry Rx), and Tx Ty Tz.
         limits: how large it may be.
         tool: which of the recorded tools, from 0; None where there is one.
+        reference: the tool in whose frame the poses are, row by row, where both were seen; None for the tracker's.
 
     Raises:
-        InvalidPointCloudError: no such columns, several tools and none chosen, or no row in which the tool was seen.
+        InvalidPointCloudError: no such columns, several tools and none chosen, a reference that is not another one of
+            them, or no row in which they were seen.
         ValueError: a file that is cut.
     """
     data = (limits or FileLimits.from_environment()).read(path)
@@ -73,28 +77,72 @@ def read_poses(path: Path, limits: FileLimits | None = None, tool: int | None = 
     starts = [i for i, name in enumerate(names) if name in (QUATERNION[0], ANGLES[0])]
     if not starts:
         raise InvalidPointCloudError(COLUMNS, f"{path.name} without", "export it from NDI Track")
-    tool = chosen(tool, [_tool_name(rows[0][:start], i) for i, start in enumerate(starts)], path)
-    start = starts[tool]
+    called = [_tool_name(rows[0][:start], i) for i, start in enumerate(starts)]
+    used = chosen_with(tool, reference, called, path)
+    columns = [_columns(names, starts[i], i, path) for i in used]
+    seen = [row for row in rows[1:] if row and all(_is_seen_in(row, state) for state, _ in columns)]
+    if not seen:
+        raise never_seen(used, called, path)
+    return relative([_poses_in(seen, wanted) for _, wanted in columns])
+
+
+def _columns(names: Sequence[str], start: int, tool: int, path: Path) -> tuple[int | None, slice]:
+    """Where the state of a tool is, if anywhere, and where its pose is."""
     rotation = QUATERNION if names[start] == QUATERNION[0] else ANGLES
     wanted = [*rotation, *PLACE]
     if names[start : start + len(wanted)] != wanted:
         given = f"{path.name} with others"
         raise InvalidPointCloudError(f"{COLUMNS} of tool {tool}", given, "export it from NDI Track")
     state = max((i for i, name in enumerate(names[:start]) if name.startswith("state")), default=None)
-    seen = [row for row in rows[1:] if row and (state is None or _is_seen(*row[state : state + 1]))]
-    seen = [row[start : start + len(wanted)] for row in seen]
-    if any(len(row) < len(wanted) for row in seen):
+    return state, slice(start, start + len(wanted))
+
+
+def _poses_in(rows: Sequence[Sequence[str]], columns: slice) -> Array:
+    if any(len(row) < columns.stop for row in rows):
         raise ValueError("a row that ends before its pose")
-    values = np.array([[float(value) for value in row] for row in seen]).reshape(-1, len(wanted))
-    if len(values) == 0:
-        raise InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
+    values = np.array([[float(value) for value in row[columns]] for row in rows])
     return poses_of(values[:, :-3], values[:, -3:])
+
+
+def relative(poses: Sequence[Array]) -> Array:
+    """(N, 4, 4) of the first tool, in the frame of the second, if any (T_reference_tracker @ T_tracker_tool)."""
+    return poses[0] if len(poses) == 1 else np.linalg.inv(poses[1]) @ poses[0]
 
 
 def _tool_name(before: Sequence[str], number: int) -> str:
     """What NDI Track calls a tool: the title of its port, which stands before its columns."""
     ports = [name.strip() for name in before if name.strip().lower().startswith("port ")]
     return ports[-1] if ports else f"tool {number}"
+
+
+def chosen_with(tool: int | None, reference: int | None, names: Sequence[str], path: Path) -> list[int]:
+    """The places of the tool and, where one is named, of its reference.
+
+    Raises:
+        InvalidPointCloudError: as `chosen`, of either; or a reference that is the tool itself.
+    """
+    tool = chosen(tool, names, path)
+    if reference is None:
+        return [tool]
+    if reference == tool or not 0 <= reference < len(names):
+        expected, given = f"a reference other than tool {tool}", f"{reference} of {path.name} {_listed(names)}"
+        raise InvalidPointCloudError(expected, given, "name another one with --reference")
+    return [tool, reference]
+
+
+def never_seen(used: Sequence[int], names: Sequence[str], path: Path) -> InvalidPointCloudError:
+    """The error for a recording without a row to use."""
+    if len(used) == 1:
+        return InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
+    expected = f"rows with tool {used[0]} and its reference {used[1]} in view"
+    given = f"none in {path.name} {_listed(names)}"
+    return InvalidPointCloudError(expected, given, "name another --reference, or record it again")
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = [f"{i}: {name[:LONGEST_NAME]}" if name != f"tool {i}" else str(i) for i, name in enumerate(names)]
+    listed = ", ".join(shown[:MOST_NAMES] + ["..."] * (len(names) > MOST_NAMES))
+    return f"with {len(names)} ({listed})"
 
 
 def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
@@ -106,10 +154,8 @@ def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
     if tool is None and len(names) == 1:
         return 0
     if tool is None or not 0 <= tool < len(names):
-        shown = [f"{i}: {name[:LONGEST_NAME]}" if name != f"tool {i}" else str(i) for i, name in enumerate(names)]
-        listed = ", ".join(shown[:MOST_NAMES] + ["..."] * (len(names) > MOST_NAMES))
         asked = "one tool" if tool is None else f"tool {tool}"
-        raise InvalidPointCloudError(asked, f"{path.name} with {len(names)} ({listed})", "name one with --tool")
+        raise InvalidPointCloudError(asked, f"{path.name} {_listed(names)}", "name one with --tool")
     return tool
 
 
@@ -119,8 +165,8 @@ def needs_tip(path: Path) -> InvalidPointCloudError:
     return InvalidPointCloudError("the tip of the tool", f"{path.name}, a recording of its poses", how)
 
 
-def _is_seen(state: str = "") -> bool:
-    return state.strip().lower() in SEEN
+def _is_seen_in(row: Sequence[str], state: int | None) -> bool:
+    return state is None or "".join(row[state : state + 1]).strip().lower() in SEEN
 
 
 def poses_of(rotations: ArrayLike, translations: ArrayLike) -> Array:
@@ -142,7 +188,7 @@ def _matrices(rotations: Array) -> Array:
 
 
 def tips(poses: Array, tip_mm: ArrayLike) -> Array:
-    """(N, 3) where the tip was in the tracker's frame."""
+    """(N, 3) where the tip was, in the frame of the poses."""
     return poses[:, :3, :3] @ np.asarray(tip_mm, dtype=np.float64) + poses[:, :3, 3]
 
 

@@ -47,6 +47,7 @@ register --source cloud.npy --target empty
 REGISTER --label Femur
 REGISTER --tip 1,2,3
 REGISTER --tool 1
+REGISTER --reference 0
 REGISTER --topic /points
 REGISTER --clouds 0:1
 register --source points.csv --target cloud.npy --tip 1,2,3

@@ -81,14 +81,16 @@ class Surface:
             (count, 3) points, mm, and the (count, 3) unit normals of their faces (by the winding order).
 
         Raises:
-            InvalidPointCloudError: for a cloud without faces.
+            InvalidPointCloudError: for a cloud without faces, and for faces without an area.
         """
+        from gapr_core.geometry.triangles import sampled
+
         crosses, areas = self._face_crosses()
-        face = rng.choice(len(areas), size=count, p=areas / areas.sum())
-        u, v = rng.random((2, count, 1))
-        u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-        a, b, c = (self.points[self.triangles[face, i]] for i in range(3))
-        return a + u * (b - a) + v * (c - a), crosses[face] / areas[face, None]
+        if not 0.0 < areas.sum() < np.inf:
+            raise InvalidPointCloudError("faces with an area", f"{len(areas)} without", "check the mesh and its unit")
+        upto = np.cumsum(areas / areas.sum())
+        chosen, (u, v) = rng.random(count), rng.random((2, count))
+        return sampled(self.points, self.triangles, crosses, areas, upto / upto[-1], chosen, u, v)  # type: ignore[no-any-return]
 
     def _face_crosses(self) -> tuple[Array, Array]:
         """(F, 3) vectors across the faces, as long as twice their areas, and these lengths (F,)."""

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import cKDTree
 
 from gapr_core.surface import Surface
 
@@ -202,18 +201,18 @@ def sheet(rows: Sequence[tuple[ArrayLike, ArrayLike]], step_mm: float = 2.5) -> 
     return skeleton(surface[..., :3].reshape(-1, 3), surface[..., 3].ravel())
 
 
-def skeleton(points: ArrayLike, radii: ArrayLike, neighbours: int = 2) -> Shape:
-    """A solid from samples of its medial sheet or line: `points` (K, 3) dense against `radii` (K,)."""
+def skeleton(points: ArrayLike, radii: ArrayLike) -> Shape:
+    """A solid from samples of its medial sheet or line: `points` (K, 3) dense against `radii` (K,).
+
+    Every place sees the two samples that are nearest to it, so that the surface is no chain of beads.
+    """
     centres, radius = np.asarray(points, dtype=np.float64), np.asarray(radii, dtype=np.float64)
-    tree = cKDTree(centres)
 
     def distance(x: Grid, y: Grid, z: Grid) -> Grid:
-        grids = np.broadcast_arrays(x, y, z)
-        queries = np.stack([g.ravel() for g in grids], axis=1)
-        limit = float(radius.max()) + 8.0
-        apart, nearest = tree.query(queries, k=neighbours, distance_upper_bound=limit)
-        inside = np.where(np.isfinite(apart), apart - np.append(radius, 0.0)[nearest], limit).min(axis=1)
-        return inside.reshape(grids[0].shape).astype(np.float32)
+        from gapr_core.data.solid_kernels import nearest_samples
+
+        cells = (np.asarray(axis, dtype=np.float64).ravel() for axis in (x, y, z))
+        return nearest_samples(*cells, centres, radius, float(radius.max()) + 8.0)  # type: ignore[no-any-return]
 
     return Shape((centres - radius[:, None]).min(axis=0), (centres + radius[:, None]).max(axis=0), distance)
 

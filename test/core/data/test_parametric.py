@@ -13,7 +13,7 @@ from gapr_core.data.bones.pelvis import PelvisParameters, pelvis_surface
 from gapr_core.data.bones.thoracic import ThoracicParameters, thoracic_surface
 from gapr_core.data.bones.tibia import TibiaParameters, tibia_surface
 from gapr_core.data.parameters import draw
-from gapr_core.data.solid import is_closed, volume_mm3
+from gapr_core.data.solid import is_closed, skeleton, volume_mm3
 from gapr_core.errors import ConfigError
 
 PARAMETERS = (FemurParameters, TibiaParameters, PelvisParameters, ThoracicParameters)
@@ -170,3 +170,16 @@ def test_ten_cartilages_a_side_stand_out_from_the_sternum():
 def test_an_unknown_bone_is_refused():
     with pytest.raises(ConfigError, match="femur, tibia, pelvis, thoracic"):
         parametric.make_bone("humerus", 0)
+
+
+def test_a_medial_sheet_is_seen_from_its_two_nearest_samples():
+    rng = np.random.default_rng(0)
+    centres, radii = rng.uniform(0.0, 30.0, (60, 3)), rng.uniform(1.0, 4.0, 60)
+    x, y, z = (np.arange(-12.0, 45.0, step, dtype=np.float32) for step in (1.5, 1.7, 1.3))
+    found = skeleton(centres, radii).distance(x[None, None], y[None, :, None], z[:, None, None])
+    places = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).transpose(2, 1, 0, 3)
+    limit = radii.max() + 8.0
+    apart, nearest = cKDTree(centres).query(places, k=2, distance_upper_bound=limit)
+    wanted = np.where(np.isfinite(apart), apart - np.append(radii, 0.0)[nearest], limit).min(axis=-1)
+    assert (wanted == limit).any()
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-5)

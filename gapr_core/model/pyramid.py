@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import extent
+from gapr_core.model import pyramid_kernels
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.types import Cloud, Level, Neighborhood
 
@@ -146,26 +147,16 @@ def neighborhood(centres: Array, tree: cKDTree, cap: int, radius: float, small_b
     """
     support = np.asarray(tree.data)
     distance, index = tree.query(centres, k=min(cap, len(support)))
-    distance, index = distance.reshape(len(centres), -1), index.reshape(len(centres), -1)
-    valid = distance <= radius
-    valid[:, 0] = True
-    index = np.where(valid, index, 0)
-    near = support[index]
-    c_h = _mean(near, valid, centres)
-    c_k = _mean(near, valid & (distance <= small_ball * radius), centres)
+    distance, index = distance.reshape(len(centres), -1), index.reshape(len(centres), -1).astype(np.int64)
+    valid, c_h, c_k = np.empty(index.shape, dtype=bool), np.empty(centres.shape), np.empty(centres.shape)
+    pyramid_kernels.balls(centres, support, distance, index, radius, small_ball * radius, valid, c_h, c_k)
     return Neighborhood(
-        torch.from_numpy(index.astype(np.int64)),
+        torch.from_numpy(index),
         torch.from_numpy(valid),
         _tensor(c_h),
         _tensor(c_k),
         torch.full((len(centres),), radius),
     )
-
-
-def _mean(near: Array, chosen: NDArray[np.bool_], otherwise: Array) -> Array:
-    count = chosen.sum(axis=1)[:, None]
-    total = np.einsum("nkc,nk->nc", near, chosen.astype(np.float64))
-    return np.where(count > 0, total / np.maximum(count, 1), otherwise)
 
 
 def _inside(ups: list[Index], coarsest: Neighborhood) -> list[Array]:
@@ -178,9 +169,8 @@ def _inside(ups: list[Index], coarsest: Neighborhood) -> list[Array]:
 
 def oriented_normals(points: Array, near: Neighborhood, inside: Array, reach: float) -> tuple[Array, Array]:
     """Plane normals turned away from `inside`, and how surely: 1 when `inside` is 0.15 `reach` or more behind."""
-    offset = points[near.index.numpy()] - near.c_h.double().numpy()[:, None]
-    offset *= near.valid.numpy()[..., None]
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
+    spreads = pyramid_kernels.spreads(points, near.index.numpy(), near.valid.numpy(), near.c_h.double().numpy())
+    normals = np.linalg.eigh(spreads)[1][:, :, 0]
     outward = np.einsum("ni,ni->n", normals, points - inside)
     return normals * np.where(outward < 0, -1.0, 1.0)[:, None], np.minimum(1.0, np.abs(outward) / (0.15 * reach))
 

@@ -6,8 +6,12 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import leaky_relu
 
+from gapr_core.model import steps
 from gapr_core.model.config import choose
+
+SLOPE = 0.1  # of every leaky ReLU
 
 
 class GroupNorm(nn.Module):
@@ -18,11 +22,14 @@ class GroupNorm(nn.Module):
         self.groups = min(groups, width)
         self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
 
-    def forward(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:
+    def forward(self, x: Tensor, lengths: tuple[int, ...], slope: float = 1.0) -> Tensor:
+        """The norm, and a leaky ReLU of this slope below zero after it."""
         x = x.float()
+        if steps.fit(x, self.weight):
+            return steps.norm(x, lengths, self.groups, self.weight, self.bias, slope)
         centred = x - self._mean(x, lengths)
         variance = self._mean(centred * centred, lengths)
-        return centred * (torch.rsqrt(variance + 1e-5) * self.weight) + self.bias
+        return activated(centred * (torch.rsqrt(variance + 1e-5) * self.weight) + self.bias, slope)
 
     def _mean(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:
         """Mean over each cloud's points and each group's channels, at its points and channels: (1 or N, C).
@@ -52,8 +59,13 @@ def segments(lengths: tuple[int, ...], device: torch.device) -> tuple[Tensor, Te
 class LayerNorm(nn.LayerNorm):
     """Each point by itself; nothing depends on how much of the bone is seen."""
 
-    def forward(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:  # type: ignore[override]
-        return super().forward(x)
+    def forward(self, x: Tensor, lengths: tuple[int, ...], slope: float = 1.0) -> Tensor:  # type: ignore[override]
+        return activated(super().forward(x), slope)
+
+
+def activated(x: Tensor, slope: float) -> Tensor:
+    """Leaky ReLU; x itself where the slope is 1."""
+    return x if slope == 1.0 else leaky_relu(x, slope)
 
 
 NORMS = {"group": GroupNorm, "layer": LayerNorm}
@@ -71,10 +83,10 @@ class Unary(nn.Module):
         super().__init__()
         self.linear = nn.Linear(width_in, width, bias=False)
         self.norm = make_norm(norm, width)
-        self.activation = nn.Identity() if plain else nn.LeakyReLU(0.1)
+        self.slope = 1.0 if plain else SLOPE
 
     def forward(self, x: Tensor, lengths: tuple[int, ...]) -> Tensor:
-        return self.activation(self.norm(self.linear(x), lengths))
+        return self.norm(self.linear(x), lengths, self.slope)  # type: ignore[no-any-return]
 
 
 def pad(x: Tensor, lengths: tuple[int, ...]) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from gapr_core.model import steps
 from gapr_core.model.config import ModelConfig, choose
 from gapr_core.model.pairs import gather
 from gapr_core.model.types import Cloud, Matches, PatchPairs
@@ -114,8 +115,9 @@ def log_optimal_transport(scores: Tensor, dustbin: Tensor, valid_p: Tensor, vali
     Returns:
         (P, a + 1, b + 1) log assignment: every existing point's row (column) sums to one.
     """
-    batch, a, b = scores.shape
     mask_p, mask_q = (torch.nn.functional.pad(v, (0, 1), value=True) for v in (valid_p, valid_q))
+    if steps.fit(scores, dustbin):
+        return steps.transport(scores, dustbin, mask_p, mask_q, rounds - 1)
     padded = torch.nn.functional.pad(scores, (0, 1, 0, 1))
     bins = torch.zeros_like(padded)
     bins[:, -1], bins[:, :, -1] = 1.0, 1.0

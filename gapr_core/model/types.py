@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import accumulate
 from typing import Any, TypeVar
 
 import numpy as np
@@ -180,10 +181,9 @@ def collate(clouds: list[Cloud]) -> Cloud:
     fine = clouds[0].fine_stage
     starts = _starts([len(c.levels[fine].points) for c in clouds])
     size = max(c.patches.shape[1] for c in clouds)
-    patches = [_pad(c.patches, size) + start for c, start in zip(clouds, starts, strict=True)]
     return Cloud(
         levels,
-        torch.cat(patches),
+        _shifted([c.patches for c in clouds], starts, size),
         torch.cat([_pad(c.patches_valid, size) for c in clouds]),
         fine,
         torch.cat([c.centre_mm for c in clouds]),
@@ -193,7 +193,7 @@ def collate(clouds: list[Cloud]) -> Cloud:
 
 def _join_levels(pyramids: list[tuple[Level, ...]], depth: int) -> Level:
     own = [levels[depth] for levels in pyramids]
-    starts = _starts([len(level.points) for level in own])
+    starts = _starts([level.points.shape[0] for level in own])
     below = up = None
     if depth > 0:
         finer = _starts([len(levels[depth - 1].points) for levels in pyramids])
@@ -218,15 +218,25 @@ def _join_levels(pyramids: list[tuple[Level, ...]], depth: int) -> Level:
 def _join(parts: list[Neighborhood], starts: list[int]) -> Neighborhood:
     width = max(p.index.shape[1] for p in parts)
     return Neighborhood(
-        torch.cat([_pad(p.index, width) + start for p, start in zip(parts, starts, strict=True)]),
+        _shifted([p.index for p in parts], starts, width),
         torch.cat([_pad(p.valid, width) for p in parts]),
         *(torch.cat([getattr(p, name) for p in parts]) for name in ("c_h", "c_k", "radius")),
     )
 
 
 def _starts(lengths: list[int]) -> list[int]:
-    return [sum(lengths[:i]) for i in range(len(lengths))]
+    return [0, *accumulate(lengths[:-1])]
+
+
+def _shifted(tables: list[Tensor], starts: list[int], width: int) -> Tensor:
+    """Tables of rows one after the other, each with its start added, padded with it to `width` columns."""
+    joined = tables[0].new_empty(sum(table.shape[0] for table in tables), width)
+    for table, start, place in zip(tables, starts, joined.split([table.shape[0] for table in tables]), strict=True):
+        torch.add(table, start, out=place[:, : table.shape[1]])
+        place[:, table.shape[1] :] = start
+    return joined
 
 
 def _pad(table: Tensor, size: int) -> Tensor:
-    return torch.nn.functional.pad(table, (0, size - table.shape[1]))
+    missing = size - table.shape[1]
+    return torch.nn.functional.pad(table, (0, missing)) if missing else table

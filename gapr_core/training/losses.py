@@ -10,6 +10,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, softplus
 
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.transformer import Aggregated
+from gapr_core.model.types import Features, collate
 from gapr_core.training.targets import POSITIVE_OVERLAP, TrainingPair, fine_labels, true_patch_pairs
 
 MARGIN_POSITIVE = 0.1  # Delta_p
@@ -85,6 +86,15 @@ def bone_loss(logits: Tensor, is_bone: Tensor) -> Tensor | float:
     return binary_cross_entropy_with_logits(logits[said], is_bone[said].float())
 
 
+def features(network: GAPRNet, pair: TrainingPair) -> tuple[Features, Features]:
+    """What the backbone makes of sources and targets: all clouds in one pass, each different target once."""
+    targets = pair.target if pair.distinct is None else pair.distinct
+    which = tuple(range(len(targets))) if pair.distinct is None else pair.which
+    clouds, sources = collate([pair.source, targets]), len(pair.source)
+    found = network.backbone(clouds)
+    return found.chosen(clouds, tuple(range(sources))), found.chosen(clouds, tuple(sources + row for row in which))
+
+
 def compute_losses(
     network: GAPRNet,
     pair: TrainingPair,
@@ -93,11 +103,7 @@ def compute_losses(
     bone_weight: float = 0.5,
 ) -> tuple[Losses, Aggregated]:
     """One pass of a batch with the truth: the fine loss looks at true patch pairs and need not wait for good ones."""
-    f_p = network.backbone(pair.source)
-    if pair.distinct is None:
-        f_q = network.backbone(pair.target)
-    else:
-        f_q = network.backbone(pair.distinct).chosen(pair.distinct, pair.which)
+    f_p, f_q = features(network, pair)
     a = network.aggregation(pair.source, pair.target, f_p.coarse, f_q.coarse)
     coarse = circle_loss(a.source, a.target, pair.overlaps, a.source_valid, a.target_valid)
     early = circle_loss(a.early_source, a.early_target, pair.overlaps, a.source_valid, a.target_valid)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,8 +59,10 @@ def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: F
     """Joins two clouds of one frame with the truth (4, 4), mm."""
     T = to_units(T_target_source, source, target)
     radius = matching_radius(frame)
-    overlaps = patch_overlaps(source, target, T, radius)
-    near = cKDTree(target.fine.points.numpy()).query(se3.apply(T, source.fine.points.numpy()))[0] < radius
+    matches = _matches(source, target, T, radius)
+    overlaps = _overlaps(source, target, matches)
+    near = np.zeros(len(source.fine.points), dtype=bool)
+    near[matches["i"][matches["v"] < radius]] = True
     return TrainingPair(
         source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius]),
         is_bone=torch.from_numpy(near),
@@ -76,16 +79,22 @@ def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:
 
 def patch_overlaps(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[np.float32]:
     """(n, m): for every two patches, the share of points with a match in the other, averaged over both sides."""
-    p = se3.apply(T, source.fine.points.numpy())
-    q = target.fine.points.double().numpy()
+    return _overlaps(source, target, _matches(source, target, T, radius))
+
+
+def _matches(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[Any]:
+    """Fine points i of the source and j of the target within `radius` of each other, and how far apart, v."""
+    p, q = se3.apply(T, source.fine.points.numpy()), target.fine.points.double().numpy()
+    return cKDTree(p).sparse_distance_matrix(cKDTree(q), radius, output_type="ndarray")  # type: ignore[no-any-return]
+
+
+def _overlaps(source: Cloud, target: Cloud, matches: NDArray[Any]) -> NDArray[np.float32]:
     node_p, node_q = _nodes(source), _nodes(target)
-    matches = cKDTree(p).sparse_distance_matrix(cKDTree(q), radius, output_type="ndarray")
     i, j = matches["i"], matches["j"]
     kept = (node_p[i] >= 0) & (node_q[j] >= 0)
     i, j = i[kept], j[kept]
     shape = len(source.patches), len(target.patches)
-    hits_p = _hits(i, node_p[i], node_q[j], shape)
-    hits_q = _hits(j, node_q[j], node_p[i], shape[::-1]).T
+    hits_p, hits_q = _hits(i, node_p, node_q[j], shape), _hits(j, node_q, node_p[i], shape[::-1]).T
     size_p, size_q = (c.patches_valid.sum(1).clamp(min=1).numpy() for c in (source, target))
     return (0.5 * (hits_p / size_p[:, None] + hits_q / size_q)).astype(np.float32)
 
@@ -98,10 +107,13 @@ def _nodes(cloud: Cloud) -> NDArray[np.int64]:
     return node
 
 
-def _hits(point: NDArray[np.int64], own: NDArray[np.int64], other: NDArray[np.int64], shape: tuple[int, int]) -> Array:
-    """How many different points of each own patch have a match in each other patch."""
-    keys = np.unique(np.stack([point, own, other]), axis=1)
-    return np.bincount(keys[1] * shape[1] + keys[2], minlength=shape[0] * shape[1]).reshape(shape).astype(np.float64)
+def _hits(point: NDArray[np.int64], node: NDArray[np.int64], other: NDArray[np.int64], shape: tuple[int, int]) -> Array:
+    """How many different points of each own patch, `node` of every point, have a match in each other patch."""
+    has_match = np.zeros((len(node), shape[1]), dtype=bool)
+    has_match[point, other] = True
+    point, other = np.nonzero(has_match)
+    counts = np.bincount(node[point] * shape[1] + other, minlength=shape[0] * shape[1])
+    return counts.reshape(shape).astype(np.float64)
 
 
 def join(pairs: list[TrainingPair]) -> TrainingPair:

@@ -74,7 +74,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
     ema = GAPRNet(model).to(device)
     ema.load_state_dict(network.state_dict())
     learns = learning(network, config.trained)
-    optimizer = torch.optim.AdamW(learns, config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay)
+    optimizer = optimizer_of(learns, config)
     state: dict[str, Any] = {"step": 0, "seconds": 0.0}
     if checkpoint.exists():
         state = load_checkpoint(checkpoint, network, ema, optimizer)
@@ -105,7 +105,7 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
                 losses = learner(pairs.to(device), generator)
                 (losses.total / per_step).backward()
             parts.append(losses)
-        norm = torch.nn.utils.clip_grad_norm_(learns, config.clip)
+        norm = torch.nn.utils.clip_grad_norm_(learns, config.clip, foreach=True)
         lost = 0 if torch.isfinite(norm) else lost + 1
         if lost == MOST_LOST:
             raise FloatingPointError(f"{lost} steps in a row, up to {step + 1}, had gradients that are not finite")
@@ -196,6 +196,12 @@ def learning(network: GAPRNet, trained: str) -> list[nn.Parameter]:
     return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 
+def optimizer_of(learns: list[nn.Parameter], config: TrainConfig) -> torch.optim.AdamW:
+    """AdamW in one pass over all parameters."""
+    rates = {"lr": config.learning_rate, "weight_decay": config.weight_decay, "betas": (0.9, 0.98)}
+    return torch.optim.AdamW(learns, fused=True, **rates)  # type: ignore[arg-type]
+
+
 def bones_folder(folder: Path, config: TrainConfig) -> Path:
     """Where the bones in use of a run are kept: a scratch folder of this machine, the same at every call."""
     name = sha256(f"{folder.resolve()} {json.dumps(config.to_dict())}".encode()).hexdigest()[:16]
@@ -258,8 +264,7 @@ def learning_rate(config: TrainConfig, progress: float) -> float:
 @torch.no_grad()
 def average(ema: GAPRNet, network: GAPRNet, decay: float) -> None:
     """Exponential moving average of the weights."""
-    for kept, new in zip(ema.parameters(), network.parameters(), strict=True):
-        kept.lerp_(new, 1.0 - decay)
+    torch._foreach_lerp_(list(ema.parameters()), list(network.parameters()), 1.0 - decay)
 
 
 def check_folder(folder: Path, config: TrainConfig, model: ModelConfig) -> None:

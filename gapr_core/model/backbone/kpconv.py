@@ -13,8 +13,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from gapr_core.model import steps
 from gapr_core.model.config import ModelConfig, choose
-from gapr_core.model.layers import Unary, make_norm
+from gapr_core.model.layers import SLOPE, Unary, activated, make_norm
 from gapr_core.model.pairs import LocalPairs
 from gapr_core.model.vectors import dot, minus, parts
 
@@ -74,8 +75,11 @@ class KPConv(nn.Module):
         self.register_buffer("kernel", kernel_layout(), persistent=False)
 
     def forward(self, x: Tensor, pairs: LocalPairs) -> Tensor:
-        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-            influence = influences(self.places(pairs), pairs.hood.valid, self.kernel, self.sigma)
+        if self.places is surface_places and steps.fit(x, self.kernel):
+            influence = steps.surface_influences(pairs.centres, pairs.support, pairs.hood, self.kernel, self.sigma)
+        else:
+            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+                influence = influences(self.places(pairs), pairs.hood.valid, self.kernel, self.sigma)
         weighed = influence.to(x.dtype) @ pairs.keys(x)  # (M, 15, C_in)
         return weighed.flatten(1) @ self.weight / pairs.hood.valid.sum(1, keepdim=True)
 
@@ -91,10 +95,9 @@ class KPConvBlock(nn.Module):
         self.norm = make_norm(config.norm, middle)
         self.leave = Unary(middle, width, config.norm, plain=True)
         self.skip = Unary(width_in, width, config.norm, plain=True)
-        self.activation = nn.LeakyReLU(0.1)
 
     def forward(self, x: Tensor, pairs: LocalPairs) -> Tensor:
         here, there = pairs.centres.lengths, pairs.support.lengths
         y = self.convolution(self.enter(x, there), pairs)
-        y = self.leave(self.activation(self.norm(y, here)), here)
-        return self.activation(y + self.skip(pairs.at_centres(x), here))
+        y = self.leave(self.norm(y, here, SLOPE), here)
+        return activated(y + self.skip(pairs.at_centres(x), here), SLOPE)

@@ -204,6 +204,13 @@ class RulesConfig(Settings):
     pushed_motions: int = setting(
         3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6
     )
+    few_points: int = setting(
+        250, "fewer do not say whose bone it is: few_points_confidence is the most; 0: off", low=0, high=1_000_000
+    )
+    few_points_confidence: float = setting(0.85, "largest confidence of a source of few points", low=0, high=1)
+    noise_share: float = setting(
+        1.3, "residuals over a stated noise of the sensor up to which few points may be surer", low=0, high=100
+    )
     ruled_out: float = setting(0.4, "largest confidence of a pose that a rule refuses", low=0, high=1)
     independent_points: float = setting(
         30.0, "independent residuals that a source counts for where hypotheses share the probability", low=0

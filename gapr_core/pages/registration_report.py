@@ -56,6 +56,7 @@ WORDS = {
     "explained_of_compared": "share of the compared surface that is explained",
     "violating_of_compared": "share of the compared surface that the camera looked through",
     "rival_margin": "lead over the next hypothesis of the scene",
+    "few_points": "limit: few points do not say whose bone it is",
 }  # features of the confidence
 
 

@@ -14,7 +14,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, cortices, explained, mirror, rules
+from gapr_core.registration import clutter, cortices, explained, few_points, mirror, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess
@@ -145,7 +145,7 @@ class Registrar:
         if isinstance(assessment, Refusal):
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
-        named = explained.named_clutter(assessment, self.config)
+        named = explained.named_clutter(few_points.limited(assessment, self.config), self.config)
         result = replace(answer(named, self.config), guidance=guidance)
         clock.lap("assess")
         return replace(result, stage_ms=clock.stages)

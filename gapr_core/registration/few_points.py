@@ -13,6 +13,7 @@ from gapr_core.registration.bias_field import UNKNOWNS
 from gapr_core.results import Refusal, RegistrationStatus
 
 NAME = "few_points"  # of the limit, among the contributions to the log odds
+NEARLY_ALL = 0.9  # share of the points
 
 
 def limited(assessment: Assessment, config: RegistrarConfig) -> Assessment:
@@ -38,9 +39,10 @@ def limited(assessment: Assessment, config: RegistrarConfig) -> Assessment:
 
 
 def is_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True where the noise is stated and the residuals of all points, the pose's unknowns counted, are no larger."""
-    stated_mm, residuals_mm = config.sensor.noise_mm, assessment.fit.signed_mm
-    left = len(residuals_mm) - UNKNOWNS
-    if stated_mm is None or left <= 0:
+    """True where the noise is stated, nearly all points count for the pose, and their residuals are no larger."""
+    counts = assessment.fit.weights > 0.0
+    left = counts.sum() - UNKNOWNS
+    if config.sensor.noise_mm is None or left <= 0 or counts.mean() < NEARLY_ALL:
         return False
-    return bool(np.sqrt((residuals_mm**2).sum() / left) <= config.rules.noise_share * stated_mm)
+    residual_mm = np.sqrt((assessment.fit.signed_mm[counts] ** 2).sum() / left)
+    return bool(residual_mm <= config.rules.noise_share * config.sensor.noise_mm)

@@ -66,9 +66,11 @@ def dots(registrar, femur, target):
     points = femur.sample(400, np.random.default_rng(4))[0]
     made = registrar.assess(points, target)
 
-    def of(count, probability=SURE, refusal=None):
-        signed = np.full(count, 0.4) * np.sqrt((count - 6) / count)
-        fit = replace(made.fit, signed_mm=signed, weights=np.zeros(count))  # what does not count for the pose, too
+    def of(count, probability=SURE, refusal=None, gross=0):
+        signed, weights = np.full(count, 0.4), np.full(count, 0.7)
+        weights[:gross], signed[:gross] = 0.0, 8.0
+        signed *= np.sqrt((count - gross - 6) / (count - gross))
+        fit = replace(made.fit, signed_mm=signed, weights=weights)
         source = sources.prepare(points[:count])
         return replace(made, fit=fit, source=source, probability=probability, refusal=refusal)
 
@@ -102,10 +104,9 @@ def test_few_points_whose_noise_is_known_and_left_may_be_sure(dots):
     assert few_points.limited(dots(6), with_noise(10.0)).probability == 0.85
 
 
-def test_a_residual_that_is_not_known_is_no_small_one(dots):
-    lost = dots(40)
-    lost.fit.signed_mm[3] = np.nan
-    assert few_points.limited(lost, with_noise(1.0)).probability == 0.85
+def test_a_gross_point_in_ten_does_not_count_and_more_are_no_noise(dots):
+    assert few_points.limited(dots(40, gross=4), with_noise(0.4 / 1.29)).probability == SURE
+    assert few_points.limited(dots(40, gross=5), with_noise(0.4 / 1.29)).probability == 0.85
 
 
 def test_who_asks_for_more_than_few_points_can_say_reads_what_helps(dots):

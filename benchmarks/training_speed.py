@@ -54,7 +54,7 @@ def main() -> None:
 
 
 class Clock:
-    """Times of steps, taken where the trainer makes a line of its log."""
+    """Times of steps, taken where the trainer averages the weights at the end of each."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds, self.drawing = seconds, 0.0
@@ -62,13 +62,13 @@ class Clock:
 
     def watch(self) -> None:
         """From now on every step and every drawing of pairs is timed."""
-        log_row, get = trainer.log_row, dataset.TrainingPairs.__getitem__
+        average, get = trainer.average, dataset.TrainingPairs.__getitem__
 
-        def timed_row(*given: Any) -> Any:
+        def timed(*given: Any) -> Any:
             self.steps.append((time.process_time(), time.perf_counter(), self.drawing))
             if time.process_time() > self.seconds and len(self.steps) > LEFT_OUT + 1:
                 raise Enough
-            return log_row(*given)
+            return average(*given)
 
         def timed_get(pairs: Any, number: int) -> Any:
             begun = time.process_time()
@@ -76,7 +76,7 @@ class Clock:
             self.drawing += time.process_time() - begun
             return made
 
-        trainer.log_row, dataset.TrainingPairs.__getitem__ = timed_row, timed_get  # type: ignore[method-assign]
+        trainer.average, dataset.TrainingPairs.__getitem__ = timed, timed_get  # type: ignore[method-assign]
 
     def summary(self, batch: int) -> str:
         """One line; the processor time is that of this process, the pairs are those of all."""

@@ -43,11 +43,12 @@ from gapr_core.runtime import files
 from gapr_core.runtime.arguments import above_zero, at_least_one
 from gapr_core.runtime.console import say
 from gapr_core.runtime.parallel import end_with_parent
+from gapr_core.training import run_folder
 from gapr_core.training.ablation.table import FIGURES, folder_of, write
 from gapr_core.training.config import TrainConfig, Variant, default_plan, read_plan, trained_as
 from gapr_core.training.dataset import available
 from gapr_core.training.targets import training_pair
-from gapr_core.training.trainer import check_folder, train
+from gapr_core.training.trainer import train
 from gapr_core.training.validation import inlier_ratios
 
 Record = dict[str, Any]
@@ -130,7 +131,7 @@ def ablate(
     }  # fmt: skip
     for folder, settings in todo.items():
         if (folder / "config.json").exists():
-            check_folder(folder, settings, settings.network())
+            run_folder.check(folder, settings, settings.network())
     examination(recipe, out / "pairs", anatomy)
     tasks = [Task(folder, settings, anatomy, out / "pairs", deadline, pose) for folder, settings in todo.items()]
     missing = [task for task in tasks if not (task.folder / "exam.json").exists()]

@@ -13,7 +13,7 @@ import pytest
 from gapr_core import cli
 from gapr_core.errors import ConfigError
 from gapr_core.model.config import ModelConfig
-from gapr_core.training import curves, provenance, trainer
+from gapr_core.training import curves, provenance, run_folder
 from gapr_core.training.config import TrainConfig
 
 PNG = b"\x89PNG\r\n"
@@ -73,14 +73,14 @@ def test_a_running_mean_leaves_out_what_is_not_finite():
 
 def test_a_line_after_a_crash_takes_the_place_of_the_one_that_was_cut_off(tmp_path):
     path = tmp_path / "log.csv"
-    trainer.append(path, {"pairs": 8, "loss": 1.0})
+    run_folder.append(path, {"pairs": 8, "loss": 1.0})
     path.write_bytes(path.read_bytes() + b"16,0.")
-    trainer.append(path, {"pairs": 24, "loss": 2.0})
+    run_folder.append(path, {"pairs": 24, "loss": 2.0})
     assert curves.read_csv(path) == [{"pairs": 8.0, "loss": 1.0}, {"pairs": 24.0, "loss": 2.0}]
 
 
 def test_a_picture_that_cannot_be_drawn_is_a_warning_and_no_error(tmp_path, caplog):
-    trainer.draw_curves(tmp_path / "nowhere")
+    run_folder.draw_curves(tmp_path / "nowhere")
     assert "no curves of" in caplog.text and "log.csv" in caplog.text
 
 
@@ -131,7 +131,7 @@ def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused
     begun = {"train": replace(TrainConfig(), model="old/best.yaml").to_dict(), "model": ModelConfig().to_dict()}
     del begun["train"]["share"], begun["model"]["centred_features"]
     (tmp_path / "config.json").write_text(json.dumps(begun))
-    trainer.check_folder(tmp_path, replace(TrainConfig(), model="new/best.yaml"), ModelConfig())
+    run_folder.check(tmp_path, replace(TrainConfig(), model="new/best.yaml"), ModelConfig())
     for config, model in ((TrainConfig(share=3), ModelConfig()), (TrainConfig(), ModelConfig(centred_features=True))):
         with pytest.raises(ConfigError, match="begun"):
-            trainer.check_folder(tmp_path, config, model)
+            run_folder.check(tmp_path, config, model)

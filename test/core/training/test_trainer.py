@@ -17,10 +17,11 @@ import yaml
 from gapr_core.data import protocols
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
+from gapr_core.model.config import ModelConfig
 from gapr_core.model.export import leaves
 from gapr_core.runtime.settings import load
 from gapr_core.surface import Surface
-from gapr_core.training import distributed, export, trainer, validation
+from gapr_core.training import batches, distributed, export, start, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
@@ -49,7 +50,7 @@ def settings(toy, tmp_path_factory):
 
 
 def test_a_pair_is_a_function_of_its_number(settings, anatomy, toy):
-    model = trainer.ModelConfig.from_yaml(settings.model)
+    model = ModelConfig.from_yaml(settings.model)
     first, second = TrainingPairs(settings, model, anatomy), TrainingPairs(settings, model, anatomy)
     second.pair(0)  # another history
     a, b = first.pair(7), second.pair(7)
@@ -61,7 +62,7 @@ def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
     """Under the true motion nearly every source point of the clean protocol lies on the target."""
     from gapr_core.model.repositioning import move
 
-    pairs = TrainingPairs(replace(settings, mix={"L1": 1.0}), trainer.ModelConfig.from_yaml(settings.model), anatomy)
+    pairs = TrainingPairs(replace(settings, mix={"L1": 1.0}), ModelConfig.from_yaml(settings.model), anatomy)
     for number in range(3):
         pair = pairs.pair(number)
         moved = move(pair.T, pair.source.fine.points[None])[0]
@@ -71,7 +72,7 @@ def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
 
 def test_validation_draws_again_where_a_source_is_too_large_for_the_network(settings, anatomy, monkeypatch):
     """A camera sees far more than the bone in many wounds; one such draw ended a run before its first step."""
-    model = trainer.ModelConfig.from_yaml(settings.model)
+    model = ModelConfig.from_yaml(settings.model)
     seeds = []
 
     def large_at_first(protocol, specimen, seed):
@@ -104,7 +105,7 @@ def test_a_run_of_less_than_one_step_is_refused(settings, anatomy, tmp_path):
 
 def test_a_protocol_that_the_network_never_sees_is_named(settings, anatomy):
     """Points far away span many times the target: such a share of the mix would silently be drawn as something else."""
-    model = trainer.ModelConfig.from_yaml(settings.model)
+    model = ModelConfig.from_yaml(settings.model)
     with pytest.raises(ConfigError, match="L1-far10"):
         validation.validation_set(replace(settings, mix={"L1-far10": 1.0}), model, anatomy)
 
@@ -168,7 +169,7 @@ def test_a_network_without_a_head_begins_with_weights_that_have_one(settings, an
     """Those that ship have one since it was trained, and training.md says to begin with them."""
     with_head = replace(settings, model_settings={"bone_head": "mlp"}, mix={"scene-C2": 1.0}, validation_pairs=0)
     first = trainer.train(replace(with_head, pairs=4), tmp_path / "first", anatomy)
-    begun = trainer.begin(replace(settings, initial=str(first)), trainer.ModelConfig.from_yaml(settings.model))
+    begun = start.begin(replace(settings, initial=str(first)), ModelConfig.from_yaml(settings.model))
     before, own = weights.load(first)[0].state_dict(), begun.state_dict()
     assert own and all(torch.equal(tensor, before[name]) for name, tensor in own.items())
     assert all(name.startswith("bone_head.") for name in before.keys() - own.keys())
@@ -183,7 +184,7 @@ def test_what_the_documentation_begins_with_the_shipped_weights_can_begin_with_t
     shipped = REPOSITORY / "gapr_core/weights/gapr_net.safetensors"
     config = load(TrainConfig, REPOSITORY / f"config/{name}.yaml", [])
     config = replace(config, initial=str(shipped), model=config.model and str(REPOSITORY / config.model))
-    begun, before = trainer.begin(config, config.network()).state_dict(), weights.load(shipped)[0].state_dict()
+    begun, before = start.begin(config, config.network()).state_dict(), weights.load(shipped)[0].state_dict()
     assert all(torch.equal(tensor, before[tensor_name]) for tensor_name, tensor in begun.items())
 
 
@@ -218,9 +219,9 @@ def test_a_run_goes_on_without_the_weights_that_it_began_with(settings, anatomy,
 
 
 def test_workers_make_the_same_pairs_in_the_same_order(settings, anatomy):
-    model = trainer.ModelConfig.from_yaml(settings.model)
+    model = ModelConfig.from_yaml(settings.model)
     alone, helped = (
-        list(trainer.micro_batches(replace(settings, workers=w, pairs=8), model, anatomy, 1, 0, 1)) for w in (0, 1)
+        list(batches.micro_batches(replace(settings, workers=w, pairs=8), model, anatomy, 1, 0, 1)) for w in (0, 1)
     )
     assert len(alone) == len(helped) == 3
     assert all(torch.equal(a.overlaps, b.overlaps) for a, b in zip(alone, helped, strict=True))
@@ -311,7 +312,7 @@ def test_unknown_keys_of_a_run_are_named():
 
 
 def test_pairs_that_share_a_target_learn_what_they_learn_alone(settings, anatomy):
-    model = trainer.ModelConfig.from_yaml(settings.model)
+    model = ModelConfig.from_yaml(settings.model)
     batch = TrainingPairs(settings, model, anatomy)[1]
     assert batch.which == (0, 0) and len(batch.distinct) == 1
     torch.manual_seed(0)

@@ -1,0 +1,110 @@
+"""The folder of a run: its settings, lines of its log, its validation and its curves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from gapr_core.errors import ConfigError
+from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
+from gapr_core.runtime import files
+from gapr_core.training import provenance
+from gapr_core.training.config import TrainConfig
+from gapr_core.training.losses import Losses
+from gapr_core.training.validation import validate
+
+log = logging.getLogger(__name__)
+
+
+def check(folder: Path, config: TrainConfig, model: ModelConfig) -> None:
+    """The folder is empty, or holds a run with these settings.
+
+    The network's settings count, not the path of their yaml; an entry that did not exist then stood at its default.
+
+    Raises:
+        ConfigError: the folder holds another run.
+    """
+    path = folder / "config.json"
+    if path.exists():
+        begun = json.loads(path.read_text())
+        there = TrainConfig.from_dict(begun["train"]), ModelConfig.from_dict(begun["model"])
+        if (replace(there[0], model=config.model), there[1]) != (config, model):
+            raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
+
+
+def claim(
+    folder: Path, config: TrainConfig, model: ModelConfig, anatomy: Path | None, step: int, world: int
+) -> list[dict[str, Any]]:
+    """Write the run's settings, if they are not there yet, and where it goes on; returns all of provenance.json.
+
+    Only now, when nothing that the settings name was refused: the next try may have others.
+    """
+    path = folder / "config.json"
+    if not path.exists():
+        files.write_json(path, {"train": config.to_dict(), "model": model.to_dict()})
+    return provenance.append(folder, config, anatomy, step, world)
+
+
+def log_row(
+    state: dict[str, Any], config: TrainConfig, rate: float, norm: float, parts: list[Losses]
+) -> dict[str, Any]:
+    """One line of log.csv."""
+    names = (
+        ("coarse", "fine", "early", "bone") if isinstance(parts[0].bone, torch.Tensor) else ("coarse", "fine", "early")
+    )
+    means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in names}
+    row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
+    total = sum(float(p.total.detach()) for p in parts) / len(parts)
+    values = {"rate": rate, "norm": norm, "loss": total, **means}
+    return row | {name: float(f"{value:.5g}") for name, value in values.items()}
+
+
+def report(
+    folder: Path, ema: GAPRNet, held_out: Any, state: dict[str, Any], config: TrainConfig, device: torch.device
+) -> None:
+    """Validate the averaged weights: lines of validation.csv, and one on the terminal."""
+    if not held_out:
+        return
+    scores = validate(ema, held_out, device)
+    for protocol, score in scores.items():
+        values = {name: round(value, 4) for name, value in asdict(score).items()}
+        row = {"pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1), "protocol": protocol}
+        append(folder / "validation.csv", row | values)
+    total = scores["all"]
+    tqdm.write(
+        f"{state['step'] * config.batch} pairs  {state['seconds'] / 60:.0f} min  inliers: coarse "
+        f"{total.coarse_inliers:.2f}, fine {total.fine_inliers:.2f}  recall: 4 mm/5 deg {total.first:.2f}, "
+        f"a near pose among the proposals {total.among:.2f}"
+    )
+
+
+def draw_curves(folder: Path) -> None:
+    """Draw curves.png again; where even matplotlib cannot be loaded, a warning instead of the end of the run."""
+    try:
+        from gapr_core.training import curves
+    except ImportError as error:
+        log.warning("no curves of %s: %s", folder, error)
+    else:
+        curves.draw_or_warn(folder)
+
+
+def append(path: Path, row: dict[str, Any]) -> None:
+    """One line at the end of a CSV file, with a head if it is new; in place of one that a crash cut off."""
+    with path.open("a+b") as file:
+        size = file.seek(0, 2)
+        file.seek(max(size - 4096, 0))
+        whole = size - len(file.read().rpartition(b"\n")[2])
+        file.truncate(whole)
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if whole == 0:
+            writer.writeheader()
+        writer.writerow(row)

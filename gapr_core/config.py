@@ -207,7 +207,7 @@ class RulesConfig(Settings):
     few_points: int = setting(
         250, "fewer do not say whose bone it is: few_points_confidence is the most; 0: off", low=0, high=1_000_000
     )
-    few_points_confidence: float = setting(0.85, "largest confidence of a source of few points", low=0, high=1)
+    few_points_confidence: float = setting(0.89, "largest confidence of a source of few points", low=0, high=1)
     noise_share: float = setting(
         1.3, "residuals over a stated noise of the sensor up to which few points may be surer", low=0, high=100
     )

@@ -84,15 +84,15 @@ def with_noise(noise_mm, **settings):
 def test_few_points_do_not_say_whose_bone_it_is(dots):
     few, config = dots(249), RegistrarConfig()
     found = few_points.limited(few, config)
-    assert found.probability == 0.85 and found.refusal is None
+    assert found.probability == 0.89 and found.refusal is None
     assert sum(found.contributions.values()) - sum(few.contributions.values()) == pytest.approx(
-        logit(0.85) - logit(SURE)
+        logit(0.89) - logit(SURE)
     )
     assert few_points.limited(dots(250), config).probability == SURE
 
 
 def test_what_is_no_surer_than_that_stays(dots):
-    unsure = dots(60, probability=0.85)
+    unsure = dots(60, probability=0.89)
     assert few_points.limited(unsure, RegistrarConfig()) is unsure
     assert np.isnan(few_points.limited(dots(60, probability=np.nan), RegistrarConfig()).probability)
 
@@ -100,19 +100,19 @@ def test_what_is_no_surer_than_that_stays(dots):
 def test_few_points_whose_noise_is_known_and_left_may_be_sure(dots):
     """0.4 mm, the pose's six unknowns counted, may be at most 1.3 times what is stated."""
     assert few_points.limited(dots(40), with_noise(0.4 / 1.29)).probability == SURE
-    assert few_points.limited(dots(40), with_noise(0.4 / 1.31)).probability == 0.85
-    assert few_points.limited(dots(6), with_noise(10.0)).probability == 0.85
+    assert few_points.limited(dots(40), with_noise(0.4 / 1.31)).probability == 0.89
+    assert few_points.limited(dots(6), with_noise(10.0)).probability == 0.89
 
 
 def test_a_gross_point_in_ten_does_not_count_and_more_are_no_noise(dots):
     assert few_points.limited(dots(40, gross=4), with_noise(0.4 / 1.29)).probability == SURE
-    assert few_points.limited(dots(40, gross=5), with_noise(0.4 / 1.29)).probability == 0.85
+    assert few_points.limited(dots(40, gross=5), with_noise(0.4 / 1.29)).probability == 0.89
 
 
 def test_who_asks_for_more_than_few_points_can_say_reads_what_helps(dots):
     found = few_points.limited(dots(40), RegistrarConfig(min_confidence=0.9))
     assert found.refusal.status is RegistrationStatus.LOW_CONFIDENCE
-    for word in ("40 points", "another subject", "0.85", "0.9", "250", "noise_mm"):
+    for word in ("40 points", "another subject", "0.89", "0.9", "250", "noise_mm"):
         assert word in found.refusal.reason
     refused = Refusal(RegistrationStatus.DEGENERATE, "flat")
     assert few_points.limited(dots(40, refusal=refused), RegistrarConfig(min_confidence=0.9)).refusal is refused
@@ -125,5 +125,5 @@ def test_a_registrar_and_a_tracker_limit_what_few_points_say(registrar, femur, t
     tracker = Tracker(registrar)
     tracker.register(noisy, target)
     for found in (registrar.register(noisy, target), tracker.register(noisy, target)):
-        assert found.ok and found.confidence == 0.85 and found.contributions["few_points"] < 0.0
+        assert found.ok and found.confidence == 0.89 and found.contributions["few_points"] < 0.0
     assert stated.register(noisy, target).confidence > 0.9

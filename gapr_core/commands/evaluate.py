@@ -16,7 +16,7 @@ from gapr_core.baselines import RegistrationMethod
 from gapr_core.benchmark import methods
 from gapr_core.benchmark.record import ERROR
 from gapr_core.commands import options
-from gapr_core.commands.register import as_json
+from gapr_core.commands.answer import as_json
 from gapr_core.data.pair_files import load_clouds, pair_paths
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -26,6 +26,7 @@ from gapr_core.runtime.console import say
 
 log = logging.getLogger(__name__)
 Answer = dict[str, Any]
+WRITE_SECONDS = 5.0  # the file holds all answers, and grows: it is written again after so long
 INVALID_INPUT = "INVALID_INPUT"  # status of a pair that cannot be read
 
 
@@ -50,8 +51,16 @@ def run(args: Namespace) -> int:
     waiting = [path for path, made in made_of.items() if not made.items() <= answers.get(path.stem, {}).items()]
     for path in waiting[:1]:
         _answer(path, method)  # compiled code loads with the first call, whose time is not the method's
-    for path in tqdm(waiting, unit="pair", disable=None):
-        answers |= _written(args.out, {path.stem: _answer(path, method) | made_of[path]})
+    new: dict[str, Answer] = {}
+    written = time.monotonic()
+    try:
+        for path in tqdm(waiting, unit="pair", disable=None):
+            new[path.stem] = _answer(path, method) | made_of[path]
+            if time.monotonic() - written > WRITE_SECONDS:
+                answers |= _written(args.out, new)
+                new, written = {}, time.monotonic()
+    finally:  # of an interrupted run, too
+        answers |= _written(args.out, new) if new else {}
     _say_counts(args.out, [answers[path.stem] for path in paths])
     return 0
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.commands import checks, options
+from gapr_core.commands.answer import as_json, guidance_json
 from gapr_core.errors import ConfigError
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import files
@@ -194,22 +195,11 @@ def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
             f"gain {spot.gain_mm:.2f} mm, {100 * spot.rivals_excluded:.0f} % of the rivals excluded")  # fmt: skip
 
 
-def _guidance_json(result: RegistrationResult, spots: Sequence[Patch]) -> dict[str, Any] | None:
-    if result.guidance is None:
-        return None
-    patches = [
-        {"centre_mm": spot.centre.tolist(), "normal": spot.normal.tolist(), "tre95_mm": spot.tre95_mm,
-         "rivals_excluded": spot.rivals_excluded, "gain_mm": spot.gain_mm}
-        for spot in spots
-    ]  # fmt: skip
-    return {"now_mm": result.guidance.now_mm, "patches": patches}
-
-
 def _write(args: Namespace, done: Registration) -> None:
     """The files that were asked for; those of a pose only where there is one."""
     if args.json:
         errors = [asdict(error) for error in done.errors]
-        more = {"targets": errors, "guidance": _guidance_json(done.result, done.spots)}
+        more = {"targets": errors, "guidance": guidance_json(done.result, done.spots)}
         files.write_json(args.json, as_json(done.result) | more)
     if args.report:
         from gapr_core.pages import registration_report
@@ -237,21 +227,3 @@ def _write_pose(args: Namespace, done: Registration) -> None:
         scene.write_coloured(args.residuals, result.apply(result.residuals.points), result.residuals)
     if args.slicer:
         scene.write_slicer(args.slicer, done.target, result, done.errors)
-
-
-def as_json(result: RegistrationResult) -> dict[str, Any]:
-    """The contract of the JSON output: transform is 4x4 row-major, source -> target, mm; null on a refusal."""
-    pose, covariance = result.T_target_source, result.covariance
-    return {
-        "transform": None if pose is None else pose.tolist(),
-        "confidence": result.confidence,
-        "status": str(result.status),
-        "covariance": None if covariance is None else covariance.tolist(),
-        "centre_mm": None if result.centre_mm is None else np.asarray(result.centre_mm).tolist(),
-        "seconds": result.seconds,
-        "tre_mm": result.tre_mm,
-        "tre95_mm": result.tre95_mm,
-        "inlier_ratio": result.inlier_ratio,
-        "contributions": {name: round(log_odds, 3) for name, log_odds in result.contributions.items()},
-        "reason": result.reason,
-    }

@@ -79,6 +79,24 @@ def test_evaluate_goes_on_where_it_stopped(tmp_path, pair):
     assert set(both) == {"a", "b"} and both["a"] == first["a"]
 
 
+def test_an_interrupted_evaluation_has_written_what_it_had_answered(tmp_path, pair, monkeypatch):
+    from gapr_core.commands import evaluate
+
+    (tmp_path / "pairs").mkdir()
+    for name in "abc":
+        np.savez(tmp_path / "pairs" / f"{name}.npz", source=pair.source[:5], target=pair.target)
+    answer = evaluate._answer
+
+    def interrupted(path, method):
+        if path.stem == "c":
+            raise KeyboardInterrupt
+        return answer(path, method)
+
+    monkeypatch.setattr(evaluate, "_answer", interrupted)
+    cli.main(["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "poses.json")])
+    assert set(json.loads((tmp_path / "poses.json").read_text())) == {"a", "b"}
+
+
 def test_two_runs_of_evaluate_lose_no_answers_of_each_other(tmp_path, pair):
     out, running = tmp_path / "new" / "poses.json", []
     for name in "ab":

@@ -25,6 +25,7 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
+VIEWPOINT = "check that the viewpoint is the camera's place in the frame of the cloud, in mm, "
 NO_RIVAL = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 
 
@@ -100,7 +101,7 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
     if believed or not (in_scene or len(source.points) >= config.source.dense_points):
         return assessment
     if in_scene:
-        share, limit, more = assessment.features["inlier_ratio"], config.part.mostly_clutter, ""
+        share, limit, more = assessment.features["inlier_ratio"], config.part.mostly_clutter, VIEWPOINT
     else:
         share = float(_on_surface(assessment.fit.T, source, assessment.target, config).mean())
         limit, more = config.part.mostly_off, "say where the camera was, "

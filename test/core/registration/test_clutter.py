@@ -83,6 +83,15 @@ def test_without_a_viewpoint_a_refusal_of_clutter_asks_for_one(target, scene):
     assert result.status is RegistrationStatus.CLUTTER and "where the camera was" in result.reason
 
 
+def test_a_refusal_of_clutter_with_a_viewpoint_behind_the_surface_asks_to_check_it(target, femur):
+    """All of the cloud is bone; only the viewpoint is wrong, as one in another frame or unit is."""
+    points, normals = femur.sample(6000, np.random.default_rng(5))
+    seen = points[normals @ [0.0, 1.0, 0.0] > 0.3]
+    viewpoint = seen.mean(axis=0) - [0.0, 400.0, 0.0]
+    result = Registrar(RegistrarConfig(num_threads=1)).register(seen, target, viewpoint=viewpoint)
+    assert result.status is RegistrationStatus.CLUTTER and "check that the viewpoint" in result.reason
+
+
 def test_a_refused_cloud_that_lies_on_the_bone_is_not_called_clutter(target, femur):
     shaft = femur.sample(4000, np.random.default_rng(5))[0]
     along = np.abs(shaft[:, 2] - shaft[:, 2].mean())

@@ -73,6 +73,7 @@ class Session:
     def close(self) -> None:
         """End the worker, after the cloud that it has in hand, and give the topics back; waits for nothing."""
         self.stop_waiting("the node stopped")
+        self.worker.run(partial(self._registration.end, "the node stopped"))
         self._closed = True
         self.worker.stop()
         self._publishers.close()

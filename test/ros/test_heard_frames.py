@@ -226,7 +226,9 @@ def test_the_node_puts_no_transform_from_the_future_into_its_buffer(blob_path, c
     now_s = 1000.0
     with node_in_thread(method, blob_path, output_frame="world", tf_timeout=60.0, use_sim_time=True) as node:
         client.wait_for_state("active")
-        wait_until(lambda: client.clock.publish(Clock(clock=Time(seconds=now_s).to_msg())) or node.now_ns() == now_s * NS)
+        wait_until(
+            lambda: client.clock.publish(Clock(clock=Time(seconds=now_s).to_msg())) or node.now_ns() == now_s * NS
+        )
         for stamp_s, x in ((999.5, 1.0), (3e7, 1.0), (999.7, 2.0), (999.9, 2.0)):
             heard.hear(_transform(x, stamp_s), "the camera")
         assert client.ask(GOOD, frame="camera", stamp_s=999.8)["level"] == 0

@@ -35,7 +35,7 @@ class Frames:
         publish: send to /tf.
         listen: look up from the start; else from the first `listen()`.
         note_sent: is given every transform that goes to /tf.
-        check_future: raises RefusedError for a stamp, ns, of a transform that comes too far ahead of the clock.
+        is_future: whether the stamp, ns, of a transform that was heard is too far ahead of the clock.
 
     Attributes:
         behind: the last transform was not sent, because buffers still hold those of another round.
@@ -47,9 +47,9 @@ class Frames:
         publish: bool,
         listen: bool,
         note_sent: Callable[[TransformStamped], None] | None = None,
-        check_future: Callable[[int], None] = lambda stamp: None,
+        is_future: Callable[[int], bool] = lambda stamp: False,
     ) -> None:
-        self._node, self._note_sent, self._check_future = node, note_sent, check_future
+        self._node, self._note_sent, self._is_future = node, note_sent, is_future
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
         self._newest_ns, self._any_older = -1, False  # stamp of the clouds of this round of time
         self._tf2 = _import_tf2() if publish or listen else None
@@ -69,7 +69,7 @@ class Frames:
         if self._tf2 is not None and self._buffer is None:
             self._buffer = self._tf2.Buffer(node=self._node)
             self._buffer.jump_handle.unregister()  # `start_over` clears it; that of Jazzy's first tf2_ros_py raises
-            self._heard = Heard(self._buffer, self._check_future, self._node)
+            self._heard = Heard(self._buffer, self._is_future, self._node)
             self._listener = self._tf2.TransformListener(self._heard, self._node)
 
     def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from gapr_ros.node.refusal import RefusedError
 from gapr_ros.node.timeline import BACK_NS, RESTART_AFTER, stamp_ns
 
 if TYPE_CHECKING:
@@ -22,12 +21,12 @@ class Heard:
 
     Args:
         buffer: of tf2.
-        check_future: raises RefusedError for a stamp, ns, that is too far ahead of the clock.
+        is_future: whether a stamp, ns, is too far ahead of the clock.
         node: logs what is left out.
     """
 
-    def __init__(self, buffer: Any, check_future: Callable[[int], None], node: Any) -> None:
-        self._buffer, self._check_future, self._node = buffer, check_future, node
+    def __init__(self, buffer: Any, is_future: Callable[[int], bool], node: Any) -> None:
+        self._buffer, self._is_future, self._node = buffer, is_future, node
         self._newest_ns: dict[str, int] = {}  # by child frame
         self._back_ns: dict[str, list[int]] = {}  # stamps in a row that went back
         self._any_older: set[str] = set()
@@ -44,12 +43,9 @@ class Heard:
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf."""
         child, stamp = transform.child_frame_id, stamp_ns(transform.header)
-        try:
-            self._check_future(stamp)
-        except RefusedError as refusal:
-            self._warn(f"a transform of '{child}' is left out: {refusal.text}")
-            return
-        if self._is_of_now(child, stamp):
+        if self._is_future(stamp):
+            self._warn(f"a transform of '{child}' is left out: its stamp is ahead of the clock; synchronise the clocks")
+        elif self._is_of_now(child, stamp):
             self._buffer.set_transform(transform, authority)
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:

@@ -59,7 +59,7 @@ class Session:
         self._shared = SharedFrame(host, self.conflicts) if publish else None
         self._named = SharedName(host, self.conflicts)
         note_sent = self._shared.note_own if self._shared else None
-        self._frames = Frames(host.ros, publish, listen, note_sent, self._check_future)
+        self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future)
         self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
         self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation, self._left)
@@ -122,9 +122,9 @@ class Session:
         if message.header.frame_id:
             self._frames.listen()
 
-    def _check_future(self, stamp_ns: int) -> None:
-        """Of a transform, as of a cloud."""
-        timeline.check_future(stamp_ns, self._host.now_ns(), self._host.parameters.max_future)
+    def _is_future(self, stamp_ns: int) -> bool:
+        """Of a transform."""
+        return timeline.is_far_ahead(stamp_ns, self._host.now_ns(), self._host.parameters.max_future)
 
     def register_newest(self, waiter: Any) -> bool:
         """Register the newest cloud now; its outcome becomes the waiter's result.

@@ -19,7 +19,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.signals import uninstall_signal_handlers
 from rclpy.utilities import remove_ros_args
 from shape_msgs.msg import Mesh, MeshTriangle
-from trusted_pose import TrustedPose
+from trusted_pose import TrustedPose, parser
 
 from gapr_core import load
 
@@ -75,12 +75,14 @@ def obstacle(types: Any, mesh: Mesh, transform: TransformStamped) -> Any:
 
 def main() -> None:
     """Run until it is stopped."""
+    arguments = parser(__doc__)
+    arguments.add_argument("bone", type=Path, help="its mesh")
+    given = arguments.parse_args(remove_ros_args(sys.argv)[1:])
     import moveit_msgs.msg
 
-    arguments = remove_ros_args(sys.argv)
     rclpy.init(args=sys.argv)
     try:
-        rclpy.spin(BoneInScene(arguments[1], moveit_msgs.msg))
+        rclpy.spin(BoneInScene(given.bone, moveit_msgs.msg))
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     uninstall_signal_handlers()  # ends rclpy's thread for signals first: it shuts down too, and twice is an error

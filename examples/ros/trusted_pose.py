@@ -9,6 +9,7 @@ another cloud. For a pose in another frame (`frame`) tf2 gives where the cloud's
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 
@@ -19,6 +20,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import uninstall_signal_handlers
 from rclpy.time import Time
+from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Header
 
 from msg_adapters import matrix_to_transform, transform_to_matrix
@@ -169,8 +171,15 @@ def _key(stamp: str) -> Stamp:
     return int(seconds), int(nanoseconds)
 
 
+def parser(description: str) -> argparse.ArgumentParser:
+    """What may stand before --ros-args: `--help`, which prints the description, and nothing else."""
+    shape = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(description=description, formatter_class=shape, allow_abbrev=False)
+
+
 def main() -> None:
     """Run until it is stopped."""
+    parser(__doc__).parse_args(remove_ros_args(sys.argv)[1:])
     rclpy.init(args=sys.argv)
     try:
         rclpy.spin(TrustedPose())

@@ -40,6 +40,12 @@ class Late:
         jobs, self._jobs = self._jobs, deque()
         self._jobs.extend(each for each in jobs if not self._is_done(*each, wait_s))
 
+    def end(self, why: str) -> None:
+        """Drop those that wait."""
+        jobs, self._jobs = self._jobs, deque()
+        for _ in jobs:
+            self._left(False, why)
+
     def _is_done(self, since: float, job: Job, wait_s: float) -> bool:
         try:
             self._collect(job)

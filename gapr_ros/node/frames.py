@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError
+from gapr_ros.node.heard import Heard
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.timeline import BACK_NS
 from gapr_ros.parameters import NodeParameters
@@ -34,15 +35,21 @@ class Frames:
         publish: send to /tf.
         listen: look up from the start; else from the first `listen()`.
         note_sent: is given every transform that goes to /tf.
+        is_future: whether the stamp, ns, of a transform that was heard is too far ahead of the clock.
 
     Attributes:
         behind: the last transform was not sent, because buffers still hold those of another round.
     """
 
     def __init__(
-        self, node: Node, publish: bool, listen: bool, note_sent: Callable[[TransformStamped], None] | None = None
+        self,
+        node: Node,
+        publish: bool,
+        listen: bool,
+        note_sent: Callable[[TransformStamped], None] | None = None,
+        is_future: Callable[[int], bool] = lambda stamp: False,
     ) -> None:
-        self._node, self._note_sent = node, note_sent
+        self._node, self._note_sent, self._is_future = node, note_sent, is_future
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
         self._newest_ns, self._any_older = -1, False  # stamp of the clouds of this round of time
         self._tf2 = _import_tf2() if publish or listen else None
@@ -50,6 +57,7 @@ class Frames:
             node.get_logger().warning(f"{MISSING}: nothing goes to /tf and no other frame can be used")
         self._broadcaster = self._tf2.TransformBroadcaster(node) if self._tf2 and publish else None
         self._buffer: Any = None
+        self._heard: Heard | None = None
         self._listener: Any = None
         if listen:
             self.listen()
@@ -61,7 +69,8 @@ class Frames:
         if self._tf2 is not None and self._buffer is None:
             self._buffer = self._tf2.Buffer(node=self._node)
             self._buffer.jump_handle.unregister()  # `start_over` clears it; that of Jazzy's first tf2_ros_py raises
-            self._listener = self._tf2.TransformListener(self._buffer, self._node)
+            self._heard = Heard(self._buffer, self._is_future, self._node)
+            self._listener = self._tf2.TransformListener(self._heard, self._node)
 
     def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float) -> Array:
         """T_parent_child (4, 4), metres, at a time. Waits in the caller's thread, by the wall clock.
@@ -85,8 +94,8 @@ class Frames:
     def start_over(self) -> None:
         """What was heard so far is of another round of time: between that and what comes tf2 would interpolate."""
         self._newest_ns = -1
-        if self._buffer is not None:
-            self._buffer.clear()  # not what is static
+        if self._heard is not None:
+            self._heard.start_over()
 
     def note_cloud(self, stamp_ns: int) -> None:
         """A cloud was let in; one that is older than those of a round can be begins another one, as after a reset."""
@@ -119,6 +128,8 @@ class Frames:
     def forget(self) -> None:
         """The listeners start over: older stamps are news again."""
         self._any_older = True
+        if self._heard is not None:
+            self._heard.expect_older()
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
 
     def close(self) -> None:
@@ -129,7 +140,7 @@ class Frames:
             self._node.destroy_service(self._buffer.srv)
         if self._broadcaster is not None:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
-        self._listener = self._buffer = self._broadcaster = None
+        self._listener = self._heard = self._buffer = self._broadcaster = None
 
 
 def check_names(parameters: NodeParameters) -> None:

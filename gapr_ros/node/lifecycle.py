@@ -122,16 +122,32 @@ class RegisterNode(LifecycleNodeMixin, Node):
         service.callback = partial(self._on_change_asked, service.callback)
 
     async def _on_change_asked(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
+        if not self._is_to_configure(request.transition):
+            return self._change(change, request, response)
+        if self._loader.busy:
+            return self._refuse_change(response, f"{self._loader}: one bone at a time")
+        answer = Future()
+
+        def configure(loading: Future) -> None:
+            """At once: whatever comes first could set a parameter that the bone was read without."""
+            self._loaded = loading.result()
+            answer.set_result(self._change(change, request, response))
+
+        self._load_to_configure().add_done_callback(configure)
+        return await answer
+
+    def _change(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
         try:
-            if self._is_to_configure(request.transition):
-                if self._loader.busy:
-                    raise RuntimeError(f"{self._loader}: one bone at a time")
-                self._loaded = await self._load_to_configure()
             return change(request, response)
         except Exception as error:  # rclpy raises where the state does not allow the transition
-            self.get_logger().error(f"a change of state was refused: {error}")
-            response.success = False
-            return response
+            return self._refuse_change(response, str(error))
+        finally:
+            self._loaded = None
+
+    def _refuse_change(self, response: Any, why: str) -> Any:
+        self.get_logger().error(f"a change of state was refused: {why}")
+        response.success = False
+        return response
 
     def _load_to_configure(self) -> Future:
         """Read the bone, and the settings of the method too."""

@@ -39,7 +39,10 @@ class Loader:
         return f"loading {self._path} for {time.monotonic() - self._since:.0f} s" if self.busy else ""
 
     def load(self) -> Future:
-        """Read and prepare the bone that the parameters name now; the future gets a `Ready`, or the exception."""
+        """Read and prepare the bone that the parameters name now; the future gets a `Ready`, or the exception.
+
+        It is busy until those have been called who wait for the future (`add_done_callback`).
+        """
         done, parameters = Future(), self._host.parameters
         self._path, self._since = parameters.model_path or "no model_path", time.monotonic()
         self._thread = threading.Thread(target=self._run, args=(parameters, done), name="loading", daemon=True)
@@ -58,5 +61,7 @@ class Loader:
         self._host.call_soon(partial(self._finish, done, outcome))
 
     def _finish(self, done: Future, outcome: Ready | BaseException) -> None:
-        self._thread = None
-        done.set_result(outcome)
+        try:
+            done.set_result(outcome)
+        finally:
+            self._thread = None

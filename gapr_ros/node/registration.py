@@ -67,6 +67,10 @@ class Registration:
         self._pushed_out = job
         self._late.take(self._situation().parameters.tf_timeout)
 
+    def end(self, why: str) -> None:
+        """No cloud waits for its transform any longer; never raises."""
+        self._late.end(why)
+
     def _collect(self, job: Job) -> None:
         now = self._situation()
         if job.epoch < now.oldest:

@@ -58,7 +58,8 @@ class Session:
         publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
         self._shared = SharedFrame(host, self.conflicts) if publish else None
         self._named = SharedName(host, self.conflicts)
-        self._frames = Frames(host.ros, publish, listen, self._shared.note_own if self._shared else None)
+        note_sent = self._shared.note_own if self._shared else None
+        self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future)
         self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
         self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation, self._left)
@@ -73,6 +74,7 @@ class Session:
     def close(self) -> None:
         """End the worker, after the cloud that it has in hand, and give the topics back; waits for nothing."""
         self.stop_waiting("the node stopped")
+        self.worker.run(partial(self._registration.end, "the node stopped"))
         self._closed = True
         self.worker.stop()
         self._publishers.close()
@@ -119,6 +121,10 @@ class Session:
         self._begin_again("an initialpose", Seed(T_frame_model, intake.plain_frame(message.header.frame_id)))
         if message.header.frame_id:
             self._frames.listen()
+
+    def _is_future(self, stamp_ns: int) -> bool:
+        """Of a transform."""
+        return timeline.is_far_ahead(stamp_ns, self._host.now_ns(), self._host.parameters.max_future)
 
     def register_newest(self, waiter: Any) -> bool:
         """Register the newest cloud now; its outcome becomes the waiter's result.

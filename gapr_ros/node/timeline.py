@@ -54,6 +54,14 @@ def check_future(stamp: int, now_ns: int, max_future_s: float) -> None:
         raise RefusedError(Reason.FUTURE, f"{text}; synchronise the clocks")
 
 
+def is_far_ahead(stamp: int, now_ns: int, max_future_s: float) -> bool:
+    """Whether the stamp of a transform is a second more ahead of the clock than that of a cloud may be.
+
+    Some nodes send transforms that hold for the second to come, as AMCL does. Off as `check_future` is.
+    """
+    return max_future_s > 0.0 and now_ns > 0 and stamp - now_ns > max_future_s * 1e9 + BACK_NS
+
+
 def check_age(stamp: int, now_ns: int, max_age_s: float) -> None:
     """Refuse a cloud that is too old. Off without a limit, before the clock runs and for clouds without a stamp.
 

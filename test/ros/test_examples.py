@@ -178,6 +178,17 @@ def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):
     assert "Traceback" not in program.log
 
 
+@pytest.mark.parametrize("name", ["trusted_pose", "planning_scene"])
+def test_help_says_how_to_start_a_consumer_and_starts_none(capsys, monkeypatch, name):
+    module = loaded("trusted_pose", monkeypatch)
+    module = module if name == "trusted_pose" else loaded(name, monkeypatch)
+    monkeypatch.setattr(module.rclpy, "init", lambda args: pytest.fail("a node was started"))
+    monkeypatch.setattr("sys.argv", [f"{name}.py", "--help", "--ros-args", "-p", "max_tre:=0.002"])
+    with pytest.raises(SystemExit) as end:
+        module.main()
+    assert end.value.code == 0 and f"python examples/ros/{name}.py" in capsys.readouterr().out
+
+
 # --- MoveIt: moveit_msgs is part of a ROS installation, so its messages are stood in for here ---
 
 

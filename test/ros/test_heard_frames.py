@@ -14,7 +14,8 @@ from rclpy.parameter import Parameter
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from gapr_ros.node import frames
+from gapr_ros.node import frames, timeline
+from gapr_ros.node.heard import Heard
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 NEEDS_TF2 = "the real tf2 buffer comes with a ROS installation: apt install ros-jazzy-tf2-py"
@@ -34,6 +35,9 @@ class Model:
     def insert(self, stamp_s, x):
         if stamp_s >= max(self._known, default=0.0) - 10.0:
             self._known[stamp_s] = x
+
+    def set_transform(self, transform, authority):
+        self.insert(Time.from_msg(transform.header.stamp).nanoseconds * 1e-9, transform.transform.translation.x)
 
     def can_transform(self, parent, child, stamp):
         stamp_s = stamp.nanoseconds * 1e-9
@@ -55,10 +59,10 @@ class Real:
     def __init__(self):
         tf2 = pytest.importorskip("tf2_py", reason=NEEDS_TF2)
         self._core, self._errors = tf2.BufferCore(), tf2.TransformException
-        self.clear, self._insert = self._core.clear, self._core.set_transform
+        self.clear, self.set_transform = self._core.clear, self._core.set_transform
 
     def insert(self, stamp_s, x):
-        self._insert(_transform(x, stamp_s), "the camera")
+        self.set_transform(_transform(x, stamp_s), "the camera")
 
     def can_transform(self, parent, child, stamp):
         return self._core.can_transform_core(parent, child, stamp)[0]
@@ -91,8 +95,11 @@ def heard(monkeypatch, request):
         buffer.srv = None
         return buffer
 
-    listener = SimpleNamespace(unregister=lambda: None)
-    names = {"Buffer": make, "TransformListener": lambda *_: listener, "TransformException": Missing}
+    def listen(into, node):
+        buffer.hear = into.set_transform
+        return SimpleNamespace(unregister=lambda: None)
+
+    names = {"Buffer": make, "TransformListener": listen, "TransformException": Missing}
     monkeypatch.setattr(frames, "_import_tf2", lambda: SimpleNamespace(**names))
     return buffer
 
@@ -136,6 +143,94 @@ def test_a_cloud_of_a_new_round_of_time_is_never_put_where_the_camera_was_in_the
             if len(method.calls) > calls:
                 assert where(method) == pytest.approx(3.0, abs=1e-2)
         assert [answer["level"] for answer in answers[-3:]] == [0] * 3, answers
+
+
+NS = 1_000_000_000
+
+
+def hears(buffer, now_s=0):
+    """A `Heard`, a function that lets it hear a transform of the camera, and the warnings that are written."""
+    said = []
+    logger = SimpleNamespace(warning=lambda text, **_: said.append(text))
+    node = SimpleNamespace(get_logger=lambda: logger)
+    heard = Heard(buffer, lambda stamp_ns: timeline.is_far_ahead(stamp_ns, now_s * NS, 0.5), node)
+    return heard, lambda stamp_s, x: heard.set_transform(_transform(x, stamp_s), "the camera"), said
+
+
+@pytest.fixture(params=[Model, Real])
+def buffer(request):
+    return request.param()
+
+
+def seen_at(buffer, stamp_s):
+    """Where the camera was, by the buffer; None where it does not know."""
+    stamp = Time(nanoseconds=round(stamp_s * NS))
+    known = buffer.can_transform("world", "camera", stamp)
+    return buffer.lookup_transform("world", "camera", stamp).transform.translation.x if known else None
+
+
+def test_one_transform_from_the_future_neither_freezes_the_camera_nor_shuts_out_what_comes(buffer):
+    """tf2 interpolated from the last one to it, over a year, and ignored all that came."""
+    _, hear, said = hears(buffer, now_s=1000)
+    for stamp_s, x in ((999.9, 1.0), (1000.0, 1.0), (3e7, 1.0), (1000.1, 2.0), (1000.2, 2.0)):
+        hear(stamp_s, x)
+    assert seen_at(buffer, 1000.15) == pytest.approx(2.0) and seen_at(buffer, 1000.3) is None
+    assert said == ["a transform of 'camera' is left out: its stamp is ahead of the clock; synchronise the clocks"]
+    hear(1001.4, 2.0)
+    assert seen_at(buffer, 1001.3) == pytest.approx(2.0), "some nodes send what holds for the second to come"
+
+
+def test_transforms_that_go_on_after_one_ahead_of_all_others_are_soon_heard(buffer):
+    """No clock says that it is wrong, as in a bag."""
+    _, hear, _ = hears(buffer)
+    for stamp_s in (1000.0, 1500.0, 1000.1, 1000.2, 1000.3, 1000.4):
+        hear(stamp_s, 1.0)
+    assert seen_at(buffer, 1000.35) == pytest.approx(1.0)
+    assert seen_at(buffer, 1000.15) is None and seen_at(buffer, 1400.0) is None
+
+
+def test_a_straggler_among_transforms_changes_nothing(buffer):
+    _, hear, said = hears(buffer)
+    for i in range(20):
+        hear(1000.0 + i, 1.0)
+        hear(998.5 + i, 7.0)
+    hear(1018.8, 1.0)  # within a second
+    assert seen_at(buffer, 1018.5) == seen_at(buffer, 1018.9) == pytest.approx(1.0) and not said
+
+
+def test_another_round_of_transforms_is_never_mixed_with_the_last_though_no_cloud_comes(buffer):
+    """As while the node is disabled: only clouds told it that time had started over."""
+    _, hear, said = hears(buffer)
+    for i in range(100):
+        hear(1000.0 + 0.1 * i, 1.0)
+    for i in range(30):
+        hear(1002.0 + 0.1 * i, 3.0)
+        seen = [seen_at(buffer, 1002.0 + 0.1 * i - back_s) for back_s in (0.01, 0.05)]
+        assert i < 3 or seen == pytest.approx([3.0, 3.0])
+    assert said == ["the stamps of the transforms of 'camera' went back: those of before are forgotten"]
+
+
+def test_after_a_reset_another_round_of_transforms_may_begin_however_little_they_go_back(buffer):
+    heard, hear, _ = hears(buffer)
+    for stamp_s in (1000.0, 1000.5, 1000.2, 1000.9):
+        hear(stamp_s, 1.0)
+    heard.expect_older()
+    for stamp_s in (1000.3, 1000.4):
+        hear(stamp_s, 3.0)
+    assert seen_at(buffer, 1000.39) == pytest.approx(3.0) and seen_at(buffer, 1000.45) is None
+
+
+def test_the_node_puts_no_transform_from_the_future_into_its_buffer(blob_path, client, method, heard):
+    now_s = 1000.0
+    with node_in_thread(method, blob_path, output_frame="world", tf_timeout=60.0, use_sim_time=True) as node:
+        client.wait_for_state("active")
+        wait_until(
+            lambda: client.clock.publish(Clock(clock=Time(seconds=now_s).to_msg())) or node.now_ns() == now_s * NS
+        )
+        for stamp_s, x in ((999.5, 1.0), (3e7, 1.0), (999.7, 2.0), (999.9, 2.0)):
+            heard.hear(_transform(x, stamp_s), "the camera")
+        assert client.ask(GOOD, frame="camera", stamp_s=999.8)["level"] == 0
+        assert where(method) == pytest.approx(2.0, abs=1e-2)
 
 
 def test_a_long_bag_that_is_looped_without_simulated_time_goes_on_in_other_frames(blob_path, client, method, heard):

@@ -149,6 +149,21 @@ def test_a_limit_that_is_set_while_a_bone_is_read_holds_for_it(blob_path, client
     assert made[:2] == [0.9, 0.9]
 
 
+def test_a_parameter_that_is_set_just_as_the_bone_is_ready_does_not_miss_the_method(blob_path, client, method):
+    """It was taken, and the method was made without it: between the end of the reading and the change of state."""
+    with node_in_thread(method, blob_path, autostart=False) as node:
+        finish, answers = node._loader._finish, []
+
+        def finish_and_set(*args):
+            finish(*args)
+            answers.append(node.set_parameters([Parameter("seed", value=7)])[0])
+
+        node._loader._finish = finish_and_set
+        assert client.change_state(Transition.TRANSITION_CONFIGURE)
+        assert not answers[0].successful and "read when configuring" in answers[0].reason
+        assert node.session._ready.parameters.seed == node.parameters.seed == 0
+
+
 def test_a_bone_that_is_ready_after_the_node_was_destroyed_raises_nothing(blob_path, client, slow):
     with node_in_thread(slow, blob_path) as node:
         wait_until(lambda: "loading" in client.values().get("message", ""))

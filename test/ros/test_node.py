@@ -318,6 +318,25 @@ def test_clouds_whose_transform_never_comes_are_dropped_counted_and_logged(blob_
     assert "a cloud is not registered with the newer ones: tf_missing: tracker <- probe" in capfd.readouterr().err
 
 
+def test_clouds_that_wait_for_their_transforms_are_counted_as_dropped_when_the_node_is_cleaned_up(
+    blob_path, client, monkeypatch, capfd
+):
+    tf2, method = LaggingTf2(), Collecting()
+    monkeypatch.setattr(frames, "_import_tf2", lambda: tf2)
+    with node_in_thread(method, blob_path, output_frame="tracker", accumulate=20, tf_timeout=60.0) as node:
+        client.wait_for_state("active")
+        method.gate.clear()
+        calls, tf2.known_s = len(method.calls), 100.5
+        for i in range(4):
+            client.send(GOOD, stamp_s=100.0 + i)
+            wait_until(lambda i=i: node.counters.received == i + 1 and len(method.calls) > calls)
+        for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+            assert client.change_state(transition)
+        method.gate.set()
+        wait_until(lambda: node.counters.dropped == 3 and node.counters.refused == 1, what=lambda: node.counters)
+    assert "a cloud is not registered with the newer ones: the node stopped" in capfd.readouterr().err
+
+
 def test_few_clouds_wait_for_their_transforms_and_those_of_before_a_reset_do_not():
     tries, left = [], []
 

@@ -191,6 +191,9 @@ class RulesConfig(Settings):
     largest_scale_z: float = setting(
         3.0, "standard deviations by which the size of a source may be off; more is another bone", low=0
     )
+    other_size_better: float = setting(
+        0.5, "log of mean squares by which a source grown or shrunk may fit better; more is another bone", low=0
+    )
     mirrored_better: float = setting(
         0.01, "log of mean squares by which the mirrored source may fit better; more is another side", low=0
     )
@@ -204,17 +207,25 @@ class RulesConfig(Settings):
     pushed_motions: int = setting(
         3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6
     )
-    few_points: int = setting(
-        250, "fewer do not say whose bone it is: few_points_confidence is the most; 0: off", low=0, high=1_000_000
-    )
-    few_points_confidence: float = setting(0.89, "largest confidence of a source of few points", low=0, high=1)
-    noise_share: float = setting(
-        1.3, "residuals over a stated noise of the sensor up to which few points may be surer", low=0, high=100
-    )
     ruled_out: float = setting(0.4, "largest confidence of a pose that a rule refuses", low=0, high=1)
     independent_points: float = setting(
         30.0, "independent residuals that a source counts for where hypotheses share the probability", low=0
     )
+
+
+@dataclass(frozen=True)
+class LimitsConfig(Settings):
+    """What no pose can be sure of (`gapr_core.registration.limits`)."""
+
+    most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
+    few_points: int = setting(250, "fewer points do not say whose bone it is", low=0, high=1_000_000)
+    near_pairs: int = setting(125, "nor do points of which fewer pairs are neighbours", low=0, high=1_000_000_000)
+    noise_kept: float = setting(1.3, "residuals over a stated noise up to which they do say it", low=0, high=100)
+    noise_exceeded: float = setting(
+        2.5, "residuals over the noise of a named sensor and the model from which on they do not", low=0, high=100
+    )
+    model_mm: float = setting(0.3, "standard deviation of the model of a bone", low=0, high=10, unit="mm")
+    covered: float = setting(0.9, "least share of the covariance within 4 mm and 5 deg", low=0, high=1)
 
 
 @dataclass(frozen=True)
@@ -375,6 +386,7 @@ class RegistrarConfig(Settings):
     smooth_bias: SmoothBiasConfig = field(default_factory=SmoothBiasConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     rules: RulesConfig = field(default_factory=RulesConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
     cortices: CorticesConfig = field(default_factory=CorticesConfig)
     accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)

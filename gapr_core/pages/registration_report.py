@@ -56,8 +56,10 @@ WORDS = {
     "explained_of_compared": "share of the compared surface that is explained",
     "violating_of_compared": "share of the compared surface that the camera looked through",
     "rival_margin": "lead over the next hypothesis of the scene",
-    "few_points": "limit: few points do not say whose bone it is",
-}  # features of the confidence
+    "sparse": "limit: few points, or points far apart, do not say whose bone it is",
+    "beyond_noise": "limit: residuals far larger than the noise of the sensor",
+    "imprecise": "limit: the covariance leaves the pose loose",
+}  # features of the confidence, and its limits
 
 
 @dataclass(frozen=True, eq=False)

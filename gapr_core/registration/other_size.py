@@ -19,12 +19,18 @@ from gapr_core.registration.target import PreparedTarget
 Array = NDArray[np.float64]
 
 SIZES = (0.945, 1.055)  # far enough from 1 that noise and a sensor's bias fit neither better
+HALFWAY = (0.9725, 1.0275)  # between these and 1: a source of this size fits in 1 as well as in one of `SIZES`
 
 
 def margin(
-    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+    T: Array,
+    source: PreparedSource,
+    target: PreparedTarget,
+    config: VerificationConfig,
+    num_threads: int = 0,
+    sizes: tuple[float, ...] = SIZES,
 ) -> float:
-    """Log of the mean square residual that the source reaches in another size over its own; the lesser of `SIZES`.
+    """Log of the mean square residual that the source reaches in another size over its own; the least of `sizes`.
 
     The source grows about its centroid and is refined from the pose. Its residuals grow with it, so that they count in
     its own size: a mean square over s^2.
@@ -38,6 +44,6 @@ def margin(
     centre = some.mean(axis=0)
     own, *others = (
         refine_many(T[None], centre + size * (some - centre), target, limits_mm, num_threads)[1][0] / size**2
-        for size in (1.0, *SIZES)
+        for size in (1.0, *sizes)
     )
     return mirror.log_ratio(min(others), own)

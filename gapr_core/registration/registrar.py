@@ -14,7 +14,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, cortices, explained, few_points, mirror, rules
+from gapr_core.registration import clutter, cortices, explained, limits, mirror, other_size, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess
@@ -25,7 +25,7 @@ from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.refinement import refine_fully
-from gapr_core.registration.sensor import offset_surface
+from gapr_core.registration.sensor import errors, offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
@@ -145,7 +145,7 @@ class Registrar:
         if isinstance(assessment, Refusal):
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
-        named = explained.named_clutter(few_points.limited(assessment, self.config), self.config)
+        named = explained.named_clutter(limits.limited(assessment, self.config), self.config)
         result = replace(answer(named, self.config), guidance=guidance)
         clock.lap("assess")
         return replace(result, stage_ms=clock.stages)
@@ -189,6 +189,8 @@ class Registrar:
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
         if assessment.is_sure(self.config.may_pass):
+            assessment = self._unless_grown(assessment)
+        if assessment.is_sure(self.config.may_pass):
             assessment = self._unless_mirrored(assessment, clock, enough)
         if assessment.is_sure(self.config.may_pass):
             assessment = bias_corrected(assessment, self.config)
@@ -210,6 +212,21 @@ class Registrar:
         both = a.target.both_cortices
         again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
         return (again or a).limited(most)
+
+    def _unless_grown(self, assessment: Assessment) -> Assessment:
+        """The same; refused where the source fits better in another size.
+
+        Few points fit in many sizes, the part that was found in a scene is what fitted, and a sensor whose scale is not
+        known to better may be wrong by as much.
+        """
+        a, config = assessment, self.config
+        few = len(a.source.points) < config.limits.few_points
+        if few or a.seen is not None or errors(config.sensor, len(a.source.points)).scale > config.scale.sure:
+            return a
+        found = other_size.margin(
+            a.fit.T, a.source, a.target, config.verification, config.num_threads, other_size.HALFWAY
+        )
+        return a.refused(rules.by_growth(found, config.rules), config.rules)
 
     def _unless_mirrored(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The same; refused where the mirror image of the source fits better.

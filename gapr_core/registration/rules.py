@@ -1,8 +1,9 @@
 """The safety rules: what refuses a pose, whatever its probability. Each rule refuses alone.
 
-Five rules do not weigh the probability: a motion that is not observed, a pose that can be pushed aside, a rival that is
-as good, a source of another size, a source whose mirror image fits better. Pushing and mirroring cost time: they are
-done only where the pose may still be accepted. Two are the user's thresholds: `min_confidence` and `max_tre_mm`.
+Six rules do not weigh the probability: a motion that is not observed, a pose that can be pushed aside, a rival that is
+as good, a source of another size by small changes and by larger ones, a source whose mirror image fits better. Pushing,
+growing and mirroring cost time: they are done only where the pose may still be accepted. Two rules are the user's
+thresholds: `min_confidence` and `max_tre_mm`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from gapr_core.clouds import MM_PER_UNIT
 from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
 from gapr_core.geometry import se3
 from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.other_size import HALFWAY
 from gapr_core.registration.refinement import Fit, refine_many
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
@@ -87,6 +89,19 @@ def by_size(features: Mapping[str, float], rules: RulesConfig = DEFAULT) -> Refu
     if not features["scale_z"] > rules.largest_scale_z:
         return None
     reason = f"the source fits best in another size ({features['scale_z']:.1f} standard deviations off)"
+    return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: is it of this bone, and is its scale right?")
+
+
+def by_growth(log_ratio: float, rules: RulesConfig = DEFAULT) -> Refusal | None:
+    """Why the source is larger or smaller than this bone's; None where it fits no better grown or shrunk.
+
+    Args:
+        log_ratio: log of the mean square residual of the source in the better of two other sizes over that in its own.
+        rules: how much better another size may fit.
+    """
+    if not log_ratio < -rules.other_size_better:
+        return None
+    reason = f"the source fits the bone better grown or shrunk by {100.0 * (HALFWAY[1] - 1.0):.3g} %"
     return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: is it of this bone, and is its scale right?")
 
 

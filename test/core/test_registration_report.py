@@ -13,7 +13,7 @@ from gapr_core.formats import markups
 from gapr_core.geometry import se3
 from gapr_core.pages import registration_report
 from gapr_core.pages.report import Step, alignment_figure
-from gapr_core.registration import few_points
+from gapr_core.registration import limits
 from gapr_core.registration.features import FEATURES, SCENE_FEATURES, STREAM_FEATURES
 from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
 from gapr_core.surface import Surface
@@ -150,7 +150,12 @@ def test_the_histogram_counts_every_point_once():
 
 def test_every_feature_of_the_confidence_has_words():
     shown = STREAM_FEATURES[1:]  # the first is the answer of the frames themselves
-    assert set(registration_report.WORDS) == {*FEATURES, *SCENE_FEATURES, *shown, few_points.NAME}
+    assert set(registration_report.WORDS) == {
+        *FEATURES,
+        *SCENE_FEATURES,
+        *shown,
+        *(limit.name for limit in limits.LIMITS),
+    }
 
 
 def test_planned_targets_are_shown_with_every_hypothesis(femur):

@@ -1,0 +1,133 @@
+"""What no pose can be sure of, whatever the probability that its features give: its limits.
+
+The model of the confidence weighs what it measures. These limits stand for what it does not: evidence that is missing
+looks like evidence that is good, and neither the noise of a sensor nor the covariance is compared with the answer. A
+limit refuses nothing by itself; it keeps a pose below `LimitsConfig.most`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import logit
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.geometry import se3
+from gapr_core.registration import sensor
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.bias_field import UNKNOWNS
+from gapr_core.registration.roughness import NEAR_MM
+from gapr_core.results import Refusal, RegistrationStatus
+
+Array = NDArray[np.float64]
+
+NEARLY_ALL = 0.9  # share of the points
+DRAWS = 4096
+
+
+class Limit(NamedTuple):
+    """One limit: its name among the contributions to the log odds, whether it holds, and what helps against it."""
+
+    name: str
+    holds: Callable[[Assessment, RegistrarConfig], bool]
+    why: str
+
+
+def limited(assessment: Assessment, config: RegistrarConfig) -> Assessment:
+    """The same, no surer than the first limit that holds allows; refused where more is asked for than that."""
+    a, most = assessment, config.limits.most
+    if not a.probability > most:
+        return a
+    limit = next((each for each in LIMITS if each.holds(a, config)), None)
+    if limit is None:
+        return a
+    lowered = {**a.contributions, limit.name: float(logit(most) - logit(a.probability))}
+    found = replace(a, probability=most, contributions=lowered)
+    if a.refusal is not None or most >= config.min_confidence:
+        return found
+    reason = f"the pose is right with a probability of {most:g} at most, {config.min_confidence:g} is asked for"
+    return replace(found, refusal=Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {limit.why}"))
+
+
+def is_sparse(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where few points, or few that are near each other, do not say whose bone it is.
+
+    Bones of different subjects are alike to half a millimetre over a knee end. A dense source shows the difference as a
+    misfit that near points share. Between sparse points it looks like noise, unless the noise is known
+    (`SensorConfig.noise_mm`) and the residuals are no larger.
+    """
+    few = len(assessment.source.points) < config.limits.few_points
+    return (few or near_pairs(assessment) < config.limits.near_pairs) and not is_noise(assessment, config)
+
+
+def near_pairs(assessment: Assessment) -> int:
+    """Pairs of points that count for the pose and whose foot points lie at most as far apart as neighbours do."""
+    feet = assessment.fit.feet[assessment.fit.weights > 0.0]
+    tree = cKDTree(feet)
+    return int((tree.count_neighbors(tree, NEAR_MM[1]) - len(feet)) // 2)
+
+
+def is_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the noise is stated, nearly all points count for the pose, and their residuals are no larger."""
+    noise_mm, counts = config.sensor.noise_mm, assessment.fit.weights > 0.0
+    if noise_mm is None or counts.mean() < NEARLY_ALL:
+        return False
+    return residual_mm(assessment) <= config.limits.noise_kept * noise_mm
+
+
+def is_beyond_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the residuals are far larger than the noise of the sensor that is named, and of a bone's model."""
+    limits, kind = config.limits, config.sensor
+    if kind.kind == "unknown" and kind.noise_mm is None:
+        return False
+    noise_mm = sensor.errors(kind, len(assessment.source.points)).noise_mm
+    return residual_mm(assessment) > limits.noise_exceeded * np.hypot(noise_mm, limits.model_mm)
+
+
+def residual_mm(assessment: Assessment) -> float:
+    """Root mean square residual of the points that count for the pose, whose unknowns count; infinite without any."""
+    signed = assessment.fit.signed_mm[assessment.fit.weights > 0.0]
+    left = len(signed) - UNKNOWNS
+    return float(np.sqrt((signed**2).sum() / left)) if left > 0 else np.inf
+
+
+def is_imprecise(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the covariance itself gives less to a right pose, one within 4 mm and 5 deg."""
+    return right_share(assessment.uncertainty.covariance) < config.limits.covered
+
+
+def right_share(covariance: Array) -> float:
+    """Share of a normal distribution with this covariance (6, 6), mm and rad, within 4 mm and 5 deg of its mean."""
+    values, vectors = np.linalg.eigh(covariance)
+    off = draws() * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    shift_mm, turn_deg = np.linalg.norm(off[:, :3], axis=1), np.degrees(np.linalg.norm(off[:, 3:], axis=1))
+    return float(((shift_mm <= se3.RIGHT_MM) & (turn_deg <= se3.RIGHT_DEG)).mean())
+
+
+@lru_cache(maxsize=1)
+def draws() -> Array:
+    """(DRAWS, 6) standard normal, always the same."""
+    return np.random.default_rng(0).normal(size=(DRAWS, 6))
+
+
+LIMITS = (
+    Limit(
+        "sparse",
+        is_sparse,
+        "so few points, or points so far apart, may as well be of another subject's bone; measure more of them, "
+        "denser, or state how precise they are (noise_mm of the sensor)",
+    ),
+    Limit(
+        "beyond_noise",
+        is_beyond_noise,
+        "the residuals are far larger than the noise of the sensor; check that it is this subject's bone, and what is "
+        "said of the sensor",
+    ),
+    Limit("imprecise", is_imprecise, "the points leave the pose too loose; measure a larger part of the bone"),
+)

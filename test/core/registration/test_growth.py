@@ -1,0 +1,43 @@
+"""A source half way between the sizes that the confidence looks at is of another bone too."""
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core.config import RulesConfig, SensorConfig
+from gapr_core.registration import rules
+
+
+@pytest.fixture(scope="module")
+def seen(femur):
+    """One side of the bone, 0.2 mm of noise."""
+    points, normals = femur.sample(9000, np.random.default_rng(2))
+    side = points[normals @ [0.6, 0.0, 0.8] > 0.2][:2500]
+    return side + np.random.default_rng(3).normal(0.0, 0.2, side.shape)
+
+
+def scaled(points, size):
+    return points.mean(axis=0) + size * (points - points.mean(axis=0))
+
+
+@pytest.mark.parametrize("size", [0.975, 1.028])
+def test_only_growing_and_shrinking_the_source_refuses_one_of_another_size(registrar, target, seen, size):
+    """`scale_z` is held still: of half a bone it says nothing, here it would refuse as well."""
+    blind = RegistrarConfig(num_threads=1, rules=RulesConfig(largest_scale_z=100.0))
+    found = Registrar(blind, registrar.proposers).register(scaled(seen, size), target)
+    assert found.status is RegistrationStatus.LOW_CONFIDENCE and found.confidence <= 0.4
+    assert "grown or shrunk by 2.75 %" in found.reason
+    assert registrar.register(seen, target).ok
+
+
+def test_a_sensor_whose_scale_may_be_wrong_by_as_much_is_not_asked(registrar, target, seen):
+    off = scaled(seen, 1.028)
+    config = RegistrarConfig(
+        num_threads=1, rules=RulesConfig(largest_scale_z=100.0), sensor=SensorConfig(kind="laser", scale=0.02)
+    )
+    assert "grown" not in Registrar(config, registrar.proposers).register(off, target).reason
+
+
+@pytest.mark.parametrize(("log_ratio", "refuses"), [(-0.49, False), (-0.51, True), (0.6, False), (np.nan, False)])
+def test_another_size_has_to_fit_clearly_better(log_ratio, refuses):
+    assert (rules.by_growth(log_ratio) is not None) == refuses

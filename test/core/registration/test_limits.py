@@ -1,0 +1,137 @@
+"""What no pose can be sure of: each limit alone, and what lifts it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import logit
+from scipy.stats import chi2
+
+from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
+from gapr_core.config import LimitsConfig, SensorConfig
+from gapr_core.registration import limits
+from gapr_core.results import Refusal
+
+SURE = 0.97
+TIGHT = np.diag([0.25] * 3 + [np.radians(0.5) ** 2] * 3)
+
+
+@pytest.fixture
+def made(registrar, femur, target):
+    """An answer of which the model is sure: so many points this far apart, residuals of 0.4 mm in all."""
+    patch = femur.sample(400, np.random.default_rng(4))[0]
+    answer = registrar.assess(patch, target)
+
+    def of(count=1000, spacing_mm=1.0, gross=0, covariance=TIGHT, **more):
+        side = int(np.ceil(np.sqrt(count)))
+        feet = spacing_mm * np.column_stack([*np.indices((side, side)).reshape(2, -1), np.zeros(side * side)])[:count]
+        signed, weights = np.full(count, 0.4), np.full(count, 0.7)
+        weights[:gross], signed[:gross] = 0.0, 8.0
+        signed *= np.sqrt((count - gross - 6) / (count - gross))
+        up = np.tile([0.0, 0.0, 1.0], (count, 1))
+        fit = replace(answer.fit, signed_mm=signed, weights=weights, gradients=up, moved=feet + signed[:, None] * up)
+        uncertainty = replace(answer.uncertainty, covariance=covariance)
+        source = SimpleNamespace(points=feet)
+        given = {"fit": fit, "source": source, "uncertainty": uncertainty, "probability": SURE, "refusal": None}
+        return replace(answer, **given | more)
+
+    return of
+
+
+def named(**sensor):
+    return RegistrarConfig(num_threads=1, sensor=SensorConfig(**sensor))
+
+
+def test_a_dense_source_of_a_pose_that_is_well_known_may_be_sure(made):
+    for config in (RegistrarConfig(), named(kind="laser"), named(kind="pointer")):
+        answer = made()
+        assert limits.limited(answer, config) is answer
+
+
+def test_few_points_do_not_say_whose_bone_it_is(made):
+    few = made(249)
+    found = limits.limited(few, RegistrarConfig())
+    assert found.probability == 0.89 and found.refusal is None and list(found.contributions)[-1] == "sparse"
+    assert sum(found.contributions.values()) - sum(few.contributions.values()) == pytest.approx(
+        logit(0.89) - logit(SURE)
+    )
+    assert limits.limited(made(250), RegistrarConfig()).probability == SURE
+
+
+def test_nor_do_points_without_neighbours(made):
+    assert limits.near_pairs(made(1000, spacing_mm=6.1)) == 0
+    assert limits.near_pairs(made(9, spacing_mm=5.0)) == 12  # of a square of 3 x 3: along its sides, not across
+    assert limits.near_pairs(made(9, spacing_mm=5.0, gross=1)) == 10  # points that count
+    assert limits.limited(made(1000, spacing_mm=6.1), RegistrarConfig()).probability == 0.89
+    assert limits.limited(made(1000, spacing_mm=5.9), RegistrarConfig()).probability == SURE
+
+
+def test_what_is_no_surer_than_that_stays(made):
+    unsure = made(60, probability=0.89)
+    assert limits.limited(unsure, RegistrarConfig()) is unsure
+    assert np.isnan(limits.limited(made(60, probability=np.nan), RegistrarConfig()).probability)
+    assert limits.limited(made(60), RegistrarConfig(limits=LimitsConfig(most=1.0))).probability == SURE
+
+
+def test_few_points_whose_noise_is_known_and_left_may_be_sure(made):
+    """0.4 mm, the pose's six unknowns counted, may be at most 1.3 times what is stated."""
+    assert limits.limited(made(40), named(noise_mm=0.4 / 1.29)).probability == SURE
+    assert limits.limited(made(40), named(noise_mm=0.4 / 1.31)).probability == 0.89
+    assert limits.limited(made(7, gross=1), named(noise_mm=1.0)).probability == 0.89  # none left to be measured
+
+
+def test_a_gross_point_in_ten_does_not_count_and_more_are_no_noise(made):
+    assert limits.limited(made(40, gross=4), named(noise_mm=0.4 / 1.29)).probability == SURE
+    assert limits.limited(made(40, gross=5), named(noise_mm=0.4 / 1.29)).probability == 0.89
+
+
+@pytest.mark.parametrize("sensor", [{"kind": "laser"}, {"noise_mm": 0.15}])
+def test_residuals_far_beyond_the_noise_of_a_sensor_may_be_of_another_bone(made, sensor):
+    """At most 2.5 times the root of 0.15^2 (a laser) and 0.3^2 (a model of a bone)."""
+    most = 2.5 * np.hypot(0.15, 0.3) / 0.4
+    for times, probability in ((0.99 * most, SURE), (1.01 * most, 0.89)):
+        answer = made()
+        larger = replace(answer, fit=replace(answer.fit, signed_mm=times * answer.fit.signed_mm))
+        found = limits.limited(larger, named(**sensor))
+        assert found.probability == probability
+        assert limits.limited(larger, RegistrarConfig()).probability == SURE  # of a sensor that nobody named
+    assert list(found.contributions)[-1] == "beyond_noise"
+
+
+def test_no_pose_is_surer_than_its_covariance(made):
+    loose = made(covariance=np.diag([2.0**2] * 3 + [1e-6] * 3))
+    assert list(limits.limited(loose, RegistrarConfig()).contributions)[-1] == "imprecise"
+    assert limits.limited(loose, RegistrarConfig()).probability == 0.89
+    assert limits.limited(made(covariance=np.diag([1.5**2] * 3 + [1e-6] * 3)), RegistrarConfig()).probability == SURE
+
+
+def test_the_share_of_a_covariance_that_is_right_is_that_of_its_normal_distribution():
+    shifts = np.diag([2.0**2] * 3 + [1e-9] * 3)
+    assert limits.right_share(shifts) == pytest.approx(chi2.cdf((4.0 / 2.0) ** 2, 3), abs=0.02)
+    turns = np.diag([1e-9] * 3 + [np.radians(3.0) ** 2] * 3)
+    assert limits.right_share(turns) == pytest.approx(chi2.cdf((5.0 / 3.0) ** 2, 3), abs=0.02)
+    one_way = np.outer([1.0, 1.0, 0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]) * 4.0
+    assert limits.right_share(one_way) == pytest.approx(chi2.cdf(4.0**2 / 8.0, 1), abs=0.02)
+    assert limits.right_share(shifts + turns) == pytest.approx(chi2.cdf(4.0, 3) * chi2.cdf(25.0 / 9.0, 3), abs=0.02)
+
+
+def test_who_asks_for_more_than_a_limit_allows_reads_what_helps(made):
+    asked = RegistrarConfig(min_confidence=0.9)
+    found = limits.limited(made(40), asked)
+    assert found.refusal.status is RegistrationStatus.LOW_CONFIDENCE
+    for word in ("0.89", "0.9", "another subject", "denser", "noise_mm"):
+        assert word in found.refusal.reason
+    refused = Refusal(RegistrationStatus.DEGENERATE, "flat")
+    assert limits.limited(made(40, refusal=refused), asked).refusal is refused
+
+
+def test_a_registrar_and_a_tracker_limit_what_few_points_say(registrar, femur, target):
+    points = femur.sample(120, np.random.default_rng(4))[0]
+    noisy = points + np.random.default_rng(5).normal(0.0, 0.2, points.shape)
+    stated = Registrar(named(noise_mm=0.2), registrar.proposers)
+    tracker = Tracker(registrar)
+    tracker.register(noisy, target)
+    for found in (registrar.register(noisy, target), tracker.register(noisy, target)):
+        assert found.ok and found.confidence == 0.89 and found.contributions["sparse"] < 0.0
+    assert stated.register(noisy, target).confidence > 0.9

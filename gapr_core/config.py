@@ -218,8 +218,9 @@ class LimitsConfig(Settings):
     """What no pose can be sure of (`gapr_core.registration.limits`)."""
 
     most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
-    few_points: int = setting(250, "fewer points do not say whose bone it is", low=0, high=1_000_000)
-    near_pairs: int = setting(125, "nor do points of which fewer pairs are neighbours", low=0, high=1_000_000_000)
+    few_points: int = setting(
+        250, "fewer points that have a neighbour do not say whose bone it is", low=0, high=1_000_000
+    )
     noise_kept: float = setting(1.3, "residuals over a stated noise up to which they do say it", low=0, high=100)
     noise_exceeded: float = setting(
         2.5, "residuals over the noise of a named sensor and the model from which on they do not", low=0, high=100

@@ -1,11 +1,14 @@
 """A source half way between the sizes that the confidence looks at is of another bone too."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.config import RulesConfig, SensorConfig
-from gapr_core.registration import rules
+from gapr_core.registration import other_size, rules
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +39,17 @@ def test_a_sensor_whose_scale_may_be_wrong_by_as_much_is_not_asked(registrar, ta
         num_threads=1, rules=RulesConfig(largest_scale_z=100.0), sensor=SensorConfig(kind="laser", scale=0.02)
     )
     assert "grown" not in Registrar(config, registrar.proposers).register(off, target).reason
+
+
+def test_few_points_and_a_part_of_a_scene_are_not_asked(registrar, target, seen, monkeypatch):
+    asked = []
+    monkeypatch.setattr(other_size, "margin", lambda *words: asked.append(words[-1]) or -1.0)
+    answer = registrar.assess(seen, target)
+    few, enough = (replace(answer, refusal=None, source=SimpleNamespace(points=seen[:n])) for n in (249, 250))
+    asked.clear()
+    assert registrar._unless_grown(few) is few
+    assert registrar._unless_grown(replace(enough, seen=answer.source)).refusal is None and not asked
+    assert registrar._unless_grown(enough).refusal is not None and asked == [other_size.HALFWAY]
 
 
 @pytest.mark.parametrize(("log_ratio", "refuses"), [(-0.49, False), (-0.51, True), (0.6, False), (np.nan, False)])

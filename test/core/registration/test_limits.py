@@ -60,9 +60,10 @@ def test_few_points_do_not_say_whose_bone_it_is(made):
 
 
 def test_nor_do_points_without_neighbours(made):
-    assert limits.near_pairs(made(1000, spacing_mm=6.1)) == 0
-    assert limits.near_pairs(made(9, spacing_mm=5.0)) == 12  # of a square of 3 x 3: along its sides, not across
-    assert limits.near_pairs(made(9, spacing_mm=5.0, gross=1)) == 10  # points that count
+    assert limits.with_neighbours(made(1000, spacing_mm=6.1)) == 0
+    assert limits.with_neighbours(made(16, spacing_mm=5.9)) == 16
+    assert limits.with_neighbours(made(16, spacing_mm=5.9, gross=8)) == 8  # points that count
+    assert limits.with_neighbours(made(5000, spacing_mm=5.9)) == 1000
     assert limits.limited(made(1000, spacing_mm=6.1), RegistrarConfig()).probability == 0.89
     assert limits.limited(made(1000, spacing_mm=5.9), RegistrarConfig()).probability == SURE
 

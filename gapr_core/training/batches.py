@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
-from typing import TypeVar
 
 from torch.utils.data import DataLoader
 
@@ -17,9 +14,6 @@ from gapr_core.model.config import ModelConfig
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, one_thread
 from gapr_core.training.targets import TrainingPair
-
-Made = TypeVar("Made")
-AHEAD = 4  # micro-batches that are made before they are asked for
 
 
 def bones_folder(folder: Path, config: TrainConfig) -> Path:
@@ -42,8 +36,7 @@ def micro_batches(
 ) -> Iterator[TrainingPair]:
     """This process's share of the micro-batches, in order, from number `first` on.
 
-    With `cache`, a folder, the workers of all processes draw every bone once; `pinned` is for copies to a GPU. Without
-    workers, one of several processes makes them in a thread: a bone that takes long then holds up none of the others.
+    With `cache`, a folder, the workers of all processes draw every bone once; `pinned` is for copies to a GPU.
     """
     dataset = TrainingPairs(config, model, anatomy, cache=cache)
     numbers = range(first + rank, config.pairs // config.micro_batch, world)
@@ -53,20 +46,8 @@ def micro_batches(
         sampler=list(numbers),
         num_workers=config.workers,
         worker_init_fn=one_thread,
-        prefetch_factor=AHEAD if config.workers else None,
+        prefetch_factor=4 if config.workers else None,
         multiprocessing_context="fork" if config.workers else None,
         pin_memory=pinned,
     )
-    return ahead(iter(loader)) if world > 1 and not config.workers else iter(loader)
-
-
-def ahead(batches: Iterator[Made]) -> Iterator[Made]:
-    """The same in the same order; a thread makes the next ones while the caller is busy or waits for others."""
-    pool, end = ThreadPoolExecutor(1, "batches"), object()
-    try:
-        coming = deque(pool.submit(next, batches, end) for _ in range(AHEAD))
-        while (made := coming.popleft().result()) is not end:
-            coming.append(pool.submit(next, batches, end))
-            yield made  # type: ignore[misc]
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    return iter(loader)

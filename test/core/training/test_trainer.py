@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -226,33 +225,6 @@ def test_workers_make_the_same_pairs_in_the_same_order(settings, anatomy):
     )
     assert len(alone) == len(helped) == 3
     assert all(torch.equal(a.overlaps, b.overlaps) for a, b in zip(alone, helped, strict=True))
-
-
-def test_a_thread_makes_the_next_batches_in_order_and_an_error_comes_where_it_belongs():
-    begun = []
-
-    def numbers():
-        for number in range(9):
-            begun.append(number)
-            if number == 7:
-                raise ValueError("the eighth")
-            yield number
-
-    made = batches.ahead(numbers())
-    assert next(made) == 0
-    assert [next(made) for _ in range(6)] == list(range(1, 7)) and begun == list(range(8))
-    with pytest.raises(ValueError, match="the eighth"):
-        next(made)
-    assert list(batches.ahead(iter(range(3)))) == [0, 1, 2]
-
-
-def test_batches_that_nobody_asks_for_are_not_made():
-    begun = []
-    made = batches.ahead(number for number in range(100) if not begun.append(number))
-    next(made)
-    made.close()
-    time.sleep(0.05)
-    assert len(begun) <= 1 + batches.AHEAD
 
 
 @pytest.mark.timeout(400)

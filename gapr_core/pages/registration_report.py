@@ -58,7 +58,7 @@ WORDS = {
     "rival_margin": "lead over the next hypothesis of the scene",
     "sparse": "limit: few points, or points far apart, do not say whose bone it is",
     "beyond_noise": "limit: residuals far larger than the noise of the sensor",
-    "imprecise": "limit: the covariance leaves the pose loose",
+    "uncertain": "limit: the covariance leaves the pose loose",
 }  # features of the confidence, and its limits
 
 

@@ -100,7 +100,7 @@ def residual_mm(assessment: Assessment) -> float:
     return float(np.sqrt((signed**2).sum() / left)) if left > 0 else np.inf
 
 
-def is_imprecise(assessment: Assessment, config: RegistrarConfig) -> bool:
+def is_uncertain(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True where the covariance itself gives less to a right pose, one within 4 mm and 5 deg."""
     return right_share(assessment.uncertainty.covariance) < config.limits.covered
 
@@ -132,5 +132,5 @@ LIMITS = (
         "the residuals are far larger than the noise of the sensor; check that it is this subject's bone, and what is "
         "said of the sensor",
     ),
-    Limit("imprecise", is_imprecise, "the points leave the pose too loose; measure a larger part of the bone"),
+    Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
 )

@@ -102,7 +102,7 @@ def test_residuals_far_beyond_the_noise_of_a_sensor_may_be_of_another_bone(made,
 
 def test_no_pose_is_surer_than_its_covariance(made):
     loose = made(covariance=np.diag([2.0**2] * 3 + [1e-6] * 3))
-    assert list(limits.limited(loose, RegistrarConfig()).contributions)[-1] == "imprecise"
+    assert list(limits.limited(loose, RegistrarConfig()).contributions)[-1] == "uncertain"
     assert limits.limited(loose, RegistrarConfig()).probability == 0.89
     assert limits.limited(made(covariance=np.diag([1.5**2] * 3 + [1e-6] * 3)), RegistrarConfig()).probability == SURE
 

@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--look-alikes", type=int, default=0,
                         help="more of subjects' femora and tibiae at L3, half of them against another subject's, and "
-                        "as many seen by all other families (default: %(default)s)")  # fmt: skip
+                        "as many seen by all other families, half as many thinned (default: %(default)s)")  # fmt: skip
     parser.add_argument(
         "--streams", type=int, default=0, help="streams of frames, half of them of others (default: %(default)s)"
     )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gapr_core.calibration.other_side import on_own_side
 from gapr_core.calibration.shapes import SHAPES
+from gapr_core.calibration.views import VIEWS
 from gapr_core.config import SENSOR_KINDS
 from gapr_core.data import anatomy, protocols, scans
 from gapr_core.data import pool as bone_pool
@@ -54,6 +55,7 @@ SEEN_AS = {
     "structured-light": {"structured-light": 3.0},
     "stereo": {"stereo": 4.0},
     "photogrammetry": {"photogrammetry": 4.0},
+    "thinned": {"thinned": 4.0},
     "covered": {"covered": 4.0},
     "moving": {"moving": 4.0},
     "scene": {"scene-C1": 2.0, "scene-C2": 2.0, "scene-C3": 2.0},
@@ -73,7 +75,7 @@ DESCRIBED = 0.5  # share of the sensors' sources of which the user says what mea
 IN_A_ROW = 4  # pairs that share a target
 OWN_TARGET = ("paper", "incomplete")  # whose source is cut out of its own target
 SHORTEST = (0.15, 0.6)  # share of the bone's length that a short scan holds
-SCALES = (0.04, 0.07)  # by which a bone of a wrong scale is larger or smaller
+SCALES = (0.03, 0.07)  # by which a bone of a wrong scale is larger or smaller: beyond what ultrasound errs by
 
 
 @dataclass(frozen=True)
@@ -140,18 +142,21 @@ def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Subjects' femora and tibiae, every other one of another subject, twice as many as `count`.
+    """Subjects' femora and tibiae, every other one of another subject, two and a half times as many as `count`.
 
-    The first half is seen as at L3, where they are hardest to distinguish, the second by all other families in turn.
+    So many are seen as at L3, where they are hardest to distinguish, so many by all other families in turn, and half as
+    many are thinned: where neighbours are far apart, another subject's ridges look like noise.
     """
     row, turn = IN_A_ROW, IN_A_ROW * len(BONES)
-    numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES][:count]
+    numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
     own_list = seed + LOOK_ALIKE_SEEDS
     whats = ("own", "person")
     others = [family for family in SEEN_AS if family not in ("L3", "scene", *HELD_OUT)]
     families = ["L3"] * count + [others[number // len(whats) % len(others)] for number in range(count)]
+    families += ["thinned"] * (count // 2)
+    numbers = 2 * numbers[:count] + numbers[count : count + count // 2]
     return [Task(folder, split, own_list, number, family, whats[number % len(whats)], True)
-            for number, family in zip(2 * numbers, families, strict=True)]  # fmt: skip
+            for number, family in zip(numbers, families, strict=True)]  # fmt: skip
 
 
 def draw(task: Task) -> Drawn:
@@ -222,7 +227,7 @@ def first_of_twins(person: str) -> str:
 
 
 def view(seen_as: str, specimen: Specimen, seed: int, around: Sequence[Specimen] = ()) -> Pair:
-    """A bone against itself, seen by a protocol or one of this file's views; at a joint with one of those around it."""
+    """A bone against itself, seen by a protocol or one of `VIEWS`; at a joint with one of those around it."""
     if seen_as in VIEWS:
         return replace(VIEWS[seen_as](specimen, np.random.default_rng([seed, 11])), protocol=seen_as)
     return protocols.make_pair(seen_as, specimen, seed, around)
@@ -239,34 +244,6 @@ def before(setting: Setting, stranger: Specimen, what: str, pair: Pair) -> Pair:
     metadata = pair.metadata | {"origin_mm": setting.origin_mm}
     return replace(pair, target=setting.cloud, T_target_source=truth, person=setting.whole.person,
                    bone=setting.whole.bone, metadata=metadata)  # fmt: skip
-
-
-def patch_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """A one-sided view of 1 to 12 % of the bone, of few points."""
-    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.01, 0.12), (60.0, 1500.0)))
-    noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
-    level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
-    return protocols.one_sided(specimen, rng, level)
-
-
-def mixed_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """Between and beyond the protocols: from many clean points to tiny, noisy, biased, dirty views."""
-    share = rng.uniform(0.1, 0.9)
-    noise_mm, bias_mm, outliers = (rng.uniform(0.0, most) * (rng.random() < 0.7) for most in (2.0, 1.5, 0.25))
-    share_of = str(rng.choice(["seen", "region"]))
-    points = int(np.exp(rng.uniform(np.log(300), np.log(6000))))
-    level = protocols.Level((share, share), share_of, noise_mm, bias_mm, outliers, points)
-    return protocols.one_sided(specimen, rng, level)
-
-
-def crop_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """Clean points of a region of the bone, from all sides, as a piece that was cut out of a model."""
-    cloud, _ = specimen.sample(2 * TARGET_POINTS, rng)
-    distance = ((cloud - cloud[rng.integers(len(cloud))]) ** 2).sum(axis=1)
-    source = cloud[distance <= np.quantile(distance, rng.uniform(0.1, 0.9))]
-    source = source[rng.permutation(len(source))[: rng.integers(300, 6000)]]
-    metadata = {"origin_mm": np.zeros(3)}
-    return Pair(source, cloud, np.eye(4), "", specimen.bone, specimen.person, "crop", metadata)
 
 
 def _another_person(specimen: Specimen, others: Sequence[Specimen], rng: np.random.Generator) -> Specimen:
@@ -317,11 +294,6 @@ def _made(bone: str, folder: str, split: str) -> list[Specimen]:
     return anatomy.surfaces(folder, bone, split) + parametric + new
 
 
-VIEWS: dict[str, Callable[[Specimen, np.random.Generator], Pair]] = {
-    "patch": patch_view,
-    "mixed": mixed_view,
-    "crop": crop_view,
-}
 STRANGERS: dict[str, Callable[[Specimen, Sequence[Specimen], np.random.Generator], Specimen]] = {
     "own": lambda specimen, others, rng: specimen,
     "person": _another_person,

@@ -48,7 +48,7 @@ WORDS = {
     "log_scale_sd": "uncertainty of that size",
     "size_margin": "fit of a source of another size",
     "mirror_margin": "fit of the mirrored source",
-    "rough_misfit": "misfit that changes within centimetres",
+    "rough_misfit": "misfit that may change within centimetres",
     "shared_misfit": "the same, shared by the sources of a stream",
     "shared_smooth": "smooth misfit that they share",
     "free_space_score": "score against the camera's lines of sight",

@@ -126,10 +126,10 @@ def measure(
     config: RegistrarConfig,
 ) -> dict[str, float]:
     """The features behind the confidence in a scene (`features.SCENE_FEATURES`); every one is finite."""
-    fit, noise_mm = explained.fit, scene.source.noise_mm
-    seen = clutter.seen_of(fit.T[None], scene, target, config.clutter)
+    seen = clutter.seen_of(explained.fit.T[None], scene, target, config.clutter)
     visible = _visible_features(seen, candidates, target)
-    shared = of_the_fit(fit, candidates, uncertainty, explained.source, noise_mm, target, config)
+    flatness_mm = scene.source.flatness_mm[explained.members]  # of the part alone it is that of what lies on the bone
+    shared = of_the_fit(explained.fit, candidates, uncertainty, explained.source, flatness_mm, target, config)
     values = visible | shared | {"inlier_ratio": explained.share}
     return {name: values[name] for name in SCENE_FEATURES}
 

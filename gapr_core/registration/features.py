@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
 from gapr_core.geometry.extent import half_extent_mm
+from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration import mirror, other_size, sensor
 from gapr_core.registration.bias_field import equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
@@ -40,7 +41,7 @@ SIGNS = {
     "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
     "frames_log_odds": 1, "shared_misfit": -1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
-LEAST_NOISE_MM = 0.1  # a source without roughness counts as so rough
+LEAST_NOISE_MM = 0.1  # a source without noise counts as having so much
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
 NO_RIVAL = 2.0  # a pose alone counts as having a rival of so many times its mean square
 LEAST_MARGIN = 1e-3  # added to the share by which the rival is worse, so that its logarithm is finite
@@ -65,7 +66,7 @@ def measure(
         config: how a mirrored source is refined, and how far a smooth bias reaches.
     """
     second = candidates.scores[1] if len(candidates.scores) > 1 else NO_RIVAL * candidates.scores[0]
-    values = of_the_fit(fit, candidates, uncertainty, source, source.noise_mm, target, config) | {
+    values = of_the_fit(fit, candidates, uncertainty, source, source.flatness_mm, target, config) | {
         "inlier_ratio": float((fit.weights > 0.0).mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
         "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + LEAST_MARGIN)),
@@ -78,16 +79,16 @@ def of_the_fit(
     candidates: Candidates,
     uncertainty: PoseUncertainty,
     source: PreparedSource,
-    noise_mm: float,
+    flatness_mm: Array,
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """What `FEATURES` and `SCENE_FEATURES` share; `source` is what was fitted, `noise_mm` that of the whole cloud."""
+    """What `FEATURES` and `SCENE_FEATURES` share; `source` is what was fitted, (N,) its flatness in the whole cloud."""
     inlier = fit.weights > 0.0
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
     return {
         "log_sigma": float(np.log(fit.sigma_mm)),
-        "log_excess": float(np.log(fit.sigma_mm / max(noise_mm, LEAST_NOISE_MM))),
+        "log_excess": float(np.log(fit.sigma_mm / max(noise_of(flatness_mm, source, fit), LEAST_NOISE_MM))),
         "smooth_misfit": uncertainty.smooth_mm,
         "short_misfit": uncertainty.short_mm,
         "support": float(candidates.support[0]),
@@ -98,6 +99,16 @@ def of_the_fit(
         "extent": half_extent_mm(source.points) / target.half_extent_mm,
         **of_another_bone(fit, source, target, config),
     }
+
+
+def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
+    """What a point is off its neighbours' plane by, mm, less what the bone is where the point lies on it; the median.
+
+    Neighbours do not lie in a plane since they are noisy, and since the bone is curved: of a thinned cloud's, which are
+    centimetres apart, mostly that. Their foot points show the second alone, and variances add up.
+    """
+    curved_mm = fit_planes(fit.feet, np.ascontiguousarray(source.neighbours))[1]
+    return float(np.sqrt(max(np.median(flatness_mm**2 - curved_mm**2), 0.0)))
 
 
 def of_another_bone(

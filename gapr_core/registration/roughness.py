@@ -4,7 +4,8 @@ What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wron
 apart are nearly as alike as those of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the
 covariance of the residuals at short range, less that at longer range, tells the two apart (an empirical covariogram;
 Matheron 1963). Noise takes no part: it is independent from point to point. Large residuals are damped: a few of them
-would decide.
+would decide. What counts is the upper end of what the difference may be: few pairs say little, and a misfit that nobody
+could see is not a small one.
 """
 
 from __future__ import annotations
@@ -22,33 +23,42 @@ NEAR_MM, FAR_MM = (0.0, 6.0), (12.0, 16.0)  # between foot points on the bone; h
 LIMITS_MM = np.array([NEAR_MM, FAR_MM])
 CENTRES = 600  # inliers, evenly spread, of which each is compared with all
 LARGEST_SIGMAS = 4.0  # a residual of so many standard deviations counts as none
+SURE_SIGMAS = 1.645  # above what is measured: the difference is larger in 5 % of the cases
+DIGITS = 6  # of a foot point, mm: what is less must not decide which points are near
 
 
 def rough_misfit_mm(fit: Fit) -> float:
-    """Root, mm, of the residuals' covariance over less than 6 mm, minus that over 12 to 16 mm; with their sign.
+    """Root, mm, of the most by which the covariance over less than 6 mm exceeds that over 12 to 16 mm; with its sign.
 
-    0 where no two inliers are so near, or none so far apart.
+    A product of two independent residuals of variance s^2 has a standard deviation of s^2, a mean of m of them
+    s^2 / sqrt(m); `products_mm2` counts a pair of two centres twice. The most is s^2: it is all that is known where no
+    two inliers are so near, or none so far apart.
     """
     feet, damped = on_the_bone(fit)
+    largest_mm2 = float((damped**2).mean()) if len(damped) else fit.sigma_mm**2
     chosen = sampling.thin(feet, CENTRES)
     total, count = products_mm2(feet[chosen], damped[chosen], feet, damped, LIMITS_MM, chosen)
-    return signed_root(*(total / count)) if count.all() else 0.0
+    if not count.all():
+        return float(np.sqrt(largest_mm2))
+    near_mm2, far_mm2 = total / count
+    possible_mm2 = near_mm2 - far_mm2 + SURE_SIGMAS * largest_mm2 * np.sqrt((2.0 / count).sum())
+    return signed_root(min(possible_mm2, largest_mm2))
 
 
 def on_the_bone(fit: Fit) -> tuple[Array, Array]:
     """(M, 3) foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm.
 
-    Foot points: noise must not decide which points are near.
+    Foot points: noise must not decide which points are near. Rounded: nor must the last bits of a pose.
     """
     inlier = fit.weights > 0.0
     signed = fit.signed_mm[inlier]
     damped = signed * np.maximum(1.0 - (signed / (LARGEST_SIGMAS * fit.sigma_mm)) ** 2, 0.0)
-    return fit.feet[inlier], damped
+    return fit.feet[inlier].round(DIGITS), damped
 
 
-def signed_root(near_mm2: float, far_mm2: float) -> float:
-    """Root, mm, of the difference of two covariances; its sign is that of the difference."""
-    return float(np.sign(near_mm2 - far_mm2) * np.sqrt(abs(near_mm2 - far_mm2)))
+def signed_root(difference_mm2: float) -> float:
+    """Root, mm, of the size of a difference of covariances, with its sign."""
+    return float(np.sign(difference_mm2) * np.sqrt(abs(difference_mm2)))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -62,4 +62,4 @@ class SharedMisfit:
         if self._count.min() < FEWEST_PAIRS:
             return None
         near, far = self._total / (self._count + USUAL_PAIRS)
-        return signed_root(near, far), signed_root(far, 0.0)
+        return signed_root(near - far), signed_root(far)

@@ -194,11 +194,12 @@ def test_every_feature_of_a_scene_says_what_its_name_says(monkeypatch):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     weights = np.where(np.arange(12) < 3, 0.0, 0.5)
     fit = Fit(T, 0.5, np.zeros(12), weights, gradients, np.zeros(12, dtype=int), se3.apply(T, points))
-    part, members = SimpleNamespace(points=points, normals=normals), np.arange(30) < 12
+    alone = np.arange(12)[:, None]  # neighbours without a curvature
+    part, members = SimpleNamespace(points=points, normals=normals, neighbours=alone), np.arange(30) < 12
     known = PoseUncertainty(np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6]), 0.1, 0.2, 0.3, np.eye(3)[2], np.eye(3)[2])
     candidates = Candidates(None, np.array([2.0, 3.0]), np.array([0.7, 0.1]))
     bone = SimpleNamespace(points=np.zeros((50, 3)), spacing_mm=3.0, half_extent_mm=50.0)
-    scene, asked = SimpleNamespace(source=SimpleNamespace(noise_mm=0.3)), []
+    scene, asked = SimpleNamespace(source=SimpleNamespace(flatness_mm=np.where(members, 0.3, 9.0))), []
     seen = Visible(*(np.array([x]) for x in (0.2, 0.05, 0.4)), CONFIG.clutter.free_space)
     monkeypatch.setattr(explained.clutter, "seen_of", lambda *words: asked.append(words) or seen)
     monkeypatch.setattr(features, "of_another_bone", lambda *words: dict.fromkeys(OTHER_BONE, 0.125))
@@ -213,7 +214,7 @@ def test_every_feature_of_a_scene_says_what_its_name_says(monkeypatch):
     assert found["normal_agreement"] == pytest.approx(np.median(cosines))
     reach = max(np.linalg.norm(p - points.mean(axis=0)) for p in points)
     assert found["extent"] == pytest.approx(reach / 50.0) and found["scale_z"] == 0.125
-    scene.source.noise_mm = 0.01  # a source without roughness counts as a tenth of a millimetre rough
+    scene.source.flatness_mm = np.full(30, 0.01)  # a source without noise counts as having a tenth of a millimetre
     blind = Explained(part, members, replace(fit, weights=np.zeros(12)))
     found = explained.measure(blind, candidates, known, scene, bone, CONFIG)
     assert found["log_excess"] == pytest.approx(np.log(5.0)) and found["normal_agreement"] == 0.0

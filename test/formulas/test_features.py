@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
+from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import features
+from gapr_core.registration import source as sources
 from gapr_core.registration.bias_field import equations_of
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
@@ -47,7 +48,9 @@ def other_bone(monkeypatch):
 def measured(fit, scores=(0.25, 0.5), normals=None, noise_mm=0.3, **more):
     count = len(fit.moved)
     normals = np.tile(AXIS, (count, 1)) if normals is None else normals
-    source = SimpleNamespace(points=se3.apply(se3.inverse(T), fit.moved), normals=normals, noise_mm=noise_mm)
+    alone = np.arange(count)[:, None]  # neighbours without a curvature
+    points, flatness_mm = se3.apply(se3.inverse(T), fit.moved), np.full(count, noise_mm)
+    source = SimpleNamespace(points=points, normals=normals, flatness_mm=flatness_mm, neighbours=alone)
     covariance = np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6])
     known = PoseUncertainty(covariance, 0.1, 0.2, 0.3, AXIS, AXIS)
     candidates = Candidates(None, np.array(scores), np.array([0.7, 0.1]))
@@ -78,8 +81,37 @@ def test_the_margin_is_that_to_the_next_pose_and_of_a_single_pose_that_to_twice_
     assert measured(fit_of(points), scores)["margin"] == pytest.approx(np.log(ratio - 1.0 + 1e-3))
 
 
-def test_a_source_without_roughness_counts_as_a_tenth_of_a_millimetre_rough(points, other_bone):
+def test_a_source_without_noise_counts_as_having_a_tenth_of_a_millimetre(points, other_bone):
     assert measured(fit_of(points), noise_mm=0.01)["log_excess"] == pytest.approx(np.log(5.0))
+
+
+def on_a_cylinder(radius_mm, noise_mm, rng):
+    """Points 5 mm apart on a cylinder, and lifted by noise: as a fit to that cylinder, and as a prepared source."""
+    angle, height = (x.ravel() for x in np.meshgrid(np.arange(-1.0, 1.0, 5.0 / radius_mm), np.arange(0.0, 120.0, 5.0)))
+    out = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    feet, signed = radius_mm * out + height[:, None] * AXIS, rng.normal(0.0, noise_mm, len(angle))
+    fit = Fit(np.eye(4), 0.5, signed, np.ones(len(feet)), out, np.zeros(len(feet), int), feet + signed[:, None] * out)
+    return fit, sources.describe(fit.moved, SourceConfig())
+
+
+@pytest.mark.parametrize("radius_mm", [25.0, 60.0])
+def test_the_curvature_of_the_bone_is_no_noise(radius_mm):
+    """Of noise s a plane through k points leaves s sqrt(1 - 3 / k); without noise nothing is left of the curvature."""
+    rng = np.random.default_rng(3)
+    fit, source = on_a_cylinder(radius_mm, 0.5, rng)
+    expected = 0.5 * np.sqrt(1.0 - 3.0 / source.neighbours.shape[1])
+    found = features.noise_of(source.flatness_mm, source, fit)
+    assert found == pytest.approx(expected, rel=0.2)
+    smooth, source = on_a_cylinder(radius_mm, 0.0, rng)
+    assert source.noise_mm > 10.0 / radius_mm and features.noise_of(source.flatness_mm, source, smooth) < 1e-6
+
+
+def test_a_source_that_is_flatter_than_the_bone_has_no_noise():
+    """Variances add up: .5 mm of .3 mm and .4 mm; a bone of .6 mm leaves nothing."""
+    fit, source = on_a_cylinder(15.0, 0.0, np.random.default_rng(4))
+    bone_mm = source.flatness_mm
+    assert features.noise_of(np.hypot(bone_mm, 0.3), source, fit) == pytest.approx(0.3)
+    assert features.noise_of(0.9 * bone_mm, source, fit) == 0.0
 
 
 def test_normals_agree_as_their_median_cosine_of_either_sign_among_inliers(points, other_bone):

@@ -28,23 +28,60 @@ def field(feet, length_mm, size_mm, rng):
     return size_mm * np.linalg.cholesky(K) @ rng.normal(size=len(feet))
 
 
-def test_it_is_the_difference_of_the_two_mean_products():
-    """Four points by hand: pairs at 5 mm (products 2 and 12), at 15 to 20 mm (3, 4, 6, 8)."""
-    feet = np.array([[0.0, 0, 0], [5.0, 0, 0], [0.0, 15.0, 0], [5.0, 15.0, 0]])
-    found = roughness.rough_misfit_mm(plane_fit(np.array([1.0, 2.0, 3.0, 4.0]), feet))
+def possible(near, far, largest, near_pairs, far_pairs):
+    """By hand: the difference of the two means, and 1.645 standard deviations of it; each pair is counted twice."""
+    difference = near - far + 1.645 * largest * np.sqrt(1.0 / near_pairs + 1.0 / far_pairs)
+    return np.sign(min(difference, largest)) * np.sqrt(abs(min(difference, largest)))
+
+
+FOUR = np.array([[0.0, 0, 0], [5.0, 0, 0], [0.0, 15.0, 0], [5.0, 15.0, 0]])  # pairs: two at 5 mm, four at 15 to 20 mm
+
+
+def test_it_is_what_the_difference_of_the_two_mean_products_may_be(monkeypatch):
+    """Four points by hand: products 2 and 12 of near ones, 3, 8, 4 and 6 of far ones."""
+    monkeypatch.setattr(roughness, "SURE_SIGMAS", 0.0)
+    found = roughness.rough_misfit_mm(plane_fit(np.array([1.0, 2.0, 3.0, 4.0]), FOUR))
     assert found == pytest.approx(np.sqrt((2 + 12) / 2 - (3 + 8 + 4 + 6) / 4))
-    turned = roughness.rough_misfit_mm(plane_fit(np.array([1.0, -2.0, 3.0, -4.0]), feet))
+    turned = roughness.rough_misfit_mm(plane_fit(np.array([1.0, -2.0, 3.0, -4.0]), FOUR))
     assert turned == pytest.approx(-np.sqrt((2 + 12) / 2 + (3 + 8 - 4 - 6) / 4))
+    monkeypatch.undo()
+    turned = roughness.rough_misfit_mm(plane_fit(np.array([1.0, -2.0, 3.0, -4.0]), FOUR))
+    assert turned == pytest.approx(possible(-7.0, 0.25, (1 + 4 + 9 + 16) / 4, 2, 4))
+    assert turned == pytest.approx(1.853, abs=1e-3)
 
 
-def test_large_residuals_are_damped():
+def test_it_is_at_most_the_size_of_the_residuals():
+    found = roughness.rough_misfit_mm(plane_fit(np.array([1.0, 2.0, 3.0, 4.0]), FOUR))
+    assert found == pytest.approx(np.sqrt((1 + 4 + 9 + 16) / 4))
+    assert found < np.sqrt(7.0 - 5.25 + 1.645 * 7.5 * np.sqrt(1 / 2 + 1 / 4))
+
+
+def test_the_more_pairs_the_less_is_possible():
+    """Of noise alone: what is found of 200 points is well above what is found of 6000, and both above nothing."""
+    rng, found = np.random.default_rng(5), []
+    for count in (200, 6000):
+        several = [plane_fit(rng.normal(0.0, 1.0, count), feet_of(count, seed)) for seed in range(20)]
+        found.append([roughness.rough_misfit_mm(fit) for fit in several])
+    assert np.median(found[0]) > 2.0 * np.median(found[1]) > 0.1
+    assert (np.array(found) > 0.0).mean() > 0.85  # 95 % of the truth is below, and the truth is nothing
+
+
+def test_large_residuals_are_damped(monkeypatch):
     """By hand: r (1 - (r / 4 sigma)^2) of (1, 2, 3, 5) with a sigma of 1 is (15/16, 3/2, 21/16, 0)."""
-    feet = np.array([[0.0, 0, 0], [5.0, 0, 0], [0.0, 15.0, 0], [5.0, 15.0, 0]])
+    monkeypatch.setattr(roughness, "SURE_SIGMAS", 0.0)
     signed, (a, b, c) = np.array([1.0, 2.0, 3.0, 5.0]), (15 / 16, 3 / 2, 21 / 16)
-    places, damped = roughness.on_the_bone(plane_fit(signed, feet, sigma_mm=1.0))
-    assert damped == pytest.approx([a, b, c, 0.0]) and places == pytest.approx(feet)
-    found = roughness.rough_misfit_mm(plane_fit(signed, feet, sigma_mm=1.0))
+    places, damped = roughness.on_the_bone(plane_fit(signed, FOUR, sigma_mm=1.0))
+    assert damped == pytest.approx([a, b, c, 0.0]) and places == pytest.approx(FOUR)
+    found = roughness.rough_misfit_mm(plane_fit(signed, FOUR, sigma_mm=1.0))
     assert found == pytest.approx(-np.sqrt((a * c + b * c) / 4 - a * b / 2))
+
+
+def test_the_last_bits_of_a_foot_point_do_not_decide_which_points_are_near():
+    """5.9999999 and 6.0000001 mm are both 6 mm: not near."""
+    for apart in (6.0 - 1e-8, 6.0 + 1e-8):
+        feet = np.array([[0.0, 0, 0], [apart, 0, 0]])
+        places, _ = roughness.on_the_bone(plane_fit(np.ones(2), feet))
+        assert places[1, 0] == 6.0
 
 
 def test_a_rough_field_shows_and_a_smooth_one_and_noise_do_not():
@@ -66,7 +103,8 @@ def test_how_far_noise_lifts_the_points_does_not_decide_which_are_near():
     chosen = np.arange(600)
     moved = lifted.moved
     total, count = roughness.products_mm2(moved[chosen], noise[chosen], moved, noise, roughness.LIMITS_MM, chosen)
-    assert abs(on_the_feet) < 1.0 < 1.5 < roughness.signed_root(*(total / count))
+    near, far = total / count
+    assert abs(on_the_feet) < 1.2 < 1.5 < roughness.signed_root(near - far)
 
 
 def test_outliers_take_no_part():
@@ -80,7 +118,9 @@ def test_outliers_take_no_part():
     assert roughness.rough_misfit_mm(plane_fit(off, feet, weights)) == pytest.approx(alone)
 
 
-def test_without_pairs_there_is_nothing_to_say():
-    feet = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
-    assert roughness.rough_misfit_mm(plane_fit(np.ones(3), feet)) == 0.0
-    assert roughness.rough_misfit_mm(plane_fit(np.ones(3), feet, np.zeros(3))) == 0.0
+def test_without_pairs_all_that_is_known_is_how_large_the_residuals_are():
+    feet, signed = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [100.0, 0.0, 0.0]]), np.array([1.0, -2.0, 4.0])
+    assert roughness.rough_misfit_mm(plane_fit(signed, feet)) == pytest.approx(np.sqrt(21.0 / 3.0))  # none is far
+    far = feet * [2.4, 1.0, 1.0]
+    assert roughness.rough_misfit_mm(plane_fit(signed, far)) == pytest.approx(np.sqrt(21.0 / 3.0))  # none is near
+    assert roughness.rough_misfit_mm(plane_fit(signed, feet, np.zeros(3), sigma_mm=1.5)) == 1.5  # no inlier

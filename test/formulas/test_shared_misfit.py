@@ -73,9 +73,9 @@ def test_a_patch_too_small_for_long_range_says_nothing(every_pair_counts):
     assert shared.add(plane_fit(np.ones(50), patch)) is None
 
 
-def stream_of(stays, each_frame, noise_mm=1.5, frames=5):
+def stream_of(stays, each_frame, seed=4, noise_mm=1.5, frames=5):
     """The last answer for frames of 1000 of 4000 places: fields that stay and that do not, and noise."""
-    shared, rng, feet = SharedMisfit(MEMORY), np.random.default_rng(4), feet_of(4000)
+    shared, rng, feet = SharedMisfit(MEMORY), np.random.default_rng(seed), feet_of(4000)
     own = stays(feet, rng)
     for _ in range(frames):
         seen = rng.permutation(len(feet))[:1000]
@@ -98,7 +98,8 @@ def test_what_stays_and_is_rough_shows_and_nothing_else_does():
     assert abs(stream_of(nothing, nothing)) < 0.2
     assert abs(stream_of(tissue, nothing)) < 0.3  # its covariance falls by .05 mm^2 from near to far
     assert abs(stream_of(nothing, rough)) < 0.25
-    assert stream_of(rough, nothing) == pytest.approx(0.5 * np.sqrt(0.70), abs=0.08)
+    found = [stream_of(rough, nothing, seed) for seed in range(4)]
+    assert np.mean(found) == pytest.approx(0.5 * np.sqrt(0.70), abs=0.05)
 
 
 def test_tissue_of_one_thickness_is_smooth_alone():

@@ -148,21 +148,23 @@ def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people
     assert names == {"3-1", "3-scene-1", "3-laser-1"}
 
 
-def test_look_alikes_are_long_bones_at_l3_then_of_all_families_and_every_other_one_is_another_subjects(monkeypatch):
+def test_look_alikes_are_long_bones_at_l3_of_all_families_and_thinned_every_other_one_of_another_subject(monkeypatch):
     monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(seen_as))
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     bones = {bone: [parametric_specimen(bone, number) for number in (0, 1)] for bone in ("femur", "tibia")}
     monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
     pairs.setting_of.cache_clear()
-    both = pairs.look_alikes(FOLDER, "train", 3, 32)
-    tasks, others = both[:32], [pairs.draw(task) for task in both[32:]]
+    both = pairs.look_alikes(FOLDER, "train", 3, 36)
+    tasks, thinned, others = both[:36], both[72:], [pairs.draw(task) for task in both[36:72]]
     drawn = [pairs.draw(task) for task in tasks]
-    assert [each.what for each in drawn + others] == ["own", "person"] * 32
+    assert [each.what for each in drawn + others] == ["own", "person"] * 36
+    assert [(task.family, task.what) for task in thinned] == [("thinned", "own"), ("thinned", "person")] * 9
     assert {each.seen_as for each in drawn} <= set(pairs.SEEN_AS["L3"])
     known = set(pairs.SEEN_AS) - {"L3", "scene", *pairs.HELD_OUT}
     assert {each.family for each in others[::2]} == {each.family for each in others[1::2]} == known
     kinds = {pairs.setting_of(FOLDER, "train", task.seed, task.number // pairs.IN_A_ROW).whole.bone for task in tasks}
-    assert kinds == {"femur", "tibia"} and len(set(both)) == 64 and {task.seed for task in tasks} == {503}
+    assert kinds == {"femur", "tibia"} and {task.seed for task in tasks} == {503}
+    assert len(set(both)) == 90 and not {task.number for task in thinned} & {task.number for task in tasks}
     assert all(len(each.people) == 2 for each in drawn[1::2])
     assert collect._name(tasks[1]) == "503-L3-person-1"
 

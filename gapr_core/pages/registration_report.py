@@ -21,6 +21,7 @@ from gapr_core.geometry import se3
 from gapr_core.pages import palette
 from gapr_core.pages.guidance import GuidedStep, guidance_figure
 from gapr_core.pages.report import Report, Step, alignment_figure
+from gapr_core.registration.words import WORDS
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import origin
 from gapr_core.surface import Surface
@@ -29,37 +30,6 @@ Array = NDArray[np.float64]
 NOWHERE = np.zeros((0, 3))
 MOST_HYPOTHESES = 5
 NONE = "–"
-WORDS = {
-    "log_sigma": "size of the residuals",
-    "log_excess": "residuals against the noise of the source",
-    "smooth_misfit": "smooth misfit to the bone, long range",
-    "short_misfit": "smooth misfit to the bone, short range",
-    "inlier_ratio": "share of the points that fit",
-    "residual": "residual of the best hypothesis before refinement",
-    "margin": "lead over the next hypothesis",
-    "support": "share of the attempts that ended here",
-    "log_shift_sd": "uncertainty of the position",
-    "log_turn_sd": "uncertainty of the rotation",
-    "normal_agreement": "agreement of the normals",
-    "log_points": "number of points",
-    "extent": "size of the source against the bone",
-    "scale_z": "evidence that another size fits better",
-    "scale_off": "size with which the source fits best",
-    "log_scale_sd": "uncertainty of that size",
-    "size_margin": "fit of a source of another size",
-    "mirror_margin": "fit of the mirrored source",
-    "rough_misfit": "misfit that may change within centimetres",
-    "shared_misfit": "the same, shared by the sources of a stream",
-    "shared_smooth": "smooth misfit that they share",
-    "free_space_score": "score against the camera's lines of sight",
-    "log_explained_mm2": "measured surface that the bone explains",
-    "explained_of_compared": "share of the compared surface that is explained",
-    "violating_of_compared": "share of the compared surface that the camera looked through",
-    "rival_margin": "lead over the next hypothesis of the scene",
-    "sparse": "limit: few points, or points far apart, do not say whose bone it is",
-    "beyond_noise": "limit: residuals far larger than the noise of the sensor",
-    "uncertain": "limit: the covariance leaves the pose loose",
-}  # features of the confidence, and its limits
 
 
 @dataclass(frozen=True, eq=False)

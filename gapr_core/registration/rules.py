@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gapr_core.clouds import MM_PER_UNIT
 from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
 from gapr_core.geometry import se3
+from gapr_core.registration import words
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.other_size import HALFWAY
 from gapr_core.registration.refinement import Fit, refine_many
@@ -119,11 +120,21 @@ def by_mirror(log_ratio: float, rules: RulesConfig = DEFAULT) -> Refusal | None:
     return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {question}")
 
 
-def by_threshold(probability: float, tre95_mm: float, config: RegistrarConfig) -> Refusal | None:
-    """Why the pose does not meet what the user asks for; None when it does. A probability of NaN does not."""
+def by_threshold(
+    probability: float, tre95_mm: float, config: RegistrarConfig, contributions: Mapping[str, float] | None = None
+) -> Refusal | None:
+    """Why the pose does not meet what the user asks for; None when it does. A probability of NaN does not.
+
+    Args:
+        probability: 0 to 1.
+        tre95_mm: bound of the error over the bone.
+        config: what is asked for.
+        contributions: log odds that each feature adds, of which the reason names the worst.
+    """
     if not probability >= config.min_confidence:
-        reason = f"the best pose is right with a probability of only {probability:.2f}"
-        return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}, {config.min_confidence:g} is asked for")
+        worst, asked = words.against(contributions or {}), f"{config.min_confidence:g} is asked for"
+        reason = f"the best pose is right with a probability of only {probability:.2f}, {asked}"
+        return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}; against it: {worst}" if worst else reason)
     if config.max_tre_mm > 0.0 and not tre95_mm <= config.max_tre_mm:
         reason = f"the error over the bone is below {tre95_mm:.1f} mm (95 %), allowed are {config.max_tre_mm:g} mm"
         return Refusal(RegistrationStatus.IMPRECISE, reason)

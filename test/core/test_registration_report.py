@@ -13,8 +13,6 @@ from gapr_core.formats import markups
 from gapr_core.geometry import se3
 from gapr_core.pages import registration_report
 from gapr_core.pages.report import Step, alignment_figure
-from gapr_core.registration import limits
-from gapr_core.registration.features import FEATURES, SCENE_FEATURES, STREAM_FEATURES
 from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
 from gapr_core.surface import Surface
 
@@ -146,16 +144,6 @@ def test_the_histogram_counts_every_point_once():
     near = np.isfinite(DISTANCES)
     counted, aside = registration_report.residual_figure(DISTANCES[near], RESIDUALS.inlier[near]).data
     assert sorted([*counted.x, *aside.x]) == DISTANCES[near].tolist() and len(counted.x) == 15
-
-
-def test_every_feature_of_the_confidence_has_words():
-    shown = STREAM_FEATURES[1:]  # the first is the answer of the frames themselves
-    assert set(registration_report.WORDS) == {
-        *FEATURES,
-        *SCENE_FEATURES,
-        *shown,
-        *(limit.name for limit in limits.LIMITS),
-    }
 
 
 def test_planned_targets_are_shown_with_every_hypothesis(femur):

@@ -10,10 +10,11 @@ import tiny
 
 from gapr_core.config import RegistrarConfig, SourceConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import mirror, refinement, rules
+from gapr_core.registration import limits, mirror, refinement, rules, words
 from gapr_core.registration import source as sources
 from gapr_core.registration.assessment import shared_probability
 from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.features import FEATURES, SCENE_FEATURES, STREAM_FEATURES
 from gapr_core.registration.verification import Candidates
 from gapr_core.results import RegistrationStatus
 
@@ -234,6 +235,19 @@ def test_a_probability_below_the_threshold_refuses_alone(probability):
     refusal = rules.by_threshold(probability, 0.1, CONFIG)
     assert refusal.status is RegistrationStatus.LOW_CONFIDENCE
     assert rules.by_threshold(0.5, 0.1, CONFIG) is None
+    assert "against" not in refusal.reason
+
+
+def test_a_low_probability_names_the_two_features_that_speak_most_against_the_pose():
+    adds = {"mirror_margin": -1.72, "log_sigma": -0.8, "margin": 2.0, "size_margin": -0.6, "extent": -0.1}
+    reason = rules.by_threshold(0.16, 0.1, CONFIG, adds).reason
+    assert reason.endswith("against it: fit of the mirrored source (-1.7), size of the residuals (-0.8)")
+    assert "against" not in rules.by_threshold(0.16, 0.1, CONFIG, {"log_sigma": -0.49, "margin": 2.0}).reason
+
+
+def test_every_feature_and_limit_of_the_confidence_has_words():
+    named = {*FEATURES, *SCENE_FEATURES, *STREAM_FEATURES[1:], *(limit.name for limit in limits.LIMITS)}
+    assert set(words.WORDS) == named  # the first of a stream is the answer of the frames themselves
 
 
 def test_an_error_bound_above_the_allowed_one_refuses_alone():

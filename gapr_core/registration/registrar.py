@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +14,17 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, cortices, explained, limits, mirror, other_size, rules
+from gapr_core.registration import checks, clutter, cortices, explained, limits, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.guidance import guide
-from gapr_core.registration.mirror import Misfit
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.refinement import refine_fully
-from gapr_core.registration.sensor import errors, offset_surface
+from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
@@ -188,12 +187,15 @@ class Registrar:
 
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
-        if assessment.is_sure(self.config.may_pass):
-            assessment = self._unless_grown(assessment)
-        if assessment.is_sure(self.config.may_pass):
-            assessment = self._unless_mirrored(assessment, clock, enough)
-        if assessment.is_sure(self.config.may_pass):
-            assessment = bias_corrected(assessment, self.config)
+        config = self.config
+        if assessment.is_sure(config.may_pass):
+            assessment = checks.unless_grown(assessment, config)
+        if assessment.is_sure(config.may_pass):
+            believed = assessment.is_sure(config.rules.mirrored_below) or enough(assessment)
+            assessment = checks.unless_mirrored(assessment, config, believed, partial(self._of_image, clock=clock))
+        clock.lap("assess")
+        if assessment.is_sure(config.may_pass):
+            assessment = bias_corrected(assessment, config)
             clock.lap("refine")
         return assessment.corrected(self.precision)
 
@@ -212,48 +214,6 @@ class Registrar:
         both = a.target.both_cortices
         again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
         return (again or a).limited(most)
-
-    def _unless_grown(self, assessment: Assessment) -> Assessment:
-        """The same; refused where the source fits better in another size.
-
-        Few points fit in many sizes, the part that was found in a scene is what fitted, and a sensor whose scale is not
-        known to better may be wrong by as much.
-        """
-        a, config = assessment, self.config
-        few = len(a.source.points) < config.limits.few_points
-        if few or a.seen is not None or errors(config.sensor, len(a.source.points)).scale > config.scale.sure:
-            return a
-        found = other_size.margin(
-            a.fit.T, a.source, a.target, config.verification, config.num_threads, other_size.HALFWAY
-        )
-        return a.refused(rules.by_growth(found, config.rules), config.rules)
-
-    def _unless_mirrored(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
-        """The same; refused where the mirror image of the source fits better.
-
-        A few points leave much to chance, wherever on the bone, and so does an answer that is not sure: the mirror
-        image of such a source is registered in full.
-        """
-        a, config = assessment, self.config
-        if mirror.is_symmetric(a.target, config):
-            return a
-        found = mirror.image_margin(a.fit.T, a.source, a.target, config)
-        is_sure = a.is_sure(config.rules.mirrored_below) or enough(a)
-        by_chance = len(a.source.points) <= config.rules.mirrored_points or not is_sure
-        if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
-            found = min(found, self._full_image_margin(a, clock))
-        clock.lap("assess")
-        return a.refused(rules.by_mirror(found, config.rules), config.rules)
-
-    def _full_image_margin(self, assessment: Assessment, clock: Clock) -> float:
-        """As `mirror.image_margin`, with the mirror image of the source registered in full; infinite without a pose."""
-        a, config = assessment, self.config
-        flipped = sources.prepare(a.source.points * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
-        image = None if isinstance(flipped, Refusal) else self._of_image(flipped, a.target, clock)
-        if image is None:
-            return np.inf
-        flipped_one, own = (Misfit(float(each.candidates.scores[0]), each.fit.sigma_mm) for each in (image, a))
-        return flipped_one.log_ratio(own)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         """The mirror image of a source, registered in full; `memory.MemoryFirst` leaves what it remembers out."""

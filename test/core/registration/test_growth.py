@@ -8,7 +8,7 @@ import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.config import RulesConfig, SensorConfig
-from gapr_core.registration import other_size, rules
+from gapr_core.registration import checks, other_size, rules
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +47,9 @@ def test_few_points_and_a_part_of_a_scene_are_not_asked(registrar, target, seen,
     answer = registrar.assess(seen, target)
     few, enough = (replace(answer, refusal=None, source=SimpleNamespace(points=seen[:n])) for n in (249, 250))
     asked.clear()
-    assert registrar._unless_grown(few) is few
-    assert registrar._unless_grown(replace(enough, seen=answer.source)).refusal is None and not asked
-    assert registrar._unless_grown(enough).refusal is not None and asked == [other_size.HALFWAY]
+    assert checks.unless_grown(few, registrar.config) is few
+    assert checks.unless_grown(replace(enough, seen=answer.source), registrar.config).refusal is None and not asked
+    assert checks.unless_grown(enough, registrar.config).refusal is not None and asked == [other_size.HALFWAY]
 
 
 @pytest.mark.parametrize(("log_ratio", "refuses"), [(-0.49, False), (-0.51, True), (0.6, False), (np.nan, False)])

@@ -1,0 +1,68 @@
+"""What an answer that may yet be accepted is asked last: does another size, does the mirror image fit better?
+
+That costs time. The rules themselves stand in `rules`; here is when they are asked, and of what.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.registration import mirror, other_size, rules, sensor
+from gapr_core.registration import source as sources
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.mirror import Misfit
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.results import Refusal
+
+Register = Callable[[PreparedSource, PreparedTarget], Assessment | None]
+
+
+def unless_grown(assessment: Assessment, config: RegistrarConfig) -> Assessment:
+    """The same; refused where the source fits better in another size.
+
+    Few points fit in many sizes, the part that was found in a scene is what fitted, and a sensor whose scale is not
+    known to better may be wrong by as much: they are not asked.
+    """
+    a, count = assessment, len(assessment.source.points)
+    if count < config.limits.few_points or a.seen is not None:
+        return a
+    if sensor.errors(config.sensor, count).scale > config.scale.sure:
+        return a
+    settings = config.verification, config.num_threads
+    found = other_size.margin(a.fit.T, a.source, a.target, *settings, other_size.HALFWAY)
+    return a.refused(rules.by_growth(found, config.rules), config.rules)
+
+
+def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: bool, register: Register) -> Assessment:
+    """The same; refused where the mirror image of the source fits better.
+
+    Args:
+        assessment: the answer.
+        config: when a mirror image is registered in full, and what it may not be better by.
+        believed: the answer is sure. Where it is not, or of few points, much is left to chance, wherever on the bone:
+            the mirror image of such a source is registered in full.
+        register: does that.
+    """
+    a = assessment
+    if mirror.is_symmetric(a.target, config):
+        return a
+    found = mirror.image_margin(a.fit.T, a.source, a.target, config)
+    by_chance = len(a.source.points) <= config.rules.mirrored_points or not believed
+    if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
+        found = min(found, full_image_margin(a, config, register))
+    return a.refused(rules.by_mirror(found, config.rules), config.rules)
+
+
+def full_image_margin(assessment: Assessment, config: RegistrarConfig, register: Register) -> float:
+    """As `mirror.image_margin`, with the mirror image of the source registered in full; infinite without a pose."""
+    a = assessment
+    flipped = sources.prepare(a.source.points * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
+    image = None if isinstance(flipped, Refusal) else register(flipped, a.target)
+    if image is None:
+        return np.inf
+    flipped_one, own = (Misfit(float(each.candidates.scores[0]), each.fit.sigma_mm) for each in (image, a))
+    return flipped_one.log_ratio(own)

@@ -3,8 +3,14 @@
 SERIES = (
     "#0b5fa5", "#d1495b", "#2e9e6b", "#e0992b", "#7b5ea7", "#3aa6b9", "#8c6d46", "#c06c9c", "#6b7a2f", "#555555"
 )  # fmt: skip
+DASHES = ("-", "--", ":", "-.")  # of the first ten lines, the next ten, and so on
 FIRST, SECOND = SERIES[:2]  # what is right or ours, and what it is compared with
 TARGET = "#9aa2ab"  # points of a target in a flat picture
 BONE = "#eadfc8"
 OTHERS = "#9aa5b1"  # measured points that are not of the bone
 GUIDE = "#bbbbbb"  # limits and diagonals
+
+
+def dash(number: int) -> str:
+    """The style of line `number`, whose colour is taken once more after ten lines."""
+    return DASHES[number // len(SERIES) % len(DASHES)]

@@ -18,7 +18,6 @@ from gapr_core.pages import palette
 
 Array = NDArray[np.float64]
 
-DASHES = ("-", "--", ":", "-.")
 CHI2_95_2D = 5.991  # 95 % quantile with two degrees of freedom
 DEG_PER_MM = RIGHT_DEG / RIGHT_MM
 
@@ -149,8 +148,7 @@ def _bins(values: Array) -> Array:
 
 
 def _style(k: int) -> dict[str, Any]:
-    dash = DASHES[k // len(palette.SERIES) % len(DASHES)]
-    return {"color": palette.SERIES[k % len(palette.SERIES)], "ls": dash, "lw": 2.6 if k == 0 else 1.6}
+    return {"color": palette.SERIES[k % len(palette.SERIES)], "ls": palette.dash(k), "lw": 2.6 if k == 0 else 1.6}
 
 
 def _figure(title: str, x: str, y: str) -> tuple[Figure, Axes]:

@@ -217,14 +217,15 @@ def _inliers(axes: Axes, run: Run, colour: str, one: bool) -> None:
 def _recalls(axes: Axes, runs: Sequence[Run], recall: str) -> None:
     """One run: a line a protocol, all of them in black. Several: a line a run, over all protocols."""
     if len(runs) > 1:
-        lines = [(run.name, run.scores.get(ALL, {}), colour, 1.8) for run, colour in
+        lines = [(run.name, run.scores.get(ALL, {}), colour, "-", 1.8) for run, colour in
                  zip(runs, _colours(len(runs)), strict=True)]  # fmt: skip
     else:
         apart = sorted(protocol for protocol in runs[0].scores if protocol != ALL)
-        lines = [(p, runs[0].scores[p], c, 1.4) for p, c in zip(apart, _colours(len(apart)), strict=True)]
-        lines += [("all protocols", runs[0].scores[ALL], "#111111", 2.6)] if ALL in runs[0].scores else []
-    for name, scores, colour, width in lines:
-        axes.plot(scores.get("pairs", []), scores.get(recall, []), marker="o", ms=3.5, lw=width, color=colour,
+        colours = _colours(len(apart))
+        lines = [(p, runs[0].scores[p], colours[k], palette.dash(k), 1.4) for k, p in enumerate(apart)]
+        lines += [("all protocols", runs[0].scores[ALL], "#111111", "-", 2.6)] if ALL in runs[0].scores else []
+    for name, scores, colour, style, width in lines:
+        axes.plot(scores.get("pairs", []), scores.get(recall, []), marker="o", ms=3.5, lw=width, color=colour, ls=style,
                   label=name)  # fmt: skip
 
 

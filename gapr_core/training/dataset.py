@@ -31,6 +31,7 @@ from gapr_core.training.targets import TrainingPair, join, training_pair
 Array = NDArray[np.float64]
 CROPPED = ("paper", "overlap", "incomplete")  # protocols (beginnings) that crop a cloud
 OWN_TARGET = ("incomplete",)  # protocols whose target is not the whole bone
+LANES = 4  # the bone of a pair and its micro-batch have numbers that are the same modulo this
 
 
 class People:
@@ -120,9 +121,14 @@ class TrainingPairs(Dataset[TrainingPair]):
         raise RuntimeError(f"no usable pair under number {number}")
 
     def _bone_number(self, number: int) -> int:
-        """Neighbouring pairs share a bone, and so its features."""
+        """Neighbouring pairs share a bone, and so its features; every fourth micro-batch has the same fourth of them.
+
+        So each of two or four processes, which take micro-batches in turn, needs its own bones only.
+        """
         rng = np.random.default_rng([self.train.seed, 3, number // self.train.share])
-        return number // self.train.reuse + int(rng.integers(self.train.pool))
+        oldest = number // self.train.reuse
+        first = (number // self.train.micro_batch - oldest) % LANES
+        return oldest + first + LANES * int(rng.integers(max(1, -(-(self.train.pool - first) // LANES))))
 
     def _seen_by(self, protocol: str, bone: PooledBone) -> Specimen:
         """What a protocol makes its pair of: the bone, or the target's own points where they are to be cropped."""
@@ -160,7 +166,7 @@ class TrainingPairs(Dataset[TrainingPair]):
         return bone
 
     def _new_bone(self, number: int) -> PooledBone:
-        people = self.people[number % len(self.people)]
+        people = self.people[number // LANES % len(self.people)]
         specimen, subjects = people.draw_of(number, self.train.synthetic, self.train.seed)
         rng = np.random.default_rng([self.train.seed, 2, number])
         points, _ = specimen.sample(TARGET_POINTS, rng)

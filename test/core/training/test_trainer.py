@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,24 @@ def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
         moved = move(pair.T, pair.source.fine.points[None])[0]
         gap = torch.cdist(moved, pair.target.fine.points).amin(1)
         assert gap.median() < 0.1 and pair.overlaps.max() > 0.3
+
+
+@pytest.mark.parametrize("pool", [3, 8, 128])
+def test_processes_that_take_micro_batches_in_turn_share_no_bone_and_all_bones_get_their_share(settings, pool):
+    """Every process would draw every bone otherwise. All kinds of bones come in each micro-batch's turn."""
+    train = replace(settings, pool=pool, micro_batch=4, reuse=16, share=2, bones=("femur", "tibia"))
+    pairs = TrainingPairs(train, settings.network(), None)
+    numbers = [[pairs._bone_number(4 * batch + i) for i in range(4)] for batch in range(1600)]
+    for processes in (2, 4):
+        own = [{bone for batch in numbers[rank::processes] for bone in batch} for rank in range(processes)]
+        assert not any(first & second for first, second in combinations(own, 2))
+    bones = [bone for batch in numbers for bone in batch]
+    used = np.bincount(bones)[2 * pool : 380]
+    assert used.mean() == pytest.approx(16.0, rel=0.1) and used.min() > 0
+    assert all(bone - number // 16 < pool + 4 for number, bone in enumerate(bones))
+    for lane in range(4):
+        kinds = np.array([bone // 4 % 2 for batch in numbers[lane::4] for bone in batch])
+        assert kinds.mean() == pytest.approx(0.5, abs=0.1)
 
 
 def test_validation_draws_again_where_a_source_is_too_large_for_the_network(settings, anatomy, monkeypatch):

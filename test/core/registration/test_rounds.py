@@ -13,7 +13,7 @@ from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import mirror
+from gapr_core.registration import checks, mirror
 from gapr_core.registration import registrar as registrars
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import Calibration
@@ -146,7 +146,7 @@ def test_what_a_stream_may_still_accept_is_checked_against_its_image_and_correct
 ):
     """A stream raises p to sqrt(p) at most: with a threshold of .4, answers from .16 on."""
     done = []
-    monkeypatch.setattr(registrars.mirror, "image_margin", lambda *_: done.append("mirror") or mirror.LIMITS[1])
+    monkeypatch.setattr(checks.mirror, "image_margin", lambda *_: done.append("mirror") or mirror.LIMITS[1])
     monkeypatch.setattr(registrars, "bias_corrected", lambda assessment, _: done.append("bias") or assessment)
     config = replace(ONE_THREAD, min_confidence=0.4, rules=replace(ONE_THREAD.rules, mirrored_below=0.0))
     calibration = Calibration("fixed", Additive(float(logit(probability)), ()), {})

@@ -65,6 +65,7 @@ SCENES = {
     "scene-stereo": {"scene-stereo": 1.0},
     "scene-layers": {"scene-layers": 1.0},
     "scene-joint": {"scene-joint": 1.0},
+    "scene-bare": {"depth-camera": 2.0, "stereo": 1.0},
 }  # those of `SEEN_AS`, and families that only lists of their own have
 AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # how a bone is seen with its neighbour, and where that cannot be
 HELD_OUT = ("laser", "structured-light")  # families that no model is fitted on, only judged
@@ -142,21 +143,29 @@ def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Subjects' femora and tibiae, every other one of another subject, two and a half times as many as `count`.
+    """Subjects' femora and tibiae, every other one of another subject, nearly three times as many as `count`.
 
-    So many are seen as at L3, where they are hardest to distinguish, so many by all other families in turn, and half as
-    many are thinned: where neighbours are far apart, another subject's ridges look like noise.
+    So many are seen as at L3, where they are hardest to distinguish, so many by all other families in turn, half as
+    many are thinned, since another subject's ridges look like noise where neighbours are far apart, and three of ten
+    are a camera's clouds.
     """
-    row, turn = IN_A_ROW, IN_A_ROW * len(BONES)
+    row, turn, whats = IN_A_ROW, IN_A_ROW * len(BONES), ("own", "person")
     numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
-    own_list = seed + LOOK_ALIKE_SEEDS
-    whats = ("own", "person")
     others = [family for family in SEEN_AS if family not in ("L3", "scene", *HELD_OUT)]
-    families = ["L3"] * count + [others[number // len(whats) % len(others)] for number in range(count)]
-    families += ["thinned"] * (count // 2)
-    numbers = 2 * numbers[:count] + numbers[count : count + count // 2]
-    return [Task(folder, split, own_list, number, family, whats[number % len(whats)], True)
-            for number, family in zip(numbers, families, strict=True)]  # fmt: skip
+    cameras = [family for family in SCENES if family != AT_A_JOINT]
+    thinned, seen_by_a_camera = ["thinned"] * (count // 2), _in_turn(cameras, 3 * count // 10)
+    own_list = seed + LOOK_ALIKE_SEEDS
+    lists = [
+        *zip(numbers[:count], ["L3"] * count, strict=True),
+        *zip(numbers[:count], _in_turn(others, count), strict=True),
+        *zip(numbers[count:], [*thinned, *seen_by_a_camera], strict=False),
+    ]
+    return [Task(folder, split, own_list, number, family, whats[number % 2], True) for number, family in lists]
+
+
+def _in_turn(families: Sequence[str], count: int) -> list[str]:
+    """So many of them; one that is next to another twice, for the own bone and for another subject's."""
+    return [families[number // 2 % len(families)] for number in range(count)]
 
 
 def draw(task: Task) -> Drawn:

@@ -155,16 +155,19 @@ def test_look_alikes_are_long_bones_at_l3_of_all_families_and_thinned_every_othe
     monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
     pairs.setting_of.cache_clear()
     both = pairs.look_alikes(FOLDER, "train", 3, 36)
-    tasks, thinned, others = both[:36], both[72:], [pairs.draw(task) for task in both[36:72]]
+    tasks, others, thinned, cameras = both[:36], both[36:72], both[72:90], both[90:]
+    others = [pairs.draw(task) for task in others]
     drawn = [pairs.draw(task) for task in tasks]
     assert [each.what for each in drawn + others] == ["own", "person"] * 36
     assert [(task.family, task.what) for task in thinned] == [("thinned", "own"), ("thinned", "person")] * 9
+    assert len(cameras) == 10 and {task.family for task in cameras} == set(pairs.SCENES) - {pairs.AT_A_JOINT}
+    assert [task.what for task in cameras] == ["own", "person"] * 5
     assert {each.seen_as for each in drawn} <= set(pairs.SEEN_AS["L3"])
     known = set(pairs.SEEN_AS) - {"L3", "scene", *pairs.HELD_OUT}
     assert {each.family for each in others[::2]} == {each.family for each in others[1::2]} == known
     kinds = {pairs.setting_of(FOLDER, "train", task.seed, task.number // pairs.IN_A_ROW).whole.bone for task in tasks}
     assert kinds == {"femur", "tibia"} and {task.seed for task in tasks} == {503}
-    assert len(set(both)) == 90 and not {task.number for task in thinned} & {task.number for task in tasks}
+    assert len(set(both)) == 100 and not {task.number for task in thinned + cameras} & {task.number for task in tasks}
     assert all(len(each.people) == 2 for each in drawn[1::2])
     assert collect._name(tasks[1]) == "503-L3-person-1"
 

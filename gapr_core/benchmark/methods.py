@@ -76,7 +76,7 @@ def _refined(make_coarse: Trained, weights: str | None) -> RegistrationMethod:
     return baselines.Refined(coarse, baselines.PointToPlane(), f"{coarse.name}{REFINED}")
 
 
-PEERS = ("geotransformer",)
+PEERS = ("geotransformer", "predator")
 REFINED = "+point_to_plane"
 Trained = Callable[[str | None], RegistrationMethod]
 RAW: dict[str, Trained] = {
@@ -113,7 +113,7 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
     Args:
         name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
             proposers alone), "gapr_tracker", "gapr_paper" (the paper's pipeline; "gapr_paper@WEIGHTS" with those of a
-            run), "geotransformer@WEIGHTS" (its authors' code, see `peer`), a baseline of
+            run), "geotransformer@WEIGHTS" and "predator@WEIGHTS" (their authors' code, see `peer`), a baseline of
             `gapr_core.baselines.REGISTRY`, or "package.module:factory" for a callable without arguments that returns a
             `RegistrationMethod`.
         config: settings of our own methods.

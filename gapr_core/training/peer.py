@@ -1,7 +1,7 @@
 """Train a network of others on the pairs, in the batches and with the optimiser and the schedule of `gapr train`.
 
-`gapr_core.training.geotransformer` is a command. Networks and losses are their own
-(`gapr_core.benchmark.peer`). Call a command again to go on after a stop; a checkpoint is written every two minutes.
+`gapr_core.training.geotransformer` and `predator` are the commands; networks and losses are their own. Call one again
+to go on after a stop; a checkpoint is written every two minutes.
 """
 
 from __future__ import annotations

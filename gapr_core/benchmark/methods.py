@@ -61,14 +61,14 @@ def _paper_pipeline(weights: str | None) -> RegistrationMethod:
     return PaperPipeline(weights) if weights else PaperPipeline()
 
 
-def _geotransformer(weights: str | None, pose: str = "local_to_global") -> RegistrationMethod:
-    from gapr_core.benchmark.geotransformer import GeoTransformer
+def _peer(weights: str | None, name: str, pose: str = "own") -> RegistrationMethod:
+    """A network of others, by its module in `gapr_core.benchmark`."""
+    from gapr_core.benchmark.peer import Peer
 
     if weights is None:
-        raise ConfigError(
-            "geotransformer@WEIGHTS", "no weights", "train them with python -m gapr_core.training.geotransformer"
-        )
-    return GeoTransformer(weights, pose)
+        raise ConfigError(f"{name}@WEIGHTS", "no weights", f"train them with python -m gapr_core.training.{name}")
+    code = importlib.import_module(f"gapr_core.benchmark.{name}").Checkout.at()
+    return Peer(code, weights, pose)
 
 
 def _refined(make_coarse: Trained, weights: str | None) -> RegistrationMethod:
@@ -76,12 +76,13 @@ def _refined(make_coarse: Trained, weights: str | None) -> RegistrationMethod:
     return baselines.Refined(coarse, baselines.PointToPlane(), f"{coarse.name}{REFINED}")
 
 
+PEERS = ("geotransformer", "predator")
 REFINED = "+point_to_plane"
 Trained = Callable[[str | None], RegistrationMethod]
 RAW: dict[str, Trained] = {
     "gapr_paper": _paper_pipeline,
-    "geotransformer": _geotransformer,
-    "geotransformer_ransac": partial(_geotransformer, pose="ransac"),
+    **{name: partial(_peer, name=name) for name in PEERS},
+    **{f"{name}_ransac": partial(_peer, name=name, pose="ransac") for name in PEERS},
 }
 TRAINED = RAW | {name + REFINED: partial(_refined, maker) for name, maker in RAW.items()}  # NAME, or NAME@WEIGHTS
 
@@ -112,7 +113,7 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
     Args:
         name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
             proposers alone), "gapr_tracker", "gapr_paper" (the paper's pipeline; "gapr_paper@WEIGHTS" with those of a
-            run), "geotransformer@WEIGHTS" (its authors' code, see `geotransformer`), a baseline of
+            run), "geotransformer@WEIGHTS" and "predator@WEIGHTS" (their authors' code, see `peer`), a baseline of
             `gapr_core.baselines.REGISTRY`, or "package.module:factory" for a callable without arguments that returns a
             `RegistrationMethod`.
         config: settings of our own methods.

@@ -37,7 +37,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--table", type=int, required=True, choices=(*PROTOCOLS, *TRAINED), help="of the paper")
     parser.add_argument("--out", type=Path, required=True, help="folder of the table; an interrupted one goes on")
     parser.add_argument("--weights", type=Path, help="of the network in tables 1 to 3 (gapr train wrote them)")
-    parser.add_argument("--also", default="", help="more methods in tables 1 to 3, with commas: geotransformer@WEIGHTS")
+    parser.add_argument("--also", default="", help="more methods in tables 1 to 3, with commas: predator@WEIGHTS")
     parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--split", default="test", choices=[s for s in anatomy.SPLITS if s != "train"], help="(test)")
     parser.add_argument("--bones", default=",".join(anatomy.BONES), help="with commas; the paper's four")

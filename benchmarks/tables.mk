@@ -104,6 +104,6 @@ $(BENCHMARKS:%=$(OUT)/done/%): $(OUT)/done/%: $(OUT)/bench/%/table.md
 
 $(OUT)/done/%:
 	@mkdir -p $(@D) $(OUT)/printed $(OUT)/figures
-	python benchmarks/$(made_by_$*) > $(OUT)/printed/$*.md
-	$(PUBLISH) $* $(OUT)/printed/$*.md --command "python benchmarks/$(made_by_$*)"
+	python benchmarks/$(strip $(made_by_$*)) > $(OUT)/printed/$*.md
+	$(PUBLISH) $* $(OUT)/printed/$*.md --command "python benchmarks/$(strip $(made_by_$*))"
 	@touch $@

@@ -35,8 +35,8 @@ FEATURES_OF = {
     "network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES, STREAM: STREAM_FEATURES,
 }  # fmt: skip
 SIGNS = {
-    "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1, "log_shift_sd": -1,
-    "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1, "mirror_margin": 1,
+    "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1,
+    "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1, "mirror_margin": 1,
     "rough_misfit": -1,
     "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
     "frames_log_odds": 1, "shared_misfit": -1,

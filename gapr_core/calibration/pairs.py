@@ -164,7 +164,7 @@ def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def _in_turn(families: Sequence[str], count: int) -> list[str]:
-    """So many of them; one that is next to another twice, for the own bone and for another subject's."""
+    """`count` names, each family twice in a row: once for the own bone and once for another subject's."""
     return [families[number // 2 % len(families)] for number in range(count)]
 
 

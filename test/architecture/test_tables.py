@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 def commands():
     """What `make` would run for all tables, as lists of words."""
     if shutil.which("make") is None:
-        pytest.skip("needs make")
+        pytest.skip("it asks make what it would run: apt install make")
     asked = ["make", "-n", "-f", "benchmarks/tables.mk", "all", "real", "OUT=nowhere", "REAL=nothing"]
     printed = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     return [shlex.split(line) for line in printed.splitlines()]

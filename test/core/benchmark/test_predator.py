@@ -172,7 +172,7 @@ def test_matches_are_among_the_points_with_the_highest_scores_only():
 
 
 def test_its_own_registration_finds_a_motion_among_wrong_matches():
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", reason="RANSAC of its own pose: pip install open3d")
     T = se3.from_rotation_translation(se3.random_rotation(RNG), [0.4, -0.3, 0.1])
     p, features = RNG.random((150, 3)), RNG.normal(size=(150, 6))
     q = se3.apply(T, p)

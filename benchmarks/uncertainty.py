@@ -109,7 +109,7 @@ def refined(registrar: Registrar, pair: Pair, target: PreparedTarget) -> tuple[F
         return None
     fit = refine_fully(pair.T_target_source, source.points, target, config.refinement, source.neighbours)
     known = estimate(fit, config.covariance, config.sensor).covariance
-    fit = corrected_fit(fit, known, source, target, config.smooth_bias, config.refinement)
+    fit = corrected_fit(fit, known, source, target, config)
     return fit, estimate(fit, config.covariance, config.sensor), source.points
 
 

@@ -36,6 +36,9 @@ class SourceConfig(Settings):
 
     fewest_points: int = setting(6, "fewer usable points are refused: as many as a pose has unknowns", low=6)
     most_points: int = setting(6000, "more points are thinned evenly", low=100, high=1_000_000)
+    fitted_points: int = setting(
+        1500, "of these so many, drawn at random, are compared and assessed, unless most may not be bone", low=100
+    )
     normal_neighbours: int = setting(30, "points that give a normal", low=4, high=200)
     smallest_width_mm: float = setting(2.0, "a narrower cloud is refused: a line", low=0, high=1000, unit="mm")
     most_raw_points: int = setting(100_000, "more are drawn from at random before the even thinning", low=1000)
@@ -98,7 +101,7 @@ class CovarianceConfig(Settings):
     correlation_mm: float = setting(
         20.0, "l of the bias's correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm"
     )
-    centres: int = setting(80, "points that span the bias", low=1, high=10_000)
+    centres: int = setting(60, "points that span the bias", low=1, high=10_000)
     sizes_mm: tuple[float, ...] = setting(
         (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0),
         "standard deviations of the bias to choose from", low=1e-3, high=100, unit="mm",
@@ -168,14 +171,14 @@ class SmoothBiasConfig(Settings):
     """The smooth bias that an accepted pose is corrected for (`gapr_core.registration.smooth_bias`)."""
 
     correlation_mm: float = setting(20.0, "l of its correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm")
-    centres: int = setting(80, "points that span it", low=1, high=10_000)
+    centres: int = setting(60, "points that span it", low=1, high=10_000)
     sizes_mm: tuple[float, ...] = setting(
         (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0),
         "standard deviations to choose from", low=1e-3, high=100, unit="mm",
     )  # fmt: skip
     evidence: float = setting(2.0, "log likelihood ratio from which a bias is believed; infinity: never", low=0)
     smallest_share: float = setting(0.15, "information of a field over the largest, to have a say", low=0, high=1)
-    iterations: int = setting(3, "steps of the pose", low=1, high=100)
+    iterations: int = setting(2, "steps of the pose", low=1, high=100)
     fewest_points: int = setting(200, "inliers without which no bias is looked for", low=10)
     largest_move: float = setting(22.5, "largest squared Mahalanobis distance of a move (chi square: 99.9 %)", low=0)
 

@@ -143,14 +143,16 @@ def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Subjects' femora and tibiae, every other one of another subject, nearly three times as many as `count`.
+    """Femora and tibiae of subjects, every other one of another subject, three times as many as `count`; and rib cages.
 
     So many are seen as at L3, where they are hardest to distinguish, so many by all other families in turn, half as
     many are thinned, since another subject's ridges look like noise where neighbours are far apart, and three of ten
-    are a camera's clouds.
+    are a camera's clouds. Two of ten are rib cages at L3.
     """
     row, turn, whats = IN_A_ROW, IN_A_ROW * len(BONES), ("own", "person")
-    numbers = [number for number in range(turn * count) if BONES[number // row % len(BONES)] in LOOK_ALIKES]
+    bones = {number: BONES[number // row % len(BONES)] for number in range(turn * count)}
+    numbers = [number for number, bone in bones.items() if bone in LOOK_ALIKES]
+    of_ribs = [number for number, bone in bones.items() if bone == "thoracic"][: 2 * count // 10]
     others = [family for family in SEEN_AS if family not in ("L3", "scene", *HELD_OUT)]
     cameras = [family for family in SCENES if family != AT_A_JOINT]
     thinned, seen_by_a_camera = ["thinned"] * (count // 2), _in_turn(cameras, 3 * count // 10)
@@ -159,6 +161,7 @@ def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
         *zip(numbers[:count], ["L3"] * count, strict=True),
         *zip(numbers[:count], _in_turn(others, count), strict=True),
         *zip(numbers[count:], [*thinned, *seen_by_a_camera], strict=False),
+        *zip(of_ribs, ["L3"] * len(of_ribs), strict=True),
     ]
     return [Task(folder, split, own_list, number, family, whats[number % 2], True) for number, family in lists]
 

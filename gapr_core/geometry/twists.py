@@ -37,6 +37,17 @@ def nees(twist: ArrayLike, covariance: ArrayLike) -> float:
     return float(error @ np.linalg.solve(covariance / np.outer(scale, scale), error))
 
 
+def covariance_about(offset: ArrayLike, covariance: ArrayLike) -> Array:
+    """(6, 6) covariance of a pose about a centre that lies `offset` (3,), mm, from the one it is about now.
+
+    A turn r about c shifts c + d by r x d: the shift of the new centre is v - d x r.
+    """
+    x, y, z = np.asarray(offset, dtype=np.float64)
+    move = np.eye(6)
+    move[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(move @ np.asarray(covariance) @ move.T)
+
+
 def motion_jacobians(points: ArrayLike, centre: ArrayLike) -> Array:
     """(N, 3, 6) derivative of each moved point (target frame) by the twist about `centre`: [I, -[p - c]x]."""
     x, y, z = (np.asarray(points, dtype=np.float64) - np.asarray(centre)).T

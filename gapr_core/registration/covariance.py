@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.geometry.twists import covariance_about
 from gapr_core.registration import fit_kernels
 from gapr_core.registration import sensor as sensors
 from gapr_core.registration.bias_field import (
@@ -78,21 +79,24 @@ def estimate(
     """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
 
     Args:
-        fit: the pose and its residuals.
+        fit: the pose and its residuals; all points that it rests on count, the smooth misfits are those of its own.
         config: of the errors.
         sensor: what is known of them before.
         around: (N, k) neighbours of each point, where they are known (see `smooth_misfits_mm`).
         misfits_mm: the smooth and the short misfit, where they are known; else they are measured.
     """
-    count = int(np.count_nonzero(fit.weights))
+    rests = fit.rests_on
+    count = int(np.count_nonzero(rests.weights))
     known = sensors.errors(sensor or SensorConfig(), count)
-    spanned = fields(fit, config.correlation_mm, config.centres)
-    equations = equations_of(fit, config.correlation_mm, config.centres)
+    spanned = fields(rests, config.correlation_mm, config.centres)
+    equations = equations_of(rests, config.correlation_mm, config.centres)
     bias_mm = config.bias_gain * expected_bias_mm(equations, known.bias_mm, config)
-    sigma_mm = float(np.sqrt(equations.design_effect)) * fit.sigma_mm
+    sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
     noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, config.noise_points)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
-    covariance = sandwich(fit, spanned, expected, config)
+    covariance = sandwich(rests, spanned, expected, config)
+    if rests is not fit:
+        covariance = covariance_about(fit.moved.mean(axis=0) - rests.moved.mean(axis=0), covariance)
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     counts = config.smooth_neighbours, config.short_neighbours
     smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)

@@ -11,8 +11,8 @@ from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration import mirror, other_size, sensor
 from gapr_core.registration.bias_field import equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.refinement import Fit
-from gapr_core.registration.roughness import rough_misfit_mm
+from gapr_core.registration.refinement import SD_OF_MEDIAN, Fit
+from gapr_core.registration.roughness import SURE_SIGMAS, rough_misfit_mm
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
@@ -41,6 +41,7 @@ SIGNS = {
     "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
     "frames_log_odds": 1, "shared_misfit": -1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
+ERROR_OF_MEDIAN = float(np.sqrt(np.pi / 2.0))  # standard error of a median over that of a mean
 LEAST_NOISE_MM = 0.1  # a source without noise counts as having so much
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
 NO_RIVAL = 2.0  # a pose alone counts as having a rival of so many times its mean square
@@ -102,13 +103,20 @@ def of_the_fit(
 
 
 def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
-    """What a point is off its neighbours' plane by, mm, less what the bone is where the point lies on it; the median.
+    """The most, mm, that a point may be off its neighbours' plane by, less what the bone is where the point lies on it.
 
     Neighbours do not lie in a plane since they are noisy, and since the bone is curved: of a thinned cloud's, which are
-    centimetres apart, mostly that. Their foot points show the second alone, and variances add up.
+    centimetres apart, mostly that. Their foot points show the second alone, and variances add up. What is left is small
+    beside both there, and of few points little is known: the noise counts as the upper end of what it may be, so that
+    residuals exceed it only where that is seen. Its median has the standard error of one of independent patches.
     """
-    curved_mm = fit_planes(fit.feet, np.ascontiguousarray(source.neighbours))[1]
-    return float(np.sqrt(max(np.median(flatness_mm**2 - curved_mm**2), 0.0)))
+    curved_mm = fit_planes(fit.rests_on.feet, source.patches)[1]
+    left_mm2 = flatness_mm**2 - curved_mm**2
+    middle_mm2 = float(np.median(left_mm2))
+    spread_mm2 = SD_OF_MEDIAN * float(np.median(np.abs(left_mm2 - middle_mm2)))
+    patches = max(len(fit.rests_on.feet) / source.patches.shape[1], 1.0)
+    most_mm2 = middle_mm2 + SURE_SIGMAS * ERROR_OF_MEDIAN * spread_mm2 / np.sqrt(patches)
+    return float(np.sqrt(max(most_mm2, 0.0)))
 
 
 def of_another_bone(
@@ -137,6 +145,7 @@ def scale_of(fit: Fit, config: CovarianceConfig, prior: ScaleConfig) -> tuple[fl
     Returns:
         The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
     """
+    fit = fit.rests_on
     if np.count_nonzero(fit.weights) < prior.fewest_points:
         return 0.0, 1.0
     growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # the points hold the noise too

@@ -67,3 +67,14 @@ def leading_means(values, counts, neighbours, count):
                     out[p] = total / count
                     break
     return out
+
+
+@numba.njit(**EXACT)
+def shared_out(values, patches, count):
+    """(count,) means of the `values` (N,) of the patches (N, k) that each point is in; 0 for one in none."""
+    total, found = np.zeros(count), np.zeros(count)
+    for p in range(len(patches)):
+        for q in patches[p]:
+            total[q] += values[p]
+            found[q] += 1.0
+    return total / np.maximum(found, 1.0)

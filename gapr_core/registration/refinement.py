@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import fit_kernels, kernels
+from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.runtime.parallel import in_pieces
 
@@ -40,6 +41,7 @@ class Fit:
         elements: (N,) indices of the nearest target points, -1 where none is near.
         moved: (N, 3) source points in the target frame.
         bias_mm: standard deviation of the smooth bias for which the pose is corrected; 0 for plain least squares.
+        whole: the same pose with all points of a source of which only some are here; None where all are.
     """
 
     T: Array
@@ -50,6 +52,12 @@ class Fit:
     elements: NDArray[np.int64]
     moved: Array
     bias_mm: float = 0.0
+    whole: Fit | None = None
+
+    @property
+    def rests_on(self) -> Fit:
+        """The same pose with all points that it rests on."""
+        return self.whole or self
 
     @cached_property
     def jacobian(self) -> Array:
@@ -118,6 +126,23 @@ def refine_fully(
     return evaluate_with_patches(fit.T, points, target, config, neighbours)
 
 
+def rest_on_whole(fit: Fit, source: PreparedSource, target: PreparedTarget, config: RefinementConfig) -> Fit:
+    """The fit of a source of which only some points are fitted, moved to where all rest: their noise averages out."""
+    if not source.is_part:
+        return fit
+    limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
+    variances, trust = np.full_like(limits, fit.sigma_mm**2), trust_of_whole(fit, source, config)
+    poses, _ = kernels.refine_batch(fit.T[None], source.whole, trust, *target.kernel_view, limits, variances)
+    some = evaluate_with_patches(poses[0], source.points, target, config, source.neighbours)
+    return replace(some, whole=evaluate_trusted(poses[0], source.whole, target, config, trust))
+
+
+def trust_of_whole(fit: Fit, source: PreparedSource, config: RefinementConfig) -> Array:
+    """(M,) `patch_trust` of all points of a source: the mean over the patches that each is in, 0 for one in none."""
+    trust = patch_trust(fit, source.neighbours, config)
+    return np.asarray(fit_kernels.shared_out(trust, source.patches, len(source.whole)))
+
+
 def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
     """Residuals, scale and weights of a pose as it is; no patch is distrusted."""
     signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
@@ -126,6 +151,12 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
     signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
     weights = fit_kernels.weights(signed, aside, elements, target.elements, sigma_mm**2, limit_mm)
     return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
+
+
+def evaluate_trusted(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, trust: Array) -> Fit:
+    """`evaluate` of a pose, made exactly rigid, with a known trust (N,) of the points in the weights."""
+    fit = evaluate(se3.nearest_rigid(T), points, target, config)
+    return replace(fit, weights=fit.weights * trust)
 
 
 def evaluate_with_patches(

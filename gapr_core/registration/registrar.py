@@ -23,7 +23,7 @@ from gapr_core.registration.guidance import guide
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
-from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.refinement import refine_fully, rest_on_whole
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
@@ -168,7 +168,7 @@ class Registrar:
             how = "pass what `prepare` returns for it"
             raise InvalidPointCloudError("a prepared target", type(target).__name__, how)
         target = offset_surface(target, self.config.sensor)
-        prepared = sources.prepare(source, self.config.source, self.config.num_threads)
+        prepared = sources.prepare(source, self.config.source, self.config.num_threads, viewpoint is not None)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
@@ -234,6 +234,7 @@ class Registrar:
             candidates = verify(poses, source, target, config.verification, config.num_threads)
             clock.lap("verify")
             fit = refine_fully(candidates.poses[0], source.points, target, config.refinement, source.neighbours)
+            fit = rest_on_whole(fit, source, target, config.refinement)
             clock.lap("refine")
             assessment = assess(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)

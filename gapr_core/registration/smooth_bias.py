@@ -14,13 +14,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig
+from gapr_core.config import RegistrarConfig, SmoothBiasConfig
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist, nees
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import NormalEquations, equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import estimate
-from gapr_core.registration.refinement import Fit, evaluate_with_patches
+from gapr_core.registration.refinement import Fit, evaluate_trusted, evaluate_with_patches, trust_of_whole
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 
@@ -33,7 +33,7 @@ def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessmen
     Without evidence of a bias the same object comes back.
     """
     a = assessment
-    fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config.smooth_bias, config.refinement)
+    fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config)
     if fit is a.fit:
         return a
     misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # those that were assessed
@@ -41,39 +41,43 @@ def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessmen
 
 
 def corrected_fit(
-    fit: Fit,
-    covariance: Array,
-    source: PreparedSource,
-    target: PreparedTarget,
-    config: SmoothBiasConfig,
-    refinement: RefinementConfig,
+    fit: Fit, covariance: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> Fit:
     """The fit after some steps of generalised least squares; `fit` itself where its residuals show no bias.
 
-    A move that the covariance all but rules out is not made: an answer must stay near what was assessed.
+    All points that it rests on take part: the more, the better they tell noise from bias. A move that the covariance
+    all but rules out is not made: an answer must stay near what was assessed.
 
     Args:
-        fit: from `refine_fully`.
+        fit: from `refinement.refine_fully`, or from `rest_on_whole` after it.
         covariance: (6, 6) of `fit`, as `gapr_core.registration.covariance.estimate` gives it.
         source, target: what was refined, and on what.
-        config: of the bias.
-        refinement: as `fit` was refined with.
+        config: of the bias, and of the refinement as `fit` was refined.
     """
-    if np.count_nonzero(fit.weights) < config.fewest_points:
+    bias, refinement, before = config.smooth_bias, config.refinement, fit.rests_on
+    if np.count_nonzero(before.weights) < bias.fewest_points:
         return fit
-    spanned, corrected = fields(fit, config.correlation_mm, config.centres), fit
-    equations = equations_of(fit, config.correlation_mm, config.centres)
-    for number in range(config.iterations):
+    trust = None if fit.whole is None else trust_of_whole(fit, source, refinement)
+
+    def of_points(T: Array) -> Fit:
+        return evaluate_with_patches(T, source.points, target, refinement, source.neighbours)
+
+    def at(T: Array) -> Fit:
+        return of_points(T) if trust is None else evaluate_trusted(T, source.whole, target, refinement, trust)
+
+    spanned, corrected = fields(before, bias.correlation_mm, bias.centres), before
+    equations = equations_of(before, bias.correlation_mm, bias.centres)
+    for number in range(bias.iterations):
         if number:
             equations = NormalEquations.of(corrected, spanned).with_design_effect(equations.design_effect)
-        size_mm = believed_size_mm(equations, config)
+        size_mm = believed_size_mm(equations, bias)
         if size_mm == 0.0:
             break
         T = se3.exp(equations.step(size_mm), corrected.moved.mean(axis=0)) @ corrected.T
-        corrected = evaluate_with_patches(T, source.points, target, refinement, source.neighbours)
-        corrected = replace(corrected, bias_mm=size_mm)
-    is_plausible = nees(error_twist(corrected.T, fit.T, source.points), covariance) < config.largest_move
-    return corrected if is_plausible else fit
+        corrected = replace(at(T), bias_mm=size_mm)
+    if corrected is before or not nees(error_twist(corrected.T, fit.T, source.points), covariance) < bias.largest_move:
+        return fit
+    return corrected if trust is None else replace(of_points(corrected.T), bias_mm=corrected.bias_mm, whole=corrected)
 
 
 def believed_size_mm(equations: NormalEquations, config: SmoothBiasConfig) -> float:

@@ -28,14 +28,14 @@ class PreparedSource:
     """A cleaned source.
 
     Attributes:
-        points: (N, 3) float64, mm, in the source frame.
+        points: (N, 3) float64, mm, in the source frame: what is fitted and assessed.
         normals: (N, 3) unit normals, of arbitrary sign unless `oriented`.
         flatness_mm: (N,) root-mean-square distance of a point's neighbours to their plane.
         around: (N, k) indices of each point's nearest points, itself first, and a few more than give a normal.
-        whole: (M, 3), mm, the cloud that `patches` are of: the points, or more where these are a part.
+        whole: (M, 3), mm, the cloud that the points are of, or a part of: `patches` are of it, and the network sees it.
         patches: (N, k) indices into `whole` of what gave each normal.
         order: (N,) indices such that every prefix is spread over the whole cloud, trustworthy points first.
-        spacing_mm: median distance between neighbouring points.
+        spacing_mm: median distance between neighbouring points of the whole.
         oriented: the normals point out of the body, to where the sensor was, so that their sign says something.
     """
 
@@ -48,6 +48,11 @@ class PreparedSource:
     order: NDArray[np.int64]
     spacing_mm: float
     oriented: bool = False
+
+    @property
+    def is_part(self) -> bool:
+        """True where only some of the whole are fitted."""
+        return len(self.points) < len(self.whole)
 
     @property
     def neighbours(self) -> NDArray[np.int64]:
@@ -80,8 +85,16 @@ class PreparedSource:
         return self.points[self.order[:count]]
 
 
-def prepare(source: ArrayLike, config: SourceConfig | None = None, num_threads: int = 1) -> PreparedSource | Refusal:
-    """Clean, thin and describe a source (N, 3), mm, in so many threads; 0 for all cores.
+def prepare(
+    source: ArrayLike, config: SourceConfig | None = None, num_threads: int = 1, in_scene: bool = False
+) -> PreparedSource | Refusal:
+    """Clean, thin and describe a source.
+
+    Args:
+        source: (N, 3), mm.
+        config: how it is cleaned and thinned.
+        num_threads: 0 for all cores.
+        in_scene: all points are fitted, since few of them may be bone; else `config.fitted_points` of them at most.
 
     Returns:
         The prepared source, or why there is too little of it.
@@ -93,7 +106,47 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None, num_threads: 
     points = clouds.finite_points(source)
     if len(points) > config.most_raw_points:
         points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
-    points, found = _looked_up(sampling.distinct(points), config, num_threads)
+    points = sampling.distinct(points)
+    if len(points) > config.fitted_points and not in_scene:
+        return _some_of(points, config, num_threads)
+    points, found = _looked_up(points, config, num_threads)
+    refusal = _too_little(points, config)
+    if refusal is not None:
+        return refusal
+    if found is None:
+        points = points[sampling.thin(points, config.most_points)]
+    return describe(points, config, found, num_threads)
+
+
+def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedSource | Refusal:
+    """`fitted_points` of many points (N, 3), mm, drawn at random; the neighbours among all give their normals.
+
+    Not evenly spread: some stay so near to each other that what near residuals share is seen (`roughness`).
+    """
+    whole = points
+    if len(points) > config.most_points:
+        clean = without_isolated(points, config)
+        whole = clean[sampling.thin(clean, config.most_points)]
+    count = min(config.fitted_points, len(whole))
+    some = whole[np.sort(np.random.default_rng(0).choice(len(whole), count, replace=False))]
+    k = _neighbour_count(len(whole), config)
+    gaps, near = quadrics.nearest(some, max(k, config.companions + 1), cKDTree(whole), num_threads)
+    if len(whole) >= config.dense_points:
+        stays = _has_companions(gaps[:, config.companions], config)
+        some, gaps, near = some[stays], gaps[stays], near[stays]
+    refusal = _too_little(some, config)
+    if refusal is not None:
+        return refusal
+    around = quadrics.nearest(some, _around_count(len(some), config), num_threads=num_threads)[1]
+    return _described(some, around, gaps[:, :k], whole, np.ascontiguousarray(near[:, :k]))
+
+
+def _too_little(points: Array, config: SourceConfig) -> Refusal | None:
+    """Why these points (N, 3), mm, are too few or a line; None where they are neither.
+
+    Raises:
+        InvalidPointCloudError: their extent cannot be that of a piece of a bone in mm.
+    """
     if len(points) < config.fewest_points:
         return Refusal(
             RegistrationStatus.TOO_FEW_POINTS,
@@ -105,9 +158,7 @@ def prepare(source: ArrayLike, config: SourceConfig | None = None, num_threads: 
     width_mm = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(points.T))[1], 0.0)))  # of a line -1e-13 or so
     if width_mm < config.smallest_width_mm:
         return Refusal(RegistrationStatus.DEGENERATE, f"the source is a line: it spreads {width_mm:.1f} mm sideways")
-    if found is None:
-        points = points[sampling.thin(points, config.most_points)]
-    return describe(points, config, found, num_threads)
+    return None
 
 
 def without_isolated(points: Array, config: SourceConfig) -> Array:
@@ -162,10 +213,17 @@ def describe(points: Array, config: SourceConfig, found: Found | None = None, nu
     """
     gaps, around = found or quadrics.nearest(points, _around_count(len(points), config), num_threads=num_threads)
     patches = np.ascontiguousarray(around[:, : _neighbour_count(len(points), config)])
-    normals, flatness_mm, means = fit_planes(points, patches)
-    isolation = np.linalg.norm(points - means, axis=1) / np.maximum(gaps[:, patches.shape[1] - 1], 1e-9)
+    return _described(points, around, gaps[:, : patches.shape[1]], points, patches)
+
+
+def _described(
+    points: Array, around: NDArray[np.int64], gaps: Array, whole: Array, patches: NDArray[np.int64]
+) -> PreparedSource:
+    """Points (N, 3) with what their patches (N, k) of the whole (M, 3), whose points are `gaps` (N, k) away, say."""
+    normals, flatness_mm, means = fit_planes(whole, patches)
+    isolation = np.linalg.norm(points - means, axis=1) / np.maximum(gaps[:, -1], 1e-9)
     order, spacing_mm = _spread_order(points, isolation), float(np.median(gaps[:, 1]))
-    return PreparedSource(points, normals, flatness_mm, around, points, patches, order, spacing_mm)
+    return PreparedSource(points, normals, flatness_mm, around, whole, patches, order, spacing_mm)
 
 
 def _neighbour_count(count: int, config: SourceConfig) -> int:

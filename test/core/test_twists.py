@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import error_twist, motion_jacobians, nees, predicted_rmse_mm
+from gapr_core.geometry.twists import covariance_about, error_twist, motion_jacobians, nees, predicted_rmse_mm
 from gapr_core.metrics import bootstrap, cramer_rao
 from gapr_core.metrics.bootstrap import interval
 
@@ -214,3 +214,14 @@ def test_pairs_of_one_person_do_not_count_as_independent():
     alone, together = interval(values), interval(values, people)
     assert together[1] - together[0] > 4 * (alone[1] - alone[0])
     assert np.isnan(interval([])[0])
+
+
+def test_a_covariance_about_another_centre_predicts_the_same_errors_of_points():
+    rng = np.random.default_rng(5)
+    root, centre, offset = rng.normal(size=(6, 6)), rng.normal(size=3) * 20.0, np.array([7.0, -11.0, 13.0])
+    covariance, points = root @ root.T * np.diag([1.0] * 3 + [1e-2] * 3), rng.normal(size=(40, 3)) * 50.0
+    covariance = 0.5 * (covariance + covariance.T)
+    moved = covariance_about(offset, covariance)
+    for point in points:
+        one, other = (motion_jacobians(point[None], at)[0] for at in (centre, centre + offset))
+        np.testing.assert_allclose(one @ covariance @ one.T, other @ moved @ other.T, rtol=1e-9, atol=1e-9)

@@ -1,6 +1,7 @@
 """The refinement's scales and weights, each against the formula written down a second time."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import tiny
 
 from gapr_core.config import RefinementConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import kernels, refinement
+from gapr_core.registration import fit_kernels, kernels, refinement
 from gapr_core.registration.refinement import Fit
 
 CONFIG = RefinementConfig()
@@ -153,6 +154,37 @@ def test_a_final_evaluation_is_rigid_and_has_the_patches_trust(target, points):
     assert np.allclose(fit.T[:3, :3] @ fit.T[:3, :3].T, np.eye(3), atol=1e-12)
     plain = refinement.evaluate(fit.T, points, target, CONFIG)
     assert fit.weights == pytest.approx(plain.weights * refinement.patch_trust(plain, neighbours, CONFIG))
+
+
+def test_a_point_of_the_whole_is_trusted_as_the_patches_that_it_is_in():
+    """Four points with patches of a whole of eight: the mean over one, two or three patches, 0 in none."""
+    patches = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4], [6, 4, 3]])
+    found = fit_kernels.shared_out(np.array([1.0, 0.5, 0.25, 0.0]), patches, 8)
+    assert found == pytest.approx([1.0, 0.75, 1.75 / 3.0, 0.75 / 3.0, 0.125, 0.0, 0.0, 0.0])
+    fit, neighbours = patched(np.r_[np.full(9, 0.3), np.full(9, -0.3), [1.2, 3.0]], np.ones(20))
+    source = SimpleNamespace(neighbours=neighbours, patches=neighbours + 3, whole=np.zeros((84, 3)))
+    trust = refinement.patch_trust(fit, neighbours, CONFIG)
+    assert refinement.trust_of_whole(fit, source, CONFIG) == pytest.approx(np.r_[[0.0] * 3, trust, 0.0])
+
+
+def test_a_pose_of_some_points_comes_to_rest_with_all_of_them(target, points):
+    """Every third point is fitted: from a pose off its rest, a round with all of them, trusted as their patches."""
+    some = np.arange(0, len(points), 3)
+    alone = np.argsort(((points[some][:, None] - points[None]) ** 2).sum(axis=2), axis=1)[:, :6]
+    own = np.arange(len(some))[:, None]
+    source = SimpleNamespace(is_part=True, points=points[some], whole=points, patches=alone, neighbours=own)
+    off = refinement.refine_fully(se3.exp([0.3, 0.2, -0.1, 0.0, 0.0, 0.01]), source.points, target, CONFIG, own)
+    moved = replace(off, T=se3.exp([0.2, -0.1, 0.1, 0.0, 0.0, 0.005]) @ off.T)
+    found = refinement.rest_on_whole(moved, source, target, CONFIG)
+    limits = np.full(CONFIG.iterations, refinement.tukey_limit(moved.signed_mm, moved.sigma_mm, CONFIG))
+    trust = refinement.trust_of_whole(moved, source, CONFIG)
+    noise = np.full_like(limits, moved.sigma_mm**2)
+    expected = kernels.refine_batch(moved.T[None], points, trust, *target.kernel_view, limits, noise)[0][0]
+    assert found.T == pytest.approx(expected, abs=1e-9) and len(found.signed_mm) == len(some)
+    assert found.whole.T == pytest.approx(found.T, abs=1e-12) and len(found.whole.signed_mm) == len(points)
+    plain = refinement.evaluate(found.T, points, target, CONFIG)
+    assert found.whole.weights == pytest.approx(plain.weights * trust) and found.rests_on is found.whole
+    assert refinement.rest_on_whole(off, SimpleNamespace(is_part=False), target, CONFIG) is off is off.rests_on
 
 
 def test_a_pose_in_the_basin_is_brought_home_and_rests(target, points):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapr_core.config import RefinementConfig, RegistrarConfig, SmoothBiasConfig
+from gapr_core.config import RegistrarConfig, SmoothBiasConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import smooth_bias
 from gapr_core.registration.assessment import Assessment
@@ -66,7 +66,7 @@ def steps(monkeypatch):
 
 
 def corrected(fit, config=CONFIG, covariance=EXACT):
-    return smooth_bias.corrected_fit(fit, covariance, SOURCE, None, config, RefinementConfig())
+    return smooth_bias.corrected_fit(fit, covariance, SOURCE, None, RegistrarConfig(smooth_bias=config))
 
 
 def moved_by(count, T):
@@ -116,6 +116,20 @@ def test_a_move_beyond_the_limit_in_its_covariance_is_not_made(steps, factor, is
     distance = move @ np.linalg.solve(EXACT, move)
     found = corrected(fit, covariance=EXACT * distance / CONFIG.largest_move * factor)
     assert (found is not fit) is is_moved
+
+
+def test_all_points_of_the_source_decide_where_only_some_are_fitted(steps, monkeypatch):
+    """Six of the twelve are fitted: the steps are about the centroid of all, whose trust is in the weights."""
+    equations, some, trusts = steps(9.0, 9.0, 9.0), np.arange(6), []
+    source = SimpleNamespace(points=POINTS[some], neighbours=some[:, None], whole=POINTS)
+    monkeypatch.setattr(smooth_bias, "trust_of_whole", lambda *_: np.linspace(0.0, 1.0, COUNT))
+    monkeypatch.setattr(smooth_bias, "evaluate_trusted", lambda T, *of: trusts.append(of[-1]) or fit_of(T, of[-1]))
+    monkeypatch.setattr(smooth_bias, "evaluate_with_patches", lambda T, points, *_: replace(fit_of(T), moved=points))
+    fit = replace(fit_of(np.eye(4)), moved=POINTS[some], whole=fit_of(np.eye(4)))
+    found = smooth_bias.corrected_fit(fit, EXACT, source, None, RegistrarConfig(smooth_bias=CONFIG))
+    assert found.T == pytest.approx(moved_by(3, np.eye(4)), abs=1e-12) and found.bias_mm == pytest.approx(0.5)
+    assert len(found.moved) == 6 and len(found.whole.moved) == COUNT and found.whole.bias_mm == found.bias_mm
+    assert np.array_equal(found.whole.weights, trusts[-1]) and len(equations.seen) == 3
 
 
 def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps, monkeypatch):

@@ -66,7 +66,7 @@ class NetworkProposer:
         """Distinct poses, best first; none where the source is too small or too large for the network."""
         frame, cloud, features = self.prepare(target)
         try:
-            moving = build_cloud(source.points, frame, self.network.config)
+            moving = build_cloud(source.whole, frame, self.network.config)
         except InvalidPointCloudError:
             return Proposals(np.empty((0, 4, 4)), np.empty(0))
         found = self.match(moving, cloud, features)

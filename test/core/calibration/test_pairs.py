@@ -148,14 +148,16 @@ def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people
     assert names == {"3-1", "3-scene-1", "3-laser-1"}
 
 
-def test_look_alikes_are_long_bones_at_l3_of_all_families_and_thinned_every_other_one_of_another_subject(monkeypatch):
+def test_look_alikes_are_long_bones_of_all_families_and_rib_cages_every_other_one_of_another_subject(monkeypatch):
     monkeypatch.setattr(pairs, "view", lambda seen_as, specimen, seed, around: _NoView(seen_as))
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)
     bones = {bone: [parametric_specimen(bone, number) for number in (0, 1)] for bone in ("femur", "tibia")}
     monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
     pairs.setting_of.cache_clear()
     both = pairs.look_alikes(FOLDER, "train", 3, 36)
-    tasks, others, thinned, cameras = both[:36], both[36:72], both[72:90], both[90:]
+    tasks, others, thinned, cameras, ribs = both[:36], both[36:72], both[72:90], both[90:100], both[100:]
+    assert [(task.family, task.what) for task in ribs] == [("L3", "own"), ("L3", "person")] * 3 + [("L3", "own")]
+    assert {pairs.BONES[task.number // pairs.IN_A_ROW % 4] for task in ribs} == {"thoracic"}
     others = [pairs.draw(task) for task in others]
     drawn = [pairs.draw(task) for task in tasks]
     assert [each.what for each in drawn + others] == ["own", "person"] * 36
@@ -167,7 +169,7 @@ def test_look_alikes_are_long_bones_at_l3_of_all_families_and_thinned_every_othe
     assert {each.family for each in others[::2]} == {each.family for each in others[1::2]} == known
     kinds = {pairs.setting_of(FOLDER, "train", task.seed, task.number // pairs.IN_A_ROW).whole.bone for task in tasks}
     assert kinds == {"femur", "tibia"} and {task.seed for task in tasks} == {503}
-    assert len(set(both)) == 100 and not {task.number for task in thinned + cameras} & {task.number for task in tasks}
+    assert len(set(both)) == 107 and not {task.number for task in thinned + cameras} & {task.number for task in tasks}
     assert all(len(each.people) == 2 for each in drawn[1::2])
     assert collect._name(tasks[1]) == "503-L3-person-1"
 
@@ -181,7 +183,7 @@ def test_look_alikes_are_of_subjects_where_there_are_any(monkeypatch):
     monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): bones | {bone: [] for bone in ("pelvis", "thoracic")}})
     pairs.setting_of.cache_clear()
     subjects = {f"parametric_{number}" for number in (0, 2, 4)}
-    alike = [pairs.draw(task).people for task in pairs.look_alikes(FOLDER, "train", 3, 40)]
+    alike = [pairs.draw(task).people for task in pairs.look_alikes(FOLDER, "train", 3, 40)[:112]]
     assert {person for people in alike for person in people} == subjects
     any_bone = [pairs.draw(Task(FOLDER, "train", 3, number, "L3", "person")).people for number in range(8)]
     assert {person for people in any_bone for person in people} > subjects

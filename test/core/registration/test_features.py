@@ -67,8 +67,16 @@ def test_a_size_within_the_sensors_own_error_speaks_less_against_the_bone(bone, 
     assert plain > 2.5 > 2.0 > sound
 
 
+def test_all_points_that_a_pose_rests_on_say_how_large_the_source_is(bone, end):
+    whole = fit_of(end, bone)
+    some = {name: getattr(whole, name)[::5] for name in ("signed_mm", "weights", "gradients", "elements", "moved")}
+    settings = CONFIG.covariance, CONFIG.scale
+    assert scale_of(replace(whole, **some, whole=whole), *settings) == scale_of(whole, *settings)
+    assert scale_of(replace(whole, **some), *settings) != scale_of(whole, *settings)
+
+
 def test_without_inliers_nothing_is_known_of_the_scale():
-    nothing = SimpleNamespace(weights=np.zeros(9))
+    nothing = SimpleNamespace(weights=np.zeros(9), rests_on=SimpleNamespace(weights=np.zeros(9)))
     assert scale_of(nothing, CONFIG.covariance, CONFIG.scale) == (0.0, 1.0)
 
 

@@ -24,12 +24,13 @@ def scaled(points, size):
 
 
 @pytest.mark.parametrize("size", [0.975, 1.028])
-def test_only_growing_and_shrinking_the_source_refuses_one_of_another_size(registrar, target, seen, size):
-    """`scale_z` is held still: of half a bone it says nothing, here it would refuse as well."""
+def test_growing_and_shrinking_refuses_a_source_of_another_size(registrar, target, seen, size):
+    """Whatever the other rules and the probability say."""
     blind = RegistrarConfig(num_threads=1, rules=RulesConfig(largest_scale_z=100.0))
-    found = Registrar(blind, registrar.proposers).register(scaled(seen, size), target)
-    assert found.status is RegistrationStatus.LOW_CONFIDENCE and found.confidence <= 0.4
-    assert "grown or shrunk by 2.75 %" in found.reason
+    answer = Registrar(blind, registrar.proposers).assess(scaled(seen, size), target)
+    found = checks.unless_grown(replace(answer, refusal=None, probability=0.9), registrar.config)
+    assert found.refusal.status is RegistrationStatus.LOW_CONFIDENCE and found.probability <= 0.4
+    assert "grown or shrunk by 2.75 %" in found.refusal.reason
     assert registrar.register(seen, target).ok
 
 

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import SourceConfig
 from gapr_core.geometry import quadrics, sampling
+from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration import source as sources
 
 CONFIG = SourceConfig(isolated_mm=1.0)
@@ -36,6 +37,42 @@ def test_a_source_that_is_thinned_is_looked_up_afterwards():
     prepared = sources.prepare(cloud(), replace(CONFIG, most_points=500))
     assert len(prepared.points) <= 500
     assert np.array_equal(prepared.around, cKDTree(prepared.points).query(prepared.points, k=36)[1])
+
+
+def test_of_many_points_some_are_fitted_and_all_give_their_normals():
+    points = cloud(isolated=30) + np.where(np.arange(930) < 900, 0.0, 45.0)[:, None] * [0.0, 0.0, 1.0]
+    prepared = sources.prepare(points, replace(CONFIG, fitted_points=600))
+    whole = sampling.distinct(points)
+    assert np.array_equal(prepared.whole, whole) and prepared.is_part and not sources.prepare(points, CONFIG).is_part
+    rows = cKDTree(whole).query(prepared.points)[1]
+    assert np.array_equal(whole[rows], prepared.points) and len(np.unique(rows)) == len(rows)
+    assert 560 < len(rows) < 600 and (prepared.points[:, 2] < 12.0).all()  # isolated ones are gone
+    assert np.array_equal(prepared.patches, cKDTree(whole).query(prepared.points, k=30)[1])
+    assert np.array_equal(prepared.around, cKDTree(prepared.points).query(prepared.points, k=36)[1])
+    normals, flatness_mm, _ = fit_planes(whole, prepared.patches)
+    assert np.array_equal(prepared.normals, normals) and np.array_equal(prepared.flatness_mm, flatness_mm)
+    assert np.array_equal(prepared.order[np.argsort(prepared.order)], np.arange(len(rows)))
+
+
+def test_what_is_fitted_is_drawn_at_random_and_always_the_same():
+    config = replace(CONFIG, fitted_points=300)
+    one, again = (sources.prepare(cloud(), config) for _ in range(2))
+    assert np.array_equal(one.points, again.points) and len(one.points) == 300
+    gaps = cKDTree(one.points).query(one.points, k=2)[0][:, 1]
+    evenly = sources.prepare(cloud(), replace(CONFIG, most_points=300))
+    assert gaps.min() < 0.5 * cKDTree(evenly.points).query(evenly.points, k=2)[0][:, 1].min()
+
+
+def test_of_a_scene_all_points_are_fitted():
+    config = replace(CONFIG, fitted_points=300)
+    assert len(sources.prepare(cloud(), config, in_scene=True).points) == 900
+
+
+def test_a_cloud_of_too_many_points_is_cleaned_and_thinned_before_some_are_drawn():
+    config = replace(CONFIG, most_points=500, fitted_points=200)
+    prepared = sources.prepare(cloud(isolated=30), config)
+    clean = sources.without_isolated(sampling.distinct(cloud(isolated=30)), config)
+    assert np.array_equal(prepared.whole, clean[sampling.thin(clean, 500)]) and len(prepared.points) == 200
 
 
 def test_frames_are_the_principal_axes_and_face_the_viewpoint_where_that_is_known():

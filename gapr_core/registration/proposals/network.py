@@ -95,7 +95,7 @@ class NetworkProposer:
         return correspondences_mm(output.matches, source, target)
 
     def bone(self, source: PreparedSource, target: PreparedTarget) -> Array:
-        """(N,) the probability of every source point to be bone, as the head says; 1 without a head.
+        """(N,) the probability of every fitted source point to be bone, as the head says; 1 without a head.
 
         Raises:
             InvalidPointCloudError: the source is too small or too large for the network.
@@ -103,7 +103,7 @@ class NetworkProposer:
         import torch
 
         frame, cloud, features = self.prepare(target)
-        moving, net = build_cloud(source.points, frame, self.network.config), self.network
+        moving, net = build_cloud(source.whole, frame, self.network.config), self.network
         there, still = moving.to(self._device), cloud.to(self._device)
         with torch.inference_mode():
             own = net.backbone(there)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gapr_core.config import SourceConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.model import weights
@@ -53,6 +54,14 @@ def test_moving_the_source_moves_every_proposal(toy, pair):
     still, after = (one.propose(s, pair[1], np.random.default_rng(0)) for s in (pair[0], moved))
     shift, turn = se3.pose_error(after.poses[0] @ T, still.poses[0], pair[0].points)
     assert shift < 0.05 and turn < 0.05
+
+
+def test_the_network_sees_all_points_of_which_some_are_fitted(toy, pair):
+    one, all_points = proposer(toy), pair[0].points
+    part = sources.prepare(all_points, SourceConfig(fitted_points=400))
+    assert part.is_part and len(part.points) <= 400
+    found, expected = (one.propose(each, pair[1], np.random.default_rng(0)) for each in (part, pair[0]))
+    assert np.array_equal(found.poses, expected.poses)
 
 
 def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):

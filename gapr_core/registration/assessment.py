@@ -89,9 +89,9 @@ class Assessment:
     @property
     def residuals(self) -> Residuals:
         """Of every source point under the best pose."""
-        inlier = self.fit.weights > 0.0
+        fit, inlier = self.fit.rests_on, self.fit.rests_on.weights > 0.0
         if self.seen is None or self.members is None:
-            return Residuals(self.source.points, self.fit.signed_mm, inlier)
+            return Residuals(self.source.points if fit is self.fit else self.source.whole, fit.signed_mm, inlier)
         distance_mm = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
         counts = np.zeros(len(self.members), dtype=bool)
         counts[self.members] = inlier

@@ -93,7 +93,8 @@ def _patches(target: PreparedTarget, config: GuidanceConfig) -> Patches:
 
 def _unseen(patches: Patches, assessment: Assessment, config: GuidanceConfig) -> Patches:
     """Those of which the source shows less than half."""
-    seen = assessment.fit.moved[assessment.fit.weights > 0.0]
+    fit = assessment.fit.rests_on
+    seen = fit.moved[fit.weights > 0.0]
     if not len(seen):
         return patches
     surface = assessment.target.elements[:, :3]  # where a sensor with a stand-off sees the bone

@@ -100,6 +100,15 @@ def test_residuals_are_those_of_the_source_with_its_inliers(plane):
     assert found.inlier.tolist() == [True, True, False, False]
 
 
+def test_residuals_of_a_source_of_which_some_points_are_fitted_are_those_of_all(plane):
+    whole = made(plane)
+    part = replace(whole.fit, signed_mm=np.array([9.0]), weights=np.zeros(1), whole=whole.fit)
+    source = SimpleNamespace(points=POINTS[:1], whole=POINTS)
+    found = replace(whole, fit=part, source=source).residuals
+    assert np.array_equal(found.points, POINTS) and found.inlier.tolist() == [True, True, False, False]
+    assert np.array_equal(found.distance_mm, [0.5, 0.2, -0.1, np.nan], equal_nan=True)
+
+
 def test_residuals_of_a_scene_are_those_of_the_whole_cloud_and_inliers_those_of_the_part(plane):
     rng = np.random.default_rng(1)
     cloud = np.column_stack([rng.uniform(-8.0, 8.0, (6, 2)), [0.1, -0.3, 0.7, 1.5, 200.0, 0.2]])

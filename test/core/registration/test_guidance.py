@@ -125,6 +125,12 @@ def test_what_the_rivals_leave_open_counts_by_their_probability(distal):
         assert found.now_mm - patch.gain_mm == pytest.approx(np.sqrt(patch.tre95_mm**2 + left))
 
 
+def test_what_points_that_are_not_fitted_show_is_seen_too(distal):
+    everywhere = replace(distal.fit, moved=distal.target.points, weights=np.ones(len(distal.target.points)))
+    assert guide(distal, CONFIG) is not None
+    assert guide(replace(distal, fit=replace(distal.fit, whole=everywhere)), CONFIG) is None
+
+
 def test_a_sensor_that_stands_off_has_seen_the_bone_under_it(distal):
     """Everything was seen, 8 mm outside: with the stand-off there is nothing left to look at."""
     target, far_mm = distal.target, 8.0

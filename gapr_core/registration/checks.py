@@ -60,7 +60,7 @@ def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: b
 def full_image_margin(assessment: Assessment, config: RegistrarConfig, register: Register) -> float:
     """As `mirror.image_margin`, with the mirror image of the source registered in full; infinite without a pose."""
     a = assessment
-    flipped = sources.prepare(a.source.points * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
+    flipped = sources.prepare(a.source.whole * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
     image = None if isinstance(flipped, Refusal) else register(flipped, a.target)
     if image is None:
         return np.inf

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.config import SensorConfig
+from gapr_core.config import SensorConfig, SourceConfig
 from gapr_core.data.parametric import make_bone
-from gapr_core.registration import mirror
+from gapr_core.registration import checks, mirror
 from gapr_core.registration import source as sources
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.results import RegistrationStatus
@@ -181,3 +181,12 @@ def test_nothing_is_registered_mirrored_where_the_image_on_the_bone_fits_better_
     monkeypatch.setattr(mirror, "image_margin", lambda *given: -1.0)
     result = registrar.register(seen(femur, 400), registrar.prepare(femur))
     assert "mirror image" in result.reason and len(asked) == 1
+
+
+def test_all_points_of_a_source_are_registered_mirrored(pelvis):
+    source = sources.prepare(seen(pelvis), SourceConfig(fitted_points=500))
+    asked = []
+    answer = SimpleNamespace(source=source, target=None)
+    found = checks.full_image_margin(answer, CONFIG, lambda flipped, target: asked.append(flipped.whole))
+    flipped = source.whole * [1.0, 1.0, -1.0]
+    assert found == np.inf and np.array_equal(np.sort(asked[0], axis=0), np.sort(flipped, axis=0))

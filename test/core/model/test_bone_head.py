@@ -94,8 +94,8 @@ def test_the_shipped_weights_are_those_of_the_stage_that_their_card_names():
     """No laser and no structured light: nobody but those who judge has seen them."""
     network, card = weights.load(SHIPPED)
     assert network.config.bone_head == "mlp" and not network.config.bone_scores
-    assert card["step"] == 10_500 and card["run"]["trained"] == "all" and card["run"]["pairs"] == 84_000
-    config = TrainConfig.from_yaml(ROOT / "config/train_sensors.yaml")
+    assert card["step"] == 4500 and card["run"]["trained"] == "all" and card["run"]["pairs"] == 36_000
+    config = TrainConfig.from_yaml(ROOT / "config/train_sweeps.yaml")
     assert card["run"]["mix"] == dict(config.mix) and not {"laser", "structured-light"} & set(config.mix)
 
 

@@ -89,12 +89,13 @@ class Assessment:
     @property
     def residuals(self) -> Residuals:
         """Of every source point under the best pose."""
-        fit, inlier = self.fit.rests_on, self.fit.rests_on.weights > 0.0
         if self.seen is None or self.members is None:
-            return Residuals(self.source.points if fit is self.fit else self.source.whole, fit.signed_mm, inlier)
+            fit = self.fit.rests_on
+            points = self.source.points if fit is self.fit else self.source.whole
+            return Residuals(points, fit.signed_mm, fit.weights > 0.0)
         distance_mm = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
         counts = np.zeros(len(self.members), dtype=bool)
-        counts[self.members] = inlier
+        counts[self.members] = self.fit.weights > 0.0
         return Residuals(self.seen.points, distance_mm, counts)
 
     def is_sure(self, limit: float) -> bool:

@@ -48,7 +48,8 @@ def test_a_pelvis_is_accepted_and_a_flipped_one_is_not(registrar, target, pelvis
 
 
 def test_nothing_but_this_rule_refuses_the_flipped_pelvis(target, pelvis):
-    without = replace(CONFIG, rules=replace(CONFIG.rules, mirrored_better=10.0))
+    """No other rule; the probability is held still."""
+    without = replace(CONFIG, rules=replace(CONFIG.rules, mirrored_better=10.0), min_confidence=0.0)
     assert Registrar(without).register(seen(pelvis) * FLIP, target).ok
 
 

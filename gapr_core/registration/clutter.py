@@ -7,6 +7,7 @@ scale of the noise.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -75,9 +76,9 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) 
     return Scene(source, image, viewpoint, [])
 
 
-def with_regions(scene: Scene, config: ClutterConfig, number: int) -> Scene:
-    """The same scene with the regions of round `number`, 0 the first; no region comes twice."""
-    return replace(scene, regions=regions.regions(scene.source, config, number))
+def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:
+    """The same scene with the regions of one round after the other; no region comes twice."""
+    return (replace(scene, regions=found) for found in regions.rounds(scene.source, config))
 
 
 def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:

@@ -248,9 +248,8 @@ class Registrar:
     ) -> Assessment | None:
         """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
         config, settings, threads = self.config, self.config.clutter, self.config.num_threads
-        scene, assessment = clutter.scene_from(source, viewpoint, settings), None
-        for number in range(settings.rounds):
-            scene = clutter.with_regions(scene, settings, number)
+        seen, assessment = clutter.scene_from(source, viewpoint, settings), None
+        for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
             pool = clutter.propose(scene, target, poses, settings, threads)
             clock.lap("propose")
             if not len(pool.poses):
@@ -261,7 +260,7 @@ class Registrar:
             part = explained.refine(poses[0], scene, target, config)
             clock.lap("refine")
             assessment = explained.assess(part, candidates, scene, target, self.scene_calibration, config)
-            assessment = replace(assessment, proposer=clutter.NAME, rounds=number + 1)
+            assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
             clock.lap("assess")
             if assessment.is_sure(max(config.sure, config.min_confidence)):
                 break

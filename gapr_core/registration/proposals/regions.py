@@ -1,15 +1,21 @@
 """Hypotheses from small regions: where most of a cloud is not bone, a part of it may be nothing else.
 
-Balls of several sizes around points that are spread over the cloud are sources of their own for the exhaustive search.
-A ball on bone proposes the pose; which ball that is, the whole cloud decides later.
+The cloud is cut into segments where its surface bends or steps: at the rim of a wound, at the edge of an instrument
+(smoothness constraint: Rabbani, van den Heuvel, Vosselman 2006). The parts of a segment within balls of several sizes
+are sources of their own for the exhaustive search. One on bone proposes the pose; which one that is, the whole cloud
+decides later.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, SearchConfig
@@ -20,8 +26,10 @@ from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 SPREAD_OUT = 64  # points of a region that are spread evenly, before the others in the order of the whole cloud
+TRIES = 3  # seeds for each region that is asked for, since some grow too small a region, or one that another grew
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,30 +45,69 @@ class Region:
     centre: Array
 
 
-def regions(source: PreparedSource, config: ClutterConfig, number: int = 0) -> list[Region]:
-    """Balls of every size of the config around seeds that are spread over the source; others for every `number`."""
-    tree = cKDTree(source.points)
-    found = []
-    for radius_mm, count in zip(config.radii_mm, config.seeds, strict=True):
-        for seed in _seeds(source, count * (number + 1))[count * number :]:
-            members = np.array(tree.query_ball_point(source.points[seed], radius_mm))
-            if len(members) >= config.region_fewest_points:
-                found.append(Region(_part(source, np.sort(members)), source.points[seed]))
-    return found
+def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Region]]:
+    """The regions of one round after the other, at most `config.seeds` of each radius; none comes twice.
+
+    Args:
+        source: normals towards the camera.
+        config: radii, how many regions, and where a surface ends.
+    """
+    joined, sizes = smooth_neighbours(source, config), list(zip(config.radii_mm, config.seeds, strict=True))
+    growing = [(_grown(source, joined, radius_mm, count, config), count) for radius_mm, count in sizes]
+    for _ in range(config.rounds):
+        yield [region for grown, count in growing for region in islice(grown, count)]
 
 
-def _seeds(source: PreparedSource, count: int) -> NDArray[np.int64]:
-    start = int(np.linalg.norm(source.points - source.points.mean(axis=0), axis=1).argmin())
-    return sampling.farthest_points(source.points, count, start)
+def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_array:
+    """(N, N) adjacency: neighbours whose normals agree and of which each lies near the other's tangent plane."""
+    near = source.neighbours[:, 1 : config.smooth_neighbours + 1]
+    one, other = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
+    apart = source.points[other] - source.points[one]
+    agree = np.einsum("ni,ni->n", source.normals[one], source.normals[other])
+    off = [np.abs(np.einsum("ni,ni->n", source.normals[of], apart)) for of in (one, other)]
+    flat = np.maximum(*off) < np.sin(np.radians(config.step_deg)) * np.linalg.norm(apart, axis=1)
+    joined = flat & (agree > np.cos(np.radians(config.bend_deg)))
+    return csr_array((np.ones(int(joined.sum())), (one[joined], other[joined])), shape=2 * (len(near),))
 
 
-def _part(source: PreparedSource, members: NDArray[np.int64]) -> PreparedSource:
+def _grown(
+    source: PreparedSource, joined: csr_array, radius_mm: float, count: int, config: ClutterConfig
+) -> Iterator[Region]:
+    """Of every seed the part of its segment within a ball, where it is large enough and new."""
+    tree, known = cKDTree(source.points), set()
+    for seed in _seeds(source, joined, TRIES * count * config.rounds, config.region_fewest_points):
+        ball = np.sort(tree.query_ball_point(source.points[seed], radius_mm))
+        if len(ball) < config.region_fewest_points:
+            continue
+        _, segment = connected_components(joined[ball][:, ball], directed=False)
+        members = ball[segment == segment[np.searchsorted(ball, seed)]]
+        if len(members) >= config.region_fewest_points and members.tobytes() not in known:
+            known.add(members.tobytes())
+            yield Region(_part(source, members), source.points[seed])
+
+
+def _seeds(source: PreparedSource, joined: csr_array, count: int, fewest: int) -> Indices:
+    """The middle of every segment, the largest first; then points that are spread over the source."""
+    _, segment = connected_components(joined, directed=False)
+    sizes = np.bincount(segment)
+    large = [k for k in np.argsort(-sizes, kind="stable") if sizes[k] >= fewest]
+    middles = [_middle(source.points, np.flatnonzero(segment == k)) for k in large]
+    everywhere = np.arange(len(source.points))
+    spread = sampling.farthest_points(source.points, count, _middle(source.points, everywhere))
+    return np.concatenate([np.array(middles, dtype=np.int64), spread])
+
+
+def _middle(points: Array, some: Indices) -> int:
+    """Of some of the points the one nearest to their mean."""
+    return int(some[np.linalg.norm(points[some] - points[some].mean(axis=0), axis=1).argmin()])
+
+
+def _part(source: PreparedSource, members: Indices) -> PreparedSource:
     """Some of the points of a source, with what is known of them."""
     rank = np.empty(len(source.points), dtype=np.int64)
     rank[source.order] = np.arange(len(source.points))
     points = source.points[members]
-    start = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
-    first = sampling.farthest_points(points, SPREAD_OUT, start)
+    first = sampling.farthest_points(points, SPREAD_OUT, _middle(points, np.arange(len(points))))
     rest = np.setdiff1d(np.arange(len(points)), first)
     order = np.concatenate([first, rest[np.argsort(rank[members[rest]])]])
     return replace(

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, SearchConfig
 from gapr_core.geometry import sampling
+from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.source import PreparedSource
@@ -49,7 +50,7 @@ def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Regio
     """The regions of one round after the other, at most `config.seeds` of each radius; none comes twice.
 
     Args:
-        source: normals towards the camera.
+        source: the scene.
         config: radii, how many regions, and where a surface ends.
     """
     joined, sizes = smooth_neighbours(source, config), list(zip(config.radii_mm, config.seeds, strict=True))
@@ -59,13 +60,17 @@ def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Regio
 
 
 def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_array:
-    """(N, N) adjacency: neighbours whose normals agree and of which each lies near the other's tangent plane."""
-    near = source.neighbours[:, 1 : config.smooth_neighbours + 1]
+    """(N, N) adjacency: neighbours whose normals agree and of which each lies near the other's tangent plane.
+
+    The planes are those of so few neighbours that a fold is one: the normals of the source turn more slowly.
+    """
+    near = np.ascontiguousarray(source.neighbours[:, : config.smooth_neighbours])
+    normals, _, _ = fit_planes(source.points, near)
     one, other = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     apart = source.points[other] - source.points[one]
-    agree = np.einsum("ni,ni->n", source.normals[one], source.normals[other])
-    off = [np.abs(np.einsum("ni,ni->n", source.normals[of], apart)) for of in (one, other)]
-    flat = np.maximum(*off) < np.sin(np.radians(config.step_deg)) * np.linalg.norm(apart, axis=1)
+    agree = np.abs(np.einsum("ni,ni->n", normals[one], normals[other]))
+    off = [np.abs(np.einsum("ni,ni->n", normals[of], apart)) for of in (one, other)]
+    flat = np.maximum(*off) <= np.sin(np.radians(config.step_deg)) * np.linalg.norm(apart, axis=1)
     joined = flat & (agree > np.cos(np.radians(config.bend_deg)))
     return csr_array((np.ones(int(joined.sum())), (one[joined], other[joined])), shape=2 * (len(near),))
 

@@ -199,7 +199,8 @@ def test_a_network_without_a_head_begins_with_weights_that_have_one(settings, an
 
 
 @pytest.mark.parametrize(
-    "name", ["train", "train_longer", "train_uncentred", "train_bone_head", "train_sensors", "train_sweeps"]
+    "name",
+    ["train", "train_longer", "train_uncentred", "train_bone_head", "train_sensors", "train_sweeps", "train_probes"],
 )
 def test_what_the_documentation_begins_with_the_shipped_weights_can_begin_with_them(name):
     shipped = REPOSITORY / "gapr_core/weights/gapr_net.safetensors"

@@ -49,14 +49,21 @@ class Region:
 def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Region]]:
     """The regions of one round after the other, at most `config.seeds` of each radius; none comes twice.
 
+    There is a first round, even an empty one; they end where nothing more grows.
+
     Args:
         source: the scene.
         config: radii, how many regions, and where a surface ends.
     """
-    joined, sizes = smooth_neighbours(source, config), list(zip(config.radii_mm, config.seeds, strict=True))
-    growing = [(_grown(source, joined, radius_mm, count, config), count) for radius_mm, count in sizes]
-    for _ in range(config.rounds):
-        yield [region for grown, count in growing for region in islice(grown, count)]
+    joined, tree = smooth_neighbours(source, config), cKDTree(source.points)
+    seeds = _seeds(source, joined, TRIES * max(config.seeds) * config.rounds, config.region_fewest_points)
+    growing = [_grown(source, tree, joined, seeds, radius_mm, config) for radius_mm in config.radii_mm]
+    for number in range(config.rounds):
+        sizes = zip(growing, config.seeds, strict=True)
+        found = [region for grown, count in sizes for region in islice(grown, count)]
+        if number and not found:
+            return
+        yield found
 
 
 def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_array:
@@ -76,11 +83,11 @@ def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_arra
 
 
 def _grown(
-    source: PreparedSource, joined: csr_array, radius_mm: float, count: int, config: ClutterConfig
+    source: PreparedSource, tree: cKDTree, joined: csr_array, seeds: Indices, radius_mm: float, config: ClutterConfig
 ) -> Iterator[Region]:
     """Of every seed the part of its segment within a ball, where it is large enough and new."""
-    tree, known = cKDTree(source.points), set()
-    for seed in _seeds(source, joined, TRIES * count * config.rounds, config.region_fewest_points):
+    known = set()
+    for seed in seeds:
         ball = np.sort(tree.query_ball_point(source.points[seed], radius_mm))
         if len(ball) < config.region_fewest_points:
             continue

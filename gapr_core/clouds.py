@@ -51,7 +51,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         check_extent(surface.extent_mm, "mm", name, "in its header")
         return surface
     scale = _mm_per_unit(surface, units, name)
-    surface = Surface(surface.points * scale, surface.faces, surface.normals)
+    camera = None if surface.camera is None else surface.camera * scale
+    surface = Surface(surface.points * scale, surface.faces, surface.normals, camera)
     if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
         _warn_of_several_bones(surface, name)
     return surface
@@ -133,7 +134,7 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
     if surface.faces is not None:
         raise InvalidPointCloudError("finite vertices", f"{(~finite).sum()} that are not in {name}", "repair the mesh")
     normals = None if surface.normals is None else surface.normals[finite]
-    return Surface(surface.points[finite], None, normals)
+    return Surface(surface.points[finite], None, normals, surface.camera)
 
 
 def _warn_of_several_bones(surface: Surface, name: str) -> None:

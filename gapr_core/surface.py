@@ -21,11 +21,13 @@ class Surface:
         points: (N, 3) float64, mm; the vertices when there are faces.
         faces: (F, 3) int64 vertex indices, or None for a cloud.
         normals: (N, 3) float64 unit normals as read, or None.
+        camera: (3,) float64, mm: where a camera saw a cloud from, if its pixels say (`geometry.pinhole`), or None.
     """
 
     points: Array
     faces: NDArray[np.int64] | None = None
     normals: Array | None = None
+    camera: Array | None = None
 
     @classmethod
     def from_open3d(cls, mesh: Any) -> Surface:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 NOT_OURS = ("use_sim_time", "start_type_description_service")  # declared by rclpy itself
 LARGE = 1e9  # end of a range that has none: rclpy wants one
 ROS_TYPES = {float: "double", int: "integer", str: "string", bool: "bool", tuple: "double_array"}
+NO_FRAME = ("auto", "none")  # what `viewpoint` can be besides a place
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
 Triple = tuple[float, float, float]
 
@@ -65,8 +66,8 @@ class NodeParameters(Settings):
     crop_max: Triple = setting((0.0, 0.0, 0.0), "its highest corner", unit="m")
     crop_to_track: float = setting(0.0, "after a good pose, points farther from the bone there are left out; 0: off",
                                    unit="m", low=0.0)  # fmt: skip
-    viewpoint: str = setting("none", "where the camera is: none (not known), origin (of the cloud's frame), or a frame",
-                             live=False)  # fmt: skip
+    viewpoint: str = setting("auto", "where the camera is: auto (organised clouds show it), none (not known), origin "
+                             "(of the cloud's frame), or a frame", live=False)  # fmt: skip
     sensor: str = setting("unknown", "what measures the clouds; says what errors to expect",
                           choices=SENSOR_KINDS, live=False)  # fmt: skip
     standoff: float = setting(0.0, "how far outside of the bone the points lie; 0: what is usual for the sensor",
@@ -142,7 +143,7 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
     if parameters.accumulate > 1 and not parameters.output_frame:
         sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
-    if parameters.viewpoint != "none" and parameters.accumulate > 1:
+    if parameters.viewpoint not in NO_FRAME and parameters.accumulate > 1:
         sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
     if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
         sentences.append(f"assess_every is not used: {why}")
@@ -158,7 +159,7 @@ def why_all_assessed(parameters: NodeParameters) -> str:
         return "track is off, so there is no pose to follow"
     if parameters.accumulate > 1:
         return "a cloud that is registered with others says little alone"
-    if parameters.viewpoint != "none":
+    if parameters.viewpoint not in NO_FRAME:
         return "with a viewpoint nobody knows which part of a cloud is bone before it is assessed"
     return ""
 

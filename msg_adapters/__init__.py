@@ -3,7 +3,7 @@
 from msg_adapters import point_cloud, pose_array
 from msg_adapters.errors import InvalidMessageError
 from msg_adapters.inputs import Input
-from msg_adapters.point_cloud import cloud_to_field, cloud_to_xyz, xyz_to_cloud
+from msg_adapters.point_cloud import cloud_to_field, cloud_to_grid, cloud_to_xyz, xyz_to_cloud
 from msg_adapters.pose import (
     covariance_to_list,
     list_to_covariance,
@@ -23,6 +23,7 @@ __all__ = [
     "Input",
     "InvalidMessageError",
     "cloud_to_field",
+    "cloud_to_grid",
     "cloud_to_xyz",
     "covariance_to_list",
     "list_to_covariance",

@@ -17,8 +17,11 @@ class Input(NamedTuple):
         points: (N, 3) float64 points of a message, in its own unit and frame; rows that are not finite are dropped.
             Raises `InvalidMessageError` for a message that contradicts itself.
         count: how many points the message has, usable or not.
+        grid: (H, W, 3) float64 points of a message that is an image, row by row, usable or not; None for others.
+            Raises as `points` does.
     """
 
     message: type
     points: Callable[[Any], NDArray[np.float64]]
     count: Callable[[Any], int]
+    grid: Callable[[Any], NDArray[np.float64] | None] = lambda message: None

@@ -61,6 +61,20 @@ def cloud_to_xyz(
     return xyz if keep.all() else xyz[keep]
 
 
+def cloud_to_grid(cloud: PointCloud2) -> NDArray[np.float64] | None:
+    """The x, y, z of every pixel of an organised cloud, in the unit of the message.
+
+    Returns:
+        (H, W, 3) new array, points that are not finite among them; None for a cloud of one row or one column.
+
+    Raises:
+        InvalidMessageError: for a layout that contradicts itself or has no float x, y, z.
+    """
+    if min(cloud.height, cloud.width) < 2:
+        return None
+    return cloud_to_xyz(cloud, keep_nan=True).reshape(cloud.height, cloud.width, 3)
+
+
 def cloud_to_field(cloud: PointCloud2, name: str) -> NDArray[Any]:
     """(N,) one more field of every point, row by row, in its own dtype: `distance`, `intensity`.
 
@@ -183,4 +197,6 @@ def _describe(dtype: np.dtype[Any]) -> list[PointField]:
     ]
 
 
-INPUT = Input(PointCloud2, partial(cloud_to_xyz, drop_zeros=True), lambda cloud: cloud.width * cloud.height)
+INPUT = Input(
+    PointCloud2, partial(cloud_to_xyz, drop_zeros=True), lambda cloud: cloud.width * cloud.height, cloud_to_grid
+)

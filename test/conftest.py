@@ -4,6 +4,7 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -16,6 +17,17 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a message field of the wrong type
 domain.claim()
 settings.register_profile("the same every time", derandomize=True)  # `make fuzz` draws other cases
 settings.load_profile("the same every time")
+
+
+@pytest.fixture
+def image():
+    """(60, 80, 3) mm: a wavy surface as a pinhole camera sees it from (100, 50, -400); NaN where it saw nothing."""
+    row, column = np.mgrid[:60, :80]
+    x, y = (column - 36.0) / 400.0, (row - 33.0) / 400.0
+    depth = 450.0 + 20.0 * np.sin(40.0 * x) * np.cos(30.0 * y)
+    grid = np.stack([x * depth, y * depth, depth], axis=2) + [100.0, 50.0, -400.0]
+    grid[::7, ::5] = np.nan
+    return grid
 
 
 @pytest.fixture(autouse=True, scope="session")

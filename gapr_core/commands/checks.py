@@ -149,7 +149,7 @@ def warn_of_axes(args: Namespace) -> None:
         name = args.landmarks[0].name
         how = "save it from 3D Slicer, as PLY or markups, which say their axes"
         log.warning("in LPS: %s. If %s is RAS, %s", name, args.source.name, how)
-    if args.viewpoint and args.source.is_file() and axes.stated(args.source) == "ras":
+    if not isinstance(args.viewpoint, str) and args.source.is_file() and axes.stated(args.source) == "ras":
         log.warning("%s is turned from RAS to LPS: --viewpoint is taken to be in LPS", args.source.name)
 
 

@@ -57,7 +57,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
     parser.add_argument("--reference", type=int, metavar="TOOL",
                         help="the tool on the bone, from 0: the source is in its frame, not the tracker's")  # fmt: skip
-    parser.add_argument("--viewpoint", type=_point, help="X,Y,Z of the camera in the source's frame, mm")
+    parser.add_argument("--viewpoint", type=_place, default="auto", metavar="X,Y,Z|auto|none",
+                        help="of the camera in the source's frame, mm; auto: organised clouds show it")  # fmt: skip
     parser.add_argument(
         "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
     )
@@ -78,6 +79,10 @@ def _point(text: str) -> tuple[float, float, float]:
     except ValueError as error:
         raise ArgumentTypeError(f"three numbers X,Y,Z, not {text!r}") from error
     return x, y, z
+
+
+def _place(text: str) -> tuple[float, float, float] | str:
+    return text if text in ("auto", "none") else _point(text)
 
 
 def _span(text: str) -> tuple[int | None, int | None]:
@@ -115,6 +120,7 @@ def run(args: Namespace) -> int:
     checks.warn_of_units(args)
     checks.warn_of_axes(args)
     checks.warn_of_landmarks(args, whole.points, target.points)
+    hints |= _seen(args, method, whole)
     result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
@@ -150,11 +156,20 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
         start = planning.start_of(*args.landmarks)
         say(f"landmarks lie {start.rms_mm:.2f} mm apart (rms) at the start")
         hints["initial"] = start.T_target_source
-    if args.viewpoint:
+    if not isinstance(args.viewpoint, str):
         hints["viewpoint"] = np.array(args.viewpoint)
     for name in hints.keys() - signature(method.register).parameters.keys():
         raise ConfigError(f"a method that takes {name}", args.method, "use --method gapr, or leave the option out")
     return hints
+
+
+def _seen(args: Namespace, method: Any, source: Surface) -> dict[str, Any]:
+    """Where the camera was, if the source shows it, nobody says otherwise, and the method wants to know."""
+    if args.viewpoint != "auto" or source.camera is None or "viewpoint" not in signature(method.register).parameters:
+        return {}
+    x, y, z = source.camera
+    say(f"{args.source.name} is an image seen from {x:.0f},{y:.0f},{z:.0f} mm (--viewpoint none: take all for bone)")
+    return {"viewpoint": source.camera}
 
 
 def _errors(plan: Any, result: RegistrationResult) -> list[TargetError]:

@@ -76,7 +76,8 @@ def check(axes: str) -> None:
 def scaled(surface: Surface, factors: Array) -> Surface:
     """Points and normals times factors (3,) of 1 and -1 that are a rotation."""
     normals = None if surface.normals is None else surface.normals * factors
-    return Surface(surface.points * factors, surface.faces, normals)
+    camera = None if surface.camera is None else surface.camera * factors
+    return Surface(surface.points * factors, surface.faces, normals, camera)
 
 
 def stated(path: Path) -> str | None:

@@ -12,12 +12,15 @@ from rclpy.serialization import deserialize_message
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.options import ReadOptions
+from gapr_core.geometry import pinhole
 from gapr_core.surface import Surface
 from gapr_ros.bags.files import Bag, BagError, open_bag
 from gapr_ros.bags.writing import type_name
 from msg_adapters import INPUTS, Input
 
 log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
 
 UNIT = "m"  # REP-103
 READABLE = {type_name(kind.message()): kind for kind in INPUTS.values()}
@@ -26,7 +29,7 @@ NAME_ONE = "name one with --topic, or topic= in Python"
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """The clouds of one topic, joined, in the unit and the frame of the topic.
+    """The clouds of one topic, joined, in the unit and the frame of the topic; a single one with its camera.
 
     Raises:
         InvalidPointCloudError: a damaged or empty bag, no such topic, one without clouds, or clouds of two frames.
@@ -42,7 +45,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
         raise _unreadable(path, error) from error
     finally:
         bag.reader.close()
-    return Surface(np.vstack(clouds))
+    return Surface(np.vstack([points for points, _ in clouds]), camera=clouds[0][1] if len(clouds) == 1 else None)
 
 
 def _unreadable(path: Path, error: BagError) -> InvalidPointCloudError:
@@ -68,21 +71,21 @@ def _topic(bag: Bag, wanted: str) -> str:
     return wanted or usable[0]
 
 
-def _clouds(bag: Bag, topic: str, options: ReadOptions) -> list[NDArray[np.float64]]:
-    """The points of the clouds that are asked for, all in one frame."""
+def _clouds(bag: Bag, topic: str, options: ReadOptions) -> list[tuple[Array, Array | None]]:
+    """Points and camera of each cloud that is asked for, all in one frame."""
     bag.connections = [connection for connection in bag.connections if connection.topic == topic]
     wanted = range(bag.count)[slice(*options.clouds)]
     if not wanted:
         given = f"{bag.count} of {topic}" + (" and a choice without any" if bag.count else "")
         raise InvalidPointCloudError("clouds", given, "record the topic, or choose others with --clouds")
-    clouds: list[NDArray[np.float64]] = []
+    clouds: list[tuple[Array, Array | None]] = []
     frames: set[str] = set()
     for number, (_, connection, data) in enumerate(bag.messages()):
         if number in wanted:
-            frame, points = _cloud(READABLE[connection.msgtype], data)
-            clouds.append(points)
+            frame, points, camera = _cloud(READABLE[connection.msgtype], data)
+            clouds.append((points, camera))
             frames.add(frame)
-            options.limits.check_counts(sum(map(len, clouds)))
+            options.limits.check_counts(sum(len(points) for points, _ in clouds))
         elif number >= wanted.stop:
             break
     if len(clouds) != len(wanted):
@@ -96,10 +99,11 @@ def _clouds(bag: Bag, topic: str, options: ReadOptions) -> list[NDArray[np.float
     return clouds
 
 
-def _cloud(kind: Input, data: bytes) -> tuple[str, NDArray[np.float64]]:
-    """Frame and finite points of one message."""
+def _cloud(kind: Input, data: bytes) -> tuple[str, Array, Array | None]:
+    """Frame and finite points of one message, and where its camera was if it says."""
     try:
         message: Any = deserialize_message(data, kind.message)
-        return message.header.frame_id.lstrip("/"), kind.points(message)
+        points, grid = kind.points(message), kind.grid(message)
     except Exception as error:  # the middleware raises several kinds
         raise BagError(f"damaged: a message that is no {kind.message.__name__}: {error}") from error
+    return message.header.frame_id.lstrip("/"), points, None if grid is None else pinhole.centre_of(grid)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from gapr_ros.node import wire
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason
@@ -201,12 +202,13 @@ def _level_of_input(now: Snapshot, silent_s: float) -> tuple[bytes, str]:
 
 def _of_cloud(last: Outcome | None) -> dict[str, object]:
     names = ("cloud_stamp", "cloud_frame", "points_in", "points_used", "cloud_age_s", "confidence", "tre_mm",
-             "tre95_mm", "inlier_ratio", "found_by", "exec_ms")  # fmt: skip
+             "tre95_mm", "inlier_ratio", "found_by", "seen_from", "exec_ms")  # fmt: skip
     if last is None:
         return dict.fromkeys(names, "")
     stamp = f"{last.header.stamp.sec}.{last.header.stamp.nanosec:09d}"
+    camera_m = "" if last.seen_from is None else " ".join(f"{x:.3f}" for x in wire.to_metres(last.seen_from))
     values = (stamp, last.cloud_frame, last.points_in, last.points_used, last.age_s, last.confidence_out,
-              last.tre_mm, last.tre95_mm, last.inlier_ratio, last.found_by, last.exec_ms)  # fmt: skip
+              last.tre_mm, last.tre95_mm, last.inlier_ratio, last.found_by, camera_m, last.exec_ms)  # fmt: skip
     return dict(zip(names, values, strict=True))
 
 

@@ -24,9 +24,9 @@ class Following:
     def __init__(self) -> None:
         self._row = 0  # clouds that were followed since the last one that was assessed
 
-    def follow(self, points_mm: Array, frame: str, urgent: bool, now: Situation) -> Array | None:
+    def follow(self, points_mm: Array, frame: str, is_to_be_assessed: bool, now: Situation) -> Array | None:
         """(4, 4) T_frame_model, metres, of a cloud (N, 3), mm, in `frame`; None where it has to be assessed."""
-        pose = None if urgent or not self._may_follow(now) else _followed(points_mm, now)
+        pose = None if is_to_be_assessed or not self._may_follow(now) else _followed(points_mm, now)
         if pose is not None and not continues(now.place, pose, frame, now.model, now.parameters):
             pose = None
         self._row = 0 if pose is None else self._row + 1

@@ -156,7 +156,7 @@ def check_names(parameters: NodeParameters) -> None:
     if not parameters.model_frame:
         raise ConfigError("a model_frame", "an empty one", "give the bone's frame a name, such as femur_preop")
     if not parameters.viewpoint:
-        raise ConfigError("a viewpoint", "an empty one", "write none, origin, or the name of a frame")
+        raise ConfigError("a viewpoint", "an empty one", "write auto, none, origin, or the name of a frame")
     _check_not_the_bones(parameters)
 
 

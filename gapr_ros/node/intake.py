@@ -11,6 +11,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 from gapr_core.clouds import EXTENT_LIMITS_MM, finite_points
+from gapr_core.geometry import pinhole
 from gapr_core.surface import Surface
 from gapr_ros.node import wire
 from gapr_ros.node.refusal import Reason, RefusedError
@@ -78,6 +79,18 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
         check_unit(points, model_extent_mm, parameters.cloud_unit)
     check_spread(points, parameters.cloud_unit)
     return points
+
+
+def seen_from(cloud: Any, parameters: NodeParameters) -> Array | None:
+    """(3,) mm, the cloud's frame: the centre of the camera whose image a single cloud is, where `viewpoint` is auto.
+
+    None where the cloud is no image, or its pixels do not say (`geometry.pinhole.centre_of`).
+    """
+    if parameters.viewpoint != "auto" or parameters.accumulate > 1:
+        return None
+    grid = INPUTS[parameters.cloud_type].grid(cloud)
+    centre = None if grid is None else pinhole.centre_of(grid)
+    return None if centre is None else wire.to_mm(centre, parameters.cloud_unit)
 
 
 def check_together(points_mm: Array, model_extent_mm: float, parameters: NodeParameters) -> None:

@@ -30,10 +30,11 @@ class Outcome:
         followed: (4, 4) T_frame_model, metres, of a cloud that was not assessed; it then has no pose and no reason.
         confidence: of the registration, 0 to 1, whatever was decided later.
         points_in, points_used: of the message; given to registration, those of clouds that are registered with it too.
+        seen_from: (3,) mm, frame of the cloud: where its pixels say that the camera was, if they were asked and say.
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
         tre_mm, tre95_mm, inlier_ratio: of the registration.
         result: its whole answer; None where it was not asked.
-        found_by: how far the registration had to look: track, network or search.
+        found_by: how far the registration had to look: track, network, search, or scene with a viewpoint.
         exec_ms: wall time of the whole way.
     """
 
@@ -48,6 +49,7 @@ class Outcome:
     confidence: float = 0.0
     points_in: int = 0
     points_used: int = 0
+    seen_from: Array | None = None
     age_s: float | None = None
     tre_mm: float | None = None
     tre95_mm: float | None = None

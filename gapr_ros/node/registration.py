@@ -24,7 +24,7 @@ from gapr_ros.node.refusal import OF_STATUS, Reason, RefusedError
 from gapr_ros.node.region import Crop
 from gapr_ros.node.situation import Situation
 from gapr_ros.node.worker import Job
-from gapr_ros.parameters import NodeParameters
+from gapr_ros.parameters import NO_FRAME, NodeParameters
 from msg_adapters import INPUTS
 
 Array = NDArray[np.float64]
@@ -92,8 +92,8 @@ class Registration:
         if now.parameters.accumulate > 1:
             self._late.take(now.parameters.tf_timeout)  # the transform of this cloud has come: so have those of before
             _check_together(points_mm, outcome, now)
-        frame, urgent = outcome.header.frame_id, outcome.job.urgent
-        outcome.followed = self._following.follow(points_mm, frame, urgent, now)
+        is_to_be_assessed = outcome.job.urgent or outcome.seen_from is not None
+        outcome.followed = self._following.follow(points_mm, outcome.header.frame_id, is_to_be_assessed, now)
         if outcome.followed is not None:
             _check_time(time.monotonic() - start, now.parameters)
             return
@@ -111,6 +111,7 @@ class Registration:
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         crops = self._crops(T_frame_cloud, outcome, now)
         points_mm = intake.take_in(cloud, now.model.extent_mm, now.parameters, crops)
+        outcome.seen_from = intake.seen_from(cloud, now.parameters)
         return wire.moved_mm(T_frame_cloud, points_mm)
 
     def _crops(self, T_frame_cloud: Array, outcome: Outcome, now: Situation) -> list[Crop]:
@@ -156,9 +157,11 @@ class Registration:
     def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:
         """(3,) where the camera was, in the frame of the answer; None where it is not known, or not one place."""
         frame = now.parameters.viewpoint
-        if frame == "none" or now.parameters.accumulate > 1:
+        if now.parameters.accumulate > 1 or (frame in NO_FRAME and outcome.seen_from is None):
             return None
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
+        if outcome.seen_from is not None:
+            return wire.moved_mm(T_frame_cloud, outcome.seen_from[None])[0]
         if frame != "origin":
             T_frame_cloud = T_frame_cloud @ se3.inverse(self._lookup(frame, outcome, now))
         return T_frame_cloud[:3, 3] * wire.MM_PER_M
@@ -173,8 +176,8 @@ class Registration:
 
 def needs_frames(parameters: NodeParameters) -> bool:
     """Whether clouds cannot be read without tf2."""
-    has_viewpoint = parameters.viewpoint not in ("none", "origin")
-    return bool(parameters.output_frame or parameters.crop_frame or has_viewpoint)
+    has_frame = parameters.viewpoint not in (*NO_FRAME, "origin")
+    return bool(parameters.output_frame or parameters.crop_frame or has_frame)
 
 
 def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:

@@ -8,12 +8,13 @@ import time
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseArray
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from msg_adapters import InvalidMessageError, cloud_to_field, cloud_to_xyz, xyz_to_cloud
+from msg_adapters import INPUTS, InvalidMessageError, cloud_to_field, cloud_to_grid, cloud_to_xyz, xyz_to_cloud
 
 CODES = {"b": PointField.INT8, "B": PointField.UINT8, "h": PointField.INT16, "H": PointField.UINT16,
          "i": PointField.INT32, "I": PointField.UINT32, "f": PointField.FLOAT32, "d": PointField.FLOAT64}  # fmt: skip
@@ -95,6 +96,14 @@ def test_an_organised_cloud_keeps_its_shape_on_the_wire_and_its_row_order():
     cloud = xyz_to_cloud(points)
     assert (cloud.height, cloud.width, cloud.row_step) == (4, 6, 6 * 12)
     np.testing.assert_array_equal(cloud_to_xyz(cloud), points.reshape(-1, 3))
+
+
+def test_an_organised_cloud_comes_back_as_the_image_it_is_and_no_other_cloud_does(image):
+    np.testing.assert_array_equal(cloud_to_grid(xyz_to_cloud(image)), image)
+    for shape in ((1, -1, 3), (-1, 1, 3), (-1, 3), (0, 0, 3)):
+        assert cloud_to_grid(xyz_to_cloud(image[:0, :0] if shape[0] == 0 else image.reshape(shape))) is None
+    assert INPUTS["PointCloud2"].grid(xyz_to_cloud(image)).shape == (60, 80, 3)
+    assert INPUTS["PoseArray"].grid(PoseArray()) is None
 
 
 def test_points_that_are_not_finite_are_dropped_or_kept_on_request():

@@ -144,6 +144,41 @@ def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkey
     assert register("--viewpoint 1,2,3", source="lps.ply") == 0 and "--viewpoint" not in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("option", "expected_mm"),
+    [("", (100.0, 50.0, -400.0)), ("--viewpoint none", None), ("--viewpoint 1,2,3", (1.0, 2.0, 3.0))],
+)
+def test_an_organised_cloud_says_where_its_camera_was(folder, image, monkeypatch, capsys, option, expected_mm):
+    """Here in metres, as cameras write; a viewpoint that is given is one in mm."""
+    seen = SimpleNamespace(at=None)
+
+    def look(self, source, target, viewpoint=None):
+        seen.at = viewpoint
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
+
+    monkeypatch.setattr(Known, "register", look)
+    write_pcd("camera.pcd", image / 1000.0)
+    assert register(f"--source-units m {option}", source="camera.pcd") == 0
+    said = "camera.pcd is an image seen from 100,50,-400 mm (--viewpoint none" in capsys.readouterr().out
+    assert said is (not option)
+    if expected_mm is None:
+        assert seen.at is None
+    else:
+        np.testing.assert_allclose(seen.at, expected_mm, atol=0.01)
+
+
+def test_a_method_that_takes_no_viewpoint_registers_an_organised_cloud_without(folder, image, capsys):
+    write_pcd("camera.pcd", image)
+    assert register("", source="camera.pcd") == 0 and "seen from" not in capsys.readouterr().out
+
+
+def write_pcd(path, grid):
+    height, width = grid.shape[:2]
+    head = ["VERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1"]
+    head += [f"WIDTH {width}", f"HEIGHT {height}", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {width * height}"]
+    Path(path).write_bytes("\n".join([*head, "DATA binary", ""]).encode() + grid.astype("<f4").tobytes())
+
+
 def test_a_target_in_centimetres_that_is_read_as_millimetres_is_warned_of(folder, caplog):
     np.save("s.npy", POINTS / 10.0)
     np.save("t.npy", POINTS / 10.0)

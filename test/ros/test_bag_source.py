@@ -68,6 +68,15 @@ def test_the_only_topic_with_clouds_needs_no_name(tmp_path):
     assert len(read(tmp_path / "bag")) == 50
 
 
+def test_a_single_cloud_that_is_an_image_brings_its_camera_and_joined_ones_have_none(tmp_path, image):
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(2):
+            writer.write_cloud("/points", image / 1000.0, "camera", START_NS + i)
+    one, both = (clouds.load(tmp_path / "bag", "m", ReadOptions(clouds=(first, None))) for first in (1, 0))
+    np.testing.assert_allclose(one.camera, [100.0, 50.0, -400.0], atol=0.01)
+    assert both.camera is None and len(both.points) == 2 * len(one.points)
+
+
 def test_clouds_of_two_frames_are_not_joined(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         for i, frame in enumerate(("left", "right")):

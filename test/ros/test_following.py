@@ -313,6 +313,16 @@ def test_where_no_cloud_can_be_followed_the_node_says_so(watch, given, why):
     assert not any("assess_every" in text for text in node_parameters.remarks(NodeParameters(accumulate=1, **given)))
 
 
+def test_a_cloud_that_shows_where_its_camera_was_is_assessed(watch, image):
+    """Nobody knows which part of it is bone."""
+    live = watch(assess_every=3)
+    live.send(10)
+    live.client.send(image / 1000.0, stamp_s=11.0)
+    wait_until(lambda: live.counts["accepted"] == 2, what=lambda: live.counts)
+    live.send(12)
+    assert live.counts["followed"] == 1
+
+
 @pytest.mark.parametrize("given", [{"track": False}, {"viewpoint": "origin"}])
 def test_and_every_cloud_is_assessed(watch, given):
     live = watch(assess_every=3, **given)

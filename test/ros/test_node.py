@@ -37,7 +37,8 @@ GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 T_TARGET_SOURCE = pose_mm([0.3, -1.1, 0.7], [120.0, -40.0, 300.0])
 REGISTRATION_KEYS = set(
     "state model_path model_points cloud_stamp cloud_frame points_in points_used cloud_age_s confidence tre_mm"
-    " inlier_ratio found_by exec_ms frames_received frames_dropped frames_refused consecutive_refusals last_refusal"
+    " inlier_ratio found_by seen_from exec_ms frames_received frames_dropped frames_refused consecutive_refusals"
+    " last_refusal"
     " cloud_qos publishers_on_points".split()
 )
 

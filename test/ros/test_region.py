@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
-from harness import StandIn, accepted, node_in_thread, pose_mm
+from harness import Collecting, StandIn, accepted, node_in_thread, pose_mm
 from rclpy.parameter import Parameter
 from scipy.spatial import ConvexHull, cKDTree
 
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import frames, region
+from gapr_ros.node import frames, region, wire
 from gapr_ros.node.model import load_model
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
@@ -154,6 +154,37 @@ def test_the_origin_of_the_cloud_is_given_in_the_frame_of_the_answer(blob_path, 
         client.wait_for_state("active")
         client.ask(GOOD, frame="probe")
     np.testing.assert_allclose(method.calls[-1]["viewpoint"], T_BOX_PROBE[:3, 3] * 1000.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected_mm"),
+    [
+        ({}, [100.0, 50.0, -400.0]),
+        ({"output_frame": "table"}, se3.apply(wire.in_mm(T_BOX_PROBE), np.array([[100.0, 50.0, -400.0]]))[0]),
+        ({"cloud_unit": "mm"}, [100.0, 50.0, -400.0]),
+        ({"viewpoint": "origin"}, [0.0, 0.0, 0.0]),
+        ({"viewpoint": "none"}, None),
+        ({"accumulate": 2, "output_frame": "table"}, None),
+    ],
+)
+def test_the_pixels_of_an_organised_cloud_say_where_the_camera_was(
+    blob_path, client, image, monkeypatch, given, expected_mm
+):
+    monkeypatch.setattr(frames, "_import_tf2", Tf2)
+    method = Collecting() if "accumulate" in given else StandIn()
+    with node_in_thread(method, blob_path, **given):
+        client.wait_for_state("active")
+        per_m = 1.0 if "cloud_unit" in given else 1000.0
+        answer = client.ask(image / per_m, frame="probe")
+        assert answer["level"] == 0 and answer["points_used"] == str(int(np.isfinite(image[..., 0]).sum()))
+        assert answer["seen_from"] == ("" if len(given) == 2 or "viewpoint" in given else "0.100 0.050 -0.400")
+        assert client.ask(GOOD * 1000.0 / per_m, frame="probe")["seen_from"] == ""
+    seen, alone = method.calls[-2]["viewpoint"], method.calls[-1]["viewpoint"]
+    if expected_mm is None:
+        assert seen is None and alone is None
+    else:
+        np.testing.assert_allclose(seen, expected_mm, atol=0.01)
+        assert (alone is None) is ("viewpoint" not in given), "a cloud that is no image says nothing"
 
 
 def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client):

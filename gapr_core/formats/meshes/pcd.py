@@ -8,6 +8,7 @@ import numpy as np
 
 from gapr_core.formats import text
 from gapr_core.formats.limits import FileLimits
+from gapr_core.geometry import pinhole
 from gapr_core.surface import Array, Surface
 
 TYPES = {"F": {4: "<f4", 8: "<f8"}, "I": {n: f"<i{n}" for n in (1, 2, 4, 8)}, "U": {n: f"<u{n}" for n in (1, 2, 4, 8)}}
@@ -15,7 +16,7 @@ KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
 def read(path: Path, limits: FileLimits) -> Surface:
-    """A cloud, with its normals where all three components are there."""
+    """A cloud, with its normals where all three components are there, and its camera where it is an image that says."""
     data = limits.read(path)
     header, start = _header(data)
     count, fields = int(header["POINTS"][0]), _fields(header)
@@ -24,7 +25,8 @@ def read(path: Path, limits: FileLimits) -> Surface:
     columns = _columns(data[start:], header["DATA"][0], fields, count)
     normals = ("normal_x", "normal_y", "normal_z")
     points = _stack(columns, ("x", "y", "z"))
-    return Surface(points, None, _stack(columns, normals) if set(normals) <= set(columns) else None)
+    camera = pinhole.centre_of(points.reshape(int(header["HEIGHT"][0]), -1, 3)) if count else None
+    return Surface(points, None, _stack(columns, normals) if set(normals) <= set(columns) else None, camera)
 
 
 def _header(data: bytes) -> tuple[dict[str, list[str]], int]:

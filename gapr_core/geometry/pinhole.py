@@ -1,0 +1,90 @@
+"""Where a camera was, from the pixels of its own cloud.
+
+In an organised cloud a point's row and column say on which line of sight it lies. All lines of a pinhole camera meet in
+its centre, in whatever frame the points are, and errors in depth move points along them: they do not move the centre.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+FEWEST_POINTS = 200
+MOST_POINTS = 2000  # that are looked at, evenly spread over the pixels
+LARGEST_MISFIT = 1.0  # pixels, root mean square
+LARGEST_DISAGREEMENT = 0.15  # of the distance, between the centres that halves of the image give; that of all is nearer
+
+
+def centre_of(grid: ArrayLike) -> Array | None:
+    """The centre of the pinhole camera whose image an organised cloud is.
+
+    The projection matrix is the least-squares solution of the direct linear transform (Hartley and Zisserman 2004,
+    section 7.1; PCL's `estimateProjectionMatrix` solves the same). It counts only where both halves of the image, cut
+    either way, give nearly the same centre: a plane, rows of a line scanner or parallel slices do not.
+
+    Args:
+        grid: (H, W, 3), any unit and frame; pixels that saw nothing are not finite, or exactly (0, 0, 0).
+
+    Returns:
+        (3,) in the frame and unit of the points; None where they do not say, as in a cloud of one row.
+    """
+    grid = np.asarray(grid, dtype=np.float64)
+    rows, columns = np.nonzero(np.isfinite(grid).all(axis=2) & grid.any(axis=2))
+    if min(grid.shape[:2]) < 2 or len(rows) < FEWEST_POINTS:
+        return None
+    some = np.arange(0, len(rows), -(-len(rows) // MOST_POINTS))
+    pixels, points = np.stack([columns, rows], axis=1)[some].astype(np.float64), grid[rows, columns][some]
+    P = _projection(pixels, points)
+    if P is None or _misfit(P, pixels, points) > LARGEST_MISFIT:
+        return None
+    centre = _centre(P)
+    most = LARGEST_DISAGREEMENT * float(np.linalg.norm(points.mean(axis=0) - centre))
+    for half in (pixels[:, axis] < np.median(pixels[:, axis]) for axis in (0, 1)):
+        for part in (half, ~half):
+            P = _projection(pixels[part], points[part])
+            if P is None or not np.linalg.norm(_centre(P) - centre) <= most:
+                return None
+    return centre
+
+
+def _projection(pixels: Array, points: Array) -> Array | None:
+    """(3, 4) P with (u, v, 1) ~ P (x, y, z, 1) for pixels (N, 2) and points (N, 3); None where it has some behind it.
+
+    Both are centred and scaled before, as there (4.4).
+    """
+    if len(points) < FEWEST_POINTS // 4:
+        return None
+    to_pixel, to_point = _normalising(pixels), _normalising(points)
+    u, X = _homogeneous(pixels) @ to_pixel.T, _homogeneous(points) @ to_point.T
+    nothing = np.zeros_like(X)
+    rows = np.concatenate([np.hstack([X, nothing, -u[:, :1] * X]), np.hstack([nothing, X, -u[:, 1:2] * X])])
+    P = np.linalg.inv(to_pixel) @ np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 4) @ to_point
+    depths = _homogeneous(points) @ P[2]
+    in_front = (depths > 0.0).all() or (depths < 0.0).all()
+    return np.asarray(P) if in_front and abs(np.linalg.det(P[:, :3])) > 0.0 else None
+
+
+def _normalising(x: Array) -> Array:
+    """The similarity that moves the mean of x (N, D) to the origin and its mean distance from there to 1."""
+    middle = x.mean(axis=0)
+    scale = 1.0 / max(float(np.linalg.norm(x - middle, axis=1).mean()), np.finfo(np.float64).tiny)
+    T = np.diag([*[scale] * x.shape[1], 1.0])
+    T[:-1, -1] = -scale * middle
+    return T
+
+
+def _homogeneous(x: Array) -> Array:
+    return np.hstack([x, np.ones((len(x), 1))])
+
+
+def _misfit(P: Array, pixels: Array, points: Array) -> float:
+    """Root mean square distance between pixels and where the points are seen."""
+    seen = _homogeneous(points) @ P.T
+    return float(np.sqrt(np.mean(np.sum((seen[:, :2] / seen[:, 2:] - pixels) ** 2, axis=1))))
+
+
+def _centre(P: Array) -> Array:
+    """(3,) the point that P (3, 4) sees nowhere."""
+    return np.asarray(-np.linalg.solve(P[:, :3], P[:, 3]))

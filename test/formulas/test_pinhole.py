@@ -1,0 +1,112 @@
+"""Where a camera was, from the pixels of its own cloud: pinhole images in any frame, and clouds that are none."""
+
+import numpy as np
+import pytest
+
+from gapr_core.geometry import pinhole, se3
+
+T = se3.from_rotation_translation(se3.exp([0, 0, 0, 0.4, -1.1, 2.0])[:3, :3], [120.0, -2000.0, 700.0])
+CAMERA = T[:3, 3]
+
+
+def image(height=60, width=80, focal=90.0, distortion=0.0, noise_mm=1.0, relief_mm=40.0):
+    """(H, W, 3) mm, camera frame: a wavy surface 450 mm away; noise of depth moves points along their rays."""
+    row, column = np.mgrid[:height, :width]
+    x, y = (column - 0.45 * width) / focal, (row - 0.55 * height) / focal
+    bent = 1.0 + distortion * (x * x + y * y)
+    depth = 450.0 + relief_mm * np.sin(9.0 * x) * np.cos(7.0 * y)
+    depth += noise_mm * np.random.default_rng(0).normal(size=depth.shape)
+    return np.stack([bent * x * depth, bent * y * depth, depth], axis=2)
+
+
+def moved(grid):
+    return se3.apply(T, grid.reshape(-1, 3)).reshape(grid.shape)
+
+
+def test_an_image_shows_its_camera_in_any_frame():
+    np.testing.assert_allclose(pinhole.centre_of(image()), 0.0, atol=1e-6)
+    np.testing.assert_allclose(pinhole.centre_of(moved(image())), CAMERA, atol=1e-6)
+    np.testing.assert_allclose(pinhole.centre_of(moved(image()) / 1000.0), CAMERA / 1000.0, atol=1e-9)
+    np.testing.assert_allclose(pinhole.centre_of(moved(image()).transpose(1, 0, 2)), CAMERA, atol=1e-6)
+
+
+def test_pixels_without_a_point_and_single_precision_change_little():
+    grid = moved(image()).astype(np.float32)
+    nothing = np.random.default_rng(1).random(grid.shape[:2])
+    grid[nothing < 0.3], grid[nothing > 0.7] = np.nan, 0.0
+    np.testing.assert_allclose(pinhole.centre_of(grid), CAMERA, atol=0.01)
+
+
+def test_a_part_of_the_image_is_enough_and_a_large_one_is_thinned():
+    part = np.full((480, 640, 3), np.nan)
+    part[200:260, 300:380] = moved(image())
+    np.testing.assert_allclose(pinhole.centre_of(part), CAMERA, atol=1e-6)
+    np.testing.assert_allclose(pinhole.centre_of(moved(image(480, 640, 700.0))), CAMERA, atol=1e-6)
+
+
+def test_a_lens_that_bends_little_costs_little_and_one_that_bends_much_is_no_pinhole():
+    assert 1.0 < np.linalg.norm(pinhole.centre_of(image(240, 320, 300.0, distortion=0.05))) < 15.0
+    assert pinhole.centre_of(image(240, 320, 300.0, distortion=0.3)) is None
+
+
+def line_scanner():
+    """Each row by itself a camera that moved on."""
+    grid = image()
+    grid[..., 1] = 0.5 * np.arange(len(grid))[:, None]
+    return grid
+
+
+def parallel_slices():
+    """Tracked slices of a probe, one a row: parallel lines of sight."""
+    grid = image()
+    grid[..., 0], grid[..., 1] = np.arange(grid.shape[1]), np.arange(grid.shape[0])[:, None]
+    return grid
+
+
+def turning_scanner():
+    """A lidar: rows and columns are angles."""
+    azimuth, elevation = (np.radians(0.8 * np.arange(n) - 0.4 * n) for n in (80, 60))
+    azimuth, elevation = np.meshgrid(azimuth, elevation)
+    sight = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    return np.stack(sight, axis=2) * image()[..., 2:]
+
+
+def in_no_order():
+    grid = image()
+    return np.random.default_rng(2).permutation(grid.reshape(-1, 3)).reshape(grid.shape)
+
+
+@pytest.mark.parametrize("cloud", [line_scanner, parallel_slices, turning_scanner, in_no_order])
+def test_what_is_no_image_of_a_pinhole_has_no_camera(cloud):
+    assert pinhole.centre_of(moved(cloud())) is None
+
+
+def test_too_few_points_one_row_or_column_and_an_empty_cloud_say_nothing():
+    few = np.full((60, 80, 3), np.nan)
+    few[20:30, 20:39] = image()[20:30, 20:39]
+    assert pinhole.centre_of(few) is None
+    few[20:30, 39] = image()[20:30, 39]
+    np.testing.assert_allclose(pinhole.centre_of(few), 0.0, atol=1e-6)
+    assert pinhole.centre_of(image().reshape(1, -1, 3)) is None
+    assert pinhole.centre_of(image().reshape(-1, 1, 3)) is None
+    assert pinhole.centre_of(np.empty((0, 0, 3))) is None
+
+
+def test_a_plane_could_have_been_seen_from_anywhere():
+    """Only the disagreement of parts of it refuses: every one of its cameras fits."""
+    assert pinhole.centre_of(moved(image(noise_mm=0.0, relief_mm=0.0)).astype(np.float32)) is None
+
+
+def test_a_misfit_alone_refuses(monkeypatch):
+    rough = image() + 8.0 * np.random.default_rng(3).normal(size=(60, 80, 3)) * [1.0, 1.0, 0.0]
+    monkeypatch.setattr(pinhole, "LARGEST_DISAGREEMENT", 1e9)
+    assert pinhole.centre_of(rough) is None
+    monkeypatch.setattr(pinhole, "LARGEST_MISFIT", 1e9)
+    assert pinhole.centre_of(rough) is not None
+
+
+def test_points_behind_the_camera_alone_refuse():
+    """Their lines of sight meet just as well."""
+    grid = image()
+    grid[:, ::2] *= -1.0
+    assert pinhole.centre_of(grid) is None

@@ -2,6 +2,7 @@
 
 python -m gapr_core.training.export runs/best --out gapr_core/weights/gapr_net.safetensors
 python -m gapr_core.training.export runs/bone_head --under OLD.safetensors --out gapr_core/weights/gapr_net.safetensors
+python -m gapr_core.training.export runs/probes --mean-with OLD.safetensors --out gapr_core/weights/gapr_net.safetensors
 """
 
 from __future__ import annotations
@@ -30,11 +31,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder that `gapr train` wrote")
     parser.add_argument("--under", type=Path, help="weights that a bone head was trained on: they must be unchanged")
+    parser.add_argument(
+        "--mean-with", type=Path, nargs="+", default=[], help="weights of the same network: all average"
+    )
     parser.add_argument("--out", required=True, type=Path, help="*.safetensors")
     args = parser.parse_args(arguments)
     network, trained = weights.load(args.run / "weights.safetensors")
     under = {} if args.under is None else {"network": card_under(network, args.under)}
-    digest = weights.save(network, args.out, card(trained) | under, torch.float16)
+    others = [weights.load(path) for path in args.mean_with]
+    network = mean_of([network, *(other for other, _ in others)])
+    averaged = {"mean_with": [its_card for _, its_card in others]} if others else {}
+    digest = weights.save(network, args.out, card(trained) | under | averaged, torch.float16)
     say(f"{args.out}: {args.out.stat().st_size / 1e6:.1f} MB, sha256 of the tensors {digest}")
     return 0
 
@@ -57,6 +64,24 @@ def card_under(network: GAPRNet, path: Path) -> dict[str, Any]:
     if changed:
         raise WeightsError(f"the tensors of {path}, and a head", f"another {changed[0]}", "train the head alone")
     return its_card
+
+
+def mean_of(networks: list[GAPRNet]) -> GAPRNet:
+    """The network whose tensors are the means of those of all (Wortsman et al. 2022, a uniform soup).
+
+    It means something where one was trained on from another: their weights then lie in one basin of the loss.
+
+    Raises:
+        WeightsError: networks of different configurations.
+    """
+    first, states = networks[0], [network.state_dict() for network in networks]
+    for network in networks[1:]:
+        if network.config != first.config:
+            what, given = "networks of one configuration", f"{first.config.name} and {network.config.name}"
+            raise WeightsError(what, given, "average the stages of one training")
+    mean = GAPRNet(first.config)
+    mean.load_state_dict({name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]})
+    return mean.eval()
 
 
 if __name__ == "__main__":

@@ -184,6 +184,24 @@ def test_a_head_trained_alone_leaves_the_network_under_it_as_it_is_bit_by_bit(se
         export.main([str(tmp_path / "alone"), "--under", str(other), "--out", str(shipped)])
 
 
+def test_the_mean_of_two_stages_is_that_of_each_tensor_and_names_both(settings, anatomy, tmp_path):
+    """In float32 before the rounding to half precision; the order does not matter."""
+    first = trainer.train(replace(settings, pairs=4), tmp_path / "first", anatomy)
+    trainer.train(replace(settings, initial=str(first), pairs=4), tmp_path / "second", anatomy)
+    mean = tmp_path / "mean.safetensors"
+    export.main([str(tmp_path / "second"), "--mean-with", str(first), "--out", str(mean)])
+    averaged, card = weights.load(mean)
+    a, b = (weights.load(path)[0].state_dict() for path in (first, tmp_path / "second" / "weights.safetensors"))
+    assert any(not torch.equal(a[name], b[name]) for name in a)
+    for name, tensor in averaged.state_dict().items():
+        assert torch.equal(tensor, ((a[name] + b[name]) / 2.0).half().float()), name
+    assert card["run"]["initial"] == str(first) and [of["run"]["initial"] for of in card["mean_with"]] == [""]
+
+    other = ModelConfig.from_yaml(settings.model)
+    with pytest.raises(WeightsError, match="networks of one configuration"):
+        export.mean_of([trainer.GAPRNet(other), trainer.GAPRNet(replace(other, name="other"))])
+
+
 def test_a_network_without_a_head_begins_with_weights_that_have_one(settings, anatomy, tmp_path):
     """Those that ship have one since it was trained, and training.md says to begin with them."""
     with_head = replace(settings, model_settings={"bone_head": "mlp"}, mix={"scene-C2": 1.0}, validation_pairs=0)

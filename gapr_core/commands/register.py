@@ -58,7 +58,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--reference", type=int, metavar="TOOL",
                         help="the tool on the bone, from 0: the source is in its frame, not the tracker's")  # fmt: skip
     parser.add_argument("--viewpoint", type=_place, default="auto", metavar="X,Y,Z|auto|none",
-                        help="of the camera in the source's frame, mm; auto: organised clouds show it")  # fmt: skip
+                        help="of the camera in the source's frame, mm; auto: its pixels may show it")  # fmt: skip
     parser.add_argument(
         "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
     )
@@ -165,11 +165,16 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
 
 def _seen(args: Namespace, method: Any, source: Surface) -> dict[str, Any]:
     """Where the camera was, if the source shows it, nobody says otherwise, and the method wants to know."""
-    if args.viewpoint != "auto" or source.camera is None or "viewpoint" not in signature(method.register).parameters:
+    from gapr_core.geometry import pinhole
+
+    if args.viewpoint != "auto" or "viewpoint" not in signature(method.register).parameters or source.faces is not None:
         return {}
-    x, y, z = source.camera
+    camera = pinhole.camera_of(source.points) if source.camera is None else source.camera
+    if camera is None:
+        return {}
+    x, y, z = camera
     say(f"{args.source.name} is an image seen from {x:.0f},{y:.0f},{z:.0f} mm (--viewpoint none: take all for bone)")
-    return {"viewpoint": source.camera}
+    return {"viewpoint": camera}
 
 
 def _errors(plan: Any, result: RegistrationResult) -> list[TargetError]:

@@ -2,6 +2,7 @@
 
 In an organised cloud a point's row and column say on which line of sight it lies. All lines of a pinhole camera meet in
 its centre, in whatever frame the points are, and errors in depth move points along them: they do not move the centre.
+Without rows and columns the points lie on lines of sight all the same, which only its own frame shows.
 """
 
 from __future__ import annotations
@@ -13,8 +14,25 @@ Array = NDArray[np.float64]
 
 FEWEST_POINTS = 200
 MOST_POINTS = 2000  # that are looked at, evenly spread over the pixels
+FEWEST_SAMPLE, LARGEST_SAMPLE = 1000, 10_000  # points whose lines of sight are counted
+SAME_SIGHT = 1e-5  # tangent between lines of sight that are one; those of two pixels are farther apart
+FEWEST_A_SIGHT = 4  # coordinates of a row, and of a column, on average
 LARGEST_MISFIT = 1.0  # pixels, root mean square
 LARGEST_DISAGREEMENT = 0.15  # of the distance, between the centres that halves of the image give; that of all is nearer
+
+
+def camera_of(points: ArrayLike, grid: ArrayLike | None = None) -> Array | None:
+    """Where the camera was: what the pixels of an organised cloud say, or the origin where lines of sight say that.
+
+    Args:
+        points: (N, 3) finite points of the cloud, any unit.
+        grid: (H, W, 3) the same with those that are not finite, if it is organised.
+
+    Returns:
+        (3,) in the frame and unit of the points; None where neither says.
+    """
+    centre = None if grid is None else centre_of(grid)
+    return np.zeros(3) if centre is None and is_centre_of(points) else centre
 
 
 def centre_of(grid: ArrayLike) -> Array | None:
@@ -47,6 +65,31 @@ def centre_of(grid: ArrayLike) -> Array | None:
             if P is None or not np.linalg.norm(_centre(P) - centre) <= most:
                 return None
     return centre
+
+
+def is_centre_of(points: ArrayLike) -> bool:
+    """Whether the origin is the centre of a pinhole camera that saw a cloud, and the axes are along those of its image.
+
+    The quotients of two coordinates and the third, that along the view, are then few: one for each row and each column,
+    while the coordinates themselves are many. A plane across the view could have been seen from anywhere.
+
+    Args:
+        points: (N, 3), any unit, finite.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    points = (
+        points[np.unique(np.linspace(0, len(points) - 1, LARGEST_SAMPLE).astype(np.int64))] if len(points) else points
+    )
+    return any(_is_view_along(axis, points) for axis in (2, 0, 1))
+
+
+def _is_view_along(axis: int, points: Array) -> bool:
+    depth, across = points[:, axis], np.delete(points, axis, axis=1)
+    if len(points) < FEWEST_SAMPLE or not ((depth > 0.0).all() or (depth < 0.0).all()):
+        return False
+    sights = np.round(across / depth[:, None] / SAME_SIGHT)
+    places = (len(np.unique(column)) for column in across.T)  # few where they are on a lattice themselves
+    return all(FEWEST_A_SIGHT * len(np.unique(s)) <= n for s, n in zip(sights.T, places, strict=True))
 
 
 def _projection(pixels: Array, points: Array) -> Array | None:

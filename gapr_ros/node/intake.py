@@ -82,14 +82,14 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
 
 
 def seen_from(cloud: Any, parameters: NodeParameters) -> Array | None:
-    """(3,) mm, the cloud's frame: the centre of the camera whose image a single cloud is, where `viewpoint` is auto.
+    """(3,) mm, the cloud's frame: where the camera was that saw a single cloud, where `viewpoint` is auto.
 
-    None where the cloud is no image, or its pixels do not say (`geometry.pinhole.centre_of`).
+    Organised clouds show it in any frame, others in that of their camera (`geometry.pinhole`); None where neither does.
     """
     if parameters.viewpoint != "auto" or parameters.accumulate > 1:
         return None
-    grid = INPUTS[parameters.cloud_type].grid(cloud)
-    centre = None if grid is None else pinhole.centre_of(grid)
+    kind = INPUTS[parameters.cloud_type]
+    centre = pinhole.camera_of(kind.points(cloud), kind.grid(cloud))
     return None if centre is None else wire.to_mm(centre, parameters.cloud_unit)
 
 

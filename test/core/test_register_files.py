@@ -167,6 +167,25 @@ def test_an_organised_cloud_says_where_its_camera_was(folder, image, monkeypatch
         np.testing.assert_allclose(seen.at, expected_mm, atol=0.01)
 
 
+def test_a_cloud_on_the_pixels_of_a_camera_in_the_origin_shows_it_and_a_mesh_does_not(
+    folder, image, monkeypatch, capsys
+):
+    seen = []
+
+    def look(self, source, target, viewpoint=None):
+        seen.append(viewpoint)
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
+
+    monkeypatch.setattr(Known, "register", look)
+    cloud = image[np.isfinite(image[..., 0])] - [100.0, 50.0, -400.0]
+    np.save("s.npy", cloud)
+    assert register("") == 0 and "s.npy is an image seen from 0,0,0 mm" in capsys.readouterr().out
+    np.savez("s.npz", points=cloud, faces=[[0, 1, 2], [3, 4, 5]])
+    assert register("", source="s.npz") == 0 and "seen from" not in capsys.readouterr().out
+    np.testing.assert_array_equal(seen[0], np.zeros(3))
+    assert seen[1] is None
+
+
 def test_a_method_that_takes_no_viewpoint_registers_an_organised_cloud_without(folder, image, capsys):
     write_pcd("camera.pcd", image)
     assert register("", source="camera.pcd") == 0 and "seen from" not in capsys.readouterr().out

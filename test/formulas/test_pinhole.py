@@ -105,6 +105,49 @@ def test_a_misfit_alone_refuses(monkeypatch):
     assert pinhole.centre_of(rough) is not None
 
 
+def in_a_row(grid):
+    """Its points in any order, in metres and single precision, as drivers send them."""
+    return np.random.default_rng(4).permutation(grid.reshape(-1, 3)).astype(np.float32) / np.float32(1000.0)
+
+
+def test_points_in_any_order_show_that_their_camera_is_in_the_origin_and_nowhere_else():
+    cloud = in_a_row(image())
+    assert pinhole.is_centre_of(cloud) and pinhole.is_centre_of(cloud[:, [2, 0, 1]]), "x may be along the view, too"
+    assert pinhole.is_centre_of(np.round(cloud, 6)), "as text files have them"
+    assert not pinhole.is_centre_of(cloud + np.float32([0.02, 0.0, 0.0]))
+    assert not pinhole.is_centre_of(in_a_row(moved(image()) - CAMERA)), "the axes are not those of the image"
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_few_columns_alone_or_few_rows_alone_are_no_image(axis):
+    grid = image()
+    grid[..., axis] += np.random.default_rng(5).normal(size=grid.shape[:2])
+    assert not pinhole.is_centre_of(in_a_row(grid))
+
+
+def test_few_points_points_behind_the_camera_and_lattices_show_nothing():
+    cloud = in_a_row(image())
+    assert pinhole.is_centre_of(cloud[:1000]) and not pinhole.is_centre_of(cloud[:999])
+    assert not pinhole.is_centre_of(np.empty((0, 3)))
+    some_behind = cloud.copy()
+    some_behind[::2] *= -1.0
+    assert not pinhole.is_centre_of(some_behind)
+    heights = image()
+    heights[..., :2] = np.stack(np.mgrid[:60, :80], axis=2)
+    heights[..., 2] = np.round(heights[..., 2] / 20.0)
+    assert not pinhole.is_centre_of(heights.reshape(-1, 3)), "coordinates that are few themselves are no lines of sight"
+    assert not pinhole.is_centre_of(in_a_row(image(noise_mm=0.0, relief_mm=0.0))), "a plane across the view"
+
+
+def test_rows_and_columns_say_more_than_the_origin_and_the_origin_more_than_nothing():
+    grid = image()
+    points = grid.reshape(-1, 3)
+    np.testing.assert_allclose(pinhole.camera_of(moved(grid).reshape(-1, 3), moved(grid)), CAMERA, atol=1e-6)
+    np.testing.assert_array_equal(pinhole.camera_of(points), np.zeros(3))
+    np.testing.assert_array_equal(pinhole.camera_of(points, points[None]), np.zeros(3))
+    assert pinhole.camera_of(points + 7.0) is None and pinhole.camera_of(points + 7.0, points[None]) is None
+
+
 def test_points_behind_the_camera_alone_refuse():
     """Their lines of sight meet just as well."""
     grid = image()

@@ -187,6 +187,20 @@ def test_the_pixels_of_an_organised_cloud_say_where_the_camera_was(
         assert (alone is None) is ("viewpoint" not in given), "a cloud that is no image says nothing"
 
 
+def test_points_on_the_pixels_of_a_camera_in_the_origin_show_it_without_rows_and_columns(
+    blob_path, client, method, image
+):
+    """As RealSense's driver sends them."""
+    cloud = (image[np.isfinite(image[..., 0])] - [100.0, 50.0, -400.0]) / 1000.0
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        assert client.ask(cloud)["seen_from"] == "0.000 0.000 0.000"
+        assert client.ask(cloud + [0.01, 0.0, 0.0])["seen_from"] == ""
+    seen, moved = (call["viewpoint"] for call in method.calls[-2:])
+    np.testing.assert_array_equal(seen, np.zeros(3))
+    assert moved is None
+
+
 def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client):
     class Plain(StandIn):
         def register(self, source, target, initial=None):

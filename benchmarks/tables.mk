@@ -55,7 +55,7 @@ BENCHMARKS := one_sided clean scenes scene_stereo scene_joint scene_variants sce
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 FEW        := $(addprefix few-,pointer ultrasound femora)
 SCRIPTS    := strangers mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described \
-              guidance hollow unknowable proposals proposals_clean
+              guidance hollow unknowable proposals proposals_clean viewpoint
 made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --count 500 --mirrored 60 --sides 12 --out $(OUT)/strangers
 made_by_mirrored          = strangers.py --anatomy $(ANATOMY) --split test --count 4 --mirrored 300 --out $(OUT)/mirrored
 made_by_short_scans       = short_scans.py --anatomy $(ANATOMY) --split test --count 20
@@ -69,6 +69,7 @@ made_by_hollow            = hollow.py --anatomy $(ANATOMY) --split test --count 
 made_by_unknowable        = unknowable.py --count 8
 made_by_proposals         = proposals.py --pairs $(OUT)/pairs/one_sided --limit 16
 made_by_proposals_clean   = proposals.py --pairs $(OUT)/pairs/clean --limit 16
+made_by_viewpoint         = viewpoint.py --pairs $(OUT)/pairs/scenes --every 3
 made_by_mix               = trust.py $(MIX:%=$(OUT)/bench/%) --plot $(OUT)/figures/reliability.png
 made_by_mix_fresh         = trust.py $(OUT)/bench/fresh
 made_by_few               = trust.py $(FEW:%=$(OUT)/bench/%)
@@ -91,6 +92,7 @@ $(call done,mix_fresh): $(OUT)/bench/fresh/table.md
 $(call done,few): $(FEW:%=$(OUT)/bench/%/table.md)
 $(call done,proposals): $(OUT)/pairs/one_sided.txt
 $(call done,proposals_clean): $(OUT)/pairs/clean.txt
+$(call done,viewpoint): $(OUT)/pairs/scenes.txt
 
 $(OUT)/pairs/%.txt:
 	@mkdir -p $(@D)

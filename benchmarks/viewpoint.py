@@ -1,0 +1,96 @@
+"""What it is worth to know where the camera was: given, found in the pixels of the cloud, or not known.
+
+    python benchmarks/viewpoint.py --pairs DIR [--every 3]
+
+DIR holds scenes with a viewpoint, as `gapr make-pairs --protocol scene-C1,scene-C2,scene-C3` writes them. Their points
+are put into the pixels of an image and stay what they are. Rows and columns are rounded, so that lines of sight are up
+to half a pixel off, which those of a real image are not.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from gapr_core import Registrar, RegistrarConfig, metrics
+from gapr_core.data.pair import Pair
+from gapr_core.data.pair_files import load_pair
+from gapr_core.data.scenes.camera import FIELD_OF_VIEW_DEG, PIXELS
+from gapr_core.geometry import pinhole, quadrics
+from gapr_core.pages import markdown
+from gapr_core.runtime.console import say
+
+Array = NDArray[np.float64]
+WAYS = ("given", "in the pixels", "not known")
+
+
+def main() -> int:
+    """Register every scene in three ways, print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", required=True, type=Path)
+    parser.add_argument("--every", type=int, default=1, help="only every so many-th pair")
+    args = parser.parse_args()
+    registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+    pairs = [load_pair(path) for path in sorted(args.pairs.glob("*.npz"))[:: args.every]]
+    answers: dict[str, list[tuple[list[str], float]]] = {}
+    for pair in tqdm(pairs, unit="scene"):
+        answers.setdefault(pair.protocol, []).append(ask(registrar, pair))
+    say(markdown.table(["protocol", "scenes", *columns()], list(rows(answers))))
+    return 0
+
+
+def ask(registrar: Registrar, pair: Pair) -> tuple[list[str], float]:
+    """Right, wrong or refused in each of the ways, and how far the camera that was found is off, mm (NaN: none)."""
+    target, found = registrar.prepare(pair.target), pinhole.camera_of(pair.source, image(pair))
+    said = []
+    for viewpoint in (pair.viewpoint, found, None):
+        result = registrar.register(pair.source, target, viewpoint=viewpoint)
+        if result.T_target_source is None:
+            said.append("refused")
+            continue
+        error = metrics.pose_error(result.T_target_source, pair.T_target_source, pair.source)
+        said.append("right" if error.is_right else "wrong")
+    assert pair.viewpoint is not None
+    return said, float("nan") if found is None else float(np.linalg.norm(found - pair.viewpoint))
+
+
+def image(pair: Pair) -> Array:
+    """(H, W, 3) the points of a scene in the pixels of a camera that looks at their middle; the last of each stays."""
+    assert pair.viewpoint is not None
+    sight = pair.source - pair.viewpoint
+    ahead = sight.mean(axis=0) / np.linalg.norm(sight.mean(axis=0))
+    seen = sight @ np.vstack([quadrics.tangent_basis(ahead[None])[0], ahead[None]]).T
+    focal = PIXELS / 2.0 / np.tan(np.radians(FIELD_OF_VIEW_DEG / 2.0))
+    column, row = np.rint(focal * seen[:, :2] / seen[:, 2:]).astype(int).T
+    column, row = column - column.min(), row - row.min()
+    grid = np.full((row.max() + 1, column.max() + 1, 3), np.nan)
+    grid[row, column] = pair.source
+    return grid
+
+
+def columns() -> list[str]:
+    """Heads of what is counted."""
+    right = [f"{way}: right, wrong" for way in WAYS]
+    return [*right, "camera found", "off, median, largest (mm)"]
+
+
+def rows(answers: dict[str, list[tuple[list[str], float]]]) -> Iterator[list[str]]:
+    """One protocol after the other."""
+    for protocol, given in answers.items():
+        counted = [
+            f"{sum(said[way] == 'right' for said, _ in given)}, {sum(said[way] == 'wrong' for said, _ in given)}"
+            for way in range(len(WAYS))
+        ]
+        off = np.array([distance for _, distance in given])
+        off = off[np.isfinite(off)]
+        how_far = f"{np.median(off):.1f}, {off.max():.1f}" if len(off) else ""
+        yield [protocol, str(len(given)), *counted, str(len(off)), how_far]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

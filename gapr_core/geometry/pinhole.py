@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 200
+BEYOND, NOTHING = 1e12, 1e-12  # no coordinate, but bytes that were read as one; no distance between points
 MOST_POINTS = 2000  # that are looked at, evenly spread over the pixels
 FEWEST_SAMPLE, LARGEST_SAMPLE = 1000, 10_000  # points whose lines of sight are counted
 SAME_SIGHT = 1e-5  # tangent between lines of sight that are one; those of two pixels are farther apart
@@ -49,7 +50,7 @@ def centre_of(grid: ArrayLike) -> Array | None:
         (3,) in the frame and unit of the points; None where they do not say, as in a cloud of one row.
     """
     grid = np.asarray(grid, dtype=np.float64)
-    rows, columns = np.nonzero(np.isfinite(grid).all(axis=2) & grid.any(axis=2))
+    rows, columns = np.nonzero((np.abs(grid) < BEYOND).all(axis=2) & grid.any(axis=2))
     if min(grid.shape[:2]) < 2 or len(rows) < FEWEST_POINTS:
         return None
     some = np.arange(0, len(rows), -(-len(rows) // MOST_POINTS))
@@ -77,15 +78,14 @@ def is_centre_of(points: ArrayLike) -> bool:
         points: (N, 3), any unit, finite.
     """
     points = np.asarray(points, dtype=np.float64)
-    points = (
-        points[np.unique(np.linspace(0, len(points) - 1, LARGEST_SAMPLE).astype(np.int64))] if len(points) else points
-    )
+    points = points[(np.abs(points) < BEYOND).all(axis=1)]
+    points = points[:: max(1, -(-len(points) // LARGEST_SAMPLE))]
     return any(_is_view_along(axis, points) for axis in (2, 0, 1))
 
 
 def _is_view_along(axis: int, points: Array) -> bool:
     depth, across = points[:, axis], np.delete(points, axis, axis=1)
-    if len(points) < FEWEST_SAMPLE or not ((depth > 0.0).all() or (depth < 0.0).all()):
+    if len(points) < FEWEST_SAMPLE or not ((depth > NOTHING).all() or (depth < -NOTHING).all()):
         return False
     sights = np.round(across / depth[:, None] / SAME_SIGHT)
     places = (len(np.unique(column)) for column in across.T)  # few where they are on a lattice themselves
@@ -97,7 +97,7 @@ def _projection(pixels: Array, points: Array) -> Array | None:
 
     Both are centred and scaled before, as there (4.4).
     """
-    if len(points) < FEWEST_POINTS // 4:
+    if len(points) < FEWEST_POINTS // 4 or np.ptp(points, axis=0).max() < NOTHING:
         return None
     to_pixel, to_point = _normalising(pixels), _normalising(points)
     u, X = _homogeneous(pixels) @ to_pixel.T, _homogeneous(points) @ to_point.T
@@ -112,7 +112,7 @@ def _projection(pixels: Array, points: Array) -> Array | None:
 def _normalising(x: Array) -> Array:
     """The similarity that moves the mean of x (N, D) to the origin and its mean distance from there to 1."""
     middle = x.mean(axis=0)
-    scale = 1.0 / max(float(np.linalg.norm(x - middle, axis=1).mean()), np.finfo(np.float64).tiny)
+    scale = 1.0 / max(float(np.linalg.norm(x - middle, axis=1).mean()), NOTHING)
     T = np.diag([*[scale] * x.shape[1], 1.0])
     T[:-1, -1] = -scale * middle
     return T

@@ -92,6 +92,22 @@ def test_too_few_points_one_row_or_column_and_an_empty_cloud_say_nothing():
     assert pinhole.centre_of(np.empty((0, 0, 3))) is None
 
 
+def test_bytes_that_are_no_coordinates_and_points_that_are_one_are_no_image():
+    huge, tiny, one = 1e200 * image(), 1e-300 * image(), np.ones((60, 80, 3))
+    for grid in (
+        huge,
+        tiny,
+        one,
+        np.full((60, 80, 3), 1.7e308),
+        np.full((60, 80, 3), np.inf),
+        np.full((60, 80, 3), 5e-324),
+    ):
+        assert pinhole.camera_of(grid.reshape(-1, 3), grid) is None
+    some = image()
+    some[::9] = 1e200
+    np.testing.assert_allclose(pinhole.centre_of(some), 0.0, atol=1e-6)
+
+
 def test_a_plane_could_have_been_seen_from_anywhere():
     """Only the disagreement of parts of it refuses: every one of its cameras fits."""
     assert pinhole.centre_of(moved(image(noise_mm=0.0, relief_mm=0.0)).astype(np.float32)) is None

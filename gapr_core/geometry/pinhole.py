@@ -2,7 +2,7 @@
 
 In an organised cloud a point's row and column say on which line of sight it lies. All lines of a pinhole camera meet in
 its centre, in whatever frame the points are, and errors in depth move points along them: they do not move the centre.
-Without rows and columns the points lie on lines of sight all the same, which only its own frame shows.
+Points without rows and columns lie on such lines too, but only the frame of the camera shows it.
 """
 
 from __future__ import annotations

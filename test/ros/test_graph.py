@@ -179,7 +179,7 @@ def test_a_leading_slash_of_a_cloud_is_taken_away(blob_path, client, method):
         ({"model_frame": "/bone"}, "write bone"),
         ({"output_frame": "/tracker"}, "write tracker"),
         ({"output_frame": "bone_preop"}, "for both"),
-        ({"viewpoint": ""}, "expected a viewpoint; got an empty one; write none, origin"),
+        ({"viewpoint": ""}, "expected a viewpoint; got an empty one; write auto, none, origin"),
         ({"viewpoint": "bone_preop"}, "name the frame of the camera"),
         ({"crop_frame": "/bone_preop"}, "crop_to_track crops near its last one"),
     ],

@@ -77,10 +77,10 @@ def is_centre_of(points: ArrayLike) -> bool:
     Args:
         points: (N, 3), any unit, finite.
     """
-    points = np.asarray(points, dtype=np.float64)
-    points = points[(np.abs(points) < BEYOND).all(axis=1)]
-    points = points[:: max(1, -(-len(points) // LARGEST_SAMPLE))]
-    return any(_is_view_along(axis, points) for axis in (2, 0, 1))
+    cloud = np.asarray(points, dtype=np.float64)
+    cloud = cloud[(np.abs(cloud) < BEYOND).all(axis=1)]
+    some = cloud[:: max(1, -(-len(cloud) // LARGEST_SAMPLE))]
+    return any(_is_view_along(axis, some) for axis in (2, 0, 1))
 
 
 def _is_view_along(axis: int, points: Array) -> bool:

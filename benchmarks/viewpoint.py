@@ -46,7 +46,7 @@ def main() -> int:
 
 def ask(registrar: Registrar, pair: Pair) -> tuple[list[str], float]:
     """Right, wrong or refused in each of the ways, and how far the camera that was found is off, mm (NaN: none)."""
-    target, found = registrar.prepare(pair.target), pinhole.camera_of(pair.source, image(pair))
+    target, found = registrar.prepare(pair.target), pinhole.camera_of(image(pair))
     said = []
     for viewpoint in (pair.viewpoint, found, None):
         result = registrar.register(pair.source, target, viewpoint=viewpoint)

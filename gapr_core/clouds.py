@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import reading
 from gapr_core.formats.options import ReadOptions
+from gapr_core.geometry.extent import BEYOND
 from gapr_core.surface import Array, Surface, as_points
 
 log = logging.getLogger(__name__)
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
-BEYOND = 1e12  # no coordinate, whatever its unit, but bytes that were read as one; its square may be infinite
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
 WHOLE_BONE_MM = (60.0, 700.0)  # smaller are a patella, bones of hand and foot, the neck's vertebrae; larger is no bone
 

@@ -6,6 +6,7 @@ import importlib
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from inspect import signature
 from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
@@ -40,6 +41,11 @@ class RegistrationMethod(Protocol):
     def register(self, source: ArrayLike, target: Any) -> RegistrationResult:
         """Pose of `source` (N, 3), mm, in the frame of the prepared target, or a refusal."""
         ...
+
+
+def takes(method: RegistrationMethod, hint: str) -> bool:
+    """Whether `register` of a method takes this as well: `initial` or `viewpoint`."""
+    return hint in signature(method.register).parameters
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from functools import partial
-from inspect import signature
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from gapr_core import baselines
 from gapr_core.baselines import RegistrationMethod
+from gapr_core.baselines.base import takes
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.results import RegistrationResult
@@ -151,7 +151,7 @@ def register(
     method: RegistrationMethod, source: ArrayLike, target: Any, viewpoint: ArrayLike | None
 ) -> RegistrationResult:
     """The method's answer; it is given the camera's place, (3,) mm in the source's frame, if it can make use of it."""
-    if viewpoint is None or "viewpoint" not in signature(method.register).parameters:
+    if viewpoint is None or not takes(method, "viewpoint"):
         return method.register(source, target)
     return method.register(source, target, viewpoint=viewpoint)  # type: ignore[call-arg]
 

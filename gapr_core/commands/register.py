@@ -6,7 +6,6 @@ import logging
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -149,6 +148,8 @@ def _plan(args: Namespace) -> Any:
 
 def _hints(args: Namespace, method: Any) -> dict[str, Any]:
     """Start and viewpoint, if they are given; a method that cannot use one says so."""
+    from gapr_core.baselines.base import takes
+
     hints: dict[str, Any] = {}
     if args.landmarks:
         from gapr_core.formats import planning
@@ -158,16 +159,17 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
         hints["initial"] = start.T_target_source
     if not isinstance(args.viewpoint, str):
         hints["viewpoint"] = np.array(args.viewpoint)
-    for name in hints.keys() - signature(method.register).parameters.keys():
+    for name in (hint for hint in hints if not takes(method, hint)):
         raise ConfigError(f"a method that takes {name}", args.method, "use --method gapr, or leave the option out")
     return hints
 
 
 def _seen(args: Namespace, method: Any, source: Surface) -> dict[str, Any]:
     """Where the camera was, if the source shows it, nobody says otherwise, and the method wants to know."""
+    from gapr_core.baselines.base import takes
     from gapr_core.geometry import pinhole
 
-    if args.viewpoint != "auto" or "viewpoint" not in signature(method.register).parameters or source.faces is not None:
+    if args.viewpoint != "auto" or not takes(method, "viewpoint") or source.faces is not None:
         return {}
     camera = pinhole.camera_of(source.points) if source.camera is None else source.camera
     if camera is None:

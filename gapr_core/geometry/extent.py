@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+BEYOND = 1e12  # no coordinate, whatever its unit, but bytes that were read as one; its square may be infinite
+
 
 class Principal(NamedTuple):
     """Principal axes of a cloud, longest first.

@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gapr_core.geometry.extent import BEYOND
+
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 200
-BEYOND, NOTHING = 1e12, 1e-12  # no coordinate, but bytes that were read as one; no distance between points
+NOTHING = 1e-12  # no distance between points
 MOST_POINTS = 2000  # that are looked at, evenly spread over the pixels
 FEWEST_SAMPLE, LARGEST_SAMPLE = 1000, 10_000  # points whose lines of sight are counted
 SAME_SIGHT = 1e-5  # tangent between lines of sight that are one; those of two pixels are farther apart
@@ -22,18 +24,18 @@ LARGEST_MISFIT = 1.0  # pixels, root mean square
 LARGEST_DISAGREEMENT = 0.15  # of the distance, between the centres that halves of the image give; that of all is nearer
 
 
-def camera_of(points: ArrayLike, grid: ArrayLike | None = None) -> Array | None:
+def camera_of(cloud: ArrayLike) -> Array | None:
     """Where the camera was: what the pixels of an organised cloud say, or the origin where lines of sight say that.
 
     Args:
-        points: (N, 3) finite points of the cloud, any unit.
-        grid: (H, W, 3) the same with those that are not finite, if it is organised.
+        cloud: (N, 3), or (H, W, 3) if it is organised, any unit; points that saw nothing are not finite, or (0, 0, 0).
 
     Returns:
         (3,) in the frame and unit of the points; None where neither says.
     """
-    centre = None if grid is None else centre_of(grid)
-    return np.zeros(3) if centre is None and is_centre_of(points) else centre
+    points = np.asarray(cloud, dtype=np.float64)
+    centre = centre_of(points) if points.ndim == 3 else None
+    return np.zeros(3) if centre is None and is_centre_of(points.reshape(-1, 3)) else centre
 
 
 def centre_of(grid: ArrayLike) -> Array | None:
@@ -50,7 +52,7 @@ def centre_of(grid: ArrayLike) -> Array | None:
         (3,) in the frame and unit of the points; None where they do not say, as in a cloud of one row.
     """
     grid = np.asarray(grid, dtype=np.float64)
-    rows, columns = np.nonzero((np.abs(grid) < BEYOND).all(axis=2) & grid.any(axis=2))
+    rows, columns = np.nonzero(_saw_something(grid))
     if min(grid.shape[:2]) < 2 or len(rows) < FEWEST_POINTS:
         return None
     some = np.arange(0, len(rows), -(-len(rows) // MOST_POINTS))
@@ -75,12 +77,17 @@ def is_centre_of(points: ArrayLike) -> bool:
     while the coordinates themselves are many. A plane across the view could have been seen from anywhere.
 
     Args:
-        points: (N, 3), any unit, finite.
+        points: (N, 3), any unit; those that saw nothing are not finite, or exactly (0, 0, 0).
     """
     cloud = np.asarray(points, dtype=np.float64)
-    cloud = cloud[(np.abs(cloud) < BEYOND).all(axis=1)]
+    cloud = cloud[_saw_something(cloud)]
     some = cloud[:: max(1, -(-len(cloud) // LARGEST_SAMPLE))]
     return any(_is_view_along(axis, some) for axis in (2, 0, 1))
+
+
+def _saw_something(points: Array) -> NDArray[np.bool_]:
+    """(...) which of the points (..., 3) are points."""
+    return np.asarray((np.abs(points) < BEYOND).all(axis=-1) & points.any(axis=-1))
 
 
 def _is_view_along(axis: int, points: Array) -> bool:

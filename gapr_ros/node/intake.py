@@ -89,7 +89,8 @@ def seen_from(cloud: Any, parameters: NodeParameters) -> Array | None:
     if parameters.viewpoint != "auto" or parameters.accumulate > 1:
         return None
     kind = INPUTS[parameters.cloud_type]
-    centre = pinhole.camera_of(kind.points(cloud), kind.grid(cloud))
+    grid = kind.grid(cloud)
+    centre = pinhole.camera_of(kind.points(cloud) if grid is None else grid)
     return None if centre is None else wire.to_mm(centre, parameters.cloud_unit)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.time import Time
 
+from gapr_core.baselines.base import takes
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
@@ -111,7 +112,7 @@ class Registration:
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         crops = self._crops(T_frame_cloud, outcome, now)
         points_mm = intake.take_in(cloud, now.model.extent_mm, now.parameters, crops)
-        outcome.seen_from = intake.seen_from(cloud, now.parameters)
+        outcome.seen_from = intake.seen_from(cloud, now.parameters) if takes(now.method, "viewpoint") else None
         return wire.moved_mm(T_frame_cloud, points_mm)
 
     def _crops(self, T_frame_cloud: Array, outcome: Outcome, now: Situation) -> list[Crop]:

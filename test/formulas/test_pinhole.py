@@ -102,7 +102,7 @@ def test_bytes_that_are_no_coordinates_and_points_that_are_one_are_no_image():
         np.full((60, 80, 3), np.inf),
         np.full((60, 80, 3), 5e-324),
     ):
-        assert pinhole.camera_of(grid.reshape(-1, 3), grid) is None
+        assert pinhole.camera_of(grid) is None and pinhole.camera_of(grid.reshape(-1, 3)) is None
     some = image()
     some[::9] = 1e200
     np.testing.assert_allclose(pinhole.centre_of(some), 0.0, atol=1e-6)
@@ -158,10 +158,18 @@ def test_few_points_points_behind_the_camera_and_lattices_show_nothing():
 def test_rows_and_columns_say_more_than_the_origin_and_the_origin_more_than_nothing():
     grid = image()
     points = grid.reshape(-1, 3)
-    np.testing.assert_allclose(pinhole.camera_of(moved(grid).reshape(-1, 3), moved(grid)), CAMERA, atol=1e-6)
+    np.testing.assert_allclose(pinhole.camera_of(moved(grid)), CAMERA, atol=1e-6)
     np.testing.assert_array_equal(pinhole.camera_of(points), np.zeros(3))
-    np.testing.assert_array_equal(pinhole.camera_of(points, points[None]), np.zeros(3))
-    assert pinhole.camera_of(points + 7.0) is None and pinhole.camera_of(points + 7.0, points[None]) is None
+    np.testing.assert_array_equal(pinhole.camera_of(points[None]), np.zeros(3), "one row says nothing itself")
+    assert pinhole.camera_of(points + 7.0) is None and pinhole.camera_of(points[None] + 7.0) is None
+
+
+def test_pixels_that_saw_nothing_are_no_lines_of_sight():
+    points = image().reshape(-1, 3)
+    points[::3], points[1::3] = np.nan, 0.0
+    assert pinhole.is_centre_of(points) and pinhole.is_centre_of(points[2::3])
+    points[2] = [0.0, 0.0, -450.0]
+    assert not pinhole.is_centre_of(points), "one that is a point counts"
 
 
 def test_points_behind_the_camera_alone_refuse():

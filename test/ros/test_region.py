@@ -201,7 +201,7 @@ def test_points_on_the_pixels_of_a_camera_in_the_origin_show_it_without_rows_and
     assert moved is None
 
 
-def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client):
+def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client, image):
     class Plain(StandIn):
         def register(self, source, target, initial=None):
             return super().register(source, target, initial)
@@ -209,3 +209,5 @@ def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client):
     with node_in_thread(Plain(), blob_path):
         client.wait_for_state("active")
         assert client.ask(GOOD)["level"] == 0
+        answer = client.ask(image / 1000.0)
+        assert answer["level"] == 0 and answer["seen_from"] == "", answer

@@ -151,6 +151,8 @@ class RegistrationResult:
         features: what the confidence is computed from, by name.
         contributions: log odds that each feature adds to the confidence, by name: above 0 it speaks for the pose.
         residuals: of every used point under the best hypothesis; None where a method does not say.
+        inferred_viewpoint: (3,) mm, source frame: where the camera is taken to be, as its cloud gave no pose as bone
+            alone and nobody said it; None where it was given or is not needed.
     """
 
     status: RegistrationStatus
@@ -171,6 +173,7 @@ class RegistrationResult:
     features: Mapping[str, float] = field(default_factory=dict)
     contributions: Mapping[str, float] = field(default_factory=dict)
     residuals: Residuals | None = None
+    inferred_viewpoint: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):

@@ -66,8 +66,8 @@ class NodeParameters(Settings):
     crop_max: Triple = setting((0.0, 0.0, 0.0), "its highest corner", unit="m")
     crop_to_track: float = setting(0.0, "after a good pose, points farther from the bone there are left out; 0: off",
                                    unit="m", low=0.0)  # fmt: skip
-    viewpoint: str = setting("auto", "where the camera is: auto (its pixels may show it), none (not known), origin "
-                             "(of the cloud's frame), or a frame", live=False)  # fmt: skip
+    viewpoint: str = setting("auto", "where the camera is: auto (its pixels or its surface may show it), none (all is "
+                             "bone), origin (of the cloud's frame), or a frame", live=False)  # fmt: skip
     sensor: str = setting("unknown", "what measures the clouds; says what errors to expect",
                           choices=SENSOR_KINDS, live=False)  # fmt: skip
     standoff: float = setting(0.0, "how far outside of the bone the points lie; 0: what is usual for the sensor",

@@ -29,6 +29,7 @@ from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.geometry.sampling import random_directions
 from gapr_core.registration import clutter
+from gapr_core.registration import source as sources
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import Calibration
@@ -41,7 +42,7 @@ from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.results import Hypothesis
+from gapr_core.results import Hypothesis, Refusal
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.files import write_text
 from gapr_core.runtime.parallel import end_with_parent
@@ -51,10 +52,11 @@ Record = dict[str, Any]
 Shared = tuple[str, str, pairs.Bones]  # folder, split and the bones of both
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FOLLOWED = 0.5  # share of the pairs that become a stream
-LOOKED_AT = 3  # of the clean clouds with a viewpoint every third is registered as a scene as well: that takes seconds
+LOOKED_AT = 3  # of the clean clouds that one camera may have seen every third is registered as a scene as well
 ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
+AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # what is refused as bone is recorded as that
 ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
 
@@ -123,9 +125,11 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
     """(round, what it answered and how right that is)."""
     rng = np.random.default_rng([task.seed, task.number, 17])
     registrars, viewpoint = _registrars(drawn.sensor), drawn.pair.viewpoint
-    if viewpoint is not None and (drawn.family in pairs.SCENES or task.number % LOOKED_AT == 0):
+    if drawn.family in pairs.SCENES or task.number % LOOKED_AT == 0:
+        if viewpoint is None:
+            viewpoint = _inferred_viewpoint(drawn.pair.source)
         registrar = registrars["first round" if task.number % 2 else "search"]
-        in_scene = registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
+        in_scene = None if viewpoint is None else registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
         if isinstance(in_scene, Assessment):
             yield clutter.NAME, judged_answer(in_scene, drawn.pair)
     if drawn.family in pairs.SCENES:
@@ -141,6 +145,15 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
         tracked = accepting([memory], drawn.sensor).assess(moved.source, target)
         if isinstance(tracked, Assessment):
             yield memory.name, judged_answer(tracked, moved)
+
+
+def _inferred_viewpoint(source: Array) -> Array | None:
+    """Where a cloud (N, 3), mm, may have been seen from: what is refused as bone is registered as that camera's."""
+    prepared = sources.prepare(source, in_scene=True)
+    if isinstance(prepared, Refusal):
+        return None
+    found = clutter.inferred_viewpoints(prepared, RegistrarConfig())
+    return np.asarray(found[0]) if len(found) else None
 
 
 def judged_answer(assessment: Assessment, pair: Pair) -> Record:
@@ -205,13 +218,11 @@ class AskedOnce:
         return last[2]
 
 
-def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig | None = None) -> Registrar:
+def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig = AS_IT_IS) -> Registrar:
     """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     calibrations = [Calibration(proposer.name, ACCEPTING, {}) for proposer in proposers]
     sensor_config = SensorConfig(kind=sensor)
-    config = RegistrarConfig(
-        num_threads=1, sensor=sensor_config, clutter=clutter_config or ClutterConfig(), rules=UNCHECKED
-    )
+    config = RegistrarConfig(num_threads=1, sensor=sensor_config, clutter=clutter_config, rules=UNCHECKED)
     of_scenes = Calibration(clutter.NAME, ACCEPTING, {})
     return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
 
@@ -233,7 +244,7 @@ def _registrars(sensor: str) -> dict[str, Registrar]:
         "network": accepting([network], sensor),
         "search": accepting([network, search], sensor),
         "search alone": accepting([search], sensor),
-        "first round": accepting([search], sensor, ClutterConfig(rounds=1)),
+        "first round": accepting([search], sensor, replace(AS_IT_IS, rounds=1)),
     }
 
 

@@ -12,7 +12,7 @@ from gapr_core.results import Patch, RegistrationResult
 
 def as_json(result: RegistrationResult) -> dict[str, Any]:
     """The contract of the JSON output: transform is 4x4 row-major, source -> target, mm; null on a refusal."""
-    pose, covariance = result.T_target_source, result.covariance
+    pose, covariance, seen_from = result.T_target_source, result.covariance, result.inferred_viewpoint
     return {
         "transform": None if pose is None else pose.tolist(),
         "confidence": result.confidence,
@@ -23,6 +23,7 @@ def as_json(result: RegistrationResult) -> dict[str, Any]:
         "tre_mm": result.tre_mm,
         "tre95_mm": result.tre95_mm,
         "inlier_ratio": result.inlier_ratio,
+        "inferred_viewpoint": None if seen_from is None else np.asarray(seen_from).tolist(),
         "contributions": {name: round(log_odds, 3) for name, log_odds in result.contributions.items()},
         "reason": result.reason,
     }

@@ -57,7 +57,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--reference", type=int, metavar="TOOL",
                         help="the tool on the bone, from 0: the source is in its frame, not the tracker's")  # fmt: skip
     parser.add_argument("--viewpoint", type=_place, default="auto", metavar="X,Y,Z|auto|none",
-                        help="of the camera in the source's frame, mm; auto: its pixels may show it")  # fmt: skip
+                        help="of the camera in the source's frame, mm; auto: its pixels or its surface may show it; "
+                        "none: all is bone")  # fmt: skip
     parser.add_argument(
         "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
     )
@@ -105,6 +106,8 @@ def run(args: Namespace) -> int:
     checks.check_method(args)
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
+    if args.viewpoint == "none" and args.method in methods.OWN:
+        config = replace(config, clutter=replace(config.clutter, infer_viewpoint=False))
     method = methods.make(args.method, config)
     plan, hints = _plan(args), _hints(args, method)
     target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
@@ -195,6 +198,9 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
                 + (", and what is there is of an earlier run" if path.exists() else "")
             )
         return REFUSED
+    if result.inferred_viewpoint is not None:
+        x, y, z = result.inferred_viewpoint
+        say(f"taken for what a camera at {x:.0f},{y:.0f},{z:.0f} mm saw, since not all of it is bone (--viewpoint)")
     say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
     for error in errors:
         say(f"{error.label}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")

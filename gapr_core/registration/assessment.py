@@ -39,6 +39,7 @@ class Assessment:
         rounds: how many were asked.
         seen: the whole cloud, where `source` is only the part of it that the pose explains; else None.
         members: (N,) mask of that part in `seen`; None with it.
+        inferred_viewpoint: (3,) mm, source frame: where `seen` is taken to be seen from; None where it was given.
         contributions: log odds that each feature adds to the probability's.
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
@@ -56,6 +57,7 @@ class Assessment:
     rounds: int = 0
     seen: PreparedSource | None = None
     members: NDArray[np.bool_] | None = None
+    inferred_viewpoint: Array | None = None
     contributions: Mapping[str, float] = field(default_factory=dict)
     factor95: float = 1.0
     independent_points: float = RulesConfig.independent_points
@@ -193,6 +195,7 @@ def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResul
         features=a.features,
         contributions=a.contributions,
         residuals=a.residuals,
+        inferred_viewpoint=a.inferred_viewpoint,
     )
     if refusal is not None:
         return replace(common, status=refusal.status, reason=refusal.reason)

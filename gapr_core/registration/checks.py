@@ -25,10 +25,11 @@ def unless_grown(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same; refused where the source fits better in another size.
 
     Few points fit in many sizes, the part that was found in a scene is what fitted, and a sensor whose scale is not
-    known to better may be wrong by as much: they are not asked.
+    known to better may be wrong by as much: they are not asked. A scene that nobody called one may be a bone of another
+    size, of which a part fits: it is.
     """
     a, count = assessment, len(assessment.source.points)
-    if count < config.limits.few_points or a.seen is not None:
+    if count < config.limits.few_points or _is_known_scene(a):
         return a
     if sensor.errors(config.sensor, count).scale > config.scale.sure:
         return a
@@ -52,9 +53,14 @@ def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: b
         return a
     found = mirror.image_margin(a.fit.T, a.source, a.target, config)
     by_chance = len(a.source.points) <= config.rules.mirrored_points or not believed
-    if a.seen is None and by_chance and rules.by_mirror(found, config.rules) is None:
+    if not _is_known_scene(a) and by_chance and rules.by_mirror(found, config.rules) is None:
         found = min(found, full_image_margin(a, config, register))
     return a.refused(rules.by_mirror(found, config.rules), config.rules)
+
+
+def _is_known_scene(assessment: Assessment) -> bool:
+    """True where somebody said, or pixels, that a camera saw this."""
+    return assessment.seen is not None and assessment.inferred_viewpoint is None
 
 
 def full_image_margin(assessment: Assessment, config: RegistrarConfig, register: Register) -> float:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gapr_core.config import ClutterConfig
-from gapr_core.geometry import sampling
+from gapr_core.config import ClutterConfig, RegistrarConfig
+from gapr_core.geometry import one_view, sampling
 from gapr_core.registration import free_space
 from gapr_core.registration.clutter_kernels import refine_agreeing
 from gapr_core.registration.free_space import DepthImage, Visible
@@ -74,6 +74,19 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) 
     levelled = source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]
     image = free_space.see(levelled, source.normals, viewpoint, config.free_space)
     return Scene(source, image, viewpoint, [])
+
+
+def inferred_viewpoints(source: PreparedSource, config: RegistrarConfig) -> Array:
+    """(2, 3) mm, source frame: where a cloud was seen from if nobody says it, the likelier place first.
+
+    (0, 3) where it cannot be a camera's: too few points, or some that are grazed from wherever the others are seen.
+    """
+    settings = config.clutter
+    if not settings.infer_viewpoint or len(source.points) < config.source.dense_points:
+        return np.empty((0, 3))
+    some = source.order[: settings.inferred_points]
+    view = one_view.seen_from_one_place(source.points, source.normals, some)
+    return view.viewpoints if view.steepest_cos >= settings.least_cos else np.empty((0, 3))
 
 
 def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:

@@ -105,6 +105,11 @@ def is_uncertain(assessment: Assessment, config: RegistrarConfig) -> bool:
     return right_share(assessment.uncertainty.covariance) < config.limits.covered
 
 
+def is_inferred(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where nobody said where the camera was: the cloud's surface says it to some 10 degrees only."""
+    return assessment.inferred_viewpoint is not None
+
+
 def right_share(covariance: Array) -> float:
     """Share of a normal distribution with this covariance (6, 6), mm and rad, within 4 mm and 5 deg of its mean."""
     values, vectors = np.linalg.eigh(covariance)
@@ -133,4 +138,5 @@ LIMITS = (
         "said of the sensor",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
+    Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.geometry import se3
 from gapr_core.registration.assessment import Assessment
@@ -75,7 +75,13 @@ class MemoryFirst(Registrar):
     def __init__(self, memory: Memory, calibration: Calibration, full: Registrar) -> None:
         proposers, calibrations = (memory, *full.proposers), (calibration, *full.calibrations)
         super().__init__(full.config, proposers, calibrations, precision=full.precision)
-        self._full = full
+        self._full, self._memory = full, memory
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         return self._full._of_image(flipped, target, clock)
+
+    def _of_one_view(
+        self, source: ArrayLike, target: PreparedTarget, poses: Array, refused: Assessment | None, clock: Clock
+    ) -> Assessment | None:
+        known = np.concatenate([poses, self._memory.now[:1]])
+        return super()._of_one_view(source, target, known, refused, clock)

@@ -128,7 +128,8 @@ class Registrar:
             source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
-            viewpoint: (3,) mm, source frame: where the camera was, if there was one.
+            viewpoint: (3,) mm, source frame: where the camera was, if there was one. Without it the cloud is registered
+                as bone; where that is refused, as what a camera saw (`ClutterConfig.infer_viewpoint`).
 
         Raises:
             InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; a target
@@ -175,6 +176,8 @@ class Registrar:
         start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
             assessment = self._of_bone_alone(prepared, target, start, clock, enough)
+            if assessment is None or not (assessment.is_sure(self.config.min_confidence) or enough(assessment)):
+                assessment = self._of_one_view(source, target, start, assessment, clock)
         else:
             eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
             assessment = self._in_scene(prepared, target, start, eye, clock)
@@ -215,6 +218,23 @@ class Registrar:
         again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
         return (again or a).limited(most)
 
+    def _of_one_view(
+        self, source: ArrayLike, target: PreparedTarget, poses: Array, refused: Assessment | None, clock: Clock
+    ) -> Assessment | None:
+        """A source that is refused as bone, taken for what a camera saw, if that makes it sure; else what there is."""
+        config, settings = self.config, self.config.clutter
+        least = max(config.min_confidence, settings.inferred_least)
+        scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
+        if isinstance(scene, Refusal):
+            return refused
+        viewpoints = clutter.inferred_viewpoints(scene, config)
+        clock.lap("prepare")
+        for viewpoint, rounds in zip(viewpoints, settings.inferred_rounds, strict=False):
+            found = self._in_scene(scene, target, poses, viewpoint, clock, rounds)
+            if found is not None and found.is_sure(least):
+                return replace(found, inferred_viewpoint=viewpoint)
+        return refused
+
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         """The mirror image of a source, registered in full; `memory.MemoryFirst` leaves what it remembers out."""
         return self._in_rounds(flipped, target, NO_POSES, clock)
@@ -244,10 +264,17 @@ class Registrar:
         return assessment
 
     def _in_scene(
-        self, source: PreparedSource, target: PreparedTarget, poses: Array, viewpoint: Array, clock: Clock
+        self,
+        source: PreparedSource,
+        target: PreparedTarget,
+        poses: Array,
+        viewpoint: Array,
+        clock: Clock,
+        rounds: int | None = None,
     ) -> Assessment | None:
         """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
-        config, settings, threads = self.config, self.config.clutter, self.config.num_threads
+        config, threads = self.config, self.config.num_threads
+        settings = replace(config.clutter, rounds=rounds or config.clutter.rounds)
         seen, assessment = clutter.scene_from(source, viewpoint, settings), None
         for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
             pool = clutter.propose(scene, target, poses, settings, threads)

@@ -36,6 +36,7 @@ WORDS = {
     "sparse": "limit: few points, or points far apart, do not say whose bone it is",
     "beyond_noise": "limit: residuals far larger than the noise of the sensor",
     "uncertain": "limit: the covariance leaves the pose loose",
+    "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits
 
 

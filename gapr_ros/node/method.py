@@ -58,9 +58,12 @@ def configured(config: RegistrarConfig, parameters: NodeParameters) -> Registrar
     sensor = config.sensor if parameters.sensor == "unknown" else replace(config.sensor, kind=parameters.sensor)
     if parameters.standoff:
         sensor = replace(sensor, standoff_mm=parameters.standoff * MM_PER_M)
+    seen_at_once = parameters.viewpoint != "none" and parameters.accumulate <= 1
+    clutter = replace(config.clutter, infer_viewpoint=config.clutter.infer_viewpoint and seen_at_once)
     return replace(
         config,
         sensor=sensor,
+        clutter=clutter,
         min_confidence=parameters.min_confidence,
         max_tre_mm=parameters.max_tre * MM_PER_M,
         guide=parameters.guide,

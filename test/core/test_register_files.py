@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gapr_core import cli
+from gapr_core.benchmark import methods
 from gapr_core.commands import checks
 from gapr_core.formats.markups import Markups, save
 from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
@@ -184,6 +185,21 @@ def test_a_cloud_on_the_pixels_of_a_camera_in_the_origin_shows_it_and_a_mesh_doe
     assert register("", source="s.npz") == 0 and "seen from" not in capsys.readouterr().out
     np.testing.assert_array_equal(seen[0], np.zeros(3))
     assert seen[1] is None
+
+
+@pytest.mark.parametrize(("option", "is_inferred"), [("", True), ("--viewpoint none", False)])
+def test_a_camera_is_not_looked_for_where_all_is_bone(folder, monkeypatch, option, is_inferred):
+    made = []
+    monkeypatch.setattr(methods, "make", lambda name, config: made.append(config) or Known())
+    assert register(f"{option} --method gapr_search") == 0
+    assert made[0].clutter.infer_viewpoint is is_inferred
+
+
+def test_a_place_that_was_inferred_is_said(folder, monkeypatch, capsys):
+    monkeypatch.setattr(Known, "more", FULL | {"inferred_viewpoint": np.array([10.0, -20.0, 450.0])})
+    assert register("--json a.json") == 0
+    assert "taken for what a camera at 10,-20,450 mm saw" in capsys.readouterr().out
+    assert json.loads(Path("a.json").read_text())["inferred_viewpoint"] == [10.0, -20.0, 450.0]
 
 
 def test_a_method_that_takes_no_viewpoint_registers_an_organised_cloud_without(folder, image, capsys):

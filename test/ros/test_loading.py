@@ -16,7 +16,8 @@ from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from gapr_ros.node.method import ShippedMethod
+from gapr_core.config import ClutterConfig, RegistrarConfig
+from gapr_ros.node.method import ShippedMethod, configured
 from gapr_ros.node.model import load_model
 from gapr_ros.parameters import NodeParameters
 
@@ -52,6 +53,20 @@ def test_a_bone_of_an_uncommon_size_is_warned_of(tmp_path, caplog, scale, is_odd
     parameters = replace(NodeParameters(), model_path=str(path), model_scale=scale)
     load_model(StandIn(), parameters)
     assert ("as small as a patella" in caplog.text) is is_odd
+
+
+@pytest.mark.parametrize(
+    ("file", "given", "is_inferred"),
+    [
+        ({}, {}, True),
+        ({}, {"viewpoint": "none"}, False),
+        ({}, {"accumulate": 2}, False),  # seen from several places
+        ({"infer_viewpoint": False}, {}, False),
+    ],
+)
+def test_where_a_camera_was_is_inferred_for_single_clouds_that_may_be_more_than_bone(file, given, is_inferred):
+    settings = RegistrarConfig(clutter=ClutterConfig(**file))
+    assert configured(settings, replace(NodeParameters(), **given)).clutter.infer_viewpoint is is_inferred
 
 
 def test_the_settings_file_is_read_when_configuring_and_limits_hold_whatever_has_become_of_it(tmp_path, client):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
-from gapr_core.config import SensorConfig
+from gapr_core.config import ClutterConfig, SensorConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
 from gapr_core.registration import clutter
@@ -81,6 +81,60 @@ def test_without_the_bone_what_is_mostly_clutter_is_refused_as_such(target, scen
 def test_without_a_viewpoint_a_refusal_of_clutter_asks_for_one(target, scene):
     result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0][scene[2] :], target)
     assert result.status is RegistrationStatus.CLUTTER and "where the camera was" in result.reason
+
+
+def test_nobody_has_to_say_where_the_camera_was(target, scene):
+    points, viewpoint, count = scene
+    result = Registrar(RegistrarConfig(num_threads=1)).register(points, target)
+    assert result.ok and result.proposer == clutter.NAME
+    shift_mm, turn_deg = se3.pose_error(result.T_target_source, se3.inverse(T_SOURCE_TARGET), points[:count])
+    assert shift_mm < 2.0 and turn_deg < 2.0
+    ways = [place - points.mean(axis=0) for place in (result.inferred_viewpoint, viewpoint)]
+    assert np.dot(*[way / np.linalg.norm(way) for way in ways]) > np.cos(np.radians(30.0))
+    assert "inferred" in result.contributions or result.confidence < RegistrarConfig().limits.most
+    assert result.confidence <= RegistrarConfig().limits.most
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"clutter": ClutterConfig(infer_viewpoint=False)},
+        {"clutter": ClutterConfig(least_cos=1.0)},  # no cloud is seen so squarely
+        {"source": SourceConfig(dense_points=100_000)},
+    ],
+)
+def test_a_cloud_that_cannot_be_a_camera_s_is_taken_for_bone_alone(target, scene, settings):
+    result = Registrar(RegistrarConfig(num_threads=1, **settings)).register(scene[0], target)
+    assert not result.ok and result.inferred_viewpoint is None and result.proposer != clutter.NAME
+
+
+@pytest.mark.parametrize(("odds", "is_taken"), [(1.0, False), (1.2, True)])  # .73 and .77
+def test_a_pose_that_rests_on_an_inferred_place_needs_more_than_half(target, scene, odds, is_taken):
+    model = Calibration("scene", Additive(odds, ()), {})
+    result = Registrar(RegistrarConfig(num_threads=1), scene_calibration=model).register(scene[0], target)
+    assert result.ok is is_taken and (result.inferred_viewpoint is not None) is is_taken
+
+
+def test_a_cloud_that_is_sure_as_bone_is_not_asked_for_its_camera(target, femur, monkeypatch):
+    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: pytest.fail("asked"))
+    seen = femur.sample(3000, np.random.default_rng(5))[0]
+    assert Registrar(RegistrarConfig(num_threads=1)).register(seen, target).ok
+
+
+def test_what_is_not_sure_as_a_camera_s_either_keeps_its_first_refusal(target, scene):
+    points = scene[0][scene[2] :]
+    blind = RegistrarConfig(num_threads=1, clutter=ClutterConfig(infer_viewpoint=False))
+    first, second = (Registrar(config).register(points, target) for config in (blind, RegistrarConfig(num_threads=1)))
+    assert (first.status, first.reason, first.confidence) == (second.status, second.reason, second.confidence)
+    assert "prepare" in second.stage_ms and second.inferred_viewpoint is None
+
+
+def test_both_ends_of_the_line_of_sight_are_tried(target, scene, monkeypatch):
+    ways = clutter.inferred_viewpoints(prepare(scene[0], in_scene=True), RegistrarConfig())
+    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: ways[::-1])  # as if the wrong one was likelier
+    result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0], target)
+    assert result.ok
+    np.testing.assert_array_equal(result.inferred_viewpoint, ways[0])
 
 
 def test_a_refusal_of_clutter_with_a_viewpoint_behind_the_surface_asks_to_check_it(target, femur):

@@ -51,6 +51,8 @@ def test_few_points_and_a_part_of_a_scene_are_not_asked(registrar, target, seen,
     assert checks.unless_grown(few, registrar.config) is few
     assert checks.unless_grown(replace(enough, seen=answer.source), registrar.config).refusal is None and not asked
     assert checks.unless_grown(enough, registrar.config).refusal is not None and asked == [other_size.HALFWAY]
+    nobody_called_it_a_scene = replace(enough, seen=answer.source, inferred_viewpoint=np.zeros(3))
+    assert checks.unless_grown(nobody_called_it_a_scene, registrar.config).refusal is not None
 
 
 @pytest.mark.parametrize(("log_ratio", "refuses"), [(-0.49, False), (-0.51, True), (0.6, False), (np.nan, False)])

@@ -68,6 +68,13 @@ def test_nor_do_points_without_neighbours(made):
     assert limits.limited(made(1000, spacing_mm=5.9), RegistrarConfig()).probability == SURE
 
 
+def test_a_camera_that_nobody_named_may_have_been_elsewhere(made):
+    found = limits.limited(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig())
+    assert found.probability == 0.89 and found.refusal is None and list(found.contributions)[-1] == "inferred"
+    asked = limits.limited(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig(min_confidence=0.9))
+    assert asked.refusal.status is RegistrationStatus.LOW_CONFIDENCE and "(viewpoint)" in asked.refusal.reason
+
+
 def test_what_is_no_surer_than_that_stays(made):
     unsure = made(60, probability=0.89)
     assert limits.limited(unsure, RegistrarConfig()) is unsure

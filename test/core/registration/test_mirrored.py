@@ -191,3 +191,16 @@ def test_all_points_of_a_source_are_registered_mirrored(pelvis):
     found = checks.full_image_margin(answer, CONFIG, lambda flipped, target: asked.append(flipped.whole))
     flipped = source.whole * [1.0, 1.0, -1.0]
     assert found == np.inf and np.array_equal(np.sort(asked[0], axis=0), np.sort(flipped, axis=0))
+
+
+@pytest.mark.parametrize(
+    ("seen_from", "refused"), [({}, True), ({"seen": 1}, False), ({"seen": 1, "inferred_viewpoint": np.zeros(3)}, True)]
+)
+def test_a_scene_is_not_registered_mirrored_unless_nobody_called_it_one(monkeypatch, target, seen_from, refused):
+    monkeypatch.setattr(checks.mirror, "is_symmetric", lambda *_: False)
+    monkeypatch.setattr(checks.mirror, "image_margin", lambda *_: 0.0)
+    monkeypatch.setattr(checks, "full_image_margin", lambda *_: -1.0)
+    answer = Registrar(CONFIG).assess(seen(make_bone("pelvis", 900_001)), target)
+    answer = replace(answer, refusal=None, **seen_from)
+    found = checks.unless_mirrored(answer, CONFIG, False, lambda *_: pytest.fail("asked"))
+    assert (found.refusal is not None) is refused

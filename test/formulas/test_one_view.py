@@ -1,0 +1,114 @@
+"""Where a cloud was seen from, on surfaces made by hand: the direction nothing is grazed in, and which end of it."""
+
+import numpy as np
+import pytest
+
+from gapr_core.geometry import one_view, se3
+
+FAR_MM = 450.0
+EYE = np.array([0.0, 0.0, FAR_MM])
+
+
+def patch(normal, at=(0.0, 0.0, 0.0), half_mm=30.0, step_mm=1.5):
+    """A square of points about `at` across a normal, and their normals, of either sign."""
+    unit = np.array(normal, dtype=np.float64) / np.linalg.norm(normal)
+    u, v = np.meshgrid(*[np.arange(-half_mm, half_mm + 1e-6, step_mm)] * 2)
+    across = np.linalg.svd(unit[None])[2][1:]
+    points = np.stack([u.ravel(), v.ravel()], axis=1) @ across + at
+    return points, unit * np.where(np.arange(len(points)) % 2, 1.0, -1.0)[:, None]
+
+
+def joined(*patches):
+    points, normals = (np.vstack(each) for each in zip(*patches, strict=True))
+    return points, normals
+
+
+def off_deg(viewpoint, points, direction):
+    """Angle between the way to a viewpoint and a direction."""
+    ahead = viewpoint - points.mean(axis=0)
+    return np.degrees(np.arccos(ahead @ direction / np.linalg.norm(ahead) / np.linalg.norm(direction)))
+
+
+def seen_by_a_camera(points, normals, eye):
+    """Of points those that nothing nearer hides, in pixels of 1.5 mm at the middle; of a tie only the nearest."""
+    ahead = points.mean(axis=0) - eye
+    depth = (points - eye) @ ahead / np.linalg.norm(ahead)
+    across = np.linalg.svd(ahead[None] / np.linalg.norm(ahead))[2][1:]
+    pixel = np.floor((points - eye) @ across.T / depth[:, None] * np.linalg.norm(ahead) / 1.5).astype(int)
+    nearest = {}
+    for i in np.argsort(depth):
+        nearest.setdefault(tuple(pixel[i]), depth[i])
+    stays = np.array([depth[i] - nearest[tuple(pixel[i])] < 4.0 for i in range(len(points))])
+    return points[stays], normals[stays]
+
+
+def test_lines_of_sight_become_parallel_and_what_is_nearer_is_higher():
+    rng = np.random.default_rng(0)
+    eye = np.array([30.0, -80.0, 300.0])
+    points = rng.uniform(-40.0, 40.0, (50, 3))
+    on_the_same_line = eye + 1.1 * (points - eye)
+    both = np.vstack([points, on_the_same_line])
+    straight, _ = one_view.with_parallel_sight(both, np.tile([0.0, 0.0, 1.0], (100, 1)), eye)
+    np.testing.assert_allclose(straight[:50, :2], straight[50:, :2], atol=1e-9)
+    assert (straight[:50, 2] > straight[50:, 2]).all()
+
+
+def test_lengths_at_the_middle_stay():
+    points = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [-1e-3, 0.0, 0.0], [0.0, 0.0, 1e-3], [0.0, 0.0, -1e-3]])
+    straight, _ = one_view.with_parallel_sight(points, np.tile([0.0, 0.0, 1.0], (5, 1)), EYE)
+    assert np.linalg.norm(straight[1] - straight[0]) == pytest.approx(1e-3, rel=1e-4)
+    assert straight[3, 2] - straight[0, 2] == pytest.approx(1e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.2, 0.8), (0.9, 0.3, -0.2), (-1.0, 0.0, 0.4)])
+def test_planes_stay_planes_with_their_normals(normal):
+    points, normals = patch(normal, at=(12.0, 7.0, -5.0))
+    straight, upright = one_view.with_parallel_sight(points, normals, EYE)
+    np.testing.assert_allclose(np.abs(upright @ upright[0]), 1.0, atol=1e-9)
+    heights = straight @ upright[0]
+    assert np.ptp(heights) < 1e-9 * FAR_MM and np.ptp(straight, axis=0).max() > 10.0
+
+
+def test_a_plane_through_the_camera_has_no_normal_that_is_not_a_number():
+    points, normals = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    assert np.isfinite(one_view.with_parallel_sight(points, normals, EYE)[1]).all()
+
+
+def test_the_direction_is_the_one_in_which_nothing_is_grazed():
+    """The walls of a shallow pit lean by 45 degrees to four sides: only from above none is steep."""
+    tilted = [patch((x, y, 1.0), at=(40.0 * x, 40.0 * y, 0.0)) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    turn = se3.exp(np.array([90.0, 10.0, -40.0, 0.5, -0.9, 0.3]), np.zeros(3))
+    points, normals = joined(*tilted)
+    moved, turned = se3.apply(turn, points), normals @ turn[:3, :3].T
+    view = one_view.seen_from_one_place(moved, turned, np.arange(len(moved)))
+    up = turn[:3, 2]
+    assert min(off_deg(each, moved, up) for each in view.viewpoints) < 8.0
+    assert view.steepest_cos == pytest.approx(np.cos(np.radians(45.0)), abs=0.1)
+    np.testing.assert_allclose(view.viewpoints.mean(axis=0), moved.mean(axis=0), atol=1e-9)  # one before, one behind
+
+
+def test_a_surface_all_around_is_grazed_from_everywhere():
+    normals = np.random.default_rng(1).normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert one_view.seen_from_one_place(40.0 * normals, normals, np.arange(3000)).steepest_cos < 0.1
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_of_both_ends_the_one_from_which_nothing_is_hidden_comes_first(sign):
+    """A floor seen through a round hole in a plate 60 mm above it; from below it hides a rim of the plate."""
+    floor, plate = patch((0.0, 0.0, 1.0), half_mm=90.0), patch((0.0, 0.0, 1.0), at=(0.0, 0.0, 60.0), half_mm=90.0)
+    around = np.hypot(*plate[0][:, :2].T) > 45.0
+    points, normals = joined(floor, (plate[0][around], plate[1][around]))
+    points, normals = seen_by_a_camera(points, normals, EYE + [0.0, 0.0, 40.0])
+    points = points * [1.0, sign, sign]  # from above or from below, by half a turn
+    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)))
+    assert off_deg(view.viewpoints[0], points, np.array([0.0, 0.0, sign])) < 12.0
+    first, second = (one_view.visible_share(points, normals, each) for each in view.viewpoints)
+    assert first > second + 0.01
+
+
+def test_the_camera_is_never_in_a_large_cloud():
+    points, normals = patch((0.0, 0.0, 1.0), half_mm=400.0, step_mm=10.0)
+    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)))
+    away = np.linalg.norm(view.viewpoints - points.mean(axis=0), axis=1)
+    np.testing.assert_allclose(away, 1.5 * 400.0 * np.sqrt(2.0))

@@ -25,6 +25,7 @@ of_clean          = --protocol paper,incomplete,L1,sweep --count 20 --seed 0 $(F
 of_scenes         = --protocol scene-C1,scene-C2,scene-C3 --count 19 --seed 0 $(THREE)
 of_scene_stereo   = --protocol scene-stereo,scene-layers --count 19 --seed 0 $(THREE)
 of_scene_joint    = --protocol scene-joint,scene-theatre --count 28 --seed 0 $(TWO)
+of_scene_table    = --protocol scene-table --count 14 --seed 0 $(FOUR)
 of_scene_variants = --protocol scene-slit,scene-windows,scene-packed,scene-hand,scene-drape --count 6 --seed 0 $(THREE)
 of_scene_wrong        = --protocol scene-wrong --count 19 --seed 0 $(THREE)
 of_scene_wrong_stereo = --protocol scene-wrong-stereo --count 40 --seed 0 $(THREE)
@@ -51,7 +52,7 @@ sensor_few-pointer = pointer
 sensor_few-ultrasound = ultrasound
 
 # Tables that `gapr benchmark` writes, that benchmarks/trust.py makes of its records, and of scripts
-BENCHMARKS := one_sided clean scenes scene_stereo scene_joint scene_variants scene_wrong scene_wrong_stereo scene_image
+BENCHMARKS := one_sided clean scenes scene_stereo scene_joint scene_table scene_variants scene_wrong scene_wrong_stereo scene_image
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 FEW        := $(addprefix few-,pointer ultrasound femora)
 SCRIPTS    := strangers mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described \
@@ -69,7 +70,8 @@ made_by_hollow            = hollow.py --anatomy $(ANATOMY) --split test --count 
 made_by_unknowable        = unknowable.py --count 8
 made_by_proposals         = proposals.py --pairs $(OUT)/pairs/one_sided --limit 16
 made_by_proposals_clean   = proposals.py --pairs $(OUT)/pairs/clean --limit 16
-made_by_viewpoint         = viewpoint.py --pairs $(OUT)/pairs/scenes --every 3
+SEEN                      := scenes scene_stereo scene_joint scene_table
+made_by_viewpoint         = viewpoint.py --pairs $(SEEN:%=$(OUT)/pairs/%) --every 3
 made_by_mix               = trust.py $(MIX:%=$(OUT)/bench/%) --plot $(OUT)/figures/reliability.png
 made_by_mix_fresh         = trust.py $(OUT)/bench/fresh
 made_by_few               = trust.py $(FEW:%=$(OUT)/bench/%)
@@ -92,7 +94,7 @@ $(call done,mix_fresh): $(OUT)/bench/fresh/table.md
 $(call done,few): $(FEW:%=$(OUT)/bench/%/table.md)
 $(call done,proposals): $(OUT)/pairs/one_sided.txt
 $(call done,proposals_clean): $(OUT)/pairs/clean.txt
-$(call done,viewpoint): $(OUT)/pairs/scenes.txt
+$(call done,viewpoint): $(SEEN:%=$(OUT)/pairs/%.txt)
 
 $(OUT)/pairs/%.txt:
 	@mkdir -p $(@D)

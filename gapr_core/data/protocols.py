@@ -25,6 +25,7 @@ from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import derived
 from gapr_core.data.scenes.joint import IN_THEATRE, joint_scene
 from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
+from gapr_core.data.scenes.table import table_scene
 from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
@@ -249,6 +250,7 @@ PROTOCOLS: dict[str, Callable[..., Pair]] = {
     **{name: partial(one_sided, level=level) for name, level in LEVELS.items()},
     **{name.replace("_", "-"): partial(acquired, sensor=name) for name in SENSORS | SPARSE},
     **{name: partial(scene, level=level) for name, level in SCENE_LEVELS.items()},
+    "scene-table": table_scene,
     **{name: partial(_derived, base=base, change=change) for name, (base, change) in DERIVED.items()},
     **WITH_OTHERS,
 }

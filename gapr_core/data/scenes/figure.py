@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 PANELS = (
     *(("femur", f"scene-{name}") for name in ("C1", "C2", "C3", "packed", "windows")),
     *(("tibia", f"scene-{name}") for name in ("C1", "slit", "hand", "image", "ultrasound")),
-    *(("pelvis", f"scene-{name}") for name in ("stereo", "layers", "C3", "packed", "drape")),
+    *(("pelvis", f"scene-{name}") for name in ("stereo", "layers", "C3", "table", "drape")),
 )
 COLUMNS, COLOURS = 5, 64
 BONE, OTHER = np.array([0.98, 0.88, 0.66]), np.array([0.80, 0.24, 0.20])

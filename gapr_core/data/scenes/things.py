@@ -44,7 +44,7 @@ def hand(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
 def drape(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
     """A cloth with a round hole over the wound, 5-25 mm above the skin, tilted up to 10 degrees, with soft waves."""
     at = np.arange(-CLOTH_MM / 2.0, CLOTH_MM / 2.0 + 1.0, CLOTH_STEP_MM)
-    points, faces = _sheet(at)
+    points, faces = sheet(at)
     points[:, 2] = 3.0 * np.sin(points[:, :2] @ rng.normal(0.0, 0.03, 2) + rng.uniform(0.0, 2.0 * np.pi))
     middles = points[faces].mean(axis=1)
     faces = faces[np.hypot(middles[:, 0], middles[:, 1]) > rng.uniform(0.9, 1.5) * wound.radius_mm]
@@ -52,7 +52,7 @@ def drape(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
     return Surface(wound.at(tilted + [0.0, 0.0, height_mm + rng.uniform(5.0, 25.0)]), faces)
 
 
-def _sheet(at: Array) -> tuple[Array, NDArray[np.int64]]:
+def sheet(at: Array) -> tuple[Array, NDArray[np.int64]]:
     """A flat square of triangles with corners at all pairs of `at` (K,)."""
     x, y = np.meshgrid(at, at)
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)

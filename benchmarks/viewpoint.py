@@ -32,7 +32,7 @@ WAYS = ("given", "in the pixels", "inferred", "not known")
 
 
 def main() -> int:
-    """Register every scene in three ways, print one table."""
+    """Register every scene in four ways, print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", required=True, type=Path, nargs="+")
     parser.add_argument("--every", type=int, default=1, help="only every so many-th pair")

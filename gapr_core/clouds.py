@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         return surface
     scale = _mm_per_unit(surface, units, name)
     camera = None if surface.camera is None else surface.camera * scale
-    surface = Surface(surface.points * scale, surface.faces, surface.normals, camera)
+    surface = replace(surface, points=surface.points * scale, camera=camera)
     if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
         _warn_of_several_bones(surface, name)
     return surface
@@ -134,7 +135,7 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
     if surface.faces is not None:
         raise InvalidPointCloudError("finite vertices", f"{(~finite).sum()} that are not in {name}", "repair the mesh")
     normals = None if surface.normals is None else surface.normals[finite]
-    return Surface(surface.points[finite], None, normals, surface.camera)
+    return replace(surface, points=surface.points[finite], normals=normals)
 
 
 def _warn_of_several_bones(surface: Surface, name: str) -> None:

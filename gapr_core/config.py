@@ -356,7 +356,7 @@ class ClutterConfig(Settings):
     markers: int = setting(16, "points by which two poses are compared", low=3, high=1000)
     infer_viewpoint: bool = setting(True, "a dense cloud without one that is refused as bone may be a camera's")
     inferred_points: int = setting(2000, "points by whose normals the place of its camera is inferred", low=10)
-    inferred_rounds: tuple[int, int] = setting((2, 1), "rounds of regions for either place, the likelier first", low=1)
+    inferred_rounds: tuple[int, int] = setting((2, 1), "rounds of regions for each place, the likelier first", low=1)
     inferred_least: float = setting(0.75, "least confidence of a pose that rests on such a place", low=0, high=1)
     least_cos: float = setting(0.3, "cosine of incidence that nearly all points of such a cloud exceed", low=0, high=1)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
@@ -409,6 +409,11 @@ class RegistrarConfig(Settings):
     sure: float = setting(0.95, "a confidence from which no further proposer is asked; above 1 all are", low=0, high=2)
     num_threads: int = setting(0, "threads of a registration and its target; 0: all cores", low=0, high=1024)
     seed: int = setting(0, "seed of every random choice", low=0, high=2**31 - 1)
+
+    @property
+    def least_inferred(self) -> float:
+        """The least confidence of a pose that rests on an inferred viewpoint, whatever was seen before."""
+        return max(self.min_confidence, self.clutter.inferred_least)
 
     @property
     def may_pass(self) -> float:

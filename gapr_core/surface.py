@@ -22,12 +22,14 @@ class Surface:
         faces: (F, 3) int64 vertex indices, or None for a cloud.
         normals: (N, 3) float64 unit normals as read, or None.
         camera: (3,) float64, mm: where a camera saw a cloud from, if its pixels say (`geometry.pinhole`), or None.
+        joined: the points were measured from several places, as several clouds or slices, or by a tip.
     """
 
     points: Array
     faces: NDArray[np.int64] | None = None
     normals: Array | None = None
     camera: Array | None = None
+    joined: bool = False
 
     @classmethod
     def from_open3d(cls, mesh: Any) -> Surface:

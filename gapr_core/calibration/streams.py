@@ -106,4 +106,4 @@ def tracker_of_frames_alone() -> Tracker:
 
 @cache
 def _registrar() -> Registrar:
-    return Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+    return Registrar.from_pretrained(RegistrarConfig(num_threads=1)).of_bone_alone()

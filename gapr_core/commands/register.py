@@ -99,15 +99,13 @@ def run(args: Namespace) -> int:
     Raises:
         GaprError: options or files that cannot be used, before the work; what a method did not say, at the end.
     """
-    from gapr_core import clouds
+    from gapr_core import Registrar, clouds
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
     checks.check_method(args)
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
-    if args.viewpoint == "none" and args.method in methods.OWN:
-        config = replace(config, clutter=replace(config.clutter, infer_viewpoint=False))
     method = methods.make(args.method, config)
     plan, hints = _plan(args), _hints(args, method)
     target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
@@ -122,6 +120,8 @@ def run(args: Namespace) -> int:
     checks.warn_of_units(args)
     checks.warn_of_axes(args)
     checks.warn_of_landmarks(args, whole.points, target.points)
+    if args.viewpoint == "none" or whole.joined or whole.faces is not None:
+        method = method.of_bone_alone() if isinstance(method, Registrar) else method
     hints |= _seen(args, method, whole)
     result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
@@ -200,7 +200,7 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
         return REFUSED
     if result.inferred_viewpoint is not None:
         x, y, z = result.inferred_viewpoint
-        say(f"taken for what a camera at {x:.0f},{y:.0f},{z:.0f} mm saw, since not all of it is bone (--viewpoint)")
+        say(f"taken for what a camera at {x:.0f},{y:.0f},{z:.0f} mm saw: as bone alone it gave no pose (--viewpoint)")
     say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
     for error in errors:
         say(f"{error.label}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")

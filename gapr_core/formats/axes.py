@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def scaled(surface: Surface, factors: Array) -> Surface:
     """Points and normals times factors (3,) of 1 and -1 that are a rotation."""
     normals = None if surface.normals is None else surface.normals * factors
     camera = None if surface.camera is None else surface.camera * factors
-    return Surface(surface.points * factors, surface.faces, normals, camera)
+    return replace(surface, points=surface.points * factors, normals=normals, camera=camera)
 
 
 def stated(path: Path) -> str | None:

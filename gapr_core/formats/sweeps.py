@@ -37,7 +37,7 @@ def read_igs(path: Path, options: ReadOptions) -> Surface:
     if options.tip_mm is None:
         raise tracker.needs_tip(path)
     poses = pose_of(transforms(path, options), options.tool, path, options.reference)
-    return Surface(tracker.tips(poses, options.tip_mm))
+    return Surface(tracker.tips(poses, options.tip_mm), joined=True)
 
 
 def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: int | None = None) -> Array:
@@ -121,7 +121,7 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
     if (path / POSES).is_file():
         _say_order(files)
         slices = _placed(slices, path / POSES, options)
-    return Surface(np.vstack(slices))
+    return Surface(np.vstack(slices), joined=True)
 
 
 def _by_numbers(path: Path) -> tuple[list[str | int], str]:

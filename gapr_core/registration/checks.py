@@ -16,6 +16,7 @@ from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.mirror import Misfit
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import mean_square_mm2
 from gapr_core.results import Refusal
 
 Register = Callable[[PreparedSource, PreparedTarget], Assessment | None]
@@ -70,5 +71,13 @@ def full_image_margin(assessment: Assessment, config: RegistrarConfig, register:
     image = None if isinstance(flipped, Refusal) else register(flipped, a.target)
     if image is None:
         return np.inf
-    flipped_one, own = (Misfit(float(each.candidates.scores[0]), each.fit.sigma_mm) for each in (image, a))
-    return flipped_one.log_ratio(own)
+    return _misfit(image, config).log_ratio(_misfit(a, config))
+
+
+def _misfit(assessment: Assessment, config: RegistrarConfig) -> Misfit:
+    """How well a pose fits, mm^2 and mm; a scene's own scores are no mean squares."""
+    a = assessment
+    if a.seen is None:
+        return Misfit(float(a.candidates.scores[0]), a.fit.sigma_mm)
+    mean_square = mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)
+    return Misfit(mean_square, a.fit.sigma_mm)

@@ -31,6 +31,7 @@ from gapr_core.runtime.parallel import in_pieces, in_threads
 Array = NDArray[np.float64]
 
 NAME = "scene"
+AT_THE_BONE = ("pointer", "ultrasound")  # sensors without lines of sight
 SMALLEST_SCORE = 1e-4  # a score below, and so one below 0, counts as this
 
 
@@ -79,13 +80,15 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) 
 def inferred_viewpoints(source: PreparedSource, config: RegistrarConfig) -> Array:
     """(2, 3) mm, source frame: where a cloud was seen from if nobody says it, the likelier place first.
 
-    (0, 3) where it cannot be a camera's: too few points, or some that are grazed from wherever the others are seen.
+    (0, 3) where it cannot be a camera's: too few points, some that are grazed from wherever the others are seen, or a
+    sensor that sees nothing from afar.
     """
     settings = config.clutter
-    if not settings.infer_viewpoint or len(source.points) < config.source.dense_points:
+    cannot = config.sensor.kind in AT_THE_BONE or len(source.points) < config.source.dense_points
+    if cannot or not settings.infer_viewpoint:
         return np.empty((0, 3))
     some = source.order[: settings.inferred_points]
-    view = one_view.seen_from_one_place(source.points, source.normals, some)
+    view = one_view.seen_from_one_place(source.points, source.normals, some, source.spacing_mm)
     return view.viewpoints if view.steepest_cos >= settings.least_cos else np.empty((0, 3))
 
 

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
 VIEWPOINT = "check that the viewpoint is the camera's place in the frame of the cloud, in mm, "
+SAY_WHERE = "say where the camera was, "
 NO_RIVAL = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 
 
@@ -101,10 +102,11 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
     if believed or not (in_scene or len(source.points) >= config.source.dense_points):
         return assessment
     if in_scene:
-        share, limit, more = assessment.features["inlier_ratio"], config.part.mostly_clutter, VIEWPOINT
+        share, limit = assessment.features["inlier_ratio"], config.part.mostly_clutter
+        more = VIEWPOINT if assessment.inferred_viewpoint is None else SAY_WHERE
     else:
         share = float(_on_surface(assessment.fit.T, source, assessment.target, config).mean())
-        limit, more = config.part.mostly_off, "say where the camera was, "
+        limit, more = config.part.mostly_off, SAY_WHERE
     return assessment if share >= limit else replace(assessment, refusal=_clutter(share, assessment.refusal, more))
 
 

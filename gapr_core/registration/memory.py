@@ -74,14 +74,11 @@ class MemoryFirst(Registrar):
 
     def __init__(self, memory: Memory, calibration: Calibration, full: Registrar) -> None:
         proposers, calibrations = (memory, *full.proposers), (calibration, *full.calibrations)
-        super().__init__(full.config, proposers, calibrations, precision=full.precision)
+        super().__init__(full.config, proposers, calibrations, full._scene_calibration, full.precision)
         self._full, self._memory = full, memory
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         return self._full._of_image(flipped, target, clock)
 
-    def _of_one_view(
-        self, source: ArrayLike, target: PreparedTarget, poses: Array, refused: Assessment | None, clock: Clock
-    ) -> Assessment | None:
-        known = np.concatenate([poses, self._memory.now[:1]])
-        return super()._of_one_view(source, target, known, refused, clock)
+    def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:
+        return super()._of_one_view(source, target, np.concatenate([poses, self._memory.now[:1]]), clock)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +35,9 @@ from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 Array = NDArray[np.float64]
 
@@ -107,6 +112,12 @@ class Registrar:
         """The confidence model of a source with a viewpoint, read when the first one comes."""
         return self._scene_calibration or Calibration.shipped(clutter.NAME)
 
+    def of_bone_alone(self) -> Self:
+        """The same, but all of a source without a viewpoint is bone: for what was seen from several places."""
+        twin = copy(self)
+        twin.config = replace(self.config, clutter=replace(self.config.clutter, infer_viewpoint=False))
+        return twin
+
     @single_threaded_libraries
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
@@ -146,7 +157,9 @@ class Registrar:
             return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
         named = explained.named_clutter(limits.limited(assessment, self.config), self.config)
-        result = replace(answer(named, self.config), guidance=guidance)
+        inferred = assessment.inferred_viewpoint is not None
+        asked = replace(self.config, min_confidence=self.config.least_inferred) if inferred else self.config
+        result = replace(answer(named, asked), guidance=guidance)
         clock.lap("assess")
         return replace(result, stage_ms=clock.stages)
 
@@ -177,7 +190,9 @@ class Registrar:
         if viewpoint is None:
             assessment = self._of_bone_alone(prepared, target, start, clock, enough)
             if assessment is None or not (assessment.is_sure(self.config.min_confidence) or enough(assessment)):
-                assessment = self._of_one_view(source, target, start, assessment, clock)
+                found = self._of_one_view(source, target, start, clock)
+                if found is not None:
+                    return found
         else:
             eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
             assessment = self._in_scene(prepared, target, start, eye, clock)
@@ -218,22 +233,36 @@ class Registrar:
         again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
         return (again or a).limited(most)
 
-    def _of_one_view(
-        self, source: ArrayLike, target: PreparedTarget, poses: Array, refused: Assessment | None, clock: Clock
-    ) -> Assessment | None:
-        """A source that is refused as bone, taken for what a camera saw, if that makes it sure; else what there is."""
+    def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:
+        """A source that is refused as bone, taken for what a camera saw; None where that is not sure either.
+
+        It is asked all that one of bone alone is asked, since nobody said that it is a scene.
+        """
         config, settings = self.config, self.config.clutter
-        least = max(config.min_confidence, settings.inferred_least)
-        scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
-        if isinstance(scene, Refusal):
-            return refused
+        scene = self._scene_of_unknown(source)
+        if scene is None:
+            return None
         viewpoints = clutter.inferred_viewpoints(scene, config)
         clock.lap("prepare")
         for viewpoint, rounds in zip(viewpoints, settings.inferred_rounds, strict=False):
             found = self._in_scene(scene, target, poses, viewpoint, clock, rounds)
-            if found is not None and found.is_sure(least):
-                return replace(found, inferred_viewpoint=viewpoint)
-        return refused
+            if found is None or not found.is_sure(config.least_inferred):
+                continue
+            found = self._checked_and_corrected(replace(found, inferred_viewpoint=viewpoint), clock, never)
+            if found.refusal is None:
+                return found
+        return None
+
+    def _scene_of_unknown(self, source: ArrayLike) -> PreparedSource | None:
+        """A source prepared as a scene; None where it is none, or where no pose of it would be sure enough."""
+        config = self.config
+        if config.least_inferred > config.limits.most or not config.clutter.infer_viewpoint:
+            return None
+        try:
+            scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
+        except InvalidPointCloudError:
+            return None  # of all points some are metres away; those that were looked at as bone are not
+        return scene if isinstance(scene, PreparedSource) else None
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         """The mirror image of a source, registered in full; `memory.MemoryFirst` leaves what it remembers out."""

@@ -81,7 +81,11 @@ class Tracker:
         self._forget_shared()
 
     def share_points(self) -> None:
-        """The sources of this stream share their points, as those of an `Accumulator` do: many count as one."""
+        """The sources of this stream share their points, as those of an `Accumulator` do: many count as one.
+
+        Nor were the points of one of them seen from one place.
+        """
+        self.registrar, self._tracking = self.registrar.of_bone_alone(), self._tracking.of_bone_alone()
         self._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
         self._shared = None  # the same points have the same noise
 
@@ -189,6 +193,8 @@ class Tracker:
         """
         if assessment.refusal is not None:
             return assessment
+        if assessment.inferred_viewpoint is not None:
+            assessment = assessment.limited(self.registrar.config.limits.most)
         agrees, alone = self._agrees(assessment), assessment.probability
         self._last = assessment.fit.T
         one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))

@@ -55,6 +55,14 @@ def verify(
     return Candidates(poses, scores, support(poses, crowd, source, config.markers, config.same_pose_mm))
 
 
+def mean_square_mm2(
+    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+) -> float:
+    """What `verify` would score a pose (4, 4) with, mm^2, whatever it was chosen by."""
+    scores = refine_many(T[None], source.points, target, np.linspace(*config.final_limits_mm), num_threads)[1]
+    return float(scores[0])
+
+
 def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same_pose_mm: float) -> Array:
     """(K,) share of the crowd (M, 4, 4) within `same_pose_mm` of each pose (K, 4, 4), over `count` markers."""
     ends, others = (markers(T, source, count) for T in (poses, crowd))

@@ -45,7 +45,9 @@ def read(path: Path, options: ReadOptions) -> Surface:
         raise _unreadable(path, error) from error
     finally:
         bag.reader.close()
-    return Surface(np.vstack([points for points, _ in clouds]), camera=clouds[0][1] if len(clouds) == 1 else None)
+    joined = len(clouds) > 1
+    camera = None if joined else clouds[0][1]
+    return Surface(np.vstack([points for points, _ in clouds]), camera=camera, joined=joined)
 
 
 def _unreadable(path: Path, error: BagError) -> InvalidPointCloudError:

@@ -3,13 +3,14 @@
 import json
 import sys
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from gapr_core import cli
+from gapr_core import Registrar, cli, commands
 from gapr_core.benchmark import methods
 from gapr_core.commands import checks
 from gapr_core.formats.markups import Markups, save
@@ -187,12 +188,33 @@ def test_a_cloud_on_the_pixels_of_a_camera_in_the_origin_shows_it_and_a_mesh_doe
     assert seen[1] is None
 
 
-@pytest.mark.parametrize(("option", "is_inferred"), [("", True), ("--viewpoint none", False)])
-def test_a_camera_is_not_looked_for_where_all_is_bone(folder, monkeypatch, option, is_inferred):
-    made = []
-    monkeypatch.setattr(methods, "make", lambda name, config: made.append(config) or Known())
+@pytest.mark.parametrize(
+    ("option", "made_of", "is_inferred"),
+    [
+        ("", {}, True),
+        ("--viewpoint none", {}, False),
+        ("", {"joined": True}, False),
+        ("", {"faces": np.array(FACES)}, False),
+    ],
+)
+def test_a_camera_is_not_looked_for_where_all_is_bone_or_seen_from_several_places(
+    folder, monkeypatch, option, made_of, is_inferred
+):
+    asked = []
+
+    class Own(Registrar):
+        def prepare(self, target, units="mm"):
+            return target
+
+        def register(self, *_, **__):
+            asked.append(self.config.clutter.infer_viewpoint)
+            return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
+
+    monkeypatch.setattr(methods, "make", lambda name, config: Own(config))
+    load = commands.register._load
+    monkeypatch.setattr(commands.register, "_load", lambda *given, **how: replace(load(*given, **how), **made_of))
     assert register(f"{option} --method gapr_search") == 0
-    assert made[0].clutter.infer_viewpoint is is_inferred
+    assert asked == [is_inferred]
 
 
 def test_a_place_that_was_inferred_is_said(folder, monkeypatch, capsys):

@@ -80,7 +80,7 @@ def test_the_direction_is_the_one_in_which_nothing_is_grazed():
     turn = se3.exp(np.array([90.0, 10.0, -40.0, 0.5, -0.9, 0.3]), np.zeros(3))
     points, normals = joined(*tilted)
     moved, turned = se3.apply(turn, points), normals @ turn[:3, :3].T
-    view = one_view.seen_from_one_place(moved, turned, np.arange(len(moved)))
+    view = one_view.seen_from_one_place(moved, turned, np.arange(len(moved)), 1.5)
     up = turn[:3, 2]
     assert min(off_deg(each, moved, up) for each in view.viewpoints) < 8.0
     assert view.steepest_cos == pytest.approx(np.cos(np.radians(45.0)), abs=0.1)
@@ -90,7 +90,7 @@ def test_the_direction_is_the_one_in_which_nothing_is_grazed():
 def test_a_surface_all_around_is_grazed_from_everywhere():
     normals = np.random.default_rng(1).normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    assert one_view.seen_from_one_place(40.0 * normals, normals, np.arange(3000)).steepest_cos < 0.1
+    assert one_view.seen_from_one_place(40.0 * normals, normals, np.arange(3000), 2.6).steepest_cos < 0.1
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -101,14 +101,14 @@ def test_of_both_ends_the_one_from_which_nothing_is_hidden_comes_first(sign):
     points, normals = joined(floor, (plate[0][around], plate[1][around]))
     points, normals = seen_by_a_camera(points, normals, EYE + [0.0, 0.0, 40.0])
     points = points * [1.0, sign, sign]  # from above or from below, by half a turn
-    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)))
+    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)), 1.5)
     assert off_deg(view.viewpoints[0], points, np.array([0.0, 0.0, sign])) < 12.0
-    first, second = (one_view.visible_share(points, normals, each) for each in view.viewpoints)
+    first, second = (one_view.visible_share(points, normals, each, 1.5) for each in view.viewpoints)
     assert first > second + 0.01
 
 
 def test_the_camera_is_never_in_a_large_cloud():
     points, normals = patch((0.0, 0.0, 1.0), half_mm=400.0, step_mm=10.0)
-    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)))
+    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)), 1.5)
     away = np.linalg.norm(view.viewpoints - points.mean(axis=0), axis=1)
     np.testing.assert_allclose(away, 1.5 * 400.0 * np.sqrt(2.0))

@@ -64,7 +64,8 @@ def _inside(points: Array, corners: Array, normals: Array) -> NDArray[np.bool_]:
         edge, away = corners[:, (i + 1) % 3] - corners[:, i], points - corners[:, i]
         sides.append(np.einsum("ki,ki->k", np.cross(edge, away), normals))
     lowest, highest = np.min(sides, axis=0), np.max(sides, axis=0)
-    return np.asarray((lowest >= 0.0) | (highest <= 0.0))
+    slack = 1e-9 * np.abs(sides).max()  # on an edge between two faces it lies in both
+    return np.asarray((lowest >= -slack) | (highest <= slack))
 
 
 def _tilted(up: Array, angle: float, rng: np.random.Generator) -> Array:

@@ -146,7 +146,7 @@ def test_few_points_and_unsure_answers_are_registered_mirrored_as_well(
             own.append(in_rounds(self, source, target, poses, clock, *enough))
             return own[0]
         fit = SimpleNamespace(sigma_mm=own[0].fit.sigma_mm / np.sqrt(better_mostly))
-        return SimpleNamespace(candidates=SimpleNamespace(scores=own[0].candidates.scores / better), fit=fit)
+        return SimpleNamespace(candidates=SimpleNamespace(scores=own[0].candidates.scores / better), fit=fit, seen=None)
 
     monkeypatch.setattr(Registrar, "_in_rounds", rounds)
     result = registrar.register(seen(femur, count), registrar.prepare(femur))

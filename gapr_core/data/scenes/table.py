@@ -42,7 +42,7 @@ def _laid_down(specimen: Specimen, rng: np.random.Generator, level: SceneLevel) 
     points, faces = sheet(np.arange(-HALF_TABLE_MM, HALF_TABLE_MM + 1.0, STEP_MM))
     below_mm = (specimen.surface.points @ up).min() - middle @ up
     table = Surface(middle + below_mm * up + points @ wounds.frame(up, rng), faces)
-    return Setting(view, [specimen.surface, table], {"up": up})
+    return Setting(view, [specimen.surface, table], {"up": up, "middle": middle})
 
 
 def resting(points: Array, rng: np.random.Generator) -> Array:

@@ -9,6 +9,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.registration import clutter
 from gapr_core.results import RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
@@ -52,6 +53,16 @@ def test_only_the_newest_sources_are_kept(registrar, frames):
     assert accumulator.collected.shape == (0, 3)
     with pytest.raises(ConfigError, match="at least 1"):
         Accumulator(registrar, most=0)
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+def test_what_was_seen_from_several_places_has_no_camera(registrar, frames, prepared, alone, monkeypatch, tracked):
+    """A source that is refused alone: as a camera's it is not tried; by the registrar itself it is."""
+    refused, asked = next(pair.source for pair, result in zip(frames, alone, strict=True) if not result.ok), []
+    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: asked.append(1) or np.empty((0, 3)))
+    accumulator = Accumulator(Tracker(registrar) if tracked else registrar, most=20)
+    assert not accumulator.register(refused, prepared).ok and not asked
+    assert not registrar.register(np.vstack([refused, refused + 0.1, refused - 0.1]), prepared).ok and asked
 
 
 def test_a_source_that_is_empty_or_there_already_changes_nothing(registrar, frames, prepared):

@@ -99,7 +99,7 @@ def run(args: Namespace) -> int:
     Raises:
         GaprError: options or files that cannot be used, before the work; what a method did not say, at the end.
     """
-    from gapr_core import Registrar, clouds
+    from gapr_core import Registrar, Tracker, clouds
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
@@ -121,7 +121,7 @@ def run(args: Namespace) -> int:
     checks.warn_of_axes(args)
     checks.warn_of_landmarks(args, whole.points, target.points)
     if args.viewpoint == "none" or whole.joined or whole.faces is not None:
-        method = method.of_bone_alone() if isinstance(method, Registrar) else method
+        method = method.of_bone_alone() if isinstance(method, Registrar | Tracker) else method
     hints |= _seen(args, method, whole)
     result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,6 +80,12 @@ class Tracker:
         self._bone: PreparedTarget | None = None
         self._evidence.reset()
         self._forget_shared()
+
+    def of_bone_alone(self) -> Tracker:
+        """As `Registrar.of_bone_alone`, for the same stream."""
+        twin = copy(self)
+        twin.registrar, twin._tracking = self.registrar.of_bone_alone(), self._tracking.of_bone_alone()
+        return twin
 
     def share_points(self) -> None:
         """The sources of this stream share their points, as those of an `Accumulator` do: many count as one.

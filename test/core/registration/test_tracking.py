@@ -354,3 +354,10 @@ def test_bumps_that_no_frame_shows_alone_show_in_the_stream(registrar, specimen)
         rough = other.register(se3.apply(se3.inverse(frame.T_target_source), bumpy), prepared)
     assert plain.features["shared_misfit"] < 0.25 < rough.features["shared_misfit"]
     assert plain.confidence > rough.confidence
+
+
+def test_a_tracker_of_bone_alone_infers_no_viewpoint_and_the_other_stays_as_it_is(tracker):
+    alone = tracker.of_bone_alone()
+    for each, is_inferred in ((alone, False), (tracker, True)):
+        assert each.registrar.config.clutter.infer_viewpoint is is_inferred
+        assert each._tracking.config.clutter.infer_viewpoint is is_inferred

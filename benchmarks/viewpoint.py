@@ -60,10 +60,14 @@ def ask(registrar: Registrar, blind: Registrar, pair: Pair, wanted: Sequence[str
         if result.T_target_source is None:
             said.append("refused")
             continue
-        error = metrics.pose_error(result.T_target_source, pair.T_target_source, pair.source)
-        said.append("right" if pair.has_truth and error.is_right else "wrong")
+        said.append("right" if pair.has_truth and is_right(result.T_target_source, pair) else "wrong")
     assert pair.viewpoint is not None
     return said, float("nan") if found is None else float(np.linalg.norm(found - pair.viewpoint))
+
+
+def is_right(T: Array, pair: Pair) -> bool:
+    """Whether a pose (4, 4) is within 4 mm and 5 deg of the truth."""
+    return metrics.pose_error(T, pair.T_target_source, pair.source).is_right
 
 
 def image(pair: Pair) -> Array:

@@ -56,7 +56,7 @@ BENCHMARKS := one_sided clean scenes scene_stereo scene_joint scene_table scene_
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 FEW        := $(addprefix few-,pointer ultrasound femora)
 SCRIPTS    := strangers mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described \
-              guidance hollow unknowable proposals proposals_clean viewpoint
+              guidance hollow unknowable proposals proposals_clean viewpoint viewpoint_wrong
 made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --count 500 --mirrored 60 --sides 12 --out $(OUT)/strangers
 made_by_mirrored          = strangers.py --anatomy $(ANATOMY) --split test --count 4 --mirrored 300 --out $(OUT)/mirrored
 made_by_short_scans       = short_scans.py --anatomy $(ANATOMY) --split test --count 20
@@ -72,6 +72,8 @@ made_by_proposals         = proposals.py --pairs $(OUT)/pairs/one_sided --limit 
 made_by_proposals_clean   = proposals.py --pairs $(OUT)/pairs/clean --limit 16
 SEEN                      := scenes scene_stereo scene_joint scene_table
 made_by_viewpoint         = viewpoint.py --pairs $(SEEN:%=$(OUT)/pairs/%) --every 3
+WRONG                     := scene_wrong scene_wrong_stereo
+made_by_viewpoint_wrong   = viewpoint.py --pairs $(WRONG:%=$(OUT)/pairs/%) --ways inferred
 made_by_mix               = trust.py $(MIX:%=$(OUT)/bench/%) --plot $(OUT)/figures/reliability.png
 made_by_mix_fresh         = trust.py $(OUT)/bench/fresh
 made_by_few               = trust.py $(FEW:%=$(OUT)/bench/%)
@@ -95,6 +97,7 @@ $(call done,few): $(FEW:%=$(OUT)/bench/%/table.md)
 $(call done,proposals): $(OUT)/pairs/one_sided.txt
 $(call done,proposals_clean): $(OUT)/pairs/clean.txt
 $(call done,viewpoint): $(SEEN:%=$(OUT)/pairs/%.txt)
+$(call done,viewpoint_wrong): $(WRONG:%=$(OUT)/pairs/%.txt)
 
 $(OUT)/pairs/%.txt:
 	@mkdir -p $(@D)

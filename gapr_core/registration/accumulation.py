@@ -45,7 +45,7 @@ class Accumulator:
     def __init__(self, method: Registrar | Tracker, most: int) -> None:
         if most < 1:
             raise ConfigError("at least 1 source to keep", str(most), "1 registers every source by itself")
-        self.method, self.most = method if isinstance(method, Tracker) else method.of_bone_alone(), most
+        self.method, self.most = method.of_bone_alone() if isinstance(method, Registrar) else method, most
         if isinstance(method, Tracker):
             method.share_points()
         self.config = (method.registrar if isinstance(method, Tracker) else method).config

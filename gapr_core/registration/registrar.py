@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,9 +36,7 @@ from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
+Own = TypeVar("Own", bound="Registrar")
 Array = NDArray[np.float64]
 
 Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by itself needs no other proposer
@@ -112,7 +110,7 @@ class Registrar:
         """The confidence model of a source with a viewpoint, read when the first one comes."""
         return self._scene_calibration or Calibration.shipped(clutter.NAME)
 
-    def of_bone_alone(self) -> Self:
+    def of_bone_alone(self: Own) -> Own:
         """The same, but all of a source without a viewpoint is bone: for what was seen from several places."""
         twin = copy(self)
         twin.config = replace(self.config, clutter=replace(self.config.clutter, infer_viewpoint=False))

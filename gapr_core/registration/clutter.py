@@ -77,6 +77,11 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) 
     return Scene(source, image, viewpoint, [])
 
 
+def sees_from_afar(config: RegistrarConfig) -> bool:
+    """Whether the place of a camera is to be inferred at all: not of a sensor that is at the bone."""
+    return config.clutter.infer_viewpoint and config.sensor.kind not in AT_THE_BONE
+
+
 def inferred_viewpoints(source: PreparedSource, config: RegistrarConfig) -> Array:
     """(2, 3) mm, source frame: where a cloud was seen from if nobody says it, the likelier place first.
 
@@ -84,8 +89,7 @@ def inferred_viewpoints(source: PreparedSource, config: RegistrarConfig) -> Arra
     sensor that sees nothing from afar.
     """
     settings = config.clutter
-    cannot = config.sensor.kind in AT_THE_BONE or len(source.points) < config.source.dense_points
-    if cannot or not settings.infer_viewpoint:
+    if not sees_from_afar(config) or len(source.points) < config.source.dense_points:
         return np.empty((0, 3))
     some = source.order[: settings.inferred_points]
     view = one_view.seen_from_one_place(source.points, source.normals, some, source.spacing_mm)

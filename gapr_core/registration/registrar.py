@@ -254,7 +254,7 @@ class Registrar:
     def _scene_of_unknown(self, source: ArrayLike) -> PreparedSource | None:
         """A source prepared as a scene; None where it is none, or where no pose of it would be sure enough."""
         config = self.config
-        if config.least_inferred > config.limits.most or not config.clutter.infer_viewpoint:
+        if config.least_inferred > config.limits.most or not clutter.sees_from_afar(config):
             return None
         try:
             scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)

@@ -58,8 +58,8 @@ def configured(config: RegistrarConfig, parameters: NodeParameters) -> Registrar
     sensor = config.sensor if parameters.sensor == "unknown" else replace(config.sensor, kind=parameters.sensor)
     if parameters.standoff:
         sensor = replace(sensor, standoff_mm=parameters.standoff * MM_PER_M)
-    seen_at_once = parameters.viewpoint != "none" and parameters.accumulate <= 1
-    clutter = replace(config.clutter, infer_viewpoint=config.clutter.infer_viewpoint and seen_at_once)
+    is_inferred = config.clutter.infer_viewpoint and parameters.viewpoint != "none"
+    clutter = replace(config.clutter, infer_viewpoint=is_inferred)
     return replace(
         config,
         sensor=sensor,

@@ -60,11 +60,11 @@ def test_a_bone_of_an_uncommon_size_is_warned_of(tmp_path, caplog, scale, is_odd
     [
         ({}, {}, True),
         ({}, {"viewpoint": "none"}, False),
-        ({}, {"accumulate": 2}, False),  # seen from several places
+        ({}, {"viewpoint": "origin"}, True),
         ({"infer_viewpoint": False}, {}, False),
     ],
 )
-def test_where_a_camera_was_is_inferred_for_single_clouds_that_may_be_more_than_bone(file, given, is_inferred):
+def test_where_a_camera_was_is_inferred_unless_all_is_bone(file, given, is_inferred):
     settings = RegistrarConfig(clutter=ClutterConfig(**file))
     assert configured(settings, replace(NodeParameters(), **given)).clutter.infer_viewpoint is is_inferred
 

@@ -92,7 +92,7 @@ def inferred_viewpoints(source: PreparedSource, config: RegistrarConfig) -> Arra
     if not sees_from_afar(config) or len(source.points) < config.source.dense_points:
         return np.empty((0, 3))
     some = source.order[: settings.inferred_points]
-    view = one_view.seen_from_one_place(source.points, source.normals, some, source.spacing_mm)
+    view = one_view.seen_from_one_place(source.points, source.normals, source.neighbours, some, source.spacing_mm)
     return view.viewpoints if view.steepest_cos >= settings.least_cos else np.empty((0, 3))
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gapr_core.geometry import one_view, se3
 
@@ -42,6 +43,23 @@ def seen_by_a_camera(points, normals, eye):
     return points[stays], normals[stays]
 
 
+def neighbours_of(points, count=20):
+    return cKDTree(points).query(points, k=count)[1]
+
+
+def seen_from_one_place(points, normals, spacing_mm=1.5):
+    return one_view.seen_from_one_place(points, normals, neighbours_of(points), np.arange(len(points)), spacing_mm)
+
+
+def dome(radius_mm, step_mm=1.5):
+    """The upper half of a sphere, up to 30 degrees off its pole, with normals of either sign."""
+    u, v = np.meshgrid(*[np.arange(-radius_mm, radius_mm, step_mm)] * 2)
+    points = np.stack([u.ravel(), v.ravel()], axis=1)
+    points = points[np.hypot(*points.T) < radius_mm * np.sin(np.radians(30.0))]
+    points = np.column_stack([points, np.sqrt(radius_mm**2 - (points**2).sum(axis=1))])
+    return points, points / radius_mm * np.where(np.arange(len(points)) % 2, 1.0, -1.0)[:, None]
+
+
 def test_lines_of_sight_become_parallel_and_what_is_nearer_is_higher():
     rng = np.random.default_rng(0)
     eye = np.array([30.0, -80.0, 300.0])
@@ -80,7 +98,7 @@ def test_the_direction_is_the_one_in_which_nothing_is_grazed():
     turn = se3.exp(np.array([90.0, 10.0, -40.0, 0.5, -0.9, 0.3]), np.zeros(3))
     points, normals = joined(*tilted)
     moved, turned = se3.apply(turn, points), normals @ turn[:3, :3].T
-    view = one_view.seen_from_one_place(moved, turned, np.arange(len(moved)), 1.5)
+    view = seen_from_one_place(moved, turned)
     up = turn[:3, 2]
     assert min(off_deg(each, moved, up) for each in view.viewpoints) < 8.0
     assert view.steepest_cos == pytest.approx(np.cos(np.radians(45.0)), abs=0.1)
@@ -90,7 +108,7 @@ def test_the_direction_is_the_one_in_which_nothing_is_grazed():
 def test_a_surface_all_around_is_grazed_from_everywhere():
     normals = np.random.default_rng(1).normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    assert one_view.seen_from_one_place(40.0 * normals, normals, np.arange(3000), 2.6).steepest_cos < 0.1
+    assert seen_from_one_place(40.0 * normals, normals, 2.6).steepest_cos < 0.1
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -101,14 +119,41 @@ def test_of_both_ends_the_one_from_which_nothing_is_hidden_comes_first(sign):
     points, normals = joined(floor, (plate[0][around], plate[1][around]))
     points, normals = seen_by_a_camera(points, normals, EYE + [0.0, 0.0, 40.0])
     points = points * [1.0, sign, sign]  # from above or from below, by half a turn
-    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)), 1.5)
+    view = seen_from_one_place(points, normals)
     assert off_deg(view.viewpoints[0], points, np.array([0.0, 0.0, sign])) < 12.0
     first, second = (one_view.visible_share(points, normals, each, 1.5) for each in view.viewpoints)
     assert first > second + 0.01
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_of_both_ends_the_one_that_a_surface_bulges_towards_comes_first(sign):
+    """A dome, of which neither end hides anything: only its shape tells one from the other."""
+    points, normals = dome(80.0)
+    points = points * [1.0, sign, sign]
+    view = seen_from_one_place(points, normals * [1.0, sign, sign])
+    assert off_deg(view.viewpoints[0], points, np.array([0.0, 0.0, sign])) < 12.0
+    first, second = (one_view.visible_share(points, normals, each, 1.5) for each in view.viewpoints)
+    assert first <= second + 0.01
+
+
+def test_the_share_that_bulges_is_that_of_bumps_less_that_of_hollows():
+    points, normals = dome(80.0)
+    hollow = points * [1.0, 1.0, -1.0] + [0.0, 200.0, 0.0], normals * [1.0, 1.0, -1.0]
+    flat = patch((0.0, 0.0, 1.0), at=(0.0, -200.0, 0.0))
+    a_bump, a_hollow, a_plane = (
+        one_view.bulging_share(*each, neighbours_of(each[0]), EYE) for each in ((points, normals), hollow, flat)
+    )
+    assert a_bump > 0.95 and a_hollow < -0.95 and abs(a_plane) < 0.01
+    both = joined((points, normals), (points, normals), hollow)[0] + np.repeat(
+        [[0, 0, 0], [300, 0, 0], [0, 0, 0]], len(points), axis=0
+    )
+    turned = np.vstack([normals, normals, hollow[1]])
+    assert one_view.bulging_share(both, turned, neighbours_of(both), EYE) == pytest.approx(1.0 / 3.0, abs=0.05)
+    assert one_view.bulging_share(points, normals, neighbours_of(points), -EYE) < -0.95  # from behind
+
+
 def test_the_camera_is_never_in_a_large_cloud():
     points, normals = patch((0.0, 0.0, 1.0), half_mm=400.0, step_mm=10.0)
-    view = one_view.seen_from_one_place(points, normals, np.arange(len(points)), 1.5)
+    view = seen_from_one_place(points, normals)
     away = np.linalg.norm(view.viewpoints - points.mean(axis=0), axis=1)
     np.testing.assert_allclose(away, 1.5 * 400.0 * np.sqrt(2.0))

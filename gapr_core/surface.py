@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -109,6 +110,11 @@ def as_points(array: ArrayLike) -> Array:
     Raises:
         InvalidPointCloudError: for another shape, rows of several lengths, or entries that are not real numbers.
     """
+    if isinstance(array, Surface):
+        raise InvalidPointCloudError("an array of shape (N, 3)", "a Surface", "pass its points: surface.points")
+    if isinstance(array, str | PurePath):
+        how = "load it first: gapr_core.load(path).points"
+        raise InvalidPointCloudError("an array of shape (N, 3)", f"the path {str(array)!r}", how)
     points = _as_array(array)
     if points.dtype.kind not in "fiu":
         raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")

@@ -206,7 +206,10 @@ def problem(setting_field: Field, value: Any) -> str:
         return f"parameter '{name}' must be three finite doubles, got {value!r}: write [0.0, 0.0, 0.1]"
     if type(value) is not type(default):
         kind = ROS_TYPES[type(default)]
-        return f"parameter '{name}' must be of type {kind}, got {value!r}: write {_example(default, value)}"
+        how = f"write {_example(default, value)}"
+        if isinstance(default, str) and isinstance(value, int | float):
+            how += f" in a file, -p '{name}:=\"{value}\"' in a shell"
+        return f"parameter '{name}' must be of type {kind}, got {value!r}: {how}"
     why = why_not(setting_field, value)
     limits = range_text(setting_field)
     wanted = f"within {limits}" if " to " in limits else limits or why

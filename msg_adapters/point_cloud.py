@@ -146,7 +146,7 @@ def _single_field(cloud: PointCloud2, name: str) -> PointField:
     if len(found) != 1:
         names = ", ".join(field.name for field in cloud.fields) or "none"
         raise InvalidMessageError(f"need exactly one field {name}, the cloud has: {names}")
-    if found[0].count != 1:
+    if found[0].count > 1:  # 0, the default of the message, is read as 1, as PCL does
         raise InvalidMessageError(f"field {name} must have count 1, got {found[0].count}")
     return found[0]
 

@@ -30,7 +30,7 @@ from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
 from gapr_core.pages import benchmark_report, writers
 from gapr_core.runtime import cluster, origin
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import a_path, at_least_one
 from gapr_core.runtime.console import say
 
 DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
@@ -39,11 +39,11 @@ DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr benchmark`."""
     parser.add_argument("merge", nargs="*", help="`merge DIR...`: join the outputs of several shards into --out")
-    parser.add_argument("--pairs", type=Path, help="folder of NAME.npz, as gapr make-pairs writes it")
+    parser.add_argument("--pairs", type=a_path, help="folder of NAME.npz, as gapr make-pairs writes it")
     parser.add_argument(
         "--methods", default=DEFAULT_METHODS, help=f"with commas (default: {DEFAULT_METHODS}); see docs/benchmark.md"
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder for the table, the plots and the report")
+    parser.add_argument("--out", type=a_path, required=True, help="folder for the table, the plots and the report")
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="worker processes (1)")
     parser.add_argument("--threads", type=at_least_one, default=1, help="cores for each worker (1)")

@@ -21,7 +21,7 @@ from gapr_core.data.pair_files import load_clouds, pair_paths
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime import files, origin
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import a_path, at_least_one
 from gapr_core.runtime.console import say
 
 log = logging.getLogger(__name__)
@@ -32,9 +32,9 @@ INVALID_INPUT = "INVALID_INPUT"  # status of a pair that cannot be read
 
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr evaluate`."""
-    parser.add_argument("--pairs", required=True, type=Path, help="folder of NAME.npz with source and target, mm")
+    parser.add_argument("--pairs", required=True, type=a_path, help="folder of NAME.npz with source and target, mm")
     parser.add_argument(
-        "--out", required=True, type=Path, help="file for the answers, poses.json; keys: docs/reference/json.md"
+        "--out", required=True, type=a_path, help="file for the answers, poses.json; keys: docs/reference/json.md"
     )
     parser.add_argument("--limit", type=at_least_one, help="register only the first LIMIT pairs")
     options.add_method(parser)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.runtime import settings
+from gapr_core.runtime.arguments import a_path
 
 
 def add_method(parser: ArgumentParser) -> None:
@@ -21,7 +21,7 @@ def add_method(parser: ArgumentParser) -> None:
 
 def add_settings(parser: ArgumentParser) -> None:
     """`--config` and `--set`."""
-    parser.add_argument("--config", type=Path, help="YAML file of settings; gapr settings lists them")
+    parser.add_argument("--config", type=a_path, help="YAML file of settings; gapr settings lists them")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
         help="one setting, such as refinement.iterations=5; over --config; may be repeated",

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
-from pathlib import Path
 
 from gapr_core.benchmark.methods import REFINED
 from gapr_core.commands.benchmark import benchmark
@@ -21,7 +20,7 @@ from gapr_core.data import anatomy
 from gapr_core.data.make_pairs import Recipe, write_pairs
 from gapr_core.data.pool import specimens
 from gapr_core.errors import ConfigError
-from gapr_core.runtime.arguments import above_zero, at_least_one
+from gapr_core.runtime.arguments import a_path, above_zero, at_least_one
 from gapr_core.runtime.console import say
 
 PROTOCOLS = {
@@ -35,15 +34,15 @@ TRAINED = {4: ("Backbone (table IV)", "Final cross-attention (table IV)"), 5: ("
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr paper`."""
     parser.add_argument("--table", type=int, required=True, choices=(*PROTOCOLS, *TRAINED), help="of the paper")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the table; an interrupted one goes on")
-    parser.add_argument("--weights", type=Path, help="of the network in tables 1 to 3 (gapr train wrote them)")
+    parser.add_argument("--out", type=a_path, required=True, help="folder of the table; an interrupted one goes on")
+    parser.add_argument("--weights", type=a_path, help="of the network in tables 1 to 3 (gapr train wrote them)")
     parser.add_argument("--also", default="", help="more methods in tables 1 to 3, with commas: predator@WEIGHTS")
-    parser.add_argument("--anatomy", type=Path, help="corresponded meshes with splits.json; else parametric bones")
+    parser.add_argument("--anatomy", type=a_path, help="corresponded meshes with splits.json; else parametric bones")
     parser.add_argument("--split", default="test", choices=[s for s in anatomy.SPLITS if s != "train"], help="(test)")
     parser.add_argument("--bones", default=",".join(anatomy.BONES), help="with commas; the paper's four")
     parser.add_argument("--count", type=at_least_one, default=40, help="pairs for each bone and protocol (40)")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="processes (1)")
-    parser.add_argument("--config", type=Path, help="of the trainings in tables 4 and 5 (config/ablate_paper.yaml)")
+    parser.add_argument("--config", type=a_path, help="of the trainings in tables 4 and 5 (config/ablate_paper.yaml)")
     parser.add_argument("--pairs", type=at_least_one, help="budget of every network in tables 4 and 5")
     parser.add_argument("--seeds", type=at_least_one, default=1, help="trainings of every network in them (1)")
     parser.add_argument("--minutes", type=above_zero, default=math.inf, help="stop a training after so long")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 
 from gapr_core.runtime import files
+from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
 
 OK = 0
@@ -13,10 +13,10 @@ OK = 0
 
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr pivot`."""
-    parser.add_argument("recording", type=Path, help="NDI Track's CSV, or a PLUS sequence (.igs.mha)")
+    parser.add_argument("recording", type=a_path, help="NDI Track's CSV, or a PLUS sequence (.igs.mha)")
     parser.add_argument("--tool", type=int, help="which of several recorded tools, from 0")
     parser.add_argument("--reference", type=int, metavar="TOOL", help="the tool that the dimple moves with, from 0")
-    parser.add_argument("--json", type=Path, help="write tip, pivot and residual here as well")
+    parser.add_argument("--json", type=a_path, help="write tip, pivot and residual here as well")
 
 
 def run(args: Namespace) -> int:

@@ -17,6 +17,7 @@ from gapr_core.commands.answer import as_json, guidance_json
 from gapr_core.errors import ConfigError
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import files
+from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
@@ -41,9 +42,9 @@ class Registration(NamedTuple):
 def add_arguments(parser: ArgumentParser) -> None:
     """The options of `gapr register`; docs/formats.md explains formats, axes and units."""
     parser.add_argument(
-        "--source", required=True, type=Path, help="partial cloud, markups, recording, folder of slices, bag"
+        "--source", required=True, type=a_path, help="partial cloud, markups, recording, folder of slices, bag"
     )
-    parser.add_argument("--target", required=True, type=Path, help="full bone: mesh, cloud or label map")
+    parser.add_argument("--target", required=True, type=a_path, help="full bone: mesh, cloud or label map")
     units = ("mm", "cm", "m")
     parser.add_argument("--units", choices=units, help="of meshes and clouds (default: mm; clouds of a bag: m)")
     parser.add_argument("--source-units", choices=units, help="of the source, where it is in another unit")
@@ -60,16 +61,16 @@ def add_arguments(parser: ArgumentParser) -> None:
                         help="of the camera in the source's frame, mm; auto: its pixels or its surface may show it; "
                         "none: all is bone")  # fmt: skip
     parser.add_argument(
-        "--landmarks", nargs=2, type=Path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
+        "--landmarks", nargs=2, type=a_path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
     )
-    parser.add_argument("--targets", type=Path, help="markups of a plan, target frame: the error to expect there")
-    parser.add_argument("--out", type=Path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
-    parser.add_argument("--residuals", type=Path, help="signed distance of every point, as .json or coloured .ply")
-    parser.add_argument("--slicer", type=Path, metavar="FOLDER", help="a scene for 3D Slicer")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="one page with all of it, on refusals too")
-    parser.add_argument("--rerun", type=Path, metavar="FILE.rrd", help="a recording for rerun, on refusals too")
+    parser.add_argument("--targets", type=a_path, help="markups of a plan, target frame: the error to expect there")
+    parser.add_argument("--out", type=a_path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
+    parser.add_argument("--residuals", type=a_path, help="signed distance of every point, as .json or coloured .ply")
+    parser.add_argument("--slicer", type=a_path, metavar="FOLDER", help="a scene for 3D Slicer")
+    parser.add_argument("--report", type=a_path, metavar="FILE.html", help="one page with all of it, on refusals too")
+    parser.add_argument("--rerun", type=a_path, metavar="FILE.rrd", help="a recording for rerun, on refusals too")
     parser.add_argument("--guide", action="store_true", help="say where on the bone another look would help most")
-    parser.add_argument("--json", type=Path, help="write the result here as well; keys: docs/reference/json.md")
+    parser.add_argument("--json", type=a_path, help="write the result here as well; keys: docs/reference/json.md")
     options.add_method(parser)
 
 

@@ -18,7 +18,7 @@ from gapr_core.data.protocols import PROTOCOLS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.runtime import cluster, files
-from gapr_core.runtime.arguments import at_least_one
+from gapr_core.runtime.arguments import a_path, at_least_one
 from gapr_core.runtime.console import say
 
 FORMAT = 1
@@ -62,10 +62,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--bones", help="with commas; default: femur,tibia,pelvis,thoracic, or what --meshes holds")
     parser.add_argument("--count", type=at_least_one, default=40, help="pairs for each bone and protocol (40)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, required=True, help="folder for NAME.npz and manifest.json")
+    parser.add_argument("--out", type=a_path, required=True, help="folder for NAME.npz and manifest.json")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--anatomy", type=Path, help="folder of corresponded meshes with splits.json")
-    where.add_argument("--meshes", type=Path, help="folder of your own meshes, one per subject, or a folder per bone")
+    where.add_argument("--anatomy", type=a_path, help="folder of corresponded meshes with splits.json")
+    where.add_argument("--meshes", type=a_path, help="folder of your own meshes, one per subject, or a folder per bone")
     parser.add_argument("--units", default="mm", choices=("mm", "cm", "m"), help="of --meshes")
     parser.add_argument(
         "--split", required=True, choices=(*anatomy.SPLITS, "all"),

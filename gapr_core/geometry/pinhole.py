@@ -20,6 +20,7 @@ MOST_POINTS = 2000  # that are looked at, evenly spread over the pixels
 FEWEST_SAMPLE, LARGEST_SAMPLE = 1000, 10_000  # points whose lines of sight are counted
 SAME_SIGHT = 1e-5  # tangent between lines of sight that are one; those of two pixels are farther apart
 FEWEST_A_SIGHT = 4  # coordinates of a row, and of a column, on average
+LARGEST_FILLING = 0.25  # share of the steps of `SAME_SIGHT` across the view at which there is a line of sight
 LARGEST_MISFIT = 1.0  # pixels, root mean square
 LARGEST_DISAGREEMENT = 0.15  # of the distance, between the centres that halves of the image give; that of all is nearer
 
@@ -74,7 +75,8 @@ def is_centre_of(points: ArrayLike) -> bool:
     """Whether the origin is the centre of a pinhole camera that saw a cloud, and the axes are along those of its image.
 
     The quotients of two coordinates and the third, that along the view, are then few: one for each row and each column,
-    while the coordinates themselves are many. A plane across the view could have been seen from anywhere.
+    while the coordinates themselves are many. A plane across the view could have been seen from anywhere. And they are
+    far apart: those of a cloud that is dense, or far from the origin, are few only where they are rounded.
 
     Args:
         points: (N, 3), any unit; those that saw nothing are not finite, or exactly (0, 0, 0).
@@ -95,8 +97,10 @@ def _is_view_along(axis: int, points: Array) -> bool:
     if len(points) < FEWEST_SAMPLE or not ((depth > NOTHING).all() or (depth < -NOTHING).all()):
         return False
     sights = np.round(across / depth[:, None] / SAME_SIGHT)
-    places = (len(np.unique(column)) for column in across.T)  # few where they are on a lattice themselves
-    return all(FEWEST_A_SIGHT * len(np.unique(s)) <= n for s, n in zip(sights.T, places, strict=True))
+    found = np.array([len(np.unique(column)) for column in sights.T])
+    places = np.array([len(np.unique(column)) for column in across.T])  # few where they are on a lattice themselves
+    far_apart = found <= LARGEST_FILLING * (np.ptp(sights, axis=0) + 1.0)
+    return bool((FEWEST_A_SIGHT * found <= places).all() and far_apart.all())
 
 
 def _projection(pixels: Array, points: Array) -> Array | None:

@@ -13,7 +13,7 @@ from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
 from gapr_core.registration.kernels import residuals_at
-from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
@@ -121,6 +121,7 @@ class Accumulator:
         if viewpoint is not None:
             how = "register the clouds of a camera one by one, or leave the viewpoint out"
             raise ConfigError("collected sources without a viewpoint", "one viewpoint for all of them", how)
+        check_call(target, initial)
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target

@@ -43,6 +43,7 @@ class Assessment:
         contributions: log odds that each feature adds to the probability's.
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
+        most: no surer than this, in a stream neither: no such source was calibrated.
     """
 
     fit: Fit
@@ -61,6 +62,7 @@ class Assessment:
     contributions: Mapping[str, float] = field(default_factory=dict)
     factor95: float = 1.0
     independent_points: float = RulesConfig.independent_points
+    most: float = 1.0
 
     @property
     def centre_mm(self) -> Array:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.special import expit
 
-from gapr_core.errors import MethodUnavailableError, WeightsError
+from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.registration.additive import FIT_AGAIN, Additive, from_dict, read
-from gapr_core.registration.features import FEATURES_OF
+from gapr_core.registration.features import FEATURES, FEATURES_OF
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 CALIBRATIONS = {name: WEIGHTS / f"confidence_{name}.json" for name in FEATURES_OF}
@@ -69,6 +69,17 @@ class Calibration:
             given = f"proposer {proposer!r}, models exist for {', '.join(CALIBRATIONS)}"
             raise MethodUnavailableError("a proposer with a fitted confidence model", given, how)
         return Calibration.load(CALIBRATIONS[proposer])
+
+    def check_is_for(self, proposer: str) -> None:
+        """Refuse a model for another proposer that has one of its own, or for answers that have other features.
+
+        Raises:
+            ConfigError: it is.
+        """
+        of_rounds = FEATURES_OF.get(self.proposer, FEATURES) == FEATURES
+        if self.proposer != proposer and (proposer in CALIBRATIONS or not of_rounds):
+            how = "pass the calibrations in the order of the proposers: a model is good for its own only"
+            raise ConfigError(f"a confidence model of {proposer!r}", f"one of {self.proposer!r}", how)
 
     def probability(self, features: Mapping[str, float]) -> float:
         """Probability, 0 to 1, that the pose is within 4 mm and 5 deg; NaN where a feature is no number."""

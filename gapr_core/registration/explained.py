@@ -25,7 +25,10 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
-VIEWPOINT = "check that the viewpoint is the camera's place in the frame of the cloud, in mm, "
+VIEWPOINT = (
+    "check that the viewpoint, given or read off the pixels, is the camera's place in the frame of the cloud "
+    "(none: no camera saw it), "
+)
 SAY_WHERE = "say where the camera was, "
 NO_RIVAL = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 

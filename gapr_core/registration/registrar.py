@@ -63,7 +63,7 @@ class Registrar:
         precision: what corrects the predicted errors; the shipped one when not given.
 
     Raises:
-        ConfigError: no proposer, or not one calibration for each.
+        ConfigError: no proposer, or not one calibration for each, of that one.
         MethodUnavailableError: no confidence model ships for a proposer, and none was given.
     """
 
@@ -88,6 +88,8 @@ class Registrar:
         if len(self.calibrations) != len(self.proposers):
             given = f"{len(self.calibrations)} for {len(self.proposers)} proposers"
             raise ConfigError("one confidence model for each proposer", given, "pass as many calibrations as proposers")
+        for proposer, calibration in zip(self.proposers, self.calibrations, strict=True):
+            calibration.check_is_for(proposer.name)
         self.precision = precision or Precision.load()
 
     @classmethod
@@ -176,9 +178,7 @@ class Registrar:
         An answer that is `enough` ends the rounds, and no mirror image of its source is registered in full.
         """
         clock = clock or Clock()
-        if not isinstance(target, PreparedTarget):
-            how = "pass what `prepare` returns for it"
-            raise InvalidPointCloudError("a prepared target", type(target).__name__, how)
+        check_call(target, initial)
         target = offset_surface(target, self.config.sensor)
         prepared = sources.prepare(source, self.config.source, self.config.num_threads, viewpoint is not None)
         clock.lap("prepare")
@@ -229,7 +229,7 @@ class Registrar:
         a, most = assessment, self.config.cortices.largest_confidence
         both = a.target.both_cortices
         again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
-        return (again or a).limited(most)
+        return replace((again or a).limited(most), most=most)
 
     def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:
         """A source that is refused as bone, taken for what a camera saw; None where that is not sure either.
@@ -336,6 +336,19 @@ def shipped_network(device: str = "cpu") -> Proposer:
     return NetworkProposer.from_weights(device=device)
 
 
+def check_call(target: object, initial: ArrayLike | None) -> None:
+    """Refuse a target that is not prepared, and an `initial` that is no rigid pose, before anything is forgotten.
+
+    Raises:
+        InvalidPointCloudError: as `Registrar.register`.
+    """
+    if not isinstance(target, PreparedTarget):
+        how = "pass what `prepare` returns for it"
+        raise InvalidPointCloudError("a prepared target", type(target).__name__, how)
+    if initial is not None:
+        _rigid(initial)
+
+
 def _search(config: RegistrarConfig) -> NormalAlignedSearch:
     return NormalAlignedSearch(config.search, config.num_threads)
 
@@ -346,7 +359,10 @@ def _finite(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> A
     Raises:
         InvalidPointCloudError: another shape, or a value that is no finite number.
     """
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of several lengths
+        raise InvalidPointCloudError(f"a finite {shape} {what}", str(error), how) from error
     if array.shape != shape or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         given = f"shape {array.shape}" if array.shape != shape else str(array.tolist())
         raise InvalidPointCloudError(f"a finite {shape} {what}", given, how)

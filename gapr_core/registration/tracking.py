@@ -19,7 +19,7 @@ from gapr_core.registration.evidence import Evidence
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.following import FollowedPose, Follower
 from gapr_core.registration.memory import Memory, MemoryFirst
-from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.shared_misfit import SharedMisfit
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
@@ -125,6 +125,7 @@ class Tracker:
 
         Another target than before starts a new track, and so does `initial`.
         """
+        check_call(target, initial)
         if target is not self._bone:
             self.reset()
             self._bone = target
@@ -206,7 +207,7 @@ class Tracker:
         self._last = assessment.fit.T
         one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))
         together = self._with_shared_misfit(one_by_one, agrees)
-        return together.limited(float(np.sqrt(alone)) if agrees else alone)
+        return together.limited(min(float(np.sqrt(alone)) if agrees else alone, assessment.most))
 
     def _with_shared_misfit(self, assessment: Assessment, agrees: bool) -> Assessment:
         """The probability in the light of what the residuals of the frames have in common.

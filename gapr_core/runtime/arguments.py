@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
+from pathlib import Path
 
 
 def above_zero(text: str) -> float:
@@ -21,3 +22,10 @@ def at_least_one(text: str) -> int:
     if not text.strip().isdecimal() or int(text) < 1:
         raise ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
     return int(text)
+
+
+def a_path(text: str) -> Path:
+    """A path; an empty one, as of a variable that is not set, would be the folder that one is in."""
+    if not text.strip():
+        raise ArgumentTypeError("expected a path, got an empty text: is a variable of the shell not set?")
+    return Path(text)

@@ -60,6 +60,18 @@ def build(layout) -> PointCloud2:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(("count", "is_read"), [(0, True), (1, True), (2, False)])
+def test_a_count_of_0_the_default_of_the_message_is_one(count, is_read):
+    cloud = xyz_to_cloud(np.arange(6.0).reshape(2, 3), Header(frame_id="probe"))
+    for field in cloud.fields:
+        field.count = count
+    if is_read:
+        np.testing.assert_array_equal(cloud_to_xyz(cloud), np.arange(6.0).reshape(2, 3))
+    else:
+        with pytest.raises(InvalidMessageError, match="field x must have count 1, got 2"):
+            cloud_to_xyz(cloud)
+
+
 @settings(max_examples=300, deadline=None)
 @given(layouts())
 def test_every_legal_layout_gives_back_its_points(layout):

@@ -1,4 +1,5 @@
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import pytest
 from gapr_core import clouds
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.registration import target
-from gapr_core.surface import Surface
+from gapr_core.surface import Surface, as_points
 
 VERTICES = np.array([[0, 0, 0], [40, 0, 0], [0, 30, 0], [0, 0, 20]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -213,6 +214,15 @@ def test_a_missing_file_and_an_unknown_format_are_distinguished(tmp_path):
 def test_arrays_of_another_shape_or_type_are_refused(array):
     with pytest.raises(InvalidPointCloudError):
         clouds.load(array)
+
+
+@pytest.mark.parametrize(
+    ("given", "how"),
+    [(Surface(np.zeros((5, 3))), "pass its points"), ("a.ply", "load it first"), (Path("a.ply"), "load it first")],
+)
+def test_what_is_no_array_is_answered_with_how_to_make_one(given, how):
+    with pytest.raises(InvalidPointCloudError, match=how):
+        as_points(given)
 
 
 def test_rows_that_are_not_finite_are_dropped_but_not_all_of_them():

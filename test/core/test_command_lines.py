@@ -144,6 +144,14 @@ def test_a_wrong_command_line_is_one_line_and_exit_code_1(folder, capsys, line):
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.parametrize("option", ["--source", "--target", "--out"])
+def test_a_variable_of_the_shell_that_is_not_set_is_no_folder(folder, capsys, option):
+    line = ["register", "--source", "cloud.npy", "--target", "cloud.npy", option, ""]
+    with pytest.raises(SystemExit) as end:
+        cli.main(line)
+    assert end.value.code == 1 and "expected a path, got an empty text" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["register --source cloud.npy --target cloud.npy --method",
                                      "evaluate --pairs pairs --out o.json --method",
                                      "benchmark --pairs pairs --out o --methods"])  # fmt: skip

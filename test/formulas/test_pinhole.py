@@ -155,6 +155,17 @@ def test_few_points_points_behind_the_camera_and_lattices_show_nothing():
     assert not pinhole.is_centre_of(in_a_row(image(noise_mm=0.0, relief_mm=0.0))), "a plane across the view"
 
 
+@pytest.mark.parametrize(("count", "half_mm", "away_mm"), [(30_000, 60.0, 3000.0), (5000, 60.0, 100_000.0)])
+def test_lines_of_sight_that_are_one_only_since_they_are_rounded_show_no_camera(count, half_mm, away_mm):
+    """A dense cloud, or one far from the origin of a tracker's frame: its sights fill the few steps across the view."""
+    points = np.random.default_rng(6).uniform(-half_mm, half_mm, (count, 3)) + [0.0, 0.0, away_mm]
+    steps = np.round(points[:, :2] / points[:, 2:] / pinhole.SAME_SIGHT)
+    assert min(len(np.unique(column)) for column in steps.T) * pinhole.FEWEST_A_SIGHT < count
+    assert not pinhole.is_centre_of(points)
+    fine = np.random.default_rng(4).permutation(image(300, 300, 8000.0).reshape(-1, 3))
+    assert pinhole.is_centre_of(fine), "a camera of 8000 pixels along its focal length"
+
+
 def test_rows_and_columns_say_more_than_the_origin_and_the_origin_more_than_nothing():
     grid = image()
     points = grid.reshape(-1, 3)

@@ -49,6 +49,7 @@ def ros():
         ("max_tre", "two", "write 1.0"),
         ("min_points", 3.5, "must be of type integer, got 3.5"),
         ("model_path", 5, 'write "5"'),
+        ("model_label", 75, """write "75" in a file, -p 'model_label:="75"' in a shell"""),
         ("continuous", "yes", "write true"),
         ("min_confidence", 1.5, "within 0 to 1"),
         ("timeout", float("nan"), "must be at least 0.001 s, got nan"),

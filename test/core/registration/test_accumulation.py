@@ -56,6 +56,18 @@ def test_only_the_newest_sources_are_kept(registrar, frames):
 
 
 @pytest.mark.parametrize("tracked", [False, True])
+def test_a_call_that_cannot_be_answered_loses_nothing(registrar, frames, prepared, tracked):
+    accumulator = Accumulator(Tracker(registrar) if tracked else registrar, most=20)
+    accumulator.register(frames[0].source, prepared)
+    for target, initial in ((frames[0].target, None), (prepared, np.zeros((4, 4)))):
+        with pytest.raises(InvalidPointCloudError):
+            accumulator.register(frames[1].source, target, initial)
+    np.testing.assert_array_equal(accumulator.collected, frames[0].source)
+    accumulator.register(frames[1].source, prepared)
+    assert len(accumulator.collected) == len(frames[0].source) + len(frames[1].source)
+
+
+@pytest.mark.parametrize("tracked", [False, True])
 def test_what_was_seen_from_several_places_has_no_camera(registrar, frames, prepared, alone, monkeypatch, tracked):
     """A source that is refused alone: as a camera's it is not tried; by the registrar itself it is."""
     refused, asked = next(pair.source for pair, result in zip(frames, alone, strict=True) if not result.ok), []

@@ -45,7 +45,8 @@ def pair(femur):
 
 def test_a_sure_answer_ends_the_rounds(pair):
     right, never = Fixed("network", pair.T_target_source[None]), Fixed("search", np.eye(4)[None])
-    registrar = Registrar(ONE_THREAD, [right, never], [Calibration.shipped("search")] * 2)
+    of_both = [replace(Calibration.shipped("search"), proposer=name) for name in ("network", "search")]
+    registrar = Registrar(ONE_THREAD, [right, never], of_both)
     target = registrar.prepare(pair.target)
     result = registrar.register(pair.source, target)
     assert result.ok and result.rounds == 1
@@ -109,6 +110,12 @@ def test_as_many_confidence_models_as_proposers_are_needed():
         Registrar(proposers=[])
     with pytest.raises(ConfigError, match="one confidence model"):
         Registrar(calibrations=[])
+
+
+@pytest.mark.parametrize("other", ["network", "scene"])
+def test_the_confidence_model_of_another_proposer_is_refused(other):
+    with pytest.raises(ConfigError, match=f"model of 'search'.*one of '{other}'"):
+        Registrar(calibrations=[Calibration.shipped(other)])
 
 
 def test_a_gpu_that_is_not_there_and_a_missing_torch_are_named(monkeypatch):

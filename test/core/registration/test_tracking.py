@@ -8,7 +8,7 @@ from scipy.special import expit, logit
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.stream import Motion, simulate
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
@@ -300,6 +300,23 @@ def test_no_stream_makes_a_probability_larger_than_its_square_root(scripted, fra
     result = tracker.register(frames[1].source, prepared)
     assert result.features["shared_misfit"] == 0.0 and result.contributions["shared_misfit"] == 2.0
     assert result.confidence == pytest.approx(np.sqrt(alone)) and not result.ok
+
+
+def test_no_stream_makes_a_source_surer_than_it_may_be(scripted, frames, prepared, monkeypatch):
+    """One on both cortices, of which no model of the confidence has seen any."""
+    assess = Registrar.assess
+    tracker = scripted(None, 0.0, 0.0, 0.0)
+    monkeypatch.setattr(Registrar, "assess", lambda *a, **k: replace(assess(*a, **k), probability=0.85, most=0.85))
+    assert [tracker.register(pair.source, prepared).confidence for pair in frames[:4]] == [0.85] * 4
+
+
+def test_a_call_that_cannot_be_answered_changes_nothing(registrar, frames, prepared):
+    tracker = Tracker(registrar)
+    tracker.register(frames[0].source, prepared)
+    for target, initial in ((frames[0].target, None), (prepared, np.zeros((4, 4)))):
+        with pytest.raises(InvalidPointCloudError):
+            tracker.register(frames[1].source, target, initial)
+    assert tracker.register(frames[1].source, prepared).proposer == Memory.name
 
 
 def test_after_a_jump_what_the_frames_shared_counts_only_against_the_bone(scripted, frames, prepared):

@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gapr_core.runtime import compiled_code
+
 if TYPE_CHECKING:
     from gapr_core.clouds import load
     from gapr_core.config import RegistrarConfig
@@ -43,6 +45,9 @@ _HOMES = {
     "MethodUnavailableError": "errors",
 }
 __all__ = [*_HOMES, "__version__"]
+
+
+compiled_code.find_a_place()
 
 
 def __getattr__(name: str) -> Any:

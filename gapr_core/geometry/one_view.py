@@ -25,7 +25,7 @@ DISTANCE_MM = 450.0  # of a depth camera from what it looks at
 CLEAR_OF_CLOUD = 1.5  # radii of the cloud, from its middle: a camera is no nearer
 SMALLEST_PIXEL_MM = 1.0
 PIXEL_SPACINGS = 1.5  # typical distances between neighbours: closes the surface
-BULGE = 2.0  # what a share of points that bulge counts beside a share that is visible
+BULGE = 2.0  # how much more a share that bulges counts than one that is visible
 LEVEL_MM = 1e-6  # a point no farther off its neighbours is level
 
 

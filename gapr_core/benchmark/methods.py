@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
@@ -16,6 +16,9 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import settings
+
+if TYPE_CHECKING:
+    from gapr_core import Registrar
 
 OURS = "gapr"
 
@@ -32,13 +35,18 @@ def _from_pretrained(config: RegistrarConfig) -> RegistrationMethod:
 def _search_alone(config: RegistrarConfig) -> RegistrationMethod:
     from gapr_core import Registrar
 
-    return Registrar(config)
+    return _named(Registrar(config), "gapr_search")
 
 
 def _network_alone(config: RegistrarConfig) -> RegistrationMethod:
     from gapr_core.registration.registrar import Registrar, shipped_network
 
-    return Registrar(config, [shipped_network()])
+    return _named(Registrar(config, [shipped_network()]), "gapr_network")
+
+
+def _named(registrar: Registrar, name: str) -> Registrar:
+    registrar.name = name
+    return registrar
 
 
 def _tracker(config: RegistrarConfig) -> RegistrationMethod:

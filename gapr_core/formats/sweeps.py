@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats import text, tracker
+from gapr_core.formats import axes, text, tracker
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry import se3
 from gapr_core.surface import Surface
@@ -44,8 +45,8 @@ def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: i
     """(N, 4, 4) of one transform by its place in the list of their names, in the frame of another one if it is named.
 
     Raises:
-        InvalidPointCloudError: none of them, several and none chosen, or two that are not valid together or do not
-            lead to one frame.
+        InvalidPointCloudError: none of them, several and none chosen, two that are not valid together or do not lead
+            to one frame, or one that is not rigid, as those of an image's pixels.
     """
     names, valid = list(poses), [i for i, frames in enumerate(poses.values()) if frames]
     if tool is None and len(valid) == 1:
@@ -58,7 +59,17 @@ def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: i
     both = [number for number in poses[names[used[0]]] if all(number in poses[names[i]] for i in used)]
     if not both:
         raise tracker.never_seen(used, names, path)
-    return tracker.relative([np.stack([poses[names[i]][number] for number in both]) for i in used])
+    return tracker.relative([_rigid(poses[names[i]], both, names[i], path) for i in used])
+
+
+def _rigid(frames: Frames, numbers: list[int], name: str, path: Path) -> Array:
+    """(N, 4, 4) of one transform in these frames, without the rounding of its rotation."""
+    for number in numbers:
+        if why := se3.why_not_rigid(frames[number]):
+            given = f"{path.name} with {name} of frame {number}, whose {why}"
+            how = "name poses of tools with --tool and --reference, or record it again"
+            raise InvalidPointCloudError("rigid poses, without scale or reflection", given, how)
+    return np.stack([se3.nearest_rigid(frames[number]) for number in numbers])
 
 
 def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Frames]:
@@ -102,10 +113,12 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
     """The slices of a folder as one cloud, in mm.
 
     Each slice is a file of points (x y z) in one common frame; or, where `poses.csv` gives a 4x4 matrix in 16 numbers
-    for each slice in the order of their names (slice_2 before slice_10), of points in the slice's own frame.
+    for each slice in the order of their names (slice_2 before slice_10), of points in the slice's own frame. Axes turn
+    the whole cloud, and no slice before its pose.
 
     Raises:
-        InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid.
+        InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid; a slice that says
+            that it is in RAS.
         ValueError: no slices, or another number of poses.
     """
     files = [f for f in path.iterdir() if f.name != POSES and not f.name.startswith(".")]
@@ -117,11 +130,21 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
         raise ValueError(f"no slices ({' '.join(SLICE_ENDINGS)}) in it")
     from gapr_core.formats.reading import read
 
-    slices = [read(file, options).points for file in files]
+    _check_axes(files)
+    slices = [read(file, replace(options, axes="as_is")).points for file in files]
     if (path / POSES).is_file():
         _say_order(files)
         slices = _placed(slices, path / POSES, options)
     return Surface(np.vstack(slices), joined=True)
+
+
+def _check_axes(slices: list[Path]) -> None:
+    """Raise for a slice in RAS: what its pose or the other slices are in would be a guess."""
+    for path in slices:
+        if path.is_file() and axes.stated(path) == "ras":
+            how = "turn it to the frame of the others or of its pose, and take out what says so"
+            given = f"{path.name}, which says that it is in RAS"
+            raise InvalidPointCloudError("slices in the frame of a tracker or a probe", given, how)
 
 
 def _by_numbers(path: Path) -> tuple[list[str | int], str]:
@@ -148,10 +171,8 @@ def _placed(slices: list[Array], path: Path, options: ReadOptions) -> list[Array
 
 def _check_rigid(T: Array, number: int) -> None:
     """Raise for a matrix that is transposed, scaled or reflected, or has a number that is not finite."""
-    R = np.nan_to_num(T[:3, :3], posinf=0.0, neginf=0.0)
-    off = np.abs([*(R.T @ R - np.eye(3)).ravel(), *(T[3] - [0.0, 0.0, 0.0, 1.0])]).max()
-    if not np.isfinite(T).all() or off > se3.FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
-        row = " ".join(f"{value:.3g}" for value in T[3])
+    if not np.isfinite(T).all() or se3.why_not_rigid(T):
+        row, R = " ".join(f"{value:.8g}" for value in T[3]), np.nan_to_num(T[:3, :3], posinf=0.0, neginf=0.0)
         given = f"pose {number} with last row {row} and determinant {np.linalg.det(R):.3g} of its 3x3 part"
         how = "write it row by row, in mm, with last row 0 0 0 1, without scale or reflection"
         raise InvalidPointCloudError(f"rigid 4x4 matrices in {POSES}", given, how)

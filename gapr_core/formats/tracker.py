@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 QUATERNION, ANGLES, PLACE = ("q0", "qx", "qy", "qz"), ("rz", "ry", "rx"), ("tx", "ty", "tz")
 COLUMNS = "columns Q0 Qx Qy Qz or Rz Ry Rx, then Tx Ty Tz"
 SEEN = ("ok", "enabled", "valid")
+FARTHEST_MM = 1e6  # of a tool, by far; systems write numbers such as -3.7e28 where they have none
 FEWEST_POSES = 10
 SMALLEST_TURN_DEG = 20.0
 SPREAD_MM, LIFTED_MM = 1.0, 3.0  # of tips in a dimple, about; a tip farther from the pivot had left it
@@ -67,7 +68,7 @@ def read_poses(
 
     Raises:
         InvalidPointCloudError: no such columns, several tools and none chosen, a reference that is not another one of
-            them, or no row in which they were seen.
+            them, no row in which they were seen, or one with a number that is not finite or far too large.
         ValueError: a file that is cut.
     """
     data = (limits or FileLimits.from_environment()).read(path)
@@ -80,10 +81,10 @@ def read_poses(
     called = [_tool_name(rows[0][:start], i) for i, start in enumerate(starts)]
     used = chosen_with(tool, reference, called, path)
     columns = [_columns(names, starts[i], i, path) for i in used]
-    seen = [row for row in rows[1:] if row and all(_is_seen_in(row, state) for state, _ in columns)]
+    seen = {i: row for i, row in enumerate(rows[1:], start=2) if row and all(_is_seen_in(row, s) for s, _ in columns)}
     if not seen:
         raise never_seen(used, called, path)
-    return relative([_poses_in(seen, wanted) for _, wanted in columns])
+    return relative([_poses_in(seen, wanted, path) for _, wanted in columns])
 
 
 def _columns(names: Sequence[str], start: int, tool: int, path: Path) -> tuple[int | None, slice]:
@@ -97,10 +98,16 @@ def _columns(names: Sequence[str], start: int, tool: int, path: Path) -> tuple[i
     return state, slice(start, start + len(wanted))
 
 
-def _poses_in(rows: Sequence[Sequence[str]], columns: slice) -> Array:
-    if any(len(row) < columns.stop for row in rows):
-        raise ValueError("a row that ends before its pose")
-    values = np.array([[float(value) for value in row[columns]] for row in rows])
+def _poses_in(rows: Mapping[int, Sequence[str]], columns: slice, path: Path) -> Array:
+    """(N, 4, 4) of the rows by their numbers in the file, the line of names being row 1."""
+    for number, row in rows.items():
+        if len(row) < columns.stop:
+            raise ValueError(f"row {number} ends before its pose")
+        if wrong := [value.strip() for value in row[columns] if not abs(float(value)) <= FARTHEST_MM]:
+            given = f"{path.name} with {wrong[0][:LONGEST_NAME]} in row {number}"
+            how = "take that row out, or record it again"
+            raise InvalidPointCloudError(f"poses of finite numbers up to {FARTHEST_MM:g} mm", given, how)
+    values = np.array([[float(value) for value in row[columns]] for row in rows.values()])
     return poses_of(values[:, :-3], values[:, -3:])
 
 
@@ -202,9 +209,13 @@ def pivot(poses: Array) -> Tip:
         poses: (N, 4, 4) of the tool's marker, mm.
 
     Raises:
-        InvalidPointCloudError: fewer than ten poses, too little turning to know the tip, or a tip that did not stay.
+        InvalidPointCloudError: fewer than ten poses, one that is not finite or far too large, too little turning to
+            know the tip, or a tip that did not stay.
     """
     poses = np.asarray(poses, dtype=np.float64)
+    if wrong := int(np.sum(~(np.abs(poses) <= FARTHEST_MM).all(axis=(1, 2)))):
+        expected = f"poses of finite numbers up to {FARTHEST_MM:g} mm"
+        raise InvalidPointCloudError(expected, f"{wrong} of {len(poses)} that are not", "leave them out")
     if len(poses) < FEWEST_POSES:
         expected = f"at least {FEWEST_POSES} poses"
         raise InvalidPointCloudError(expected, f"{len(poses)}", "turn the tool on its tip longer")

@@ -134,7 +134,7 @@ class Accumulator:
         except Exception:
             self._new = [points for points in self._new if _is_among(points, before)]
             raise
-        return self._decide_on_new(result, target)
+        return self._decide_on_new(replace(result, method=self.name), target)
 
     def _last(self) -> list[Array]:
         """The sources that are registered together, the newest last."""

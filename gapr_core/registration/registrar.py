@@ -154,14 +154,15 @@ class Registrar:
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
         """The answer to an assessment: thresholds, guidance where asked for, times."""
         if isinstance(assessment, Refusal):
-            return RegistrationResult(assessment.status, reason=assessment.reason, stage_ms=clock.stages)
+            reason = assessment.reason
+            return RegistrationResult(assessment.status, reason=reason, method=self.name, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
         named = explained.named_clutter(limits.limited(assessment, self.config), self.config)
         inferred = assessment.inferred_viewpoint is not None
         asked = replace(self.config, min_confidence=self.config.least_inferred) if inferred else self.config
         result = replace(answer(named, asked), guidance=guidance)
         clock.lap("assess")
-        return replace(result, stage_ms=clock.stages)
+        return replace(result, method=self.name, stage_ms=clock.stages)
 
     @single_threaded_libraries
     def assess(

@@ -135,7 +135,7 @@ class Tracker:
         assessment = self._assess(source, target, initial, viewpoint, clock)
         if isinstance(assessment, Assessment):
             assessment = self._with_evidence(assessment)
-        result = self.registrar.conclude(assessment, clock)
+        result = replace(self.registrar.conclude(assessment, clock), method=self.name)
         if isinstance(assessment, Assessment):
             self._remember(result, assessment.source.points)
             if self._is_sure and self._has_track and assessment.seen is None:

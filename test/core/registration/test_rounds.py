@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import logit
 
-from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
+from gapr_core import Accumulator, Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.benchmark import methods
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
@@ -162,3 +162,13 @@ def test_what_a_stream_may_still_accept_is_checked_against_its_image_and_correct
     found = registrar.assess(pair.source, registrar.prepare(pair.target))
     assert found.refusal is None and found.probability == pytest.approx(probability)
     assert done == (["mirror", "bias"] if is_checked else [])
+
+
+@pytest.mark.parametrize("name", ["gapr", "gapr_search", "gapr_network", "gapr_tracker"])
+def test_an_answer_and_a_refusal_name_their_method(pair, name):
+    method = methods.make(name, ONE_THREAD)
+    target = method.prepare(pair.target)
+    results = method.register(pair.source, target), method.register(np.full((5, 3), np.nan), target)
+    assert [result.method for result in results] == [name] * 2
+    together = Accumulator(method, most=2).register(pair.source, target)
+    assert together.method == "gapr_accumulator"

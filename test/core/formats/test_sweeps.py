@@ -1,0 +1,115 @@
+"""Transforms of a sequence and of slices are rigid, and axes turn a folder of slices once."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gapr_core.cli import main
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.formats import reading
+from gapr_core.formats.options import ReadOptions
+from gapr_core.formats.poses import poses_in
+from gapr_core.geometry import se3
+
+sys.path.insert(0, str(Path(__file__).parent))
+from test_references import T_REFERENCE_BONE, motions  # noqa: E402
+from test_references import igs as igs_of_two  # noqa: E402
+from test_sources import LPS_RAS, POINTS, TIP, igs, slices_with_poses, turned_poses  # noqa: E402
+
+CHANGES = {
+    "scaled": (np.diag([0.2, 0.2, 0.2, 1.0]), "determinant 0.008"),
+    "reflected": (np.diag([1.0, 1.0, -1.0, 1.0]), "determinant -1"),
+    "sheared": (np.eye(4) + 0.2 * np.eye(4, k=1) * [1, 1, 1, 0], "rotation part"),
+    "last row": (np.diag([1.0, 1.0, 1.0, 1.00001]), "last row is 0 0 0 1.00001, not 0 0 0 1"),
+}
+
+
+def changed(poses, number, how):
+    poses = poses.copy()
+    poses[number] = poses[number] @ CHANGES[how][0]
+    return poses
+
+
+@pytest.mark.parametrize("how", CHANGES)
+def test_a_tool_of_a_sequence_is_moved_by_rigid_poses_alone(tmp_path, capsys, how):
+    """Scaled by 0.2, the tip was 30 mm from its marker instead of 150, and nothing said so."""
+    path = igs(tmp_path / "a.igs.mha", changed(turned_poses(12), 3, how), ["OK"] * 12)
+    said = f"rigid poses.*; got .*a.igs.mha with ProbeToTracker of frame 3, whose .*{CHANGES[how][1]}.*--tool"
+    with pytest.raises(InvalidPointCloudError, match=said):
+        reading.read(path, ReadOptions(tip_mm=tuple(TIP)))
+    with pytest.raises(InvalidPointCloudError, match=said):
+        poses_in(path)
+    assert main(["pivot", str(path)]) == 1
+    err = capsys.readouterr().err
+    assert "frame 3" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("how", CHANGES)
+def test_the_reference_of_a_tool_is_rigid_too(tmp_path, how):
+    path, rest = tmp_path / "two.igs.mha", motions(4, 0)
+    igs_of_two(path, (changed(rest, 2, how), ()), (motions(4, 1), ()))
+    with pytest.raises(InvalidPointCloudError, match="with ReferenceToTracker of frame 2, whose"):
+        poses_in(path, 1, 0)
+    assert len(poses_in(path, 1)) == 4
+    igs_of_two(path, (changed(rest, 2, how), {2}), (motions(4, 1), ()))
+    assert len(poses_in(path, 1, 0)) == 3  # a frame that is not valid is not looked at
+
+
+def test_transforms_of_a_sequence_that_are_not_used_may_scale(tmp_path):
+    """PLUS writes calibrations next to poses; those of an image are mm per pixel."""
+    path, poses = igs(tmp_path / "a.igs.mha", turned_poses(3), ["OK"] * 3), turned_poses(3)
+    scaled = " ".join(map(str, np.diag([0.1, 0.1, 0.1, 1.0]).ravel()))
+    head = "".join(f"Seq_Frame{i:04d}_ImageToProbeTransform = {scaled}\n" for i in range(3))
+    path.write_bytes(head.encode() + path.read_bytes())
+    np.testing.assert_allclose(poses_in(path, 1), poses, atol=1e-9)
+    with pytest.raises(InvalidPointCloudError, match="ImageToProbe of frame 0"):
+        poses_in(path, 0)
+
+
+def test_poses_of_a_sequence_with_few_digits_are_read_and_made_rigid(tmp_path):
+    path = igs(tmp_path / "a.igs.mha", np.round(turned_poses(4), 3), ["OK"] * 4)
+    found = poses_in(path)
+    np.testing.assert_allclose(found, turned_poses(4), atol=2e-3)
+    np.testing.assert_allclose(
+        found[:, :3, :3] @ found[:, :3, :3].swapaxes(1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("off", [1e-5, 5e-3])
+def test_the_last_row_of_a_pose_of_slices_is_exact(tmp_path, off):
+    poses = turned_poses(2)
+    poses[1, 3] += [0.0, 0.0, 0.0, off]
+    folder = slices_with_poses(tmp_path / "a", poses)
+    with pytest.raises(
+        InvalidPointCloudError, match=f"got a: pose 2 with last row 0 0 0 {1.0 + off:g} and determinant 1"
+    ):
+        reading.read(folder)
+
+
+@pytest.mark.parametrize("has_poses", [True, False])
+def test_a_folder_of_slices_is_turned_once_and_after_its_poses(tmp_path, has_poses):
+    folder = slices_with_poses(tmp_path / "a", [T_REFERENCE_BONE, se3.inverse(T_REFERENCE_BONE)])
+    if not has_poses:
+        (folder / "poses.csv").unlink()
+    slices = [POINTS, POINTS + 1]
+    if has_poses:
+        slices = [se3.apply(T_REFERENCE_BONE, slices[0]), se3.apply(se3.inverse(T_REFERENCE_BONE), slices[1])]
+    for axes, factors in {"auto": 1.0, "as_is": 1.0, "lps": 1.0, "lps_to_ras": LPS_RAS}.items():
+        points = reading.read(folder, ReadOptions(axes=axes)).points
+        np.testing.assert_allclose(points, np.vstack(slices) * factors, atol=1e-9)
+    with pytest.raises(ConfigError, match="ras for a, which says its own"):
+        reading.read(folder, ReadOptions(axes="ras"))
+
+
+@pytest.mark.parametrize("axes", ["auto", "as_is", "lps", "lps_to_ras"])
+def test_a_slice_that_says_ras_is_refused_by_its_name(tmp_path, axes):
+    folder = slices_with_poses(tmp_path / "a", turned_poses(2))
+    file = folder / "slice_01.xyz"
+    points = file.read_text()
+    file.write_text(f"# SPACE=RAS\n{points}")
+    with pytest.raises(InvalidPointCloudError, match="got a: slice_01.xyz, which says that it is in RAS; turn it"):
+        reading.read(folder, ReadOptions(axes=axes))
+    file.write_text(f"# SPACE=LPS\n{points}")
+    assert len(reading.read(folder, ReadOptions(axes=axes)).points) == 6

@@ -112,11 +112,11 @@ def _answer(path: Path, method: RegistrationMethod) -> Answer:
         seconds = time.perf_counter() - start
     except InvalidPointCloudError as error:
         refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=str(error))
-        return as_json(refusal) | {"status": INVALID_INPUT}
+        return as_json(refusal) | {"status": INVALID_INPUT, "prepare_seconds": None}
     except (ConfigError, MethodUnavailableError, WeightsError):
         raise
     except Exception as error:
         log.warning("%s failed", path.name, exc_info=True)
         refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=f"{type(error).__name__}: {error}")
-        return as_json(refusal) | {"status": ERROR}
+        return as_json(refusal) | {"status": ERROR, "prepare_seconds": None}
     return as_json(result) | {"seconds": seconds, "prepare_seconds": prepare_seconds}

@@ -37,12 +37,12 @@ class LocalFrames:
 def nearest(
     points: Array, count: int, tree: cKDTree | None = None, num_threads: int = 1
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Distances (N, k), mm, and indices (N, k) of each point's nearest ones, itself the first.
+    """Distances (N, k), mm, and indices (N, k) of each point's nearest ones in the tree, itself the first.
 
-    k is `count`, or N where there are fewer.
+    k is `count`, or as many as there are in the tree where there are fewer. Without a tree it is that of the points.
     """
     tree = cKDTree(points) if tree is None else tree
-    k = list(range(1, min(count, len(points)) + 1))  # a list: else a column is missing where there is one
+    k = list(range(1, min(count, tree.n) + 1))  # a list: else a column is missing where there is one
     return tree.query(points, k=k, workers=thread_count(num_threads))  # type: ignore[no-any-return]
 
 

@@ -267,3 +267,11 @@ def test_the_field_gives_the_distance_to_the_surface_not_to_its_points():
     centres = np.stack(near, axis=1) * field.cell_mm + field.origin
     true = np.abs(np.linalg.norm(centres, axis=1) - 30.0)
     assert np.abs(field.distance[near] * 8.0 / 255.0 - true).max() < 0.25
+
+
+def test_of_few_points_the_nearest_in_a_tree_of_many_are_as_many_as_asked_for():
+    many = np.random.default_rng(3).normal(size=(50, 3))
+    gaps, found = quadrics.nearest(many[:4], 12, cKDTree(many))
+    assert gaps.shape == found.shape == (4, 12)
+    np.testing.assert_array_equal(found[:, 0], range(4))
+    assert quadrics.nearest(many[:4], 12)[1].shape == (4, 4)

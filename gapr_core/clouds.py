@@ -30,7 +30,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
             a label map (NIfTI, NRRD, MHA, DICOM SEG), markups or tracked slices; an (N, 3) array of floats (rows that
             are not finite are dropped); or a `Surface`.
         units: what the numbers are, "mm", "cm" or "m"; "auto" guesses mm or m from the extent and logs a warning.
-            Files in patient coordinates (label maps, markups) are in mm, whatever is named here.
+            Files in patient coordinates (label maps, markups) and a tracker's recordings are in mm, whatever is named
+            here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
 
     A mesh file of several separate long bones is read as one body, with a warning.
@@ -41,7 +42,7 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     """
     if isinstance(source, str | Path):
         name, surface = str(source), reading.read(Path(source), options)
-        says_its_own = reading.format_of(Path(source)).in_patient
+        says_its_own = reading.format_of(Path(source)).in_patient or _is_recording(surface, options)
     else:
         name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
         says_its_own = False
@@ -57,6 +58,11 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
         _warn_of_several_bones(surface, name)
     return surface
+
+
+def _is_recording(surface: Surface, options: ReadOptions | None) -> bool:
+    """Whether these are places of a tool's tip: a tracker records them in mm."""
+    return surface.joined and options is not None and options.tip_mm is not None
 
 
 def finite_points(array: ArrayLike) -> Array:

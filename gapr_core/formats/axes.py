@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.formats import columns
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.meshes import vtp
 from gapr_core.surface import Surface
@@ -37,22 +38,24 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
 
     Args:
         surface: as it is in the file.
-        path: the file, whose comment may say SPACE=LPS or SPACE=RAS, as those of 3D Slicer do.
+        path: the file, whose comment may say SPACE=LPS or SPACE=RAS, or whose columns may be named l p s or r a s, as
+            those of 3D Slicer do.
         axes: see `ReadOptions`.
 
     Raises:
         ConfigError: unknown axes, or "lps_to_ras" of a file that says RAS.
+        InvalidPointCloudError: as `stated`.
     """
     check(axes)
-    said = stated(path)
+    said, how = _said(path) or (None, "")
     if axes == "lps_to_ras" and said == "ras":
-        raise ConfigError("a file in LPS for lps_to_ras", f"{path.name}, which says SPACE=RAS", "use as_is: it is RAS")
+        raise ConfigError("a file in LPS for lps_to_ras", f"{path.name}, which {how}", "use as_is: it is RAS")
     if axes == "auto" and said == "ras":
-        log.warning("%s says SPACE=RAS: x and y are negated, to LPS", path.name)
+        log.warning("%s %s: x and y are negated, to LPS", path.name, how)
     elif said == "ras" and axes != "ras":
-        log.warning("%s says SPACE=RAS and is read as %s, as you say", path.name, axes.upper())
+        log.warning("%s %s and is read as %s, as you say", path.name, how, axes.upper())
     elif said == "lps" and axes == "ras":
-        log.warning("%s says SPACE=LPS and is read as RAS, as you say", path.name)
+        log.warning("%s %s and is read as RAS, as you say", path.name, how)
     return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])
 
 
@@ -82,7 +85,28 @@ def scaled(surface: Surface, factors: Array) -> Surface:
 
 
 def stated(path: Path) -> str | None:
-    """What a comment in the file's beginning says, "lps" or "ras"; None without one."""
+    """What a comment in the file's beginning or the names of its columns say, "lps" or "ras"; None without.
+
+    Raises:
+        InvalidPointCloudError: columns of several kinds, or others than the comment says.
+    """
+    said = _said(path)
+    return said[0] if said else None
+
+
+def _said(path: Path) -> tuple[str, str] | None:
+    """The axes that a file says, and how it does."""
+    comment = _in_comment(path)
+    named = columns.space(path) if path.suffix.lower() in columns.ENDINGS else None
+    if comment and named and comment != named:
+        given = f"SPACE={comment.upper()} and columns {' '.join(named)}"
+        raise InvalidPointCloudError("the same axes by comment and columns", given, "correct one of them")
+    if comment:
+        return comment, f"says SPACE={comment.upper()}"
+    return (named, f"has columns {' '.join(named)}") if named else None
+
+
+def _in_comment(path: Path) -> str | None:
     with path.open("rb") as file:
         head = file.read(COMMENT_BYTES)
     if found := COMMENT.search(head):

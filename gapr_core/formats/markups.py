@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import GaprError, InvalidPointCloudError
-from gapr_core.formats import axes
+from gapr_core.formats import axes, signatures
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
-from gapr_core.formats.reading import unreadable
-from gapr_core.formats.text import check_end
+from gapr_core.formats.reading import reason_of, unreadable
+from gapr_core.formats.text import check_encoding, check_end
 from gapr_core.runtime.files import write_json
 from gapr_core.surface import Surface
 
@@ -57,12 +57,13 @@ def load(path: Path) -> Markups:
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
     if not path.is_file() or not path.name.lower().endswith((".mrk.json", ".fcsv")):
         raise InvalidPointCloudError("markups: a .mrk.json or .fcsv file", str(path), "save the points from 3D Slicer")
+    signatures.check_packed(path, path.suffix.lower())
     try:
         found = _load(path, FileLimits.from_environment())
     except GaprError:
         raise
     except Exception as error:  # whatever a damaged file leads to: the sentence is the same
-        raise unreadable(path, str(error) or type(error).__name__) from error
+        raise unreadable(path, reason_of(error)) from error
     if len(found.points) == 0:
         raise unreadable(path, "no points in it")
     return found
@@ -70,6 +71,7 @@ def load(path: Path) -> Markups:
 
 def _load(path: Path, limits: FileLimits) -> Markups:
     data = limits.read(path)
+    check_encoding(data)
     markups = _of_fcsv(data) if path.suffix.lower() == ".fcsv" else _of_json(json.loads(data.decode("utf-8-sig")))
     if not np.isfinite(markups.points).all():
         raise InvalidPointCloudError("finite coordinates", f"{path.name} with others", "place the points again")
@@ -89,20 +91,39 @@ def save(path: Path, markups: Markups, descriptions: list[str] | None = None) ->
 
 def _of_json(content: Any) -> Markups:
     points, labels = [], []
-    for node in content["markups"]:
+    for node in _nodes(content):
         space = _space(node.get("coordinateSystem"))
         mm = _mm_per_unit(node.get("coordinateUnits", "mm"))
         if "controlPoints" not in node:
             raise ValueError(f"a {node.get('type', 'node')} without points")
-        placed = [p for p in node["controlPoints"] if p.get("positionStatus", "defined") == "defined"]
-        if any(len(p["position"]) != 3 for p in placed):
-            raise ValueError("a position that is not x y z")
-        positions = np.array([p["position"] for p in placed], dtype=np.float64).reshape(-1, 3)
+        placed = [p for p in _objects(node, "controlPoints") if p.get("positionStatus", "defined") == "defined"]
+        positions = np.array([_position(p) for p in placed], dtype=np.float64).reshape(-1, 3)
         points.append(axes.to_lps(positions * mm, space))
         labels += [str(p.get("label", "")) for p in placed]
     if not points:
         raise ValueError("no markups in it")
     return Markups(np.vstack(points), tuple(labels))
+
+
+def _nodes(content: Any) -> list[dict[str, Any]]:
+    if not isinstance(content, dict) or "markups" not in content:
+        raise ValueError("JSON without the list `markups`: save control points from 3D Slicer")
+    return _objects(content, "markups")
+
+
+def _objects(holder: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    """The list of this name, of objects alone."""
+    listed = holder[name]
+    if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
+        raise ValueError(f"`{name}` that is no list of objects")
+    return listed
+
+
+def _position(point: dict[str, Any]) -> list[float]:
+    position = point.get("position")
+    if isinstance(position, list) and len(position) == 3 and all(isinstance(value, int | float) for value in position):
+        return [float(value) for value in position]
+    raise ValueError("a position that is not x y z")
 
 
 def _of_fcsv(data: bytes) -> Markups:
@@ -116,7 +137,11 @@ def _of_fcsv(data: bytes) -> Markups:
     rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
     if len(names) == STATUS:  # some versions add two columns without a name: status of the position, type of the point
         rows = [row for row in rows if len(row) <= STATUS or row[STATUS].strip() in ("", PLACED)]
+    if not set("xyz") <= set(names):
+        raise ValueError(f"columns {' '.join(names)[:60]}, not x y z")
     at = [names.index(axis) for axis in "xyz"]
+    if any(len(row) <= max(at) for row in rows):
+        raise ValueError("a row that ends before its x y z")
     points = np.array([[float(row[i]) for i in at] for row in rows]).reshape(-1, 3)
     label = names.index("label") if "label" in names else 0
     return Markups(axes.to_lps(points, space), tuple(row[label] if label < len(row) else "" for row in rows))

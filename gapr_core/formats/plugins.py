@@ -39,7 +39,7 @@ class Plugin:
             InvalidPointCloudError: what the reader cannot read.
             MethodUnavailableError: a library that the reader needs is not installed.
         """
-        return self._module().read(path, options)  # type: ignore[no-any-return]
+        return self._module().read(_folder_of(path, self.entry), options)  # type: ignore[no-any-return]
 
     def _module(self) -> Any:
         try:
@@ -50,16 +50,26 @@ class Plugin:
 
 
 def of(path: Path) -> Plugin | None:
-    """The plug-in that reads a file or folder; None without one."""
+    """The plug-in that reads a file or folder, or the folder of the file that makes it one; None without one."""
     for entry in _entries():
-        if (path.is_file() and path.name.lower().endswith(f".{entry.name}")) or (path / entry.name).is_file():
+        has_ending = path.is_file() and path.name.lower().endswith(f".{entry.name}")
+        if has_ending or (_folder_of(path, entry) / entry.name).is_file():
             return Plugin(entry)
     return None
 
 
-def endings() -> list[str]:
-    """What plug-ins read, by the names of their entries."""
-    return sorted(entry.name for entry in _entries())
+def kinds() -> list[str]:
+    """What plug-ins read: endings, and names of files that make a folder one of their kind."""
+    return sorted(entry.name if _is_file_name(entry) else f".{entry.name}" for entry in _entries())
+
+
+def _is_file_name(entry: EntryPoint) -> bool:
+    return "." in entry.name
+
+
+def _folder_of(path: Path, entry: EntryPoint) -> Path:
+    """The folder, where the path is that of the file that makes it one of its kind; else the path itself."""
+    return path.absolute().parent if _is_file_name(entry) and path.name == entry.name and path.is_file() else path
 
 
 @cache

@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import re
+from array import array
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats import text, tracker
+from gapr_core.formats import columns, text, tracker
+from gapr_core.formats.columns import COMMENTS, FIRST, Columns, Header
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
-from gapr_core.surface import Surface
+from gapr_core.surface import Array, Surface
 
-DELIMITERS = ",;\t"
-COMMENTS = ("#", "//")
+Row = tuple[int, list[str]]  # the number of its line in the file, from 1, and its cells
+
+MANY_ROWS = 12  # of a column that rises all the time by chance one in 12!
 LONGEST_NAMES = 80  # characters of a line that an error quotes
+DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
 DECIMAL_COMMAS = re.compile(r"-?\d+,\d+([;\s]+-?\d+,\d+)+[;\s]*")
 SPLIT_DECIMALS = re.compile(r"-?\d+,\d+(,-?\d+,\d+){2}")  # as x,y,z: six whole numbers
+DEFINED, UNDEFINED = "defined", ("0", "false")  # of a control point of 3D Slicer that was never placed
 
 
 def read(path: Path, limits: FileLimits) -> Surface:
-    """X y z, or x y z nx ny nz, in the first columns or where a line of names says.
+    """X y z, or x y z nx ny nz, in the first columns or where a line of names says: x y z, l p s or r a s.
 
     Raises:
-        InvalidPointCloudError: names that do not say which columns are x y z, numbers of the points in the first one,
-            or decimal commas.
+        InvalidPointCloudError: names that do not say which columns are the coordinates, numbers of the points in the
+            first one, decimal commas, or a cell that is no number.
     """
     return _surface(limits.read(path))
 
 
 def read_csv(path: Path, options: ReadOptions) -> Surface:
-    """Columns named x y z (any case), or the first three; of a recording of a tracked tool, where its tip was.
+    """Columns named x y z, l p s or r a s (any case), or the first three; of a tracked tool, where its tip was.
 
     Raises:
         InvalidPointCloudError: a recording of a tracked tool without the tip, or of several tools and none chosen; a
@@ -41,7 +46,7 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
     """
     data = options.limits.read(path)
     header = next(text.lines(data), "")
-    names = [name.strip().lower() for name in _words(header, ",")]
+    names = [name.strip().lower() for name in columns.words(header, ",")]
     if tracker.is_recording(names) and options.tip_mm is not None:
         poses = tracker.read_poses(path, options.limits, options.tool, options.reference)
         return Surface(tracker.tips(poses, options.tip_mm), joined=True)
@@ -56,24 +61,124 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
 
 def _surface(data: bytes) -> Surface:
     lines = [line for line in text.lines(data) if line.strip()]
-    rows = [line for line in lines if not line.lstrip().startswith(COMMENTS)]
-    delimiter = next((d for d in DELIMITERS if rows and d in rows[0]), None)
-    named = bool(rows) and not _is_numbers(rows[0], delimiter)
-    names = _words(rows[0] if named else _comment_above(lines), delimiter)
-    rows = rows[1:] if named else rows
+    header = columns.header_of(lines)
+    rows = [line for line in lines if not line.lstrip().startswith(COMMENTS)][header.is_line :]
     if rows and DECIMAL_COMMAS.fullmatch(rows[0].strip()):
         raise _decimal_commas(rows[0])
-    values = text.table(rows, delimiter=delimiter)
+    if _defined(header) is not None:
+        return Surface(_by_cells(data, header))
+    try:
+        values = text.table(rows, delimiter=header.delimiter, quotes=header.delimiter is not None)
+    except ValueError as error:
+        return Surface(_by_cells(data, header, error))
+    return _of_numbers(values, header, rows)
+
+
+def _of_numbers(values: Array, header: Header, rows: list[str]) -> Surface:
+    """Of a file with numbers alone below its names."""
     if values.shape[1] < 3:
         raise ValueError(f"{values.shape[1]} columns, not x y z")
     has_normals = values.shape[1] == 6 and _are_units(values[:, 3:])
-    if not (named or has_normals) and all(SPLIT_DECIMALS.fullmatch(row.strip()) for row in rows):
-        raise _decimal_commas(rows[0])
-    if not (named or has_normals):
-        _check_first(names, values)
-    columns = _columns(names, values.shape[1], delimiter, has_normals) if named else _said(names, values.shape[1])
-    has_normals = has_normals and columns == [0, 1, 2]
-    return Surface(values[:, columns], None, values[:, 3:] if has_normals else None)
+    if not (header.is_line or has_normals):
+        if all(SPLIT_DECIMALS.fullmatch(row.strip()) for row in rows):
+            raise _decimal_commas(rows[0])
+        _check_first(header.names, values)
+    places = _columns(header, values.shape[1], has_normals).places
+    has_normals = has_normals and places == FIRST.places
+    return Surface(values[:, places], None, values[:, 3:] if has_normals else None)
+
+
+def _by_cells(data: bytes, header: Header, error: ValueError | None = None) -> Array:
+    """(N, 3) points where other columns may be text and cells may be empty; a point without a number is NaN.
+
+    Raises:
+        InvalidPointCloudError: a file without names of its columns, one that is no number, or a row of another length.
+        ValueError: the error given, where no line explains it.
+    """
+    rows = _rows(data, header)
+    first = next(rows, None)
+    if first is None:
+        raise ValueError("a line of names and no points")
+    count = len(first[1])
+    is_named = header.is_line or columns.found_in_comment(header.names, count) is not None
+    places = _columns(header, count, has_normals=False).places if is_named else list(range(count))
+    values = array("d")
+    for line, cells in _placed(_chained(first, rows), _defined(header)):
+        if len(cells) != count:
+            given = f"{len(cells)} in line {line}"
+            raise InvalidPointCloudError(f"{count} columns in every line", given, "correct it, or quote its texts")
+        values.extend(_number(cells, place, line, is_named) for place in places)
+    if not is_named:
+        raise error or ValueError("no names of its columns")
+    return np.array(values).reshape(-1, 3)
+
+
+def _rows(data: bytes, header: Header) -> Iterator[Row]:
+    """The rows below the names; empty cells at the end, for which there is no name, are left out."""
+    kept = ((n, line) for n, line in enumerate(text.lines(data), start=1) if _is_row(line))
+    if header.is_line:
+        next(kept, None)
+    for line, cells in _split(kept, header.delimiter):
+        while len(cells) > len(header.names) and header.is_line and not cells[-1].strip():
+            cells.pop()
+        yield line, cells
+
+
+def _is_row(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith(COMMENTS)
+
+
+def _split(lines: Iterator[tuple[int, str]], delimiter: str | None) -> Iterator[Row]:
+    """Lines with their numbers as cells; a quoted one may have the delimiter in it, and no end of a line."""
+    if delimiter is None:
+        yield from ((number, [cell.strip('"') for cell in line.split()]) for number, line in lines)
+        return
+    at = 0
+
+    def taken() -> Iterator[str]:
+        nonlocal at
+        for at, line in lines:  # noqa: B007  the number of the line that the reader took last
+            yield line
+
+    reader = csv.reader(taken(), delimiter=delimiter, skipinitialspace=True)
+    for count, cells in enumerate(reader, start=1):
+        if reader.line_num != count:
+            given = f"a quotation mark that is not closed in its line, before line {at}"
+            raise InvalidPointCloudError("a point a line", given, "take it out, or close it")
+        yield at, cells
+
+
+def _chained(first: Row, rows: Iterable[Row]) -> Iterator[Row]:
+    yield first
+    yield from rows
+
+
+def _defined(header: Header) -> int | None:
+    """The column in which 3D Slicer says whether a control point was placed."""
+    short = [name.strip().lower() for name in header.names]
+    is_slicer = header.is_line and short.count(DEFINED) == 1 and columns.kinds_in(short) in (["lps"], ["ras"])
+    return short.index(DEFINED) if is_slicer else None
+
+
+def _placed(rows: Iterable[Row], defined: int | None) -> Iterator[Row]:
+    """Without control points that were never placed."""
+    for line, cells in rows:
+        if defined is None or "".join(cells[defined : defined + 1]).strip().lower() not in UNDEFINED:
+            yield line, cells
+
+
+def _number(cells: list[str], place: int, line: int, may_be_empty: bool) -> float:
+    cell = cells[place].strip()
+    if not cell and may_be_empty:
+        return np.nan
+    try:
+        return float(cell if "_" not in cell else "")  # Python takes 1_0 for 10
+    except ValueError as error:
+        if DECIMAL_COMMA.fullmatch(cell):
+            raise _decimal_commas(cell) from error
+        given = f"{'text' if cell else 'nothing'} in column {place + 1} of line {line}"
+        how = "correct it" + ("" if may_be_empty else ", or begin with a line of names, x y z and others for the rest")
+        raise InvalidPointCloudError("a number", given, how) from error
 
 
 def _decimal_commas(row: str) -> InvalidPointCloudError:
@@ -82,75 +187,48 @@ def _decimal_commas(row: str) -> InvalidPointCloudError:
     return InvalidPointCloudError("decimals with a point, such as 1.5", given, how)
 
 
-def _words(line: str, delimiter: str | None) -> list[str]:
-    """The names in a line; those that are empty, at its end or between spaces, are left out."""
-    if delimiter is None:
-        return [word for word in line.split() if _axis(word)]
-    words = next(csv.reader([line.strip().lstrip("\ufeff")], delimiter=delimiter), [])
-    while words and not words[-1].strip():
-        words.pop()
-    return words
-
-
-def _comment_above(lines: list[str]) -> str:
-    """The last comment before the first point, which may name the columns."""
-    above = list(itertools.takewhile(lambda line: line.lstrip().startswith(COMMENTS), lines))
-    return above[-1].lstrip(" #/") if above else ""
-
-
-def _axis(name: str) -> str:
-    """A name in lower case without its unit: x of `X (mm)` and `x_mm`."""
-    return re.sub(r"[\s(\[_/].*", "", name.strip(' "\ufeff').lower())
-
-
-def _columns(names: list[str], count: int, delimiter: str | None, has_normals: bool) -> list[int]:
-    """Where x y z are, by a line of names that is no comment; a title over x y z alone names nothing."""
-    short = [_axis(name) for name in names]
-    given = f"columns {' '.join(names)[:LONGEST_NAMES]}"
-    if len(names) != count:
-        no_axes = set("xyz").isdisjoint(short)
-        if (no_axes and (count == 3 or has_normals)) or (short[:3] == [*"xyz"] and delimiter != ","):
-            return [0, 1, 2]
-        given = f"{len(names)} names" if no_axes else f"{len(names)} ({given})"  # a title may name a patient
-        how = "give each column one name of one word; write decimals with a point, not a comma"
-        raise InvalidPointCloudError(f"a name for each of {count} columns", given, how)
-    if (found := _places(names)) is not None:
+def _columns(header: Header, count: int, has_normals: bool) -> Columns:
+    """Where the coordinates are: by the line of names, or a comment, else in the first three."""
+    if not header.is_line:
+        return columns.found_in_comment(header.names, count) or FIRST
+    if len(header.names) != count:
+        return _of_title(header, count, has_normals)
+    if (found := columns.found(header.names)) is not None:
         return found
-    if set("xyz") <= set(short):
+    given = f"columns {' '.join(header.names)[:LONGEST_NAMES]}"
+    if set("xyz") <= {columns.axis(name) for name in header.names}:
         how = "name those that are meant x y z, and the others otherwise"
         raise InvalidPointCloudError("one column each for x y z", given, how)
-    raise InvalidPointCloudError("columns x y z", given, "name them x y z, or leave that line out")
+    how = "name them x y z, or leave that line out"
+    raise InvalidPointCloudError("columns x y z, l p s or r a s", given, how)
 
 
-def _said(names: list[str], count: int) -> list[int]:
-    """Where x y z are by a comment that names every column, else the first three."""
-    found = _places(names) if len(names) == count else None
-    return found or [0, 1, 2]
+def _of_title(header: Header, count: int, has_normals: bool) -> Columns:
+    """By words that are more or fewer than the columns; a title over x y z alone names nothing."""
+    short = [columns.axis(name) for name in header.names]
+    no_axes = set("xyz").isdisjoint(short) and not any(set(kind) <= set(short) for kind in columns.AXES)
+    if no_axes and (count == 3 or has_normals):
+        return FIRST
+    if "".join(short[:3]) in columns.AXES and header.delimiter != "," and (found := columns.found(header.names)):
+        return found
+    named = f"{len(header.names)} (columns {' '.join(header.names)[:LONGEST_NAMES]})"
+    given = f"{len(header.names)} names" if no_axes else named  # a title may name a patient
+    how = "give each column one name of one word; write decimals with a point, not a comma"
+    raise InvalidPointCloudError(f"a name for each of {count} columns", given, how)
 
 
-def _check_first(names: list[str], values: np.ndarray) -> None:
-    """Raise where the first column is no x, but the number of each point, and no comment says so."""
-    is_said = len(names) == values.shape[1] and _places(names) is not None
-    if not is_said and values.shape[1] > 3 and len(values) > 2 and (np.diff(values[:, 0]) == 1.0).all():
-        given = "a first column that counts the points"
+def _check_first(names: list[str], values: Array) -> None:
+    """Raise where the first column is no x, but the number or the time of each point, and no comment says so.
+
+    Numbers of frames have gaps, and times are no whole numbers: what rises from each of many rows to the next is one.
+    """
+    is_said = len(names) == values.shape[1] and columns.found(names) is not None
+    steps = np.diff(values[:, 0])
+    counts = len(steps) > 1 and (steps == 1.0).all() or len(values) >= MANY_ROWS and (steps > 0.0).all()
+    if not is_said and values.shape[1] > 3 and counts:
+        given = "a first column that counts the points, or their times"
         raise InvalidPointCloudError("x y z in the first columns", given, "leave it out, or begin with a line of names")
 
 
-def _places(names: list[str]) -> list[int] | None:
-    """The columns named x y z, or with a unit where none is; None unless there is one of each."""
-    for words in ([name.strip(' "\ufeff').lower() for name in names], [_axis(name) for name in names]):
-        if all(words.count(axis) == 1 for axis in "xyz"):
-            return [words.index(axis) for axis in "xyz"]
-    return None
-
-
-def _is_numbers(line: str, delimiter: str | None) -> bool:
-    try:
-        [float(word) for word in line.split(delimiter)]
-    except ValueError:
-        return False
-    return True
-
-
-def _are_units(vectors: np.ndarray) -> bool:
+def _are_units(vectors: Array) -> bool:
     return bool(np.allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=0.01))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gapr_core.errors import GaprError
 from gapr_core.formats import sweeps, tracker
-from gapr_core.formats.reading import format_of, unreadable
+from gapr_core.formats.reading import format_of, reason_of, unreadable
 
 
 def poses_in(path: Path, tool: int | None = None, reference: int | None = None) -> NDArray[np.float64]:
@@ -31,4 +31,4 @@ def poses_in(path: Path, tool: int | None = None, reference: int | None = None) 
     except GaprError:
         raise
     except Exception as error:
-        raise unreadable(path, str(error) or type(error).__name__) from error
+        raise unreadable(path, reason_of(error)) from error

@@ -87,7 +87,9 @@ FORMATS = {
     ".igs.mha": Format("sweeps:read_igs", in_patient=True, uses=TRACKED),
 }
 FOLDER = Format("sweeps:read_folder", in_patient=True, uses=TRACKED)
+DETACHED = (".mhd", ".nhdr")  # headers that name another file, which is not opened for them
 LONGEST_REASON = 160
+BARE = (LookupError, TypeError, AttributeError, StopIteration, AssertionError)  # words of Python, not of the file
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Surface:
@@ -107,7 +109,7 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
     except GaprError:
         raise
     except Exception as error:  # whatever a damaged file leads to: the sentence is the same
-        raise unreadable(path, str(error) or type(error).__name__) from error
+        raise unreadable(path, reason_of(error)) from error
     if len(surface.points) == 0:
         raise unreadable(path, "no points in it")
     options.limits.check_counts(len(surface.points), 0 if surface.faces is None else len(surface.faces))
@@ -118,27 +120,38 @@ def format_of(path: Path) -> Format | plugins.Plugin:
     """The kind of a file, by its name.
 
     Raises:
-        InvalidPointCloudError: an unknown ending, or nothing there.
+        InvalidPointCloudError: nothing there, an unknown ending, a packed file, or a header without its voxels.
     """
     if plugin := plugins.of(path):
         return plugin
     if path.is_dir():
         return FOLDER
-    ending = _ending(path)
-    if ending not in FORMATS:
-        endings = " ".join([*FORMATS, *(f".{ending}" for ending in plugins.endings())])
-        raise InvalidPointCloudError(f"one of {endings}", path.name, "convert the file to one of these")
     if not path.is_file():
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
+    ending = _ending(path)
+    signatures.check_packed(path, ending)
+    if ending in DETACHED:
+        expected = "a header and its voxels in one file"
+        raise InvalidPointCloudError(expected, path.name, "save it as one file: .mha or .nrrd")
+    if ending not in FORMATS:
+        endings = " ".join([*FORMATS, *plugins.kinds()])
+        raise InvalidPointCloudError(f"one of {endings} or a folder", path.name, "convert the file to one of these")
     return FORMATS[ending]
 
 
 def says_axes(path: Path) -> bool:
-    """Whether a file says that it is in LPS or RAS: a label map, markups, or a mesh or cloud with a comment."""
+    """Whether a file says that it is in LPS or RAS: a label map, markups, or by a comment or names of columns."""
     kind = format_of(path)
     if kind.in_patient:
         return not kind.is_tracked
     return path.is_file() and axes.stated(path) is not None
+
+
+def reason_of(error: Exception) -> str:
+    """What an error of a reader says of the file."""
+    if isinstance(error, BARE):
+        return f"its content is not laid out as the format wants it ({type(error).__name__})"
+    return str(error) or type(error).__name__
 
 
 def unreadable(path: Path, why: str) -> InvalidPointCloudError:

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
+from gapr_core.errors import InvalidPointCloudError
+
+GZIP = b"\x1f\x8b"
+PACKED = ".nii.gz"  # the one packed kind that is read
+NIFTI_BYTES = 348
+NIFTI_SIZES = (NIFTI_BYTES.to_bytes(4, "little"), NIFTI_BYTES.to_bytes(4, "big"))  # its first number
 STL_HEADER_BYTES, STL_FACET_BYTES = 84, 50
 SIGNATURES = {
     b"ply": ".ply",
@@ -18,15 +25,50 @@ SIGNATURES = {
 }
 
 
-def ending_of(path: Path) -> str:
-    """The ending that the content asks for; empty where the content does not tell, or cannot be read."""
+def check_packed(path: Path, ending: str) -> None:
+    """Raise for a file that is gzip-compressed, or that is not, where its ending says the other.
+
+    Args:
+        path: a file that is there.
+        ending: its longest known one.
+
+    Raises:
+        InvalidPointCloudError: what to unpack or to rename.
+    """
+    head = _head(path)
+    is_packed = head.startswith(GZIP)
+    if ending == PACKED and head.startswith(NIFTI_SIZES):
+        raise InvalidPointCloudError("gzip-compressed NIfTI", f"{path.name}, which is plain NIfTI", "rename it to .nii")
+    if not is_packed or ending == PACKED:
+        return
+    given = f"{path.name}, which is gzip-compressed"
+    if _unpacks_to_nifti(path):
+        raise InvalidPointCloudError("a file that is not packed", given, f"it is NIfTI: rename it to {PACKED}")
+    how = "unpack it first (gunzip), or save it without compression"
+    raise InvalidPointCloudError("a file that is not packed", given, how)
+
+
+def _unpacks_to_nifti(path: Path) -> bool:
+    try:
+        with gzip.open(path) as file:
+            return file.read(len(NIFTI_SIZES[0])).startswith(NIFTI_SIZES)
+    except (OSError, EOFError):
+        return False
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes; none where the file cannot be read."""
     try:
         with path.open("rb") as file:
-            head = file.read(STL_HEADER_BYTES)
-        size = path.stat().st_size
+            return file.read(STL_HEADER_BYTES)
     except OSError:
-        return ""
+        return b""
+
+
+def ending_of(path: Path) -> str:
+    """The ending that the content asks for; empty where the content does not tell, or cannot be read."""
+    head = _head(path)
     facets = int.from_bytes(head[80:84], "little")
-    if facets and size == STL_HEADER_BYTES + STL_FACET_BYTES * facets:
+    if facets and path.stat().st_size == STL_HEADER_BYTES + STL_FACET_BYTES * facets:
         return ".stl"
     return next((ending for beginning, ending in SIGNATURES.items() if head.startswith(beginning)), "")

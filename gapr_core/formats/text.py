@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 from collections.abc import Iterable, Iterator
 from itertools import chain
@@ -9,13 +10,18 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.errors import InvalidPointCloudError
+
 Array = NDArray[np.float64]
+
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def lines(data: bytes) -> Iterator[str]:
     """The lines of a text file, one at a time, without the byte order mark that Windows puts before them.
 
     Raises:
+        InvalidPointCloudError: UTF-16.
         ValueError: the last line does not end.
     """
     check_end(data)
@@ -23,13 +29,24 @@ def lines(data: bytes) -> Iterator[str]:
 
 
 def check_end(data: bytes) -> None:
-    """Raise `ValueError` where the last line does not end: whether its last number is whole cannot be known."""
+    """Raise `ValueError` where the last line does not end: whether its last number is whole cannot be known.
+
+    Raises:
+        InvalidPointCloudError: UTF-16.
+    """
+    check_encoding(data)
     if not data.rstrip(b" \t").endswith((b"\n", b"\r")):
         raise ValueError("the last line does not end: the file is cut, or it is whole and lacks a line break")
 
 
-def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None = None) -> Array:
-    """(N, columns) numbers, one row a line; (0, 0) without any line.
+def check_encoding(data: bytes) -> None:
+    """Raise `InvalidPointCloudError` for text that begins with the byte order mark of UTF-16."""
+    if data.startswith(UTF_16):
+        raise InvalidPointCloudError("UTF-8 text", "UTF-16 text", "save it as UTF-8")
+
+
+def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None = None, quotes: bool = False) -> Array:
+    """(N, columns) numbers, one row a line, in quotes or not if those are asked for; (0, 0) without any line.
 
     Raises:
         ValueError: rows of different lengths, another number of columns, or something that is no number.
@@ -38,7 +55,8 @@ def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None
     first = next(filled, None)
     if first is None:
         return np.empty((0, 0))
-    values = np.loadtxt(chain([first], filled), ndmin=2, comments=None, delimiter=delimiter)
+    values = np.loadtxt(chain([first], filled), ndmin=2, comments=None, delimiter=delimiter,
+                        quotechar='"' if quotes else None)  # fmt: skip
     if columns is not None and values.shape[1] != columns:
         raise ValueError(f"{values.shape[1]} columns where {columns} are announced")
     return values

@@ -206,6 +206,7 @@ def test_a_folder_of_meshes_is_no_cloud_and_a_file_in_it_is_asked_for(tmp_path):
 def test_a_missing_file_and_an_unknown_format_are_distinguished(tmp_path):
     with pytest.raises(InvalidPointCloudError, match="a file that exists"):
         clouds.load(tmp_path / "none.ply")
+    (tmp_path / "none.dicom").touch()
     with pytest.raises(InvalidPointCloudError, match=r"\.ply \.pcd"):
         clouds.load(tmp_path / "none.dicom")
 

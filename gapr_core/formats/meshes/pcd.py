@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from gapr_core.geometry import pinhole
 from gapr_core.surface import Array, Surface
 
 TYPES = {"F": {4: "<f4", 8: "<f8"}, "I": {n: f"<i{n}" for n in (1, 2, 4, 8)}, "U": {n: f"<u{n}" for n in (1, 2, 4, 8)}}
+log = logging.getLogger(__name__)
+
+IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # VIEWPOINT: translation, then the quaternion with its scalar first
 KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
@@ -19,13 +23,15 @@ def read(path: Path, limits: FileLimits) -> Surface:
     """A cloud, with its normals where all three components are there, and its camera where it is an image that says."""
     data = limits.read(path)
     header, start = _header(data)
-    count, fields = int(header["POINTS"][0]), _fields(header)
+    count, fields = _whole(header, "POINTS"), _fields(header)
     limits.check_counts(count)
     limits.check_unpacked(count * fields.itemsize)
     columns = _columns(data[start:], header["DATA"][0], fields, count)
     normals = ("normal_x", "normal_y", "normal_z")
     points = _stack(columns, ("x", "y", "z"))
-    camera = pinhole.centre_of(points.reshape(int(header["HEIGHT"][0]), -1, 3)) if count else None
+    camera = pinhole.centre_of(points.reshape(_whole(header, "HEIGHT"), -1, 3)) if count else None
+    if not _is_identity(header.get("VIEWPOINT", [])):
+        log.warning("%s: VIEWPOINT is not applied: the pose is of the numbers in the file", path.name)
     return Surface(points, None, _stack(columns, normals) if set(normals) <= set(columns) else None, camera)
 
 
@@ -42,10 +48,26 @@ def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
             header[words[0].upper()] = words[1:]
     if missing := [key for key in KEYS if not header.get(key)]:
         raise ValueError(f"no {' '.join(missing)} in its header")
-    width, height, points = (int(header[key][0]) for key in ("WIDTH", "HEIGHT", "POINTS"))
-    if min(width, height) < 0 or width * height != points:
+    width, height, points = (_whole(header, key) for key in ("WIDTH", "HEIGHT", "POINTS"))
+    if width * height != points:
         raise ValueError(f"{width} x {height} points where {points} are announced")
     return header, at
+
+
+def _whole(header: dict[str, list[str]], key: str) -> int:
+    """The number after a key."""
+    word = header[key][0]
+    if not word.isdecimal():
+        raise ValueError(f"{key} {word[:20]!r} in its header, which is no whole number from 0")
+    return int(word)
+
+
+def _is_identity(viewpoint: list[str]) -> bool:
+    """Whether the words after VIEWPOINT, if any, move nothing."""
+    try:
+        return not viewpoint or [float(word) for word in viewpoint] == IDENTITY
+    except ValueError:
+        return False
 
 
 def _fields(header: dict[str, list[str]]) -> np.dtype:
@@ -56,7 +78,8 @@ def _fields(header: dict[str, list[str]]) -> np.dtype:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT of different lengths")
     parts = []
     for i, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
-        if int(size) not in TYPES.get(kind, {}) or not 1 <= int(count) <= 1 << 16:
+        is_known = size.isdecimal() and int(size) in TYPES.get(kind, {})
+        if not is_known or not count.isdecimal() or not 1 <= int(count) <= 1 << 16:
             raise ValueError(f"a field {name[:20]} of type {kind[:5]}{size[:5]} and count {count[:9]}")
         parts.append((f"{i} {name}", TYPES[kind][int(size)], (int(count),)))
     return np.dtype(parts)

@@ -23,6 +23,7 @@ BYTES = {
 }
 SHORTEST_TEXT = 2  # bytes of a number and what follows it
 FEWEST_CORNERS = 3
+CORNERS = ("vertex_indices", "vertex_index")
 MOST_LISTS = 3  # of one element: vertices, texture coordinates, and one more
 
 
@@ -34,7 +35,7 @@ def read(path: Path, limits: FileLimits) -> Surface:
     columns = ply["vertex"].data
     points = _columns(columns, "xyz")
     if "face" in ply and ply["face"].count:
-        name = next(n for n in ply["face"].data.dtype.names if n in ("vertex_indices", "vertex_index"))
+        name = next(n for n in ply["face"].data.dtype.names if n in CORNERS)
         return Surface(points, _triangles(ply["face"].data[name]))
     normals = ("nx", "ny", "nz")
     return Surface(points, None, _columns(columns, normals) if set(normals) <= set(columns.dtype.names) else None)
@@ -68,12 +69,25 @@ def _check_header(data: bytes, limits: FileLimits) -> None:
     is_text = b"format ascii" in header
     if is_text:
         text.lines(data)
-    shortest = 0
-    for name, count, properties in _elements(header.decode("ascii", "replace")):
+    shortest, elements = 0, _elements(header.decode("ascii", "replace"))
+    _check_layout({name: (count, properties) for name, count, properties in elements})
+    for name, count, properties in elements:
         limits.check_counts(*((0, count) if name == "face" else (count, 0)))
         shortest += count * _shortest_row(name, properties, is_text)
     if shortest > len(body):
         raise ValueError(f"{len(body)} bytes where the header announces at least {shortest}")
+
+
+def _check_layout(elements: dict[str, tuple[int, list[list[str]]]]) -> None:
+    """Raise `ValueError` where the points or the corners of the faces are missing."""
+    if "vertex" not in elements:
+        raise ValueError(f"elements {', '.join(elements)[:60] or 'missing'} and no vertex: a mesh or cloud has one")
+    named = {words[-1] for words in elements["vertex"][1]}
+    if missing := [axis for axis in "xyz" if axis not in named]:
+        raise ValueError(f"vertices without {' '.join(missing)}")
+    faces, properties = elements.get("face", (0, []))
+    if faces and not any(words[0] == "list" and words[-1] in CORNERS for words in properties):
+        raise ValueError(f"faces without a list {' or '.join(CORNERS)}")
 
 
 def _elements(header: str) -> list[tuple[str, int, list[list[str]]]]:
@@ -81,10 +95,21 @@ def _elements(header: str) -> list[tuple[str, int, list[list[str]]]]:
     elements: list[tuple[str, int, list[list[str]]]] = []
     for words in map(str.split, header.splitlines()):
         if words[:1] == ["element"]:
+            if len(words) != 3 or not words[2].isdecimal():
+                raise ValueError(f"a line {' '.join(words)[:40]!r} where an element has a name and a count")
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
+            _check_property(words, bool(elements))
             elements[-1][2].append(words[1:])
     return elements
+
+
+def _check_property(words: list[str], has_element: bool) -> None:
+    is_list = words[1:2] == ["list"]
+    kinds = words[2:4] if is_list else words[1:2]
+    if not has_element or len(words) != (5 if is_list else 3) or not set(kinds) <= BYTES.keys():
+        known = ", ".join(kind for kind in BYTES if not kind[-1].isdigit())
+        raise ValueError(f"a line {' '.join(words)[:40]!r} where a property of an element has a type ({known})")
 
 
 def _shortest_row(name: str, properties: list[list[str]], is_text: bool) -> int:
@@ -93,7 +118,7 @@ def _shortest_row(name: str, properties: list[list[str]], is_text: bool) -> int:
     if (lists and name != "face") or len(lists) > MOST_LISTS:
         raise ValueError(f"lists in the element {name}, which are not read")
     size = sum(SHORTEST_TEXT if is_text else BYTES[words[1 if words[0] == "list" else 0]] for words in properties)
-    corners = [words for words in lists if words[-1] in ("vertex_indices", "vertex_index")]
+    corners = [words for words in lists if words[-1] in CORNERS]
     size += sum(FEWEST_CORNERS * (SHORTEST_TEXT if is_text else BYTES[words[2]]) for words in corners)
     return max(size, 1)
 

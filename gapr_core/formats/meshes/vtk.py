@@ -27,10 +27,12 @@ def read(path: Path, limits: FileLimits) -> Surface:
     points, cells = np.empty((0, 3)), {}
     while (words := file.words()) and words[0] not in DONE:
         if words[0] == "POINTS":
-            limits.check_counts(int(words[1]))
-            points = file.numbers(3 * int(words[1]), words[2]).reshape(-1, 3)
+            (count,) = _counts(words, 3, 1)
+            limits.check_counts(count)
+            points = file.numbers(3 * count, words[2]).reshape(-1, 3)
         elif words[0] in CELLS:
-            cells[words[0]] = file.cells(int(words[1]), int(words[2]))
+            first, second = _counts(words, 3, 1, 2)
+            cells[words[0]] = file.cells(first, second)
         else:
             file.skip(words)
     if not cells:
@@ -69,6 +71,8 @@ class _File:
 
     def numbers(self, count: int, kind: str) -> Array:
         """So many numbers of the type named."""
+        if kind.lower() not in TYPES:
+            raise ValueError(f"numbers of type {kind[:20]}, which are not read: save them as float or double")
         dtype = np.dtype(TYPES[kind.lower()])
         self._limits.check_unpacked(8 * max(count, 0))
         if self._is_text:
@@ -94,9 +98,10 @@ class _File:
         if words[:1] != ["OFFSETS"]:
             self._at = before
             return offsets_of_counted(_indices(self.numbers(second, "int")), first)
+        _counts(words, 2)
         offsets = _indices(self.numbers(first, words[1]))
         words = self.words()
-        if words[:1] != ["CONNECTIVITY"]:
+        if words[:1] != ["CONNECTIVITY"] or len(words) < 2:
             raise ValueError("offsets without corners")
         return offsets, _indices(self.numbers(second, words[1]))
 
@@ -106,13 +111,14 @@ class _File:
             while self._at < len(self._data) and self.line().strip():
                 pass
         elif words[0] == "FIELD":
-            for _ in range(int(words[2])):
+            for _ in range(*_counts(words, 3, 2)):
                 self._skip_array(self.words())
         else:
             raise ValueError(f"a section {words[0][:30]!r}")
 
     def _skip_array(self, words: list[str]) -> None:
-        count = int(words[1]) * int(words[2])
+        components, tuples = _counts(words, 4, 1, 2)
+        count = components * tuples
         if words[3] != "string":
             self.numbers(count, words[3])
         for _ in range(min(count, len(self._data)) if words[3] == "string" else 0):
@@ -129,6 +135,17 @@ class _File:
         self._at += size + length
         if self._at > len(self._data):
             raise ValueError("a text that ends beyond the file")
+
+
+def _counts(words: list[str], length: int, *places: int) -> list[int]:
+    """The counts in the line of a section, which has so many words at least.
+
+    Raises:
+        ValueError: a line that is shorter, or something else at these places.
+    """
+    if len(words) < length or not all(words[place].isdecimal() for place in places):
+        raise ValueError(f"a line {' '.join(words)[:40]!r} without the counts or the type of its section")
+    return [int(words[place]) for place in places]
 
 
 def _indices(values: Array) -> NDArray[np.int64]:

@@ -439,12 +439,108 @@ def test_a_line_of_names_says_which_column_is_which(tmp_path, name):
     np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
 
 
-@pytest.mark.parametrize("names", ["r,a,s", "id,px,py,pz"])
+@pytest.mark.parametrize("names", ["r,t,s", "id,px,py,pz"])
 def test_names_that_say_something_else_are_refused(tmp_path, names):
     numbers = ",".join("123456"[: names.count(",") + 1])
     (tmp_path / "a.csv").write_text(f"{names}\n{numbers}\n")
     with pytest.raises(InvalidPointCloudError, match="name them x y z, or leave that line out"):
         reading.read(tmp_path / "a.csv")
+
+
+SLICER = "label,{},defined,selected,visible,locked,description\n"
+ROWS = (
+    'F-1,10,20,30,1,1,1,0,\n"F-2, later",-40,5,60,1,1,1,0,"hip, left"\n'
+    "F-3,0,0,0,0,1,1,0,never placed\nF-4,7,-8,90,1,1,1,0,\n"
+)
+
+
+@pytest.mark.parametrize(("content", "factors"), [
+    (SLICER.format("l,p,s") + ROWS, [1, 1, 1]), (SLICER.format("r,a,s") + ROWS, LPS_RAS),
+    ("R,A,S\n10,20,30\n-40,5,60\n7,-8,90\n", LPS_RAS),
+    ("# id r a s\n0 10 20 30\n1 -40 5 60\n2 7 -8 90\n", LPS_RAS),
+    ("L (mm);P (mm);S (mm)\n10;20;30\n-40;5;60\n7;-8;90\n", [1, 1, 1]),
+    ("r a s id\n10 20 30 0\n-40 5 60 1\n7 -8 90 2\n", LPS_RAS),
+    ("# R A S of the femur\n10 20 30\n-40 5 60\n7 -8 90\n", LPS_RAS),
+    ("# a,r,s,q\n20,10,30,\n5,-40,60,\n-8,7,90,\n", LPS_RAS),
+    ("S\tA\tR\n30\t20\t10\n60\t5\t-40\n90\t-8\t7\n", LPS_RAS),
+])  # fmt: skip
+def test_columns_l_p_s_and_r_a_s_say_their_axes(tmp_path, caplog, content, factors):
+    path = tmp_path / "a.csv"
+    path.write_text(content)
+    np.testing.assert_allclose(reading.read(path).points, POINTS * factors)
+    assert reading.says_axes(path) and ("has columns r a s: x and y are negated" in caplog.text) == (factors == LPS_RAS)
+    np.testing.assert_allclose(reading.read(path, ReadOptions(axes="as_is")).points, POINTS)
+    if factors == LPS_RAS:
+        with pytest.raises(ConfigError, match="a file in LPS for lps_to_ras; got a.csv, which has columns r a s; use"):
+            reading.read(path, ReadOptions(axes="lps_to_ras"))
+
+
+def test_normals_in_r_a_s_are_turned_with_their_points(tmp_path):
+    (tmp_path / "a.csv").write_text("r,a,s,nx,ny,nz\n10,20,30,0,1,0\n-40,5,60,1,0,0\n")
+    surface = reading.read(tmp_path / "a.csv")
+    np.testing.assert_allclose(surface.points, POINTS[:2] * LPS_RAS)
+    np.testing.assert_allclose(surface.normals, [[0, -1, 0], [-1, 0, 0]])
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    ("x,y,z,l,p,s\n1,2,3,4,5,6\n", "one kind of coordinates; got .*columns x y z and l p s"),
+    ("l,p,r,a,s\n1,2,3,4,5\n", "one kind of coordinates; got .*columns l p s and r a s"),
+    ("# SPACE=LPS\nr,a,s\n1,2,3\n", "the same axes by comment and columns; got .*SPACE=LPS and columns r a s"),
+    ("r a s r\n1 2 3\n", "a name for each of 3 columns"),
+])  # fmt: skip
+def test_columns_that_contradict_each_other_are_refused(tmp_path, content, said):
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(InvalidPointCloudError, match=said):
+        reading.read(tmp_path / "a.csv")
+
+
+MIXED = {
+    "text.csv": "name,x,y,z\nhip,10,20,30\n,-40,5,60\nknee,7,-8,90\n",
+    "quoted.csv": '"x","y","z"\n"10","20","30"\n"-40","5","60"\n"7","-8","90"\n',
+    "nameless.csv": '"10","20","30"\n"-40","5","60"\n"7","-8","90"\n',
+    "later.csv": 'x,y,z,note\n10,20,30,\n-40,5,60,"a, b"\n7,-8,90,"5"\n',
+    "tabs.txt": "# by hand\nx\ty\tz\tname\n10\t20\t30\tthe hip\n\n-40\t5\t60\t\n7\t-8\t90\t\n",
+    "spaces.xyz": "name x y z\nhip 10 20 30\nknee -40 5 60\nfoot 7 -8 90\n",
+    "comment.txt": "# x y z name\n10 20 30 hip\n-40 5 60 knee\n7 -8 90 foot\n",
+    "trailing.csv": "x,y,z,\n10,20,30,\n-40,5,60,\n7,-8,90,\n",
+}
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_of_named_columns_the_others_may_be_text(tmp_path, name):
+    (tmp_path / name).write_text(MIXED[name])
+    np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
+
+
+def test_a_point_with_an_empty_cell_is_left_out(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,t\n10,20,30,0\n,,,1\n-40,5,60,\n1,,2,3\n7,-8,90,4\n")
+    assert np.isnan(reading.read(tmp_path / "a.csv").points).any(axis=1).tolist() == [False, True, False, True, False]
+    np.testing.assert_allclose(clouds.load(tmp_path / "a.csv").points, POINTS)
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    ("# by hand\nx,y,z\n\n1,2,3\n4,Doe,6\n", "a number; got a.csv: text in column 2 of line 5; correct it"),
+    ("name,x,y,z\na,1,2,3\nb,4,5\n", "4 columns in every line; got a.csv: 3 in line 3"),
+    ("1,2,3\n4,5,6,7\n", "3 columns in every line; got a.csv: 4 in line 2"),
+    ("1,2,3\n4,,6\n", "nothing in column 2 of line 2; correct it, or begin with a line of names"),
+    ("1 2 3 0\n4 5 6 Doe\n", "text in column 4 of line 2; correct it, or begin with a line of names"),
+    ("name;x;y;z\na;25,828;-183,606;289,912\n", "decimals with a point, .* got a.csv: decimal commas"),
+    ('name,x,y,z,note\na,1,2,3,"b\nc,4,5,6,"\nd,1,2,3,\n', "a quotation mark that is not closed in its line, before"),
+    ("name,x,y,z\na,1_0,2,3\n", "text in column 2 of line 2"),
+])  # fmt: skip
+def test_what_is_no_number_is_named_by_its_line(tmp_path, content, said):
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(InvalidPointCloudError, match=said) as caught:
+        reading.read(tmp_path / "a.csv")
+    assert "Doe" not in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("name", ["a.csv", "a.txt", "a.fcsv", "a.mrk.json", "a.obj"])
+def test_utf_16_is_said_to_be_so(tmp_path, name, encoding):
+    (tmp_path / name).write_bytes("\ufeffx,y,z\n1,2,3\n".encode(encoding))
+    with pytest.raises(InvalidPointCloudError, match=f"UTF-8 text; got {name}: UTF-16 text; save it as UTF-8"):
+        reading.read(tmp_path / name)
 
 
 UNCLEAR = {
@@ -512,3 +608,17 @@ def test_which_packages_bring_readers_is_looked_up_once(tmp_path, monkeypatch):
     clouds.load(tmp_path / "a.xyz", units="mm")
     monkeypatch.setattr(plugins, "entry_points", pytest.fail)
     clouds.load(tmp_path / "a.xyz", units="mm")
+
+
+@pytest.mark.parametrize("gap", [0.033, 2.0])
+def test_a_first_column_of_times_or_of_frames_with_gaps_is_no_x(tmp_path, gap):
+    rng, rows = np.random.default_rng(0), 20
+    table = np.column_stack([gap * np.arange(rows), rng.normal(0.0, 40.0, (rows, 3))])
+    path = tmp_path / "a.csv"
+    np.savetxt(path, table, delimiter=",", fmt="%.4f")
+    with pytest.raises(InvalidPointCloudError, match="or their times.*begin with a line of names"):
+        reading.read(path)
+    np.savetxt(path, table, delimiter=",", fmt="%.4f", header="t,x,y,z", comments="")
+    np.testing.assert_allclose(reading.read(path).points, table[:, 1:], atol=1e-3)
+    np.savetxt(path, table[:11], delimiter=",", fmt="%.4f")  # so few rise by chance
+    assert len(reading.read(path).points) == 11

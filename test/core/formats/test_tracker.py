@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gapr_core import clouds
 from gapr_core.cli import main
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import reading, tracker
@@ -67,3 +68,10 @@ def test_a_pivot_far_from_the_tracker_is_found():
     poses = turned_poses()
     poses[:, :3, 3] += [0.0, 0.0, -9e5]
     np.testing.assert_allclose(tracker.pivot(poses).tip_mm, TIP, atol=1e-3)
+
+
+@pytest.mark.parametrize("units", ["mm", "cm", "m", "auto"])
+def test_a_recording_is_in_mm_whatever_is_named(tmp_path, units):
+    path = ndi_csv(tmp_path / "a.csv", turned_poses(), ())
+    origin = ReadOptions(tip_mm=(0.0, 0.0, 0.0))  # of the tool, which turns about its tip
+    np.testing.assert_array_equal(clouds.load(path, units, origin).points, reading.read(path, origin).points)

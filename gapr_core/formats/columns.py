@@ -1,0 +1,133 @@
+"""Which columns of a text file are the coordinates, and which axes their names say: x y z, l p s or r a s."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from gapr_core.errors import InvalidPointCloudError
+
+DELIMITERS = ",;\t"
+COMMENTS = ("#", "//")
+ENDINGS = (".csv", ".txt", ".xyz")
+AXES = {"xyz": None, "lps": "lps", "ras": "ras"}  # names of three columns -> the axes that they say
+
+
+class Header(NamedTuple):
+    """What stands before the first point.
+
+    Attributes:
+        delimiter: between two cells; None for white space.
+        names: of the columns, or the words of the last comment.
+        is_line: whether they stand in a line of their own, which is no comment.
+        cells: how many are in the first line that is neither empty nor a comment.
+    """
+
+    delimiter: str | None
+    names: list[str]
+    is_line: bool
+    cells: int
+
+
+class Columns(NamedTuple):
+    """Where the coordinates are, and the axes that the names say: "lps", "ras" or none."""
+
+    places: list[int]
+    space: str | None = None
+
+
+FIRST = Columns([0, 1, 2])
+
+
+def header_of(lines: Iterable[str]) -> Header:
+    """Of the lines of a file, which are taken up to the first one that is neither empty nor a comment."""
+    comment = first = ""
+    for line in lines:
+        if line.lstrip().startswith(COMMENTS):
+            comment = line
+        elif line.strip():
+            first = line
+            break
+    delimiter = next((d for d in DELIMITERS if d in first), None)
+    cells, commented = _cells(first, delimiter), words(comment.lstrip(" #/"), delimiter)
+    if not first or _are_numbers(cells) or _is_point(cells, found_in_comment(commented, len(cells))):
+        return Header(delimiter, commented, False, len(cells))
+    return Header(delimiter, words(first, delimiter), True, len(cells))
+
+
+def words(line: str, delimiter: str | None) -> list[str]:
+    """The names in a line; those that are empty, at its end or between spaces, are left out."""
+    if delimiter is None:
+        return [word for word in line.split() if axis(word)]
+    names = _cells(line.lstrip("\ufeff"), delimiter)
+    while names and not names[-1].strip():
+        names.pop()
+    return names
+
+
+def axis(name: str) -> str:
+    """A name in lower case without its unit: x of `X (mm)` and `x_mm`."""
+    return re.sub(r"[\s(\[_/].*", "", name.strip(' "\ufeff').lower())
+
+
+def kinds_in(short: list[str]) -> list[str]:
+    """The kinds of axes of which all three names are there once."""
+    return [kind for kind in AXES if all(short.count(letter) == 1 for letter in kind)]
+
+
+def found(names: list[str]) -> Columns | None:
+    """The columns named x y z, l p s or r a s, or with a unit where none is; None unless there is one of each.
+
+    Raises:
+        InvalidPointCloudError: names of several kinds.
+    """
+    for short in ([name.strip(' "\ufeff').lower() for name in names], [axis(name) for name in names]):
+        kinds = kinds_in(short)
+        if len(kinds) > 1:
+            given = f"columns {' and '.join(' '.join(kind) for kind in kinds)}"
+            raise InvalidPointCloudError("one kind of coordinates", given, "leave out or rename the others")
+        if kinds:
+            return Columns([short.index(letter) for letter in kinds[0]], AXES[kinds[0]])
+    return None
+
+
+def found_in_comment(names: list[str], count: int) -> Columns | None:
+    """By a comment that names every column, or that begins with the names of the first three."""
+    if len(names) == count and (all_named := found(names)) is not None:
+        return all_named
+    kind = "".join(axis(name) for name in names[:3])
+    return Columns(FIRST.places, AXES[kind]) if kind in AXES else None
+
+
+def space(path: Path) -> str | None:
+    """The axes that the names of the columns say, "lps" or "ras"; None where they say none.
+
+    Raises:
+        InvalidPointCloudError: names of several kinds.
+    """
+    with path.open("rb") as file:
+        header = header_of(io.TextIOWrapper(file, encoding="utf-8-sig", errors="replace"))
+    columns = found(header.names) if header.is_line else found_in_comment(header.names, header.cells)
+    return columns.space if columns else None
+
+
+def _cells(line: str, delimiter: str | None) -> list[str]:
+    return line.split() if delimiter is None else next(csv.reader([line.strip("\r\n ")], delimiter=delimiter), [])
+
+
+def _is_point(cells: list[str], columns: Columns | None) -> bool:
+    """Whether the cells that a comment names are numbers."""
+    return columns is not None and len(cells) >= 3 and _are_numbers([cells[place] for place in columns.places])
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    """Whether there are numbers alone, quoted or not; some of them may be missing."""
+    filled = [cell for cell in (cell.strip(' \t"') for cell in cells) if cell]
+    try:
+        return len([float(cell) for cell in filled]) > 0
+    except ValueError:
+        return False

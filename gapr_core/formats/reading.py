@@ -108,6 +108,12 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
         raise InvalidPointCloudError(error.expected, f"{path.name}: {error.given}", error.how_to_fix) from error
     except GaprError:
         raise
+    except PermissionError as error:
+        how = "let this user read it"
+        raise InvalidPointCloudError("a file that may be read", f"{path.name} ({error.strerror})", how) from error
+    except MemoryError as error:
+        how = "thin it, or use a machine with more memory"
+        raise InvalidPointCloudError("a file that fits into memory", path.name, how) from error
     except Exception as error:  # whatever a damaged file leads to: the sentence is the same
         raise unreadable(path, reason_of(error)) from error
     if len(surface.points) == 0:

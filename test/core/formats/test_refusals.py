@@ -187,3 +187,18 @@ def test_errors_of_python_are_no_reasons(tmp_path, monkeypatch):
     monkeypatch.setattr("gapr_core.formats.meshes.obj.read", lambda path, limits: {}["vertex"])
     said = refusal(tmp_path / "a.obj", b"v 0 0 0\n")
     assert "a.obj (its content is not laid out as the format wants it (KeyError)); export it again" in said
+
+
+@pytest.mark.parametrize(("error", "said"), [
+    (PermissionError(13, "Permission denied"), r"may be read; got a.xyz \(Permission denied\); let this user read it"),
+    (MemoryError(), "fits into memory; got a.xyz; thin it"),
+])  # fmt: skip
+def test_what_the_machine_refuses_is_no_damaged_file(tmp_path, monkeypatch, error, said):
+    (tmp_path / "a.xyz").write_text("1 2 3\n")
+
+    def refuse(*_):
+        raise error
+
+    monkeypatch.setattr(reading.Format, "read", refuse)
+    with pytest.raises(InvalidPointCloudError, match=said):
+        reading.read(tmp_path / "a.xyz")

@@ -121,7 +121,8 @@ class Accumulator:
         if viewpoint is not None:
             how = "register the clouds of a camera one by one, or leave the viewpoint out"
             raise ConfigError("collected sources without a viewpoint", "one viewpoint for all of them", how)
-        check_call(target, initial)
+        if isinstance(self.method, Registrar | Tracker):  # others have targets of their own
+            check_call(target, initial)
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target

@@ -124,14 +124,13 @@ def record_of(task: Task) -> Record:
 def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple[str, Record]]:
     """(round, what it answered and how right that is)."""
     rng = np.random.default_rng([task.seed, task.number, 17])
-    registrars, viewpoint = _registrars(drawn.sensor), drawn.pair.viewpoint
+    registrars = _registrars(drawn.sensor)
     if drawn.family in pairs.SCENES or task.number % LOOKED_AT == 0:
-        if viewpoint is None:
-            viewpoint = _inferred_viewpoint(drawn.pair.source)
         registrar = registrars["first round" if task.number % 2 else "search"]
-        in_scene = None if viewpoint is None else registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
-        if isinstance(in_scene, Assessment):
-            yield clutter.NAME, judged_answer(in_scene, drawn.pair)
+        for number, viewpoint in enumerate(_viewpoints(drawn.pair)):
+            in_scene = registrar.assess(drawn.pair.source, target, viewpoint=viewpoint)
+            if isinstance(in_scene, Assessment):
+                yield f"{clutter.NAME} {number}", judged_answer(in_scene, drawn.pair)
     if drawn.family in pairs.SCENES:
         return
     of_round = {"network": "network", "search": "search alone" if task.number % ALONE == 0 else "search"}
@@ -147,13 +146,17 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
             yield memory.name, judged_answer(tracked, moved)
 
 
-def _inferred_viewpoint(source: Array) -> Array | None:
-    """Where a cloud (N, 3), mm, may have been seen from: what is refused as bone is registered as that camera's."""
-    prepared = sources.prepare(source, in_scene=True)
+def _viewpoints(pair: Pair) -> Array:
+    """(N, 3) mm: where the camera was, or every place where the registrar would look for the one of this cloud.
+
+    Of a cloud that is refused as bone both ends of its line of sight are tried, the wrong one too.
+    """
+    if pair.viewpoint is not None:
+        return np.asarray(pair.viewpoint)[None]
+    prepared = sources.prepare(pair.source, in_scene=True)
     if isinstance(prepared, Refusal):
-        return None
-    found = clutter.inferred_viewpoints(prepared, RegistrarConfig())
-    return np.asarray(found[0]) if len(found) else None
+        return np.empty((0, 3))
+    return clutter.inferred_viewpoints(prepared, RegistrarConfig())
 
 
 def judged_answer(assessment: Assessment, pair: Pair) -> Record:

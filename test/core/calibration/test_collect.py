@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ from gapr_core.calibration.pairs import Drawn, Task
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
-from gapr_core.registration.features import FEATURES
+from gapr_core.registration import clutter
+from gapr_core.registration.features import FEATURES, FEATURES_OF
 from gapr_core.registration.memory import Memory
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.results import Hypothesis
+from gapr_core.results import Hypothesis, Refusal, RegistrationStatus
 
 TASK = Task("folder", "train", 0, 1)
+NAMES = ("network", "search", "search alone", "first round")
 
 
 class Truth:
@@ -90,6 +93,37 @@ def test_records_know_nothing_of_the_models_that_ship(truth, monkeypatch):
     ):
         monkeypatch.setattr(model, lambda *_: pytest.fail("a model that ships was asked for"))
     assert collect.record_of(TASK)["answers"]["search"]["right"]
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_scene_is_registered_from_its_camera_or_from_both_ends_of_its_line_of_sight(monkeypatch, pair, given):
+    eye, ends = np.array([0.0, 0.0, 500.0]), np.array([[0.0, 0.0, 450.0], [0.0, 0.0, -450.0]])
+    asked: list[list[float]] = []
+
+    class Registrar:
+        """Keeps from where it was asked to look."""
+
+        def assess(self, source, target, viewpoint=None):
+            if viewpoint is not None:
+                asked.append(viewpoint.tolist())
+            return Refusal(RegistrationStatus.LOW_CONFIDENCE, "none")
+
+    seen = replace(pair, metadata={"viewpoint": eye.tolist()} if given else {})
+    drawn = Drawn(seen, "depth-camera", "depth-camera", "own", ("p0",), "")
+    monkeypatch.setattr(pairs, "draw", lambda task: drawn)
+    monkeypatch.setattr(collect, "_prepared", lambda cloud: None)
+    monkeypatch.setattr(collect, "_registrars", lambda sensor: dict.fromkeys(NAMES, Registrar()))
+    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: ends)
+    collect.record_of(replace(TASK, number=collect.LOOKED_AT))
+    assert asked == ([eye.tolist()] if given else ends.tolist())
+
+
+def test_both_places_of_a_record_are_answers_of_the_round_of_scenes():
+    answer = {"features": dict.fromkeys(FEATURES_OF[clutter.NAME], 0.5), "refusal": None}
+    answers = {"scene 0": answer | {"right": True}, "scene 1": answer | {"right": False}}
+    facts = dict.fromkeys(("name", "family", "seen_as", "what", "bone"), "a") | {"people": ["p0"], "answers": answers}
+    found = answers_of([facts], clutter.NAME)
+    assert found.right.tolist() == [True, False] and found.people == (("p0",), ("p0",))
 
 
 def test_the_next_source_of_a_stream_is_a_part_of_the_view_and_the_memory_is_off_by_a_small_motion(pair):

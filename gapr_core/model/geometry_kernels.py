@@ -1,4 +1,4 @@
-"""Compiled loops of the geometry of pairs in training: point-wise features, and places and influences of KPConv.
+"""Compiled loops of the geometry of pairs: point-wise features, and places and influences of KPConv.
 
 They say what `pgf.embed`, `backbone.kpconv.surface_places` and `influences` say, to rounding. Neighbours are taken in
 chunks of one scratch array with distances known to the compiler, so that it can work on several at a time.

@@ -1,4 +1,4 @@
-"""Compiled loops of the norm in training: what torch does in dozens of passes over memory, there and back.
+"""Compiled loops of the norm: what torch does in dozens of passes over memory, there and back.
 
 They say what the tensors of `layers.GroupNorm` say, to rounding.
 

@@ -1,4 +1,4 @@
-"""Steps of training on a CPU as compiled loops that torch can go back through; registration keeps torch's own."""
+"""Steps of the network on a CPU as compiled loops that torch can go back through, in training and registration."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from gapr_core.model.types import Level, Neighborhood
 
 
 def fit(*tensors: Tensor) -> bool:
-    """Whether the loops can take these tensors: float32 on a CPU, in training, not under autocast or export."""
+    """Whether the loops can take these tensors: float32 on a CPU, not under autocast or export."""
     plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
     free = not torch.is_autocast_enabled("cpu") and not torch.compiler.is_compiling()
-    return torch.is_grad_enabled() and plain and free
+    return plain and free
 
 
 def norm(x: Tensor, lengths: tuple[int, ...], groups: int, weight: Tensor, bias: Tensor, slope: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Compiled loops of optimal transport in training: every patch pair by itself, in the processor's cache.
+"""Compiled loops of optimal transport: every patch pair by itself, in the processor's cache.
 
 The same iteration as `point_matching.log_optimal_transport`. With P_ij = exp(C_ij) / sum_j exp(C_ij) and s_j = sum_i
 P_ij mu_i, the plan after the round in log space is K_ij = P_ij mu_i nu_j / s_j: no second exponential is needed.

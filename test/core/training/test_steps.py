@@ -1,4 +1,4 @@
-"""The compiled steps of training against the tensors that registration uses: the same answers and gradients."""
+"""The compiled steps of the network against the tensors that they replace: the same answers and gradients."""
 
 from __future__ import annotations
 
@@ -113,10 +113,23 @@ def test_compiled_steps_learn_what_the_tensors_learn(with_tensors, model, batch)
     assert float((found[1] - wanted[1]).norm() / wanted[1].norm()) < 1e-5
 
 
-def test_registration_never_takes_a_compiled_step_of_training(batch, model, monkeypatch):
-    """Its models are calibrated with what the tensors say, and a first registration should not wait for compilation."""
+def test_registration_takes_the_compiled_steps_and_finds_what_the_tensors_find(
+    with_tensors, batch, model, monkeypatch
+):
+    torch.manual_seed(0)
+    network, taken = GAPRNet(model).eval(), set()
+
+    def noted(name, step):
+        return lambda *arguments: (taken.add(name), step(*arguments))[1]
+
     for name in ("norm", "embed", "surface_influences", "transport"):
-        monkeypatch.setattr(steps, name, None)
-    monkeypatch.setattr(attention.Attention, "_plain", None)
-    with torch.inference_mode():
-        assert len(GAPRNet(model).eval()(batch.source, batch.target).chosen)
+        monkeypatch.setattr(steps, name, noted(name, getattr(steps, name)))
+
+    def matched():
+        with torch.inference_mode():
+            return network(batch.source, batch.target).fine.log_z
+
+    found, wanted = matched(), with_tensors(matched)
+    exists = wanted > -1e4
+    same([found[exists]], [wanted[exists]], 1e-4)
+    assert taken == {"norm", "embed", "surface_influences", "transport"}

@@ -187,7 +187,7 @@ class Registrar:
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
         start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
-            assessment = self._of_bone_alone(prepared, target, start, clock, enough)
+            assessment = self._as_bone(prepared, target, start, clock, enough)
             if assessment is None or not (assessment.is_sure(self.config.min_confidence) or enough(assessment)):
                 found = self._of_one_view(source, target, start, clock)
                 if found is not None:
@@ -216,7 +216,7 @@ class Registrar:
             clock.lap("refine")
         return assessment.corrected(self.precision)
 
-    def _of_bone_alone(
+    def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """A source of which all points may be bone: on the outer cortex, and on both where the residuals ask for it."""

@@ -33,7 +33,8 @@ class Accumulator:
     is the newest. After three of them in a row the bone or its reference has moved, and only these three are kept.
 
     Args:
-        method: registers what is collected. The sources of a `Tracker` then count as one (`Tracker.share_points`).
+        method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
+            (`Tracker.sharing_points`).
         most: how many sources are kept, the newest among them.
 
     Raises:
@@ -45,10 +46,8 @@ class Accumulator:
     def __init__(self, method: Registrar | Tracker, most: int) -> None:
         if most < 1:
             raise ConfigError("at least 1 source to keep", str(most), "1 registers every source by itself")
-        self.method, self.most = method.of_bone_alone() if isinstance(method, Registrar) else method, most
-        if isinstance(method, Tracker):
-            method.share_points()
-        self.config = (method.registrar if isinstance(method, Tracker) else method).config
+        self.method, self.most = _of_many_places(method), most
+        self.config = (self.method.registrar if isinstance(self.method, Tracker) else self.method).config
         self._target: PreparedTarget | None = None
         self.reset()
 
@@ -191,6 +190,13 @@ class Accumulator:
         some = np.ascontiguousarray(points[:: 1 + len(points) // limits.most_points])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
         return own > limits.off * max(of_all, refinement.smallest_sigma_mm)
+
+
+def _of_many_places(method: Registrar | Tracker) -> Registrar | Tracker:
+    """The method for sources of which no camera saw all; others are taken as they are."""
+    if isinstance(method, Tracker):
+        return method.sharing_points()
+    return method.of_bone_alone() if isinstance(method, Registrar) else method
 
 
 def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:

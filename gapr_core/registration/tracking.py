@@ -87,14 +87,18 @@ class Tracker:
         twin.registrar, twin._tracking = self.registrar.of_bone_alone(), self._tracking.of_bone_alone()
         return twin
 
-    def share_points(self) -> None:
-        """The sources of this stream share their points, as those of an `Accumulator` do: many count as one.
+    def sharing_points(self) -> Tracker:
+        """Another tracker, for sources that share their points, as those of an `Accumulator` do: many count as one.
 
-        Nor were the points of one of them seen from one place.
+        Nor were the points of one of them seen from one place. It begins a stream of its own.
         """
-        self.registrar, self._tracking = self.registrar.of_bone_alone(), self._tracking.of_bone_alone()
-        self._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
-        self._shared = None  # the same points have the same noise
+        twin = copy(self)
+        twin.registrar, twin._memory = self.registrar.of_bone_alone(), Memory()
+        twin._tracking = MemoryFirst(twin._memory, self._tracking.calibrations[0], twin.registrar)
+        twin._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
+        twin._shared = None  # the same points have the same noise
+        twin.reset()
+        return twin
 
     def _forget_shared(self) -> None:
         self._shared_for_bone = False  # what the frames share speaks for the bone

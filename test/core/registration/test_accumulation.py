@@ -188,7 +188,7 @@ def test_one_viewpoint_for_clouds_of_many_views_is_refused(registrar, frames, pr
         Accumulator(registrar, most=3).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])
 
 
-def test_a_reset_reaches_the_tracker(frames, prepared):
+def test_a_reset_reaches_the_tracker_of_the_collection(registrar):
     class Counting(Tracker):
         resets = 0
 
@@ -196,11 +196,25 @@ def test_a_reset_reaches_the_tracker(frames, prepared):
             super().reset()
             self.resets += 1
 
-    tracker = Counting(Registrar(RegistrarConfig(num_threads=1)))
-    accumulator = Accumulator(tracker, most=2)
-    before = tracker.resets
+    tracker = Counting(registrar)
+    accumulator, given = Accumulator(tracker, most=2), tracker.resets
+    before = accumulator.method.resets
     accumulator.reset()
-    assert tracker.resets == before + 1
+    assert accumulator.method.resets == before + 1 and tracker.resets == given
+
+
+def test_a_tracker_given_to_a_collection_goes_on_with_its_own_stream(registrar, frames, prepared):
+    """It took its sources for one source from then on, and the poses of the collection for its own."""
+    alone, used = Tracker(registrar), Tracker(registrar)
+    for tracker in (alone, used):
+        tracker.register(frames[0].source, prepared)
+    collected = Accumulator(used, most=3)
+    assert collected.method is not used and not len(collected.method._memory.poses)
+    for frame in frames[1:3]:
+        collected.register(frame.source, prepared)
+    answers = [tracker.register(frames[1].source, prepared) for tracker in (alone, used)]
+    assert answers[0].confidence == answers[1].confidence and answers[0].features == answers[1].features
+    assert used.registrar is registrar
 
 
 def test_a_source_without_a_finite_point_gets_no_answer_from_what_was_collected_before(registrar, femur_cloud):

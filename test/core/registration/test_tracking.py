@@ -341,8 +341,7 @@ def test_a_source_that_is_sent_again_adds_nothing_to_what_is_shared(scripted, fr
 
 
 def test_sources_that_share_their_points_share_their_noise_as_well(scripted, frames, prepared):
-    tracker = scripted(None, 1.0)
-    tracker.share_points()
+    tracker = scripted(None, 1.0).sharing_points()
     results = [tracker.register(frames[i].source, prepared) for i in range(2)]
     assert all(r.ok and "shared_misfit" not in r.features for r in results)
 

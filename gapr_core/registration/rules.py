@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import MM_PER_UNIT
+from gapr_core.clouds import EXTENT_LIMITS_MM, MM_PER_UNIT
 from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import words
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 DEFAULT = RulesConfig()
 OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # that are taken for mm by mistake
+HALF_TURN_DEG = 180.0
 PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 
 
@@ -203,10 +204,17 @@ def _rms_mm(vectors: Array) -> float:
 
 
 def _what_is_loose(uncertainty: PoseUncertainty) -> str:
+    turn = _known(uncertainty.largest_turn_deg, HALF_TURN_DEG, "deg")
+    shift = _known(uncertainty.largest_shift_mm, EXTENT_LIMITS_MM[1], "mm")
     return (
-        f"the rotation about {_named(uncertainty.weakest_turn)} is known to {uncertainty.largest_turn_deg:.1f} deg, "
-        f"the shift along {_named(uncertainty.weakest_shift)} to {uncertainty.largest_shift_mm:.1f} mm only"
+        f"the rotation about {_named(uncertainty.weakest_turn)} is {turn}, "
+        f"the shift along {_named(uncertainty.weakest_shift)} is {shift}"
     )
+
+
+def _known(deviation: float, most: float, unit: str) -> str:
+    """A standard deviation in words; one beyond any that there can be says nothing but that."""
+    return f"known to {deviation:.1f} {unit} only" if deviation <= most else "not known"
 
 
 def _which_rival(candidates: Candidates, source: PreparedSource) -> str:

@@ -1,5 +1,7 @@
 """Shapes of which no pose can be known: flat faces, straight edges, solids of revolution, smooth and rough."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -87,6 +89,18 @@ def test_what_was_not_observed_is_uncertain_and_not_exact():
     assert np.sqrt(uncertainty.covariance[2, 2]) < 0.5  # across the plane it is known
     nothing = estimate(fit_of_plane(weights=np.zeros(500)), CovarianceConfig())
     assert rules.is_loose(nothing)
+
+
+@pytest.mark.parametrize(("turn_deg", "shift_mm", "turn", "shift"), [
+    (7.04, 3.0, "known to 7.0 deg only", "known to 3.0 mm only"),
+    (1811.9, 3.0, "not known", "known to 3.0 mm only"),
+    (7.04, 1e5, "known to 7.0 deg only", "not known"),
+])  # fmt: skip
+def test_a_deviation_that_no_turn_or_shift_can_have_is_not_said_in_numbers(turn_deg, shift_mm, turn, shift):
+    x, _, z = np.eye(3)
+    loose = SimpleNamespace(largest_turn_deg=turn_deg, largest_shift_mm=shift_mm, weakest_turn=x, weakest_shift=z)
+    said = f"the rotation about (1.00, 0.00, 0.00) is {turn}, the shift along (0.00, 0.00, 1.00) is {shift}"
+    assert rules._what_is_loose(loose) == said
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 RIGHT_MM, RIGHT_DEG = 4.0, 5.0  # a pose farther off at the source's centroid, or turned farther, is wrong
 LAST_ROW = 1e-6  # how far an entry of the last row may be from 0 0 0 1
+LARGEST_ENTRY = 1e6  # of a rotation part; larger is a damaged number, and no scale
 FARTHEST_FROM_RIGID = 1e-2  # of an entry of R^T R from the identity: poses are often written with few digits
 
 
@@ -68,6 +69,8 @@ def why_not_rigid(T: Array) -> str:
     R, last = T[:3, :3], T[3]
     if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > LAST_ROW:
         return "last row is {:g} {:g} {:g} {:g}, not 0 0 0 1".format(*last)
+    if (largest := np.abs(R).max()) > LARGEST_ENTRY:  # whose square may be infinite
+        return f"rotation part has an entry of size {largest:.3g}"
     if np.abs(R.T @ R - np.eye(3)).max() > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
         return f"rotation part has determinant {np.linalg.det(R):.3g}"
     return ""

@@ -87,3 +87,12 @@ def test_poses_are_as_far_apart_as_they_put_points_on_average():
     quarter = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2.0])
     points = [[3.0, 0.0, 0.0], [0.0, 0.0, 5.0]]  # moved by 3 sqrt(2) and by nothing: root of (18 + 0) / 2
     assert se3.rms_apart_mm(T @ quarter, T, points) == pytest.approx(3.0)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(("size", "said"), [
+    (1.0, ""), (1.01, "determinant 1.03"), (1e5, "determinant 1e+15"), (1e200, "an entry of size 1e+200"),
+])  # fmt: skip
+def test_what_keeps_a_motion_from_being_rigid_is_said_of_numbers_of_any_size(size, said):
+    why = se3.why_not_rigid(np.diag([size, size, size, 1.0]))
+    assert why == (f"rotation part has {said}" if said else "")

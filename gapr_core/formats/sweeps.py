@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 HEADER_BYTES = 64 << 20
 FRAME = re.compile(r"^Seq_Frame(\d+)_(\w+?)(Transform|TransformStatus)\s*=\s*(.+)$", re.MULTILINE)
+FROM_TRACKER = re.compile("TrackerTo[A-Z]")  # the inverse of a tool's pose
 POSES = "poses.csv"
 NEAR_POSES = re.compile(r"(?<![a-z])poses?(?![a-z])")
 SLICE_ENDINGS = (".csv", ".txt", ".xyz", ".npy")
@@ -35,9 +36,10 @@ def read_igs(path: Path, options: ReadOptions) -> Surface:
         InvalidPointCloudError: no tip is given, or as `pose_of`.
         ValueError: no frame is valid.
     """
+    recorded = transforms(path, options)
     if options.tip_mm is None:
         raise tracker.needs_tip(path)
-    poses = pose_of(transforms(path, options), options.tool, path, options.reference)
+    poses = pose_of(recorded, options.tool, path, options.reference)
     return Surface(tracker.tips(poses, options.tip_mm), joined=True)
 
 
@@ -45,13 +47,17 @@ def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: i
     """(N, 4, 4) of one transform by its place in the list of their names, in the frame of another one if it is named.
 
     Raises:
-        InvalidPointCloudError: none of them, several and none chosen, two that are not valid together or do not lead
-            to one frame, or one that is not rigid, as those of an image's pixels.
+        InvalidPointCloudError: none of them, several and none chosen, one that leads from the tracker to a tool, two
+            that are not valid together or do not lead to one frame, or one that is not rigid, as those of an image's
+            pixels.
     """
     names, valid = list(poses), [i for i, frames in enumerate(poses.values()) if frames]
     if tool is None and len(valid) == 1:
         tool = valid[0]
     used = tracker.chosen_with(tool, reference, names, path)
+    if turned := next((names[i] for i in used if FROM_TRACKER.match(names[i])), None):
+        how = "record it the other way round, as ProbeToTracker, or name another one with --tool"
+        raise InvalidPointCloudError("a pose of a tool in the frame of the tracker", f"{turned} of {path.name}", how)
     ends = {names[i].rpartition("To")[2] for i in used if "To" in names[i]}
     if len(ends) > 1:
         given = f"{' and '.join(names[i] for i in used)} of {path.name}"
@@ -132,6 +138,9 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
 
     _check_axes(files)
     slices = [read(file, replace(options, axes="as_is")).points for file in files]
+    if len(files) > 1:
+        log.warning("%d files of %s are joined, %s to %s; the bone must not have moved in their frame",
+                    len(files), path.name, files[0].name, files[-1].name)  # fmt: skip
     if (path / POSES).is_file():
         _say_order(files)
         slices = _placed(slices, path / POSES, options)
@@ -173,6 +182,8 @@ def _check_rigid(T: Array, number: int) -> None:
     """Raise for a matrix that is transposed, scaled or reflected, or has a number that is not finite."""
     if not np.isfinite(T).all() or se3.why_not_rigid(T):
         row, R = " ".join(f"{value:.8g}" for value in T[3]), np.nan_to_num(T[:3, :3], posinf=0.0, neginf=0.0)
-        given = f"pose {number} with last row {row} and determinant {np.linalg.det(R):.3g} of its 3x3 part"
+        with np.errstate(over="ignore"):
+            determinant = np.linalg.det(R)
+        given = f"pose {number} with last row {row} and determinant {determinant:.3g} of its 3x3 part"
         how = "write it row by row, in mm, with last row 0 0 0 1, without scale or reflection"
         raise InvalidPointCloudError(f"rigid 4x4 matrices in {POSES}", given, how)

@@ -77,6 +77,38 @@ def test_poses_of_a_sequence_with_few_digits_are_read_and_made_rigid(tmp_path):
     )
 
 
+def test_a_transform_that_leads_from_the_tracker_is_no_pose_of_a_tool(tmp_path):
+    """Its tips were those of the inverse: another cloud, and nothing said so."""
+    path = igs(tmp_path / "a.igs.mha", turned_poses(4), ["OK"] * 4)
+    path.write_bytes(path.read_bytes().replace(b"ProbeToTracker", b"TrackerToProbe"))
+    with pytest.raises(InvalidPointCloudError, match="in the frame of the tracker; got .*TrackerToProbe of a.igs.mha"):
+        reading.read(path, ReadOptions(tip_mm=tuple(TIP)))
+    path.write_bytes(path.read_bytes().replace(b"TrackerToProbe", b"TrackerToolToTracker"))
+    assert len(poses_in(path)) == 4
+
+
+def test_an_empty_sequence_is_called_empty_before_a_tip_is_asked_for(tmp_path):
+    (tmp_path / "a.igs.mha").touch()
+    with pytest.raises(InvalidPointCloudError, match=r"a\.igs\.mha \(0 bytes, an empty file\)"):
+        reading.read(tmp_path / "a.igs.mha")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_huge_pose_of_slices_is_refused_without_a_warning_of_numpy(tmp_path):
+    folder = slices_with_poses(tmp_path / "a", [np.diag([1e200, 1e200, 1e200, 1.0])])
+    with pytest.raises(InvalidPointCloudError, match="pose 1 with last row 0 0 0 1 and determinant inf"):
+        reading.read(folder)
+
+
+def test_files_that_are_joined_are_counted_and_named(tmp_path, caplog):
+    folder = slices_with_poses(tmp_path / "a", turned_poses(3))
+    reading.read(folder)
+    assert "3 files of a are joined, slice_00.xyz to slice_02.xyz; the bone must not have moved" in caplog.text
+    caplog.clear()
+    reading.read(slices_with_poses(tmp_path / "b", turned_poses(1)))
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("off", [1e-5, 5e-3])
 def test_the_last_row_of_a_pose_of_slices_is_exact(tmp_path, off):
     poses = turned_poses(2)

@@ -167,6 +167,8 @@ def unreadable(path: Path, why: str) -> InvalidPointCloudError:
     ending = _ending(path)
     if path.is_file() and path.stat().st_size == 0:
         why = "0 bytes, an empty file"
+    if signatures.is_utf_16(path):
+        return InvalidPointCloudError("UTF-8 text", f"{path.name}: UTF-16 text", "save it as UTF-8")
     other, how = signatures.ending_of(path), "export it again"
     if other and other != ending:
         how = f"it looks like {other}: rename it, if that is what it is"

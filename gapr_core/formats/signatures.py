@@ -6,6 +6,7 @@ import gzip
 from pathlib import Path
 
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats.text import UTF_16
 
 GZIP = b"\x1f\x8b"
 PACKED = ".nii.gz"  # the one packed kind that is read
@@ -63,6 +64,11 @@ def _head(path: Path) -> bytes:
             return file.read(STL_HEADER_BYTES)
     except OSError:
         return b""
+
+
+def is_utf_16(path: Path) -> bool:
+    """Whether a file that cannot be read begins with the byte order mark of UTF-16."""
+    return _head(path).startswith(UTF_16)
 
 
 def ending_of(path: Path) -> str:

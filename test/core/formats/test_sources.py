@@ -536,11 +536,11 @@ def test_what_is_no_number_is_named_by_its_line(tmp_path, content, said):
 
 
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
-@pytest.mark.parametrize("name", ["a.csv", "a.txt", "a.fcsv", "a.mrk.json", "a.obj"])
-def test_utf_16_is_said_to_be_so(tmp_path, name, encoding):
-    (tmp_path / name).write_bytes("\ufeffx,y,z\n1,2,3\n".encode(encoding))
-    with pytest.raises(InvalidPointCloudError, match=f"UTF-8 text; got {name}: UTF-16 text; save it as UTF-8"):
-        reading.read(tmp_path / name)
+@pytest.mark.parametrize("ending", ["csv", "txt", "fcsv", "mrk.json", "obj", "ply", "pcd", "vtk", "stl", "igs.mha"])
+def test_utf_16_is_said_to_be_so(tmp_path, ending, encoding):
+    (tmp_path / f"a.{ending}").write_bytes(("\ufeffx,y,z\n" + 20 * "1,2,3\n").encode(encoding))
+    with pytest.raises(InvalidPointCloudError, match=f"UTF-8 text; got a.{ending}: UTF-16 text; save it as UTF-8"):
+        reading.read(tmp_path / f"a.{ending}")
 
 
 UNCLEAR = {

@@ -25,7 +25,7 @@ def write_with_open3d(path, mesh):
     assert o3d.io.write_triangle_mesh(str(path), triangles)
 
 
-def write_vtk(path, binary):
+def write_vtk(path, binary, faces=FACES):
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -34,7 +34,7 @@ def write_vtk(path, binary):
 
     points, cells, poly = vtkPoints(), vtkCellArray(), vtkPolyData()
     points.SetData(numpy_to_vtk(VERTICES, deep=True))
-    for face in FACES:
+    for face in faces:
         cells.InsertNextCell(3, face)
     poly.SetPoints(points)
     poly.SetPolys(cells)
@@ -75,6 +75,16 @@ def test_vtk_files_come_back_with_their_vertices_and_faces(tmp_path, name):
     write_vtk(tmp_path / name, binary=name == "bone.vtk")
     surface = clouds.load(tmp_path / name)
     assert same_corners(surface) and surface.faces.shape == (4, 3)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_points_without_cells_are_a_cloud_where_the_file_says_its_end(tmp_path, binary):
+    for name in ("cloud.vtp", "cloud.vtk"):
+        write_vtk(tmp_path / name, binary, faces=())
+    surface = clouds.load(tmp_path / "cloud.vtp")
+    assert same_corners(surface) and surface.faces is None
+    with pytest.raises(InvalidPointCloudError, match="4 points without a cell, as in a cut file; save a cloud as PLY"):
+        clouds.load(tmp_path / "cloud.vtk")
 
 
 @pytest.mark.parametrize("name", ["cloud.ply", "cloud.pcd"])

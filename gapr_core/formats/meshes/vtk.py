@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.meshes.polygons import fans, offsets_of_counted, strips
 from gapr_core.surface import Array, Surface
@@ -19,10 +20,16 @@ TYPES = {
 }  # fmt: skip
 CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
 DONE = ("POINT_DATA", "CELL_DATA")
+CLOUD = "save a cloud as PLY, NPY or VTP, or with VERTICES; export a mesh again"
 
 
 def read(path: Path, limits: FileLimits) -> Surface:
-    """A mesh; a cloud has its points as VERTICES."""
+    """A mesh; a cloud has its points as VERTICES.
+
+    Raises:
+        InvalidPointCloudError: points without cells, as those of a mesh that is cut.
+        ValueError: a file that is damaged or cut.
+    """
     file = _File(limits.read(path), limits)
     points, cells = np.empty((0, 3)), {}
     while (words := file.words()) and words[0] not in DONE:
@@ -36,7 +43,8 @@ def read(path: Path, limits: FileLimits) -> Surface:
         else:
             file.skip(words)
     if not cells:
-        raise ValueError("no cells in it: the file is cut; clouds go into PLY or NPY files")
+        given = f"{len(points)} points without a cell, as in a cut file"
+        raise InvalidPointCloudError("points and cells", given, CLOUD)
     faces = [fans(*cells["POLYGONS"])] if "POLYGONS" in cells else []
     faces += [strips(*cells["TRIANGLE_STRIPS"])] if "TRIANGLE_STRIPS" in cells else []
     triangles = np.concatenate(faces) if faces else np.empty((0, 3), dtype=np.int64)

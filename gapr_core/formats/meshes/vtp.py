@@ -25,18 +25,17 @@ RAW = re.compile(rb'<AppendedData\s+encoding="raw"\s*>\s*_')
 
 
 def read(path: Path, limits: FileLimits) -> Surface:
-    """A mesh; a cloud has its points as Verts."""
+    """A mesh, or a cloud where it has no polygons: XML says its own end, so that a cut file is no cloud."""
     file = _File(limits.read(path), limits)
-    points, faces, cells, start = [], [], 0, 0
+    points, faces, start = [], [], 0
     for piece in file.pieces():
         count = int(piece.get("NumberOfPoints", "0"))
         points.append(file.numbers(piece.find("Points/DataArray"), 3 * count).reshape(-1, 3))
         for name, triangles in (("Polys", fans), ("Strips", strips)):
             faces.append(triangles(*file.cells(piece, name)) + start)
-        cells += sum(int(piece.get(f"NumberOf{name}", "0")) for name in ("Verts", "Lines", "Strips", "Polys"))
         start += count
-    if not cells:
-        raise ValueError("no cells in it; clouds go into PLY or NPY files")
+    if not points:
+        raise ValueError("no piece in it")
     joined = np.concatenate(faces)
     limits.check_counts(start, len(joined))
     return Surface(np.concatenate(points), joined if len(joined) else None)

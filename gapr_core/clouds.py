@@ -42,14 +42,14 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     """
     if isinstance(source, str | Path):
         name, surface = str(source), reading.read(Path(source), options)
-        says_its_own = reading.format_of(Path(source)).in_patient or _is_recording(surface, options)
+        is_in_mm = reading.format_of(Path(source)).is_in_mm(options or ReadOptions())
     else:
         name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
-        says_its_own = False
+        is_in_mm = False
     surface = _drop_non_finite(surface, name)
     if surface.faces is not None and len(surface.faces):
         _check_faces(surface, name)
-    if says_its_own:
+    if is_in_mm:
         check_extent(surface.extent_mm, "mm", name, "in its header")
         return surface
     scale = _mm_per_unit(surface, units, name)
@@ -58,11 +58,6 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
         _warn_of_several_bones(surface, name)
     return surface
-
-
-def _is_recording(surface: Surface, options: ReadOptions | None) -> bool:
-    """Whether these are places of a tool's tip: a tracker records them in mm."""
-    return surface.joined and options is not None and options.tip_mm is not None
 
 
 def finite_points(array: ArrayLike) -> Array:
@@ -107,7 +102,7 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     low, high = WHOLE_BONE_MM
     if low <= extent_mm <= high:
         return
-    in_header = reading.format_of(path).in_patient
+    in_header = reading.format_of(path).in_mm
     how = (
         "correct the unit in its header"
         if in_header

@@ -156,12 +156,17 @@ def warn_of_axes(args: Namespace) -> None:
 def warn_of_units(args: Namespace) -> None:
     """Warn of a unit that no file takes, since those it is of are of a kind that is in mm."""
     from gapr_core.formats import reading
+    from gapr_core.formats.options import ReadOptions
 
+    is_in_mm = {
+        args.target: reading.format_of(args.target).is_in_mm(ReadOptions()),
+        args.source: reading.format_of(args.source).is_in_mm(ReadOptions(tip_mm=args.tip)),
+    }
     for option, units, paths in (
         ("--units", args.units, (args.source, args.target)),
         ("--source-units", args.source_units, (args.source,)),
     ):
-        if units and all(reading.format_of(path).in_patient for path in paths):
+        if units and all(is_in_mm[path] for path in paths):
             said = " and ".join(path.name for path in paths) + (" are" if len(paths) > 1 else " is")
             log.warning("%s %s changes nothing: %s in mm, as all files of such kinds", option, units, said)
 

@@ -59,15 +59,15 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
     return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])
 
 
-def of_patient(surface: Surface, path: Path, axes: str) -> Surface:
-    """The surface of a file that is in LPS already, by its own header: "lps_to_ras" alone turns it.
+def unturned(surface: Surface, path: Path, axes: str) -> Surface:
+    """The surface of a file with axes of its own, LPS by its header or those of a tracker: "lps_to_ras" alone turns it.
 
     Raises:
-        ConfigError: unknown axes, or "ras": such a file says its axes.
+        ConfigError: unknown axes, or "ras": nobody names the axes of such a file.
     """
     check(axes)
     if axes == "ras":
-        raise ConfigError("axes of a mesh or a cloud", f"ras for {path.name}, which says its own", "leave them out")
+        raise ConfigError("axes of a mesh or a cloud", f"ras for {path.name}, which has its own", "leave them out")
     return scaled(surface, FACTORS["lps_to_ras"]) if axes == "lps_to_ras" else surface
 
 

@@ -25,7 +25,11 @@ class Plugin:
     """A kind of file that another package reads; as `reading.Format` to those who use it."""
 
     entry: EntryPoint
-    in_patient = is_tracked = False
+    in_mm = in_lps = is_tracked = False
+
+    def is_in_mm(self, _: ReadOptions) -> bool:
+        """False: the user may name the unit."""
+        return False
 
     @property
     def unit(self) -> str:

@@ -19,15 +19,17 @@ class Format:
     """A kind of file.
 
     Attributes:
-        reader: `module:function` under `gapr_core.formats`; takes (path, limits) or, of patient data, (path, options).
-        in_patient: whether the file says its own axes and is in mm: it comes out in LPS mm, and units do not apply.
-        with_options: whether the reader of another file takes all options.
+        reader: `module:function` under `gapr_core.formats`; takes (path, limits), or (path, options).
+        in_mm: whether its numbers are mm, whatever unit is named; its axes are its own, and none are named for it.
+        in_lps: whether it says its axes by its kind, and comes out in LPS.
+        with_options: whether the reader of a file that is not always in mm takes all options.
         unit: of its numbers, where the user names none.
         uses: the choices (`CHOICES`) that its reader takes; another one is an error and not ignored.
     """
 
     reader: str
-    in_patient: bool = False
+    in_mm: bool = False
+    in_lps: bool = False
     with_options: bool = False
     unit: str = "mm"
     uses: tuple[str, ...] = ()
@@ -37,14 +39,18 @@ class Format:
         """Whether it may be a recording in the frame of a tracker, whose axes are those of no patient."""
         return "tip_mm" in self.uses
 
+    def is_in_mm(self, options: ReadOptions) -> bool:
+        """Whether it is in mm as read with these options: places of a tool's tip are, since a tracker records them."""
+        return self.in_mm or (self.is_tracked and options.tip_mm is not None)
+
     def read(self, path: Path, options: ReadOptions) -> Surface:
-        """The surface, in LPS mm for patient data, otherwise in the file's unit with its axes turned as asked."""
+        """The surface in the file's unit; in its own axes where it has some, otherwise turned as asked."""
         self._check(path, options)
         module, function = self.reader.split(":")
         reader: Callable[[Path, FileLimits | ReadOptions], Surface]
         reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
-        if self.in_patient:
-            return axes.of_patient(reader(path, options), path, options.axes)
+        if self.in_mm:
+            return axes.unturned(reader(path, options), path, options.axes)
         return axes.turned(reader(path, options if self.with_options else options.limits), path, options.axes)
 
     def _check(self, path: Path, options: ReadOptions) -> None:
@@ -64,7 +70,8 @@ CHOICES = {  # choice of `ReadOptions` -> the files that have it, and how a user
     "clouds": ("a bag", "--clouds"),
 }
 TRACKED = ("tip_mm", "tool", "reference")
-LABEL_MAP = Format("volumes.label_map:read", in_patient=True, uses=("labels",))
+LABEL_MAP = Format("volumes.label_map:read", in_mm=True, in_lps=True, uses=("labels",))
+MARKUPS = Format("markups:read", in_mm=True, in_lps=True)
 FORMATS = {
     ".ply": Format("meshes.ply:read"),
     ".pcd": Format("meshes.pcd:read"),
@@ -79,14 +86,14 @@ FORMATS = {
     ".nrrd": LABEL_MAP,
     ".mha": LABEL_MAP,
     ".dcm": LABEL_MAP,
-    ".mrk.json": Format("markups:read", in_patient=True),
-    ".fcsv": Format("markups:read", in_patient=True),
+    ".mrk.json": MARKUPS,
+    ".fcsv": MARKUPS,
     ".csv": Format("points_text:read_csv", with_options=True, uses=TRACKED),
     ".txt": Format("points_text:read"),
     ".xyz": Format("points_text:read"),
-    ".igs.mha": Format("sweeps:read_igs", in_patient=True, uses=TRACKED),
+    ".igs.mha": Format("sweeps:read_igs", in_mm=True, uses=TRACKED),
 }
-FOLDER = Format("sweeps:read_folder", in_patient=True, uses=TRACKED)
+FOLDER = Format("sweeps:read_folder", in_mm=True, uses=TRACKED)
 DETACHED = (".mhd", ".nhdr")  # headers that name another file, which is not opened for them
 LONGEST_REASON = 160
 BARE = (LookupError, TypeError, AttributeError, StopIteration, AssertionError)  # words of Python, not of the file
@@ -148,9 +155,7 @@ def format_of(path: Path) -> Format | plugins.Plugin:
 def says_axes(path: Path) -> bool:
     """Whether a file says that it is in LPS or RAS: a label map, markups, or by a comment or names of columns."""
     kind = format_of(path)
-    if kind.in_patient:
-        return not kind.is_tracked
-    return path.is_file() and axes.stated(path) is not None
+    return kind.in_lps or (not kind.in_mm and path.is_file() and axes.stated(path) is not None)
 
 
 def reason_of(error: Exception) -> str:

@@ -273,6 +273,14 @@ def test_a_unit_that_no_file_takes_is_warned_of(folder, caplog):
     assert register("", "p.mrk.json", "p.mrk.json") == 0 and "changes nothing" not in caplog.text
 
 
+def test_a_unit_that_a_recording_does_not_take_is_warned_of(folder, caplog):
+    """Whether a .csv is one, its tip says."""
+    rows = "".join(f"OK,1,0,0,0,{x},{y},{z}\n" for x, y, z in POINTS)
+    Path("probe.csv").write_text(f"State,Q0,Qx,Qy,Qz,Tx,Ty,Tz\n{rows}")
+    assert register("--tip 0,0,0 --source-units m", "bone.ply", "probe.csv") == 0
+    assert "--source-units m changes nothing: probe.csv is in mm" in caplog.text
+
+
 def test_residuals_as_json_say_no_axes(folder, caplog):
     assert register("--residuals r.json --axes lps_to_ras") == 0 and register("--residuals r.json") == 0
     assert "in LPS: " not in caplog.text

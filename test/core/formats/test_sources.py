@@ -430,11 +430,19 @@ TABLES = {
     "l.txt": "x (mm) y (mm) z (mm)\n10 20 30\n-40 5 60\n7 -8 90\n",
     "m.txt": "x y z colour\n10 20 30 1 2\n-40 5 60 1 2\n7 -8 90 1 2\n",
     "n.csv": '"Tool, time",x,y,z\n0,10,20,30\n1,-40,5,60\n2,7,-8,90\n',
+    "text.csv": "name,x,y,z\nhip,10,20,30\n,-40,5,60\nknee,7,-8,90\n",
+    "quoted.csv": '"x","y","z"\n"10","20","30"\n"-40","5","60"\n"7","-8","90"\n',
+    "nameless.csv": '"10","20","30"\n"-40","5","60"\n"7","-8","90"\n',
+    "later.csv": 'x,y,z,note\n10,20,30,\n-40,5,60,"a, b"\n7,-8,90,"5"\n',
+    "tabs.txt": "# by hand\nx\ty\tz\tname\n10\t20\t30\tthe hip\n\n-40\t5\t60\t\n7\t-8\t90\t\n",
+    "spaces.xyz": "name x y z\nhip 10 20 30\nknee -40 5 60\nfoot 7 -8 90\n",
+    "comment.txt": "# x y z name\n10 20 30 hip\n-40 5 60 knee\n7 -8 90 foot\n",
+    "trailing.csv": "x,y,z,\n10,20,30,\n-40,5,60,\n7,-8,90,\n",
 }
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_a_line_of_names_says_which_column_is_which(tmp_path, name):
+def test_a_line_of_names_says_which_column_is_which_and_the_others_may_be_text(tmp_path, name):
     (tmp_path / name).write_text(TABLES[name], encoding="utf-8")
     np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
 
@@ -492,24 +500,6 @@ def test_columns_that_contradict_each_other_are_refused(tmp_path, content, said)
     (tmp_path / "a.csv").write_text(content)
     with pytest.raises(InvalidPointCloudError, match=said):
         reading.read(tmp_path / "a.csv")
-
-
-MIXED = {
-    "text.csv": "name,x,y,z\nhip,10,20,30\n,-40,5,60\nknee,7,-8,90\n",
-    "quoted.csv": '"x","y","z"\n"10","20","30"\n"-40","5","60"\n"7","-8","90"\n',
-    "nameless.csv": '"10","20","30"\n"-40","5","60"\n"7","-8","90"\n',
-    "later.csv": 'x,y,z,note\n10,20,30,\n-40,5,60,"a, b"\n7,-8,90,"5"\n',
-    "tabs.txt": "# by hand\nx\ty\tz\tname\n10\t20\t30\tthe hip\n\n-40\t5\t60\t\n7\t-8\t90\t\n",
-    "spaces.xyz": "name x y z\nhip 10 20 30\nknee -40 5 60\nfoot 7 -8 90\n",
-    "comment.txt": "# x y z name\n10 20 30 hip\n-40 5 60 knee\n7 -8 90 foot\n",
-    "trailing.csv": "x,y,z,\n10,20,30,\n-40,5,60,\n7,-8,90,\n",
-}
-
-
-@pytest.mark.parametrize("name", MIXED)
-def test_of_named_columns_the_others_may_be_text(tmp_path, name):
-    (tmp_path / name).write_text(MIXED[name])
-    np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
 
 
 def test_a_point_with_an_empty_cell_is_left_out(tmp_path):
@@ -596,7 +586,7 @@ def test_files_that_say_their_own_axes_are_not_turned_by_those_of_a_mesh(tmp_pat
     for axes in ("auto", "lps", "as_is"):
         np.testing.assert_allclose(reading.read(path, ReadOptions(axes=axes)).points, POINTS * LPS_RAS)
     np.testing.assert_allclose(reading.read(path, ReadOptions(axes="lps_to_ras")).points, POINTS)
-    with pytest.raises(ConfigError, match="ras for a.fcsv, which says its own"):
+    with pytest.raises(ConfigError, match="ras for a.fcsv, which has its own"):
         reading.read(path, ReadOptions(axes="ras"))
     with pytest.raises(ConfigError, match="axes auto lps"):
         reading.read(path, ReadOptions(axes="up"))

@@ -131,7 +131,7 @@ def test_a_folder_of_slices_is_turned_once_and_after_its_poses(tmp_path, has_pos
     for axes, factors in {"auto": 1.0, "as_is": 1.0, "lps": 1.0, "lps_to_ras": LPS_RAS}.items():
         points = reading.read(folder, ReadOptions(axes=axes)).points
         np.testing.assert_allclose(points, np.vstack(slices) * factors, atol=1e-9)
-    with pytest.raises(ConfigError, match="ras for a, which says its own"):
+    with pytest.raises(ConfigError, match="ras for a, which has its own"):
         reading.read(folder, ReadOptions(axes="ras"))
 
 

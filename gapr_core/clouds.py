@@ -19,6 +19,10 @@ log = logging.getLogger(__name__)
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
+CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header"
+OF_ARRAY = "pass units={unit!r}, or convert it to {read_as}"
+OPTIONS = "--units {unit}, of both files; --source-units {unit}, of the source; model_unit"
+OF_FILE = f"pass units={{unit!r}} ({OPTIONS}), or convert it to {{read_as}}"
 WHOLE_BONE_MM = (60.0, 700.0)  # smaller are a patella, bones of hand and foot, the neck's vertebrae; larger is no bone
 
 
@@ -42,17 +46,18 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     """
     if isinstance(source, str | Path):
         name, surface = str(source), reading.read(Path(source), options)
-        is_in_mm = reading.format_of(Path(source)).is_in_mm(options or ReadOptions())
+        is_in_mm, how = reading.format_of(Path(source)).is_in_mm(options or ReadOptions()), OF_FILE
     else:
         name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
-        is_in_mm = False
+        is_in_mm, how = False, OF_ARRAY
     surface = _drop_non_finite(surface, name)
+    _check_apart(surface, name)
     if surface.faces is not None and len(surface.faces):
         _check_faces(surface, name)
     if is_in_mm:
-        check_extent(surface.extent_mm, "mm", name, "in its header")
+        _check_size(surface, "mm", name, OF_HEADER)
         return surface
-    scale = _mm_per_unit(surface, units, name)
+    scale = _mm_per_unit(surface, units, name, how)
     camera = None if surface.camera is None else surface.camera * scale
     surface = replace(surface, points=surface.points * scale, camera=camera)
     if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
@@ -66,14 +71,14 @@ def finite_points(array: ArrayLike) -> Array:
     return points[(np.abs(points) < BEYOND).all(axis=1)]
 
 
-def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> None:
+def check_extent(extent_mm: float, unit: str, name: str, how: str = CONVERT) -> None:
     """Raise `InvalidPointCloudError` when something of this size cannot be a bone or a piece of one.
 
     Args:
         extent_mm: its diagonal.
         unit: that it was read as, "mm", "cm" or "m".
         name: what it is called in the message.
-        where: the unit stands, if not in a call: "in its header".
+        how: to correct the unit, with places for the `unit` that it looks like and the one that it was `read_as`.
     """
     low, high = EXTENT_LIMITS_MM
     if low <= extent_mm <= high:
@@ -81,10 +86,7 @@ def check_extent(extent_mm: float, unit: str, name: str, where: str = "") -> Non
     other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
     hint = "check the file and its unit"
     if other:
-        options = f"--units {other}, of both files; --source-units {other}, of the source; model_unit"
-        option = f"pass units={other!r} ({options})"
-        how = f"correct the unit {where}" if where else f"{option}, or convert to {unit}"
-        hint = f"it looks like {other}: {how}"
+        hint = f"it looks like {other}: {how.format(unit=other, read_as=unit)}"
     raise InvalidPointCloudError(
         f"a bone or a piece of one, {low:g} to {high:g} mm across",
         f"{name} of {extent_mm:.3g} mm read as {unit}",
@@ -102,10 +104,9 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     low, high = WHOLE_BONE_MM
     if low <= extent_mm <= high:
         return
-    in_header = reading.format_of(path).in_mm
     how = (
-        "correct the unit in its header"
-        if in_header
+        OF_HEADER
+        if reading.format_of(path).in_mm
         else "name the unit, such as units='cm' (--units cm, of both files; model_unit)"
     )
     if extent_mm < low:
@@ -115,18 +116,37 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, said, how)
 
 
-def _mm_per_unit(surface: Surface, units: str, name: str) -> float:
+def _mm_per_unit(surface: Surface, units: str, name: str, how: str) -> float:
     if units == "auto":
         units = "m" if surface.extent_mm < EXTENT_LIMITS_MM[0] else "mm"
         log.warning("%s is %.3g across: taken to be in %s; name the unit to be sure", name, surface.extent_mm, units)
     if units not in MM_PER_UNIT:
         raise InvalidPointCloudError("units 'mm', 'cm', 'm' or 'auto'", repr(units), "name one of them")
-    check_extent(surface.extent_mm * MM_PER_UNIT[units], units, name)
+    _check_size(surface, units, name, how)
     return MM_PER_UNIT[units]
 
 
+def _check_size(surface: Surface, unit: str, name: str, how: str) -> None:
+    """As `check_extent`; a few points of a cloud that are metres from all others are named as such."""
+    mm, (low, high) = MM_PER_UNIT[unit], EXTENT_LIMITS_MM
+    if surface.faces is None and surface.extent_mm * mm > high:
+        far = np.linalg.norm(surface.points - np.median(surface.points, axis=0), axis=1) * mm > high
+        if 2 * far.sum() < len(far) and low <= Surface(surface.points[~far]).extent_mm * mm <= high:
+            given = f"{name} with {far.sum()} of its {len(far)} points metres from the others"
+            raise InvalidPointCloudError("points of one bone", given, "take these out")
+    check_extent(surface.extent_mm * mm, unit, name, how)
+
+
+def _check_apart(surface: Surface, name: str) -> None:
+    """Raise for one point, or several in one place: no unit makes a piece of bone of them."""
+    if surface.extent_mm == 0.0:
+        count = len(surface.points)
+        given = f"{name} with {count} points in one place" if count > 1 else f"{name} with 1 point"
+        raise InvalidPointCloudError("points on the surface of a bone", given, "acquire more of it")
+
+
 def _drop_non_finite(surface: Surface, name: str) -> Surface:
-    finite = np.asarray(np.isfinite(surface.points).all(axis=1))
+    finite = np.asarray((np.abs(surface.points) < BEYOND).all(axis=1))
     if not finite.any():
         raise InvalidPointCloudError(
             "points", f"{name} with {len(finite)} points, none finite", "check how it was made"

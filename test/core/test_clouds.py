@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapr_core import clouds
+from gapr_core import Registrar, RegistrarConfig, clouds
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.registration import target
 from gapr_core.surface import Surface, as_points
@@ -115,11 +115,44 @@ def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
         clouds.load(VERTICES, units="m")
 
 
-def test_centimetres_become_millimetres_and_are_asked_for():
+def test_centimetres_become_millimetres_and_are_asked_for(tmp_path):
     assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
-    options = r"\(--units cm, of both files; --source-units cm, of the source; model_unit\)"
-    with pytest.raises(InvalidPointCloudError, match=rf"it looks like cm: pass units='cm' {options}"):
+    with pytest.raises(InvalidPointCloudError, match="it looks like cm: pass units='cm', or convert it to mm$"):
         clouds.load(VERTICES / 10.0, units="mm")
+    np.save(tmp_path / "a.npy", VERTICES / 10.0)
+    options = r"\(--units cm, of both files; --source-units cm, of the source; model_unit\)"
+    with pytest.raises(InvalidPointCloudError, match=rf"it looks like cm: pass units='cm' {options}, or convert it"):
+        clouds.load(tmp_path / "a.npy", units="mm")
+
+
+def test_a_source_of_a_call_without_units_is_to_be_converted():
+    """It was to be read with options of the command line."""
+    search = Registrar(RegistrarConfig(num_threads=1))
+    dense = np.random.default_rng(0).normal(size=(900, 3))
+    prepared = search.prepare(dense * 60.0)
+    with pytest.raises(InvalidPointCloudError, match="the source of .* read as mm; it looks like m: convert it to mm$"):
+        search.register(dense * 0.06, prepared)
+
+
+@pytest.mark.parametrize(("points", "said"), [
+    ([[1.0, 2.0, 3.0]], "points on the surface of a bone; got a.xyz with 1 point; acquire more of it"),
+    ([[1.0, 2.0, 3.0]] * 7, "points on the surface of a bone; got a.xyz with 7 points in one place; acquire more"),
+    ([*VERTICES, [0.0, 9e3, 0.0]], "points of one bone; got a.xyz with 1 of its 5 points metres from the others; take"),
+    (VERTICES * 1e3, "a bone or a piece of one, 10 to 2500 mm across; got a.xyz of .* check the file and its unit"),
+])  # fmt: skip
+@pytest.mark.parametrize("unit", ["mm", "cm"])
+def test_points_that_no_unit_helps_are_not_blamed_on_the_unit(tmp_path, monkeypatch, points, said, unit):
+    monkeypatch.chdir(tmp_path)
+    np.savetxt("a.xyz", np.array(points) / clouds.MM_PER_UNIT[unit])
+    with pytest.raises(InvalidPointCloudError, match=said):
+        clouds.load("a.xyz", units=unit)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_rows_with_a_number_beyond_any_coordinate_are_dropped_as_they_are_by_a_registration():
+    dirty = np.vstack([VERTICES, [[1e300, 0, 0], [0, -1e15, 0]]])
+    np.testing.assert_array_equal(clouds.load(dirty).points, VERTICES)
+    np.testing.assert_array_equal(clouds.finite_points(dirty), VERTICES)
 
 
 def test_what_may_be_in_metres_or_centimetres_is_taken_for_metres():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats import reading
+from gapr_core.formats import columns, reading
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry.extent import BEYOND
 from gapr_core.surface import Array, Surface, as_points
@@ -33,7 +33,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         source: path to a mesh or cloud (PLY, PCD, STL, OBJ, VTK, VTP, XYZ, CSV, NPY, or NPZ with `points` and `faces`),
             a label map (NIfTI, NRRD, MHA, DICOM SEG), markups or tracked slices; an (N, 3) array of floats (rows that
             are not finite are dropped); or a `Surface`.
-        units: what the numbers are, "mm", "cm" or "m"; "auto" guesses mm or m from the extent and logs a warning.
+        units: what the numbers are, "mm", "cm" or "m"; "auto" takes what the names of the columns say, or guesses mm
+            or m from the extent and logs a warning.
             Files in patient coordinates (label maps, markups) and a tracker's recordings are in mm, whatever is named
             here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
@@ -41,8 +42,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     A mesh file of several separate long bones is read as one body, with a warning.
 
     Raises:
-        InvalidPointCloudError: unreadable file, unknown format, wrong shape, nothing finite, or an extent that
-            cannot be a bone in the unit named.
+        InvalidPointCloudError: unreadable file, unknown format, wrong shape, nothing finite, an extent that cannot be a
+            bone in the unit named, or another unit in the names of its columns.
     """
     if isinstance(source, str | Path):
         name, surface = str(source), reading.read(Path(source), options)
@@ -57,6 +58,8 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
     if is_in_mm:
         _check_size(surface, "mm", name, OF_HEADER)
         return surface
+    if isinstance(source, str | Path):
+        units = _agreed(units, columns.unit(Path(source)), name)
     scale = _mm_per_unit(surface, units, name, how)
     camera = None if surface.camera is None else surface.camera * scale
     surface = replace(surface, points=surface.points * scale, camera=camera)
@@ -114,6 +117,20 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     else:
         said = "longer than any human bone. If this is one bone"
     log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, said, how)
+
+
+def _agreed(units: str, said: str | None, name: str) -> str:
+    """The unit named, or with "auto" the one that the file says.
+
+    Raises:
+        InvalidPointCloudError: they contradict each other.
+    """
+    if said is None or units == said:
+        return units
+    if units != "auto":
+        given = f"{name} with coordinates in {said} by their names, read as {units}"
+        raise InvalidPointCloudError("the unit that the file says", given, OF_FILE.format(unit=said, read_as=units))
+    return said
 
 
 def _mm_per_unit(surface: Surface, units: str, name: str, how: str) -> float:

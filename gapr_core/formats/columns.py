@@ -14,6 +14,7 @@ from gapr_core.errors import InvalidPointCloudError
 DELIMITERS = ",;\t"
 COMMENTS = ("#", "//")
 ENDINGS = (".csv", ".txt", ".xyz")
+IN_NAME = re.compile(r"\b[xyzlpsra][\s(\[_/]+(mm|cm)\b|\b[xyzlpsra]\s*[(\[]\s*(m)\s*[)\]]", re.IGNORECASE)
 AXES = {"xyz": None, "lps": "lps", "ras": "ras"}  # names of three columns -> the axes that they say
 
 
@@ -25,12 +26,14 @@ class Header(NamedTuple):
         names: of the columns, or the words of the last comment.
         is_line: whether they stand in a line of their own, which is no comment.
         cells: how many are in the first line that is neither empty nor a comment.
+        line: in which the names stand.
     """
 
     delimiter: str | None
     names: list[str]
     is_line: bool
     cells: int
+    line: str
 
 
 class Columns(NamedTuple):
@@ -55,8 +58,8 @@ def header_of(lines: Iterable[str]) -> Header:
     delimiter = next((d for d in DELIMITERS if d in first), None)
     cells, commented = _cells(first, delimiter), words(comment.lstrip(" #/"), delimiter)
     if not first or _are_numbers(cells) or _is_point(cells, found_in_comment(commented, len(cells))):
-        return Header(delimiter, commented, False, len(cells))
-    return Header(delimiter, words(first, delimiter), True, len(cells))
+        return Header(delimiter, commented, False, len(cells), comment)
+    return Header(delimiter, words(first, delimiter), True, len(cells), first)
 
 
 def words(line: str, delimiter: str | None) -> list[str]:
@@ -109,10 +112,35 @@ def space(path: Path) -> str | None:
     Raises:
         InvalidPointCloudError: names of several kinds.
     """
-    with path.open("rb") as file:
-        header = header_of(io.TextIOWrapper(file, encoding="utf-8-sig", errors="replace"))
-    columns = found(header.names) if header.is_line else found_in_comment(header.names, header.cells)
+    columns = _used(_header(path))
     return columns.space if columns else None
+
+
+def unit(path: Path) -> str | None:
+    """The unit that the names of the coordinates say, "mm", "cm" or "m", as in `x (cm)`; None where they say none.
+
+    Raises:
+        InvalidPointCloudError: several units, or as `space`.
+    """
+    if not path.is_file() or path.suffix.lower() not in ENDINGS:
+        return None
+    header = _header(path)
+    said = {(two or one).lower() for two, one in IN_NAME.findall(header.line)}
+    if not said or _used(header) is None:
+        return None
+    if len(said) > 1:
+        raise InvalidPointCloudError("one unit of all coordinates", " and ".join(sorted(said)), "correct the names")
+    return said.pop()
+
+
+def _header(path: Path) -> Header:
+    with path.open("rb") as file:
+        return header_of(io.TextIOWrapper(file, encoding="utf-8-sig", errors="replace"))
+
+
+def _used(header: Header) -> Columns | None:
+    """The columns that its names choose."""
+    return found(header.names) if header.is_line else found_in_comment(header.names, header.cells)
 
 
 def _cells(line: str, delimiter: str | None) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats import axes, text, tracker
+from gapr_core.formats import axes, columns, text, tracker
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry import se3
 from gapr_core.surface import Surface
@@ -124,7 +124,7 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
 
     Raises:
         InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid; a slice that says
-            that it is in RAS.
+            that it is in RAS or in another unit.
         ValueError: no slices, or another number of poses.
     """
     files = [f for f in path.iterdir() if f.name != POSES and not f.name.startswith(".")]
@@ -136,7 +136,7 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
         raise ValueError(f"no slices ({' '.join(SLICE_ENDINGS)}) in it")
     from gapr_core.formats.reading import read
 
-    _check_axes(files)
+    _check_said(files)
     slices = [read(file, replace(options, axes="as_is")).points for file in files]
     if len(files) > 1:
         log.warning("%d files of %s are joined, %s to %s; the bone must not have moved in their frame",
@@ -147,9 +147,12 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
     return Surface(np.vstack(slices), joined=True)
 
 
-def _check_axes(slices: list[Path]) -> None:
-    """Raise for a slice in RAS: what its pose or the other slices are in would be a guess."""
+def _check_said(slices: list[Path]) -> None:
+    """Raise for a slice in RAS or another unit: what its pose or the other slices are in would be a guess."""
     for path in slices:
+        if (unit := columns.unit(path)) not in (None, "mm"):
+            given = f"{path.name} with coordinates in {unit} by their names"
+            raise InvalidPointCloudError("slices in mm", given, "convert them")
         if path.is_file() and axes.stated(path) == "ras":
             how = "turn it to the frame of the others or of its pose, and take out what says so"
             given = f"{path.name}, which says that it is in RAS"

@@ -455,6 +455,37 @@ def test_names_that_say_something_else_are_refused(tmp_path, names):
         reading.read(tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize(("names", "unit"), [
+    ("x (cm),y (cm),z (cm)", "cm"), ("x_m,y_m,z_m", None), ("X [m],Y [m],Z [m]", "m"), ("t (mm),x,y_cm,z_cm", "cm"),
+    ("L (mm),P (mm),S (mm)", "mm"), ("x,y,z,error_cm", None), ("# x/cm,y/cm,z/cm", "cm"), ("# of the hip_cm", None),
+])  # fmt: skip
+def test_a_unit_in_the_names_of_the_coordinates_is_never_passed_over(tmp_path, names, unit):
+    """Points in cm were read as mm, as a tenth of the bone."""
+    path, extra = tmp_path / "a.csv", (names.count(",") == 3)
+    rows = np.insert(POINTS, 0 if names.startswith("t") else 3, 7.0, axis=1) if extra else POINTS
+    path.write_text(names + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    for named, mm in clouds.MM_PER_UNIT.items():
+        if named == "m":  # so large is no bone
+            continue
+        if unit in (None, named):
+            np.testing.assert_allclose(clouds.load(path, units=named).points, POINTS * mm)
+            continue
+        said = f"the unit that the file says; got .*a.csv with coordinates in {unit} by their names, read as {named}"
+        with pytest.raises(InvalidPointCloudError, match=f"{said}; pass units='{unit}'"):
+            clouds.load(path, units=named)
+    if unit == "cm":
+        np.testing.assert_allclose(clouds.load(path, units="auto").points, POINTS * 10.0)
+
+
+def test_several_units_and_slices_in_another_one_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("x (mm),y (cm),z (mm)\n1,2,3\n40,50,60\n")
+    with pytest.raises(InvalidPointCloudError, match="one unit of all coordinates; got cm and mm"):
+        clouds.load(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("x (cm),y (cm),z (cm)\n1,2,3\n40,50,60\n")
+    with pytest.raises(InvalidPointCloudError, match="slices in mm; got .*a.csv with coordinates in cm"):
+        clouds.load(tmp_path)
+
+
 SLICER = "label,{},defined,selected,visible,locked,description\n"
 ROWS = (
     'F-1,10,20,30,1,1,1,0,\n"F-2, later",-40,5,60,1,1,1,0,"hip, left"\n'

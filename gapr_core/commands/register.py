@@ -79,6 +79,8 @@ def _point(text: str) -> tuple[float, float, float]:
         x, y, z = (float(word) for word in text.split(","))
     except ValueError as error:
         raise ArgumentTypeError(f"three numbers X,Y,Z, not {text!r}") from error
+    if not np.isfinite([x, y, z]).all():
+        raise ArgumentTypeError(f"three finite numbers X,Y,Z, not {text!r}")
     return x, y, z
 
 

@@ -144,6 +144,13 @@ def test_a_wrong_command_line_is_one_line_and_exit_code_1(folder, capsys, line):
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.parametrize("option", ["--tip nan,0,0", "--tip 0,1e400,0", "--viewpoint 0,0,inf"])
+def test_a_place_that_is_not_finite_is_not_blamed_on_a_file(folder, capsys, option):
+    assert run(f"{REGISTER} {option}") == 1
+    name, value = option.split()
+    assert f"argument {name}: three finite numbers X,Y,Z, not '{value}'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--source", "--target", "--out"])
 def test_a_variable_of_the_shell_that_is_not_set_is_no_folder(folder, capsys, option):
     line = ["register", "--source", "cloud.npy", "--target", "cloud.npy", option, ""]

@@ -133,7 +133,8 @@ def format_of(path: Path) -> Format | plugins.Plugin:
     """The kind of a file, by its name.
 
     Raises:
-        InvalidPointCloudError: nothing there, an unknown ending, a packed file, or a header without its voxels.
+        InvalidPointCloudError: nothing there, an unknown ending, a packed file, a recording named as a label map, or a
+            header without its voxels.
     """
     if plugin := plugins.of(path):
         return plugin
@@ -143,6 +144,7 @@ def format_of(path: Path) -> Format | plugins.Plugin:
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
     ending = _ending(path)
     signatures.check_packed(path, ending)
+    signatures.check_sequence(path, ending)
     if ending in DETACHED:
         expected = "a header and its voxels in one file"
         raise InvalidPointCloudError(expected, path.name, "save it as one file: .mha or .nrrd")

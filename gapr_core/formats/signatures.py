@@ -13,6 +13,7 @@ PACKED = ".nii.gz"  # the one packed kind that is read
 NIFTI_BYTES = 348
 NIFTI_SIZES = (NIFTI_BYTES.to_bytes(4, "little"), NIFTI_BYTES.to_bytes(4, "big"))  # its first number
 STL_HEADER_BYTES, STL_FACET_BYTES = 84, 50
+SEQUENCE, SEQUENCE_BYTES = b"\nSeq_Frame", 8192  # after the fields of an image
 SIGNATURES = {
     b"ply": ".ply",
     b"solid": ".stl",
@@ -49,6 +50,17 @@ def check_packed(path: Path, ending: str) -> None:
     raise InvalidPointCloudError("a file that is not packed", given, how)
 
 
+def check_sequence(path: Path, ending: str) -> None:
+    """Raise for a recording by PLUS under the ending of a label map.
+
+    Raises:
+        InvalidPointCloudError: what to rename it to.
+    """
+    if ending == ".mha" and SEQUENCE in _head(path, SEQUENCE_BYTES):
+        given, how = f"{path.name}, a recording by PLUS", "rename it to .igs.mha, and give --tip"
+        raise InvalidPointCloudError("a label map as .mha", given, how)
+
+
 def _unpacks_to_nifti(path: Path) -> bool:
     try:
         with gzip.open(path) as file:
@@ -57,11 +69,11 @@ def _unpacks_to_nifti(path: Path) -> bool:
         return False
 
 
-def _head(path: Path) -> bytes:
+def _head(path: Path, size: int = STL_HEADER_BYTES) -> bytes:
     """The first bytes; none where the file cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(STL_HEADER_BYTES)
+            return file.read(size)
     except OSError:
         return b""
 

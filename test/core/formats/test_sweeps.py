@@ -87,6 +87,14 @@ def test_a_transform_that_leads_from_the_tracker_is_no_pose_of_a_tool(tmp_path):
     assert len(poses_in(path)) == 4
 
 
+@pytest.mark.parametrize("tip", [None, (0.0, 0.0, 0.0)])
+def test_a_sequence_that_is_named_as_a_label_map_is_to_be_renamed(tmp_path, tip):
+    igs(tmp_path / "a.mha", turned_poses(4), ["OK"] * 4)
+    said = "a label map as .mha; got a.mha, a recording by PLUS; rename it to .igs.mha, and give --tip"
+    with pytest.raises(InvalidPointCloudError, match=said):
+        reading.read(tmp_path / "a.mha", ReadOptions(tip_mm=tip))
+
+
 def test_an_empty_sequence_is_called_empty_before_a_tip_is_asked_for(tmp_path):
     (tmp_path / "a.igs.mha").touch()
     with pytest.raises(InvalidPointCloudError, match=r"a\.igs\.mha \(0 bytes, an empty file\)"):

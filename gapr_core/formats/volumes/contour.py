@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -34,13 +35,17 @@ def surface_of(mask: NDArray[np.uint8], affine: Array, smoothing_voxels: float =
         vertices in mm, faces wound outward, also where the affine is a reflection.
 
     Raises:
-        ValueError: a mask too thin to have a surface.
+        InvalidPointCloudError: a mask that is too thin to have a surface, or fills its image.
     """
     from skimage.measure import marching_cubes
 
     field = _smoothed(_without_specks(mask), smoothing_voxels)
     if field.max() <= 0.5 or min(field.shape) < 2:
-        raise ValueError("a segment too thin or too small for its voxels: segment it on a finer grid")
+        given, how = "one that is too thin or too small for its voxels", "segment it on a finer grid"
+        raise InvalidPointCloudError("a segment with a surface", given, how)
+    if field.min() >= 0.5:
+        given, how = "one that fills the whole image", "check the segmentation, and which label you chose"
+        raise InvalidPointCloudError("a segment with a surface", given, how)
     vertices, faces, _, _ = marching_cubes(field, 0.5, gradient_direction="ascent")
     points = vertices[:, ::-1].astype(np.float64) @ affine[:3, :3].T + affine[:3, 3]
     outward = faces[:, ::-1] if np.linalg.det(affine[:3, :3]) > 0.0 else faces

@@ -315,6 +315,17 @@ def test_letters_of_any_kind_may_be_in_a_name_and_bytes_that_are_none_are_said(t
         clouds.load(latin)
 
 
+@pytest.mark.parametrize(("voxels", "said"), [
+    (np.pad(np.ones((1, 1, 1)), 9), "too thin or too small for its voxels; segment it on a finer grid"),
+    (np.ones((1, 9, 9)), "too thin or too small for its voxels; segment it on a finer grid"),
+    (np.ones((9, 9, 9)), "fills the whole image; check the segmentation, and which label you chose"),
+])  # fmt: skip
+def test_a_segment_without_a_surface_is_no_damaged_file(tmp_path, voxels, said):
+    path = write(tmp_path / "a.nrrd", voxels, np.eye(4))
+    with pytest.raises(InvalidPointCloudError, match=f"a segment with a surface; got a.nrrd: one that (is )?{said}"):
+        clouds.load(path)
+
+
 def test_specks_are_left_out_and_said(tmp_path, caplog):
     affine, size = affine_of((1.5, 1.5, 1.5))
     voxels = voxels_of(affine, size)

@@ -251,7 +251,7 @@ class AccumulationConfig(Settings):
 
     off: float = setting(2.5, "a source so many times farther off the bone than all together is discarded", low=1)
     most_off: int = setting(3, "after so many of them in a row the bone has moved", low=1, high=1000)
-    fewest_points: int = setting(20, "points of a source that is checked by itself", low=3)
+    fewest_points: int = setting(20, "points of a source that is checked by itself; of fewer with those before", low=3)
     most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
 
 

@@ -92,9 +92,9 @@ class TrustedPose(Node):
         """Empty when the pose may be used."""
         if status.level != DiagnosticStatus.OK:
             return values["reason"]
-        if float(values["confidence"]) < self.min_confidence:
+        if not float(values["confidence"]) >= self.min_confidence:  # NaN is no confidence
             return f"confidence {values['confidence']} is below {self.min_confidence:g}"
-        if not values["tre95"] or float(values["tre95"]) > self.max_tre:
+        if not values["tre95"] or not float(values["tre95"]) <= self.max_tre:
             return f"the error is bounded by {values['tre95'] or 'nothing'} m only, {self.max_tre:g} m are allowed"
         return ""
 

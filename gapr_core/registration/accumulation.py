@@ -29,8 +29,9 @@ class Accumulator:
 
     Nothing helps more than seeing more of the bone: images of a probe that say nothing alone determine the pose
     together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
-    an accepted pose each new source is looked at by itself; one that lies off the bone is left out, and refused if it
-    is the newest. After three of them in a row the bone or its reference has moved, and only these three are kept.
+    an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
+    what lies off the bone is left out, and refused if it is the newest. After three of them in a row the bone or its
+    reference has moved, and only these three are kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -60,6 +61,7 @@ class Accumulator:
         """Forget all sources, and the track of a `Tracker`."""
         self._kept: list[Array] = []  # on the bone under an accepted pose, or from before there was one
         self._new: list[Array] = []  # since the last registration; several, where `collect` is called in between
+        self._small: list[Array] = []  # the newest of few points, which are looked at together
         self._off_in_a_row: list[Array] = []  # off the bone under an accepted pose, and left out
         self._far_in_a_row = 0  # how many sources were metres away from the others
         if isinstance(self.method, Tracker):
@@ -127,12 +129,12 @@ class Accumulator:
         self._target = target
         if not len(finite_points(source)):
             return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason="the source has no finite point")
-        before = self._new
+        kept, before = self._kept, self._new
         self.collect(source)
         try:
             result = self.method.register(_together(self._last()), target, initial)
         except Exception:
-            self._new = [points for points in self._new if _is_among(points, before)]
+            self._new = before if self._kept is kept else []  # or the collection restarted with this source
             raise
         return self._decide_on_new(replace(result, method=self.name), target)
 
@@ -146,33 +148,50 @@ class Accumulator:
         It is a refusal where the newest source lies off the bone, or so many in a row that the bone has moved.
         """
         if result.T_target_source is None:  # it says nothing of any source, nor of a row of those off the bone
+            for source in self._new:
+                self._with_small_ones(source)
             self._kept, self._new = self._last(), []
             return result
         new, off = self._new, self._off_the_bone(result.T_target_source, target)
-        self._off_in_a_row = self._row_with(off)
         self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
         self._new = []
         if len(self._off_in_a_row) >= self.config.accumulation.most_off:
             return self._restart(result)
-        if new and _is_among(new[-1], off):
-            count = len(self._kept)
-            return _refused(result, f"the newest source lies off the bone where {count} others found it: left out")
+        if new and self._off_in_a_row:
+            count, newest = len(self._kept), "newest source lies" if _is_among(new[-1], off) else "sources before lie"
+            return _refused(result, f"the {newest} off the bone where {count} others found it: left out")
         return result
 
     def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
-        """Those of the new sources that lie off the bone under a pose (4, 4), mm."""
-        everything, seen = _together(self._last()), offset_surface(target, self.config.sensor)
-        return [source for source in self._new if self._lies_off(source, everything, T, seen)]
+        """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.
 
-    def _row_with(self, off: list[Array]) -> list[Array]:
-        """The sources in a row off the bone, now with those of the new ones that are; one on the bone ends the row."""
-        row = self._off_in_a_row
+        What has too few points to be judged does neither.
+        """
+        everything, seen = _together(self._last()), offset_surface(target, self.config.sensor)
+        off: list[Array] = []
         for source in self._new:
-            if not _is_among(source, off):
-                row = []
-            elif not _is_among(source, row):
-                row = [*row, source]
-        return row
+            judged = self._with_small_ones(source)
+            points = _together(judged)
+            if not judged:
+                continue
+            if not self._lies_off(points, everything, T, seen):
+                self._off_in_a_row = []
+                continue
+            off, self._small = off + judged, []
+            if not _is_among(points, self._off_in_a_row):
+                self._off_in_a_row = [*self._off_in_a_row, points]
+        return off
+
+    def _with_small_ones(self, source: Array) -> list[Array]:
+        """What is judged with a source (N, 3): itself, or of few points those just before it too; [] for too few."""
+        fewest = self.config.accumulation.fewest_points
+        if len(source) >= fewest:
+            self._small = []
+            return [source]
+        self._small = [*self._small, source]
+        while sum(map(len, self._small[1:])) >= fewest:
+            self._small = self._small[1:]
+        return self._small if sum(map(len, self._small)) >= fewest else []
 
     def _restart(self, result: RegistrationResult) -> RegistrationResult:
         """Refuse, and keep nothing but the sources in a row that lie off the bone: where it is now."""
@@ -185,8 +204,6 @@ class Accumulator:
     def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget) -> bool:
         """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3)."""
         limits, refinement = self.config.accumulation, self.config.refinement
-        if len(source) < limits.fewest_points:
-            return False
         some = np.ascontiguousarray(points[:: 1 + len(points) // limits.most_points])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
         return own > limits.off * max(of_all, refinement.smallest_sigma_mm)

@@ -32,6 +32,7 @@ class Evidence:
     def reset(self) -> None:
         """Forget all frames."""
         self._sum, self._weight, self._agreeing = 0.0, 0.0, 0
+        self._before = self._sum, self._weight, self._agreeing
 
     @property
     def effective_frames(self) -> float:
@@ -39,15 +40,19 @@ class Evidence:
         n = max(self._agreeing, 1)
         return n / (1.0 + (n - 1) * self.config.correlation)
 
-    def add(self, probability: float, agrees: bool) -> float:
+    def add(self, probability: float, agrees: bool, again: bool = False) -> float:
         """The probability of a frame in the light of those before it.
 
         Args:
             probability: 0 to 1, of this frame alone; one that is no number comes back and is not counted.
             agrees: its pose continues the last one; after a jump the answer is at most `probability`.
+            again: it is the last frame once more, which is counted once: as it is now.
         """
         if not np.isfinite(probability):
             return probability
+        if again:
+            self._sum, self._weight, self._agreeing = self._before
+        self._before = self._sum, self._weight, self._agreeing
         if not agrees and self._sum > 0.0:
             self._sum = self._weight = 0.0
         part = float(np.sqrt(probability))

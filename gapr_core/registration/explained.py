@@ -30,7 +30,7 @@ VIEWPOINT = (
     "(none: no camera saw it), "
 )
 SAY_WHERE = "say where the camera was, "
-NO_RIVAL = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
+RIVAL_IF_ALONE = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTar
     """What lines of sight say: shares of the surface, and the margin to the best distinct rival."""
     explained, violating, compared = (float(x[0]) for x in (seen.explained, seen.violating, seen.compared))
     area_mm2 = explained * len(target.points) * target.spacing_mm**2
-    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else NO_RIVAL
+    rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else RIVAL_IF_ALONE
     return {
         "free_space_score": float(seen.score[0]),
         "log_explained_mm2": float(np.log(area_mm2 + 1.0)),

@@ -44,7 +44,7 @@ SIGNS = {
 ERROR_OF_MEDIAN = float(np.sqrt(np.pi / 2.0))  # standard error of a median over that of a mean
 LEAST_NOISE_MM = 0.1  # a source without noise counts as having so much
 LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
-NO_RIVAL = 2.0  # a pose alone counts as having a rival of so many times its mean square
+RIVAL_IF_ALONE = 2.0  # a pose alone counts as having a rival of so many times its mean square
 LEAST_MARGIN = 1e-3  # added to the share by which the rival is worse, so that its logarithm is finite
 
 
@@ -66,7 +66,7 @@ def measure(
         target: the bone.
         config: how a mirrored source is refined, and how far a smooth bias reaches.
     """
-    second = candidates.scores[1] if len(candidates.scores) > 1 else NO_RIVAL * candidates.scores[0]
+    second = candidates.scores[1] if len(candidates.scores) > 1 else RIVAL_IF_ALONE * candidates.scores[0]
     values = of_the_fit(fit, candidates, uncertainty, source, source.flatness_mm, target, config) | {
         "inlier_ratio": float((fit.weights > 0.0).mean()),
         "residual": float(np.sqrt(candidates.scores[0])),

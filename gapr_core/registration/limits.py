@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.geometry import se3
+from gapr_core.geometry import sampling, se3
 from gapr_core.registration import sensor
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import UNKNOWNS
@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 NEARLY_ALL = 0.9  # share of the points
 ASKED = 1000  # points
+SAME_CONTACT_MM = 1.0
 DRAWS = 4096
 
 
@@ -69,9 +70,13 @@ def is_sparse(assessment: Assessment, config: RegistrarConfig) -> bool:
 def with_neighbours(assessment: Assessment) -> int:
     """How many points that count for the pose have another one within 6 mm, foot point to foot point.
 
-    Of many points some `ASKED` are looked at, evenly taken: these are enough to say that they are not few.
+    Points within a millimetre are one: a pointer that is held still sends the same contact again and again. Of many
+    points some `ASKED` are looked at, evenly taken: these are enough to say that they are not few.
     """
     feet = assessment.fit.feet[assessment.fit.weights > 0.0]
+    if not len(feet):
+        return 0
+    feet = feet[sampling.voxel_indices(feet, SAME_CONTACT_MM)]
     asked = feet[:: max(1, len(feet) // ASKED)]
     return int((cKDTree(feet).query(asked, k=2)[0][:, 1] <= NEAR_MM[1]).sum())
 

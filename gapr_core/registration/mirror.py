@@ -79,7 +79,7 @@ def image_margin(T: Array, source: PreparedSource, target: PreparedTarget, confi
 
 def is_symmetric(target: PreparedTarget, config: RegistrarConfig) -> bool:
     """True for a model whose halves are mirror images of each other: a flipped source of it is no mistake."""
-    image, key = _kept_image(target, config), ("symmetric", target.offset_mm)
+    image, key = _kept_image(target, config), ("symmetric", target.offset_mm, config.verification)
     if image is None:
         return False
     if key not in target.cache:
@@ -138,7 +138,7 @@ def log_ratio(changed_mm2: float, own_mm2: float) -> float:
 
 def _kept_image(target: PreparedTarget, config: RegistrarConfig) -> Array | None:
     """`_own_image`, found once for a target."""
-    key = "own image", target.offset_mm  # targets that differ in the stand-off alone share their cache
+    key = "own image", target.offset_mm, config.verification  # targets share their cache with other stand-offs
     if key not in target.cache:
         target.cache[key] = _own_image(target, config.verification, config.num_threads)
     return target.cache[key]  # type: ignore[no-any-return]

@@ -63,7 +63,7 @@ class Registrar:
         precision: what corrects the predicted errors; the shipped one when not given.
 
     Raises:
-        ConfigError: no proposer, or not one calibration for each, of that one.
+        ConfigError: no proposer, or not one calibration for each, of that one, or of scenes.
         MethodUnavailableError: no confidence model ships for a proposer, and none was given.
     """
 
@@ -90,6 +90,8 @@ class Registrar:
             raise ConfigError("one confidence model for each proposer", given, "pass as many calibrations as proposers")
         for proposer, calibration in zip(self.proposers, self.calibrations, strict=True):
             calibration.check_is_for(proposer.name)
+        if scene_calibration is not None:
+            scene_calibration.check_is_for(clutter.NAME)
         self.precision = precision or Precision.load()
 
     @classmethod

@@ -46,7 +46,7 @@ class Tracker:
         stream: the one of a source in the light of those before it; the shipped one when not given.
 
     Raises:
-        ConfigError: `recheck` is less than 1.
+        ConfigError: `recheck` is less than 1, or a calibration is for other answers.
     """
 
     name = "gapr_tracker"
@@ -66,6 +66,7 @@ class Tracker:
         self._tracking = MemoryFirst(self._memory, calibration or Calibration.shipped(Memory.name), self.registrar)
         self._evidence = Evidence(self.registrar.config.evidence)
         self._stream = stream or Calibration.shipped(STREAM)
+        self._stream.check_is_for(STREAM)
         self._shared: SharedMisfit | None = SharedMisfit(self.registrar.config.evidence.memory)
         self.reset()
 
@@ -82,9 +83,13 @@ class Tracker:
         self._forget_shared()
 
     def of_bone_alone(self) -> Tracker:
-        """As `Registrar.of_bone_alone`, for the same stream."""
+        """As `Registrar.of_bone_alone`: another tracker, which begins a stream of its own."""
         twin = copy(self)
-        twin.registrar, twin._tracking = self.registrar.of_bone_alone(), self._tracking.of_bone_alone()
+        twin.registrar, twin._memory = self.registrar.of_bone_alone(), Memory()
+        twin._tracking = MemoryFirst(twin._memory, self._tracking.calibrations[0], twin.registrar)
+        twin._evidence = Evidence(self._evidence.config)
+        twin._shared = None if self._shared is None else SharedMisfit(self._evidence.config.memory)
+        twin.reset()
         return twin
 
     def sharing_points(self) -> Tracker:
@@ -92,12 +97,9 @@ class Tracker:
 
         Nor were the points of one of them seen from one place. It begins a stream of its own.
         """
-        twin = copy(self)
-        twin.registrar, twin._memory = self.registrar.of_bone_alone(), Memory()
-        twin._tracking = MemoryFirst(twin._memory, self._tracking.calibrations[0], twin.registrar)
+        twin = self.of_bone_alone()
         twin._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
         twin._shared = None  # the same points have the same noise
-        twin.reset()
         return twin
 
     def _forget_shared(self) -> None:
@@ -110,6 +112,8 @@ class Tracker:
     def _forget_track(self) -> None:
         self._has_track = self._is_sure = False  # there are poses to follow; the last source was sure
         self._last: Array | None = None  # pose of the last source that no rule refused, (4, 4) T_target_source
+        self._heard: Array = np.empty((0, 3))  # its points
+        self._agreed, self._said = False, 1.0  # it continued the one before it; what was said of it
         self._tracked = 0  # sources since the last full registration
         self._follower: Follower | None = None  # of the last source, where that was sure
 
@@ -201,17 +205,21 @@ class Tracker:
         """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.
 
         What they say of the bone cannot make a pose right (see `evidence`). A frame that a safety rule refuses says
-        nothing.
+        nothing, and one that is sent again nothing new.
         """
         if assessment.refusal is not None:
             return assessment
         if assessment.inferred_viewpoint is not None:
             assessment = assessment.limited(self.registrar.config.limits.most)
-        agrees, alone = self._agrees(assessment), assessment.probability
-        self._last = assessment.fit.T
-        one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees))
+        again = np.array_equal(assessment.source.points, self._heard)
+        agrees, alone = self._agrees(assessment) and (self._agreed or not again), assessment.probability
+        self._last, self._heard, self._agreed = assessment.fit.T, assessment.source.points, agrees
+        one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees, again))
         together = self._with_shared_misfit(one_by_one, agrees)
-        return together.limited(min(float(np.sqrt(alone)) if agrees else alone, assessment.most))
+        found = together.limited(min(float(np.sqrt(alone)) if agrees else alone, assessment.most))
+        found = found.limited(self._said) if again else found
+        self._said = found.probability
+        return found
 
     def _with_shared_misfit(self, assessment: Assessment, agrees: bool) -> Assessment:
         """The probability in the light of what the residuals of the frames have in common.

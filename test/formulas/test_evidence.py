@@ -29,6 +29,16 @@ def test_the_frames_that_ship_count_as_little_more_than_one():
     assert max(evidence.add(0.47, agrees=True) for _ in range(100)) < 0.5
 
 
+def test_a_frame_that_comes_again_counts_once_and_as_it_is_now():
+    once, again = Evidence(EvidenceConfig(correlation=0.0)), Evidence(EvidenceConfig(correlation=0.0))
+    for evidence in (once, again):
+        evidence.add(0.7, agrees=True)
+    for probability in (0.9, 0.6, 0.8):
+        found = again.add(probability, agrees=True, again=True) if probability != 0.9 else again.add(0.9, agrees=True)
+    assert found == pytest.approx(once.add(0.8, agrees=True))
+    assert again.add(0.8, agrees=True) == pytest.approx(once.add(0.8, agrees=True))
+
+
 def test_nothing_is_raised_beyond_its_square_root():
     evidence = Evidence(EvidenceConfig(correlation=0.0))
     for _ in range(100):

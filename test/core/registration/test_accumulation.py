@@ -175,17 +175,31 @@ def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registr
 
 @pytest.mark.parametrize(("new", "off", "row"), [("ab", "ab", "xab"), ("ab", "b", "b"), ("ab", "a", ""), ("", "", "x"),
                                                  ("xa", "xa", "xa")])  # fmt: skip
-def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(registrar, new, off, row):
+def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(registrar, prepared, new, off, row):
     sources = {name: np.full((30, 3), float(number)) for number, name in enumerate("abx")}
     accumulator = Accumulator(registrar, most=9)
     accumulator._off_in_a_row, accumulator._new = [sources["x"]], [sources[name] for name in new]
-    found = accumulator._row_with([sources[name] for name in off])
-    assert [source[0, 0] for source in found] == [sources[name][0, 0] for name in row]
+    accumulator._lies_off = lambda points, *_: any(np.array_equal(points, sources[name]) for name in off)
+    found = accumulator._off_the_bone(np.eye(4), prepared)
+    assert {source[0, 0] for source in found} == {sources[name][0, 0] for name in off}
+    assert [source[0, 0] for source in accumulator._off_in_a_row] == [sources[name][0, 0] for name in row]
 
 
 def test_one_viewpoint_for_clouds_of_many_views_is_refused(registrar, frames, prepared):
     with pytest.raises(ConfigError, match="without a viewpoint"):
         Accumulator(registrar, most=3).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])
+
+
+def test_a_source_that_cannot_be_registered_costs_no_older_one(registrar, frames, prepared, monkeypatch):
+    """Where the collection is full the oldest had gone for it, and did not come back."""
+    accumulator = Accumulator(registrar, most=2)
+    for frame in frames[:2]:
+        accumulator.collect(frame.source)
+    kept = accumulator.collected
+    monkeypatch.setattr(type(registrar), "register", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        accumulator.register(frames[2].source, prepared)
+    np.testing.assert_array_equal(accumulator.collected, kept)
 
 
 def test_a_reset_reaches_the_tracker_of_the_collection(registrar):
@@ -255,12 +269,48 @@ def test_a_source_is_compared_where_a_sensor_with_a_stand_off_sees_the_bone(femu
     assert ("left out" in result.reason) is lies_off
 
 
-@pytest.mark.parametrize(("points", "lies_off"), [(19, False), (20, True)])
-def test_a_source_of_few_points_is_not_judged_by_itself(registrar, prepared, points, lies_off):
-    collected = Accumulator(registrar, most=20)
+@pytest.mark.parametrize(("sizes", "judged"), [((19,), 0), ((20,), 20), ((7, 7), 0), ((7, 7, 7), 21), ((9, 1, 19), 20),
+                                               ((19, 20, 1), 0), ((1,) * 30, 20)])  # fmt: skip
+def test_a_source_of_few_points_is_judged_with_those_just_before_it(registrar, sizes, judged):
+    collected = Accumulator(registrar, most=50)
     assert collected.config.accumulation.fewest_points == 20
-    away = prepared.points[:points] + 30.0 * prepared.normals[:points]
-    assert collected._lies_off(away, prepared.points, np.eye(4), prepared) is lies_off
+    for size in sizes:
+        found = collected._with_small_ones(np.zeros((size, 3)))
+    assert sum(map(len, found)) == judged
+
+
+@pytest.mark.parametrize("size", [1, 6])
+def test_a_bone_that_moved_is_noticed_where_every_source_is_a_few_points(registrar, frames, prepared, size):
+    """As a pointer sends them. One of fewer than 20 points was never looked at, and old poses went out at .99."""
+    rng, points = np.random.default_rng(3), np.concatenate([frame.source for frame in frames])
+    accumulator = Accumulator(registrar, most=240 // size)
+    for _ in range(240 // size):
+        accumulator.collect(points[rng.choice(len(points), size, replace=False)])
+    assert accumulator.register(points[:size], prepared).ok
+    moved = se3.exp([20.0, 0.0, 0.0, 0.0, 0.0, 0.0]) @ np.eye(4)
+    reasons, wrong = [], []
+    for _ in range(70 // size):
+        source = se3.apply(moved, points[rng.choice(len(points), size, replace=False)])
+        result = accumulator.register(source, prepared)
+        reasons.append(result.reason)
+        if result.ok:
+            truth = frames[0].T_target_source @ se3.inverse(moved)
+            wrong.append(se3.pose_error(result.T_target_source, truth, source).rte_mm > 4.0)
+    assert sum(wrong) * size <= 20
+    assert any("it has moved" in reason for reason in reasons)
+    assert len(accumulator.collected) <= 100
+
+
+def test_a_source_too_small_to_be_judged_neither_ends_a_row_nor_gets_a_pose_within_it(registrar, prepared):
+    accepted = RegistrationResult(RegistrationStatus.OK, np.eye(4))
+    collected = Accumulator(registrar, most=20)
+    collected._lies_off = lambda *_: True
+    answers = []
+    for size in (30, 10, 30, 30):
+        collected._new = [np.full((size, 3), float(len(answers)))]
+        answers.append(collected._decide_on_new(accepted, prepared))
+    assert not any(answer.ok for answer in answers)
+    assert "sources before" in answers[1].reason and "it has moved" in answers[3].reason
 
 
 @pytest.mark.parametrize(("times", "lies_off"), [(0.9, False), (1.1, True)])

@@ -68,6 +68,19 @@ def test_nor_do_points_without_neighbours(made):
     assert limits.limited(made(1000, spacing_mm=5.9), RegistrarConfig()).probability == SURE
 
 
+def test_a_contact_that_a_pointer_sends_again_and_again_is_one_point(made):
+    """40 places 5.5 mm apart, 20 times each within a tenth of a millimetre: no more than 40 say whose bone it is."""
+    answer, rng = made(40, spacing_mm=5.5), np.random.default_rng(2)
+    fit = answer.fit
+    again = np.repeat(np.arange(40), 20)
+    jitter = rng.uniform(-0.05, 0.05, (800, 3))
+    many = replace(fit, signed_mm=fit.signed_mm[again], weights=fit.weights[again], gradients=fit.gradients[again],
+                   moved=fit.moved[again] + jitter)  # fmt: skip
+    held_still = replace(answer, fit=many, source=SimpleNamespace(points=many.feet))
+    assert 40 <= limits.with_neighbours(held_still) < 250
+    assert limits.limited(held_still, RegistrarConfig()).probability == 0.89
+
+
 def test_a_camera_that_nobody_named_may_have_been_elsewhere(made):
     found = limits.limited(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig())
     assert found.probability == 0.89 and found.refusal is None and list(found.contributions)[-1] == "inferred"

@@ -69,7 +69,7 @@ def test_the_image_of_a_bone_is_a_reflection_and_found_once(registrar, target, m
     image = mirror._own_image(target, CONFIG.verification, 1)
     assert np.linalg.det(image[:3, :3]) == pytest.approx(-1.0)
     monkeypatch.setattr(mirror, "_own_image", None)  # is not called again
-    np.testing.assert_array_equal(target.cache["own image", 0.0], image)
+    np.testing.assert_array_equal(target.cache["own image", 0.0, CONFIG.verification], image)
     assert registrar.register(seen(make_bone("pelvis", 900_001)), target).ok
 
 
@@ -80,7 +80,14 @@ def test_the_image_is_found_where_a_sensor_with_a_stand_off_sees_the_bone(pelvis
     for each in (raised, target):
         found = mirror.image_margin(np.eye(4), sources.prepare(seen(pelvis)), each, CONFIG)
         assert found < mirror.LIMITS[1]
-    assert {("own image", 0.0), ("own image", 5.0)} <= target.cache.keys()
+    assert {("own image", mm, CONFIG.verification) for mm in (0.0, 5.0)} <= target.cache.keys()
+
+
+def test_what_is_kept_of_a_target_is_not_taken_for_that_of_other_settings(target):
+    """A registrar that hardly refines took the pelvis for symmetric, and switched the rule off for all after it."""
+    hasty = replace(CONFIG, verification=replace(CONFIG.verification, middle_limits_mm=(0.2, 0.1, 1)))
+    fresh = replace(target, cache={})
+    assert mirror.is_symmetric(fresh, hasty) and not mirror.is_symmetric(fresh, CONFIG)
 
 
 def test_gross_points_that_lie_near_the_image_are_no_sign_of_a_flip(target, pelvis, monkeypatch):
@@ -113,11 +120,11 @@ def test_of_a_symmetric_model_no_source_is_refused_for_its_image(registrar, targ
 
 
 def test_a_bone_without_an_image_is_not_symmetric(target):
-    assert not mirror.is_symmetric(replace(target, cache={("own image", 0.0): None}), CONFIG)
+    assert not mirror.is_symmetric(replace(target, cache={("own image", 0.0, CONFIG.verification): None}), CONFIG)
 
 
 def test_a_bone_without_an_image_has_the_largest_margin(target):
-    unlike = replace(target, cache={("own image", 0.0): None})
+    unlike = replace(target, cache={("own image", 0.0, CONFIG.verification): None})
     assert mirror.image_margin(np.eye(4), None, unlike, CONFIG) == mirror.LIMITS[1]
 
 

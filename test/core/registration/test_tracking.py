@@ -372,6 +372,33 @@ def test_bumps_that_no_frame_shows_alone_show_in_the_stream(registrar, specimen)
     assert plain.confidence > rough.confidence
 
 
+@pytest.mark.parametrize("jumped", [False, True])
+def test_a_source_that_is_sent_again_is_no_surer(registrar, frames, prepared, jumped):
+    """Or a refusal became a pose by asking again."""
+    tracker = Tracker(registrar)
+    tracker.register(frames[0].source, prepared)
+    source = se3.apply(se3.exp([60.0, 0.0, 0.0, 0.0, 0.0, 0.3]), frames[1].source) if jumped else frames[1].source
+    first = tracker.register(source, prepared)
+    assert first.ok
+    for _ in range(6):
+        assert tracker.register(source, prepared).confidence <= first.confidence + 1e-9
+
+
+def test_a_calibration_of_other_answers_is_no_model_of_streams(registrar):
+    with pytest.raises(ConfigError, match="stream"):
+        Tracker(registrar, stream=Calibration.shipped("search"))
+
+
+def test_a_tracker_of_bone_alone_has_a_stream_of_its_own(registrar, frames, prepared):
+    tracker = Tracker(registrar)
+    tracker.register(frames[0].source, prepared)
+    alone = tracker.of_bone_alone()
+    assert not len(alone._memory.poses) and not alone._has_track
+    alone.register(frames[3].source, prepared)
+    alone.reset()
+    assert tracker._has_track and len(tracker._memory.poses) and tracker._evidence is not alone._evidence
+
+
 def test_a_tracker_of_bone_alone_infers_no_viewpoint_and_the_other_stays_as_it_is(tracker):
     alone = tracker.of_bone_alone()
     for each, is_inferred in ((alone, False), (tracker, True)):

@@ -113,9 +113,7 @@ def test_compiled_steps_learn_what_the_tensors_learn(with_tensors, model, batch)
     assert float((found[1] - wanted[1]).norm() / wanted[1].norm()) < 1e-5
 
 
-def test_registration_takes_the_compiled_steps_and_finds_what_the_tensors_find(
-    with_tensors, batch, model, monkeypatch
-):
+def test_registration_takes_the_compiled_steps_and_finds_what_the_tensors_find(with_tensors, batch, model, monkeypatch):
     torch.manual_seed(0)
     network, taken = GAPRNet(model).eval(), set()
 

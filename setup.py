@@ -10,6 +10,7 @@ from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
 
 PACKAGE = "gapr_ros"
+HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file, elsewhere
 
 CORE = [
     "numba",
@@ -83,7 +84,7 @@ setup(
     name=PACKAGE,
     version="0.2.0",
     description="Partial-to-full registration of bones with a calibrated confidence: library, command line, ROS 2 node",
-    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     maintainer="GAPR maintainers",

@@ -63,9 +63,13 @@ def test_every_folder_of_code_is_a_package_and_gets_installed():
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory):
     """A colcon workspace with this package, built."""
-    base = tmp_path_factory.mktemp("workspace")
+    return build(tmp_path_factory.mktemp("workspace"))
+
+
+def build(base, *options):
+    """A workspace in `base`."""
     folders = [f"--{kind}-base={base / kind}" for kind in ("build", "install")]
-    colcon = [sys.executable, "-m", "colcon", f"--log-base={base / 'log'}", "build", *folders]
+    colcon = [sys.executable, "-m", "colcon", f"--log-base={base / 'log'}", "build", *folders, *options]
     run = subprocess.run([*colcon, "--base-paths", str(ROOT)], cwd=base, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout + run.stderr
     return base
@@ -78,6 +82,18 @@ def test_colcon_build_gives_an_executable_that_ros2_run_finds(workspace):
     assert (prefix / "share/gapr_ros/config/register_node.yaml").is_file()
     for name in ("register_node", "bag_replay", "gapr"):
         assert os.access(prefix / "lib/gapr_ros" / name, os.X_OK)
+
+
+def test_a_workspace_of_links_runs_the_code_in_place(tmp_path):
+    program = build(tmp_path, "--symlink-install") / "install/gapr_ros/lib/gapr_ros/register_node"
+    where = "python3 -c 'import gapr_ros.register_node as r; print(r.__file__)'"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    command = f"source install/setup.bash && {where} && {program} --help"
+    run = subprocess.run(["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    file, usage = run.stdout.splitlines()[:2]
+    assert tmp_path in Path(file).parents and Path(file).resolve() == ROOT / "gapr_ros/register_node.py"
+    assert usage.startswith("usage: register_node")
 
 
 def test_everything_that_the_code_reads_is_installed_with_it(workspace):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,8 @@ from gapr_ros.node.guard import describe
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import OF_STATUS, Reason, RefusedError
 from gapr_ros.node.region import Crop
-from gapr_ros.node.situation import Situation
+from gapr_ros.node.seeding import Seeding
+from gapr_ros.node.situation import Seed, Situation
 from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NO_FRAME, NodeParameters
 from msg_adapters import INPUTS
@@ -44,7 +46,7 @@ class Registration:
     def __init__(self, frames: Frames, situation: Callable[[], Situation], left: Callable[[bool, str], None]) -> None:
         self._frames, self._situation = frames, situation
         self._late = Late(self._collect, left)
-        self._following = Following()
+        self._following, self._seeding = Following(), Seeding()
         self._pushed_out: Job | None = None
         self._frame = ""  # of the last answer; what the method remembers holds there only
 
@@ -132,8 +134,8 @@ class Registration:
         self._frame = frame
 
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
-        seed = self._initial(outcome, now)
-        options = {} if seed is None else {"initial": seed}
+        initial = self._seeding.start(now.seed, partial(self._initial, outcome=outcome, now=now))
+        options = {} if initial is None else {"initial": initial}
         viewpoint_mm = self._viewpoint_mm(outcome, now)
         if viewpoint_mm is not None:
             options["viewpoint"] = viewpoint_mm
@@ -143,17 +145,11 @@ class Registration:
         outcome.tre_mm, outcome.tre95_mm = result.tre_mm, result.tre95_mm
         return result
 
-    def _initial(self, outcome: Outcome, now: Situation) -> Array | None:
+    def _initial(self, seed: Seed, outcome: Outcome, now: Situation) -> Array:
         """The seed as T_target_source, mm, the source being in the frame of the answer."""
-        if now.seed is None:
-            return None
-        try:
-            T_seed_cloud = self._lookup(now.seed.frame, outcome, now)
-        except RefusedError as refusal:
-            text = f"the initialpose is in {now.seed.frame}: {refusal.text}; send another one, or call ~/reset"
-            raise RefusedError(refusal.reason, text) from refusal
+        T_seed_cloud = self._lookup(seed.frame, outcome, now)
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
-        return wire.core_pose(T_frame_cloud @ se3.inverse(T_seed_cloud) @ now.seed.T_frame_model)
+        return wire.core_pose(T_frame_cloud @ se3.inverse(T_seed_cloud) @ seed.T_frame_model)
 
     def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:
         """(3,) where the camera was, in the frame of the answer; None where it is not known, or not one place."""

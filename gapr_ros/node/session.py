@@ -118,8 +118,12 @@ class Session:
         except InvalidMessageError as error:
             self._host.ros.get_logger().warning(f"initialpose is ignored: {error}")
             return
-        self._begin_again("an initialpose", Seed(T_frame_model, intake.plain_frame(message.header.frame_id)))
-        if message.header.frame_id:
+        frame = intake.plain_frame(message.header.frame_id)
+        if frame == self._host.parameters.model_frame:
+            self._host.ros.get_logger().warning(f"initialpose is ignored: it is in '{frame}', the bone's own frame")
+            return
+        self._begin_again("an initialpose", Seed(T_frame_model, frame))
+        if frame:
             self._frames.listen()
 
     def _is_future(self, stamp_ns: int) -> bool:

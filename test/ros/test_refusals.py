@@ -15,9 +15,10 @@ from std_srvs.srv import SetBool
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import diagnostics
+from gapr_ros.node import diagnostics, seeding
 from gapr_ros.node.outcome import Outcome
-from gapr_ros.node.refusal import Reason
+from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node.situation import Seed
 from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
@@ -265,6 +266,58 @@ def test_a_seed_in_a_frame_that_nobody_knows_is_named(live):
     expect_refusal(live, GOOD, Reason.TF_MISSING, "the initialpose is in map")
     client.call("reset")
     expect_good(live)
+
+
+def test_a_seed_whose_frame_does_not_come_is_given_up_and_no_cloud_is_registered_with_it(live):
+    node, client, method = live
+    wait_until(client.seeds.get_subscription_count)
+    client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="map")))
+    wait_until(lambda: node.session.course.seed)
+    registered = len(method.calls)
+    expect_refusal(live, GOOD, Reason.TF_MISSING, "it is given up if that lasts 2 s")
+    time.sleep(seeding.PATIENCE_S)
+    assert len(method.calls) == registered
+    expect_good(live)
+    assert [call["initial"] for call in method.calls[registered:]] == [None]
+
+
+def test_a_seed_in_the_bones_own_frame_changes_nothing(live):
+    node, client, method = live
+    wait_until(client.seeds.get_subscription_count)
+    epoch = node.session.course.epoch
+    for frame in ("/bone_preop", ""):
+        client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id=frame)))
+        time.sleep(0.2)  # the node hears the newest one only
+    wait_until(lambda: node.session.course.seed)
+    assert node.session.course.epoch == epoch + 1, "that of the second one"
+
+
+def test_a_seed_is_given_up_only_when_its_frame_is_missing_without_a_break(monkeypatch):
+    now, there = [0.0], [False]
+    monkeypatch.setattr(seeding.time, "monotonic", lambda: now[0])
+
+    def find(seed):
+        if there[0]:
+            return seed.T_frame_model
+        raise RefusedError(Reason.TF_MISSING, "not there")
+
+    starts, seed = seeding.Seeding(), Seed(np.eye(4), "map")
+    for seconds, comes in ((0.0, False), (1.9, False), (2.5, True), (2.6, False), (4.5, False), (5.0, True)):
+        now[0], there[0] = seconds, comes
+        if comes:
+            assert starts.start(seed, find) is seed.T_frame_model
+        else:
+            with pytest.raises(RefusedError, match="the initialpose is in map: not there"):
+                starts.start(seed, find)
+    there[0], other = False, Seed(np.eye(4), "map")
+    for seconds, each in ((6.0, seed), (7.9, other)):  # another one has its own time
+        now[0] = seconds
+        with pytest.raises(RefusedError):
+            starts.start(each, find)
+    now[0] = 9.9
+    assert starts.start(other, find) is None
+    there[0] = True
+    assert starts.start(other, find) is None, "given up for good"
 
 
 def test_a_turn_beyond_the_limit_is_refused(live):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import Any
 
@@ -29,6 +30,7 @@ class SharedFrame:
         self._host, self._conflicts = host, conflicts
         self._frame, self._own = host.parameters.model_frame, host.ros.get_fully_qualified_name()
         self._sent: deque[tuple[int, int, str]] = deque(maxlen=REMEMBERED)
+        self._who, self._has_name, self._seen_at = "", False, float("-inf")
         listen = host.ros.create_subscription
         self._subscriptions = [listen(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)]
         kind = _tf_message()
@@ -54,16 +56,22 @@ class SharedFrame:
             name, _, task = status.name.rpartition(": ")
             values = {pair.key: pair.value for pair in status.values}
             if task == "registration" and name != self._own and values.get("child_frame") == self._frame:
-                self._note(name)
+                self._note(name, has_name=True)
 
     @guarded
     def _on_tf(self, message: Any) -> None:
         for transform in message.transforms:
             if transform.child_frame_id.lstrip("/") == self._frame and _key(transform) not in self._sent:
-                self._note(f"another node, as child of '{transform.header.frame_id}',")
+                self._note(f"another node, as child of '{transform.header.frame_id}',", has_name=False)
 
-    def _note(self, who: str) -> None:
-        text = f"{who} publishes '{self._frame}' on /tf too: give each bone a model_frame of its own"
+    def _note(self, who: str, has_name: bool) -> None:
+        """One conflict is one sentence, though it is seen on two topics and with several others: news are logged."""
+        now = time.monotonic()
+        if now - self._seen_at > LASTS_S or has_name > self._has_name:
+            self._who, self._has_name = who, has_name
+        if who == self._who:
+            self._seen_at = now
+        text = f"{self._who} publishes '{self._frame}' on /tf too: give each bone a model_frame of its own"
         self._conflicts.note(KIND, text, LASTS_S)
 
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray, TransformStamped
 from harness import Client, Collecting, Spinner, StandIn, context, node_in_thread, wait_until
 from rclpy.node import Node
@@ -98,6 +99,28 @@ def test_a_transform_of_somebody_else_with_this_child_is_a_conflict_and_an_own_o
         shared._on_tf(SimpleNamespace(transforms=[foreign]))
         (text,) = node.session.conflicts.texts
         assert text.startswith("another node, as child of 'map', publishes 'bone_preop' on /tf too")
+
+
+def test_one_conflict_seen_in_many_ways_is_said_once_and_once_more_with_a_name(blob_path, client, method, capfd):
+    def on_tf(parent):
+        foreign = TransformStamped(header=Header(frame_id=parent), child_frame_id="bone_preop")
+        return lambda shared: shared._on_tf(SimpleNamespace(transforms=[foreign]))
+
+    def on_diagnostics(name):
+        status = DiagnosticStatus(
+            name=f"{name}: registration", values=[KeyValue(key="child_frame", value="bone_preop")]
+        )
+        return lambda shared: shared._on_diagnostics(DiagnosticArray(status=[status]))
+
+    with node_in_thread(method, blob_path, publish_tf=True) as node:
+        client.wait_for_state("active")
+        for _ in range(3):
+            for see in (on_tf("map"), on_tf("odom"), on_diagnostics("/left/node"), on_diagnostics("/right/node")):
+                see(node.session._shared)
+        (text,) = node.session.conflicts.texts
+        assert text.startswith("/left/node publishes 'bone_preop' on /tf too")
+    said = [line for line in capfd.readouterr().err.splitlines() if "on /tf too" in line]
+    assert len(said) == 2 and "another node, as child of 'map'," in said[0] and "/left/node" in said[1]
 
 
 def test_a_second_publisher_is_named_until_it_goes(blob_path, client, method):

@@ -4,7 +4,9 @@ python examples/openigtlink/bridge.py --target knee.seg.nrrd --label Femur --tra
 
 It is a client of the tracker's server (PLUS), whose TRANSFORM gives the tip of the pointer, and a server on port 18945
 to which 3D Slicer connects (module OpenIGTLinkIF, a client connector). It sends TRANSFORM `TrackerToCT` with every
-accepted pose, and STATUS `Registration` with every answer.
+accepted pose, and STATUS `Registration` with every answer: after a refusal the last transform is an old one. The bone
+must rest in the frame of the tracker, as in that of a reference on it; points that lie off it are left out, and after
+three groups of them the collection restarts.
 
 OpenIGTLink is in mm, a TRANSFORM takes the node to its parent, and patient coordinates are RAS: what goes to Slicer is
 the pose with x and y negated on the side of the CT. Points of the tracker stay as they are.
@@ -23,12 +25,14 @@ import numpy as np
 import pyigtl
 from pyigtl.messages import MessageBase, message_type_to_class_constructor
 
-from gapr_core import Registrar, load
+from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker, load
+from gapr_core.config import SensorConfig
 from gapr_core.formats.options import ReadOptions
 
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 OK, NOT_FOUND = 1, 5  # codes of STATUS in the specification of OpenIGTLink
 STEP_MM = 1.0  # a pointer that rests sends the same point again and again
+GROUPS = 40  # of points, that are registered together
 
 
 class StatusMessage(MessageBase):
@@ -56,10 +60,10 @@ message_type_to_class_constructor["STATUS"] = StatusMessage
 
 
 class Bridge:
-    """Collects the points of one pointer and answers after every so many new ones.
+    """Groups the points of one pointer and answers after every so many new ones.
 
     Args:
-        registrar: registers.
+        registrar: registers each group together with those before, as `Accumulator` does.
         target: prepared by it, in LPS.
         tracker: a pyigtl client or server that receives the pointer's TRANSFORM.
         slicer: a pyigtl server or client that the answers are sent with.
@@ -70,8 +74,8 @@ class Bridge:
     def __init__(self, registrar: Any, target: Any, tracker: Any, slicer: Any, device: str, every: int = 50) -> None:
         self.registrar, self.target, self.tracker, self.slicer = registrar, target, tracker, slicer
         self.device, self.every = device, every
-        self.points: list[np.ndarray] = []
-        self._registered = 0
+        self.points: list[np.ndarray] = []  # since the last registration
+        self._last_tip = np.full(3, np.inf)
 
     def step(self, timeout_s: float = 1.0) -> Any:
         """Take in one message of the pointer; the result when this led to a registration, else None."""
@@ -79,12 +83,13 @@ class Bridge:
         if message is None or not np.isfinite(message.matrix).all():
             return None
         tip = np.array(message.matrix[:3, 3], dtype=np.float64)
-        if not self.points or np.linalg.norm(tip - self.points[-1]) >= STEP_MM:
+        if np.linalg.norm(tip - self._last_tip) >= STEP_MM:
             self.points.append(tip)
-        if len(self.points) - self._registered < self.every:
+            self._last_tip = tip
+        if len(self.points) < self.every:
             return None
-        self._registered = len(self.points)
-        result = self.registrar.register(np.array(self.points), self.target)
+        group, self.points = np.array(self.points), []
+        result = self.registrar.register(group, self.target)
         self.send(result)
         return result
 
@@ -107,7 +112,8 @@ def main() -> int:
     parser.add_argument("--port", type=int, default=18945, help="where 3D Slicer connects, on this machine")
     parser.add_argument("--every", type=int, default=50, help="new points between two registrations")
     args = parser.parse_args()
-    registrar = Registrar.from_pretrained()
+    pointer = RegistrarConfig(sensor=SensorConfig(kind="pointer"))
+    registrar = Accumulator(Tracker(Registrar.from_pretrained(pointer)), most=GROUPS)
     target = registrar.prepare(load(args.target, options=ReadOptions(labels=tuple(args.label))))
     host, port = args.tracker.rsplit(":", 1)
     tracker, slicer = pyigtl.OpenIGTLinkClient(host, int(port)), pyigtl.OpenIGTLinkServer(args.port)
@@ -115,7 +121,7 @@ def main() -> int:
     try:
         while True:
             if result := bridge.step():
-                sys.stdout.write(f"{time.strftime('%H:%M:%S')} {len(bridge.points)} points: {result}\n")
+                sys.stdout.write(f"{time.strftime('%H:%M:%S')} {len(registrar.collected)} points: {result}\n")
     except KeyboardInterrupt:
         return 0
     finally:

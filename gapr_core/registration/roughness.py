@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from gapr_core.geometry import sampling
 from gapr_core.registration.refinement import Fit
-from gapr_core.registration.surface_kernels import FAST
 
 Array = NDArray[np.float64]
 
@@ -62,7 +61,7 @@ def signed_root(difference_mm2: float) -> float:
     return float(np.sign(difference_mm2) * np.sqrt(abs(difference_mm2)))
 
 
-@numba.njit(**FAST)
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def products_mm2(points, residuals, others, other_residuals, limits_mm, own):  # type: ignore[no-untyped-def]
     """Products of two residuals, one of the points (N, 3) and one of the others (M, 3), by their distance.
 

@@ -27,6 +27,7 @@ from msg_adapters import matrix_to_transform, transform_to_matrix
 
 Stamp = tuple[int, int]
 WAIT_S = 0.5  # for tf2 to know the frames at the stamp of a pose; /tf may come after ~/transform
+SHUTDOWN_S = 0.5
 POLL_S = 0.05
 
 
@@ -185,6 +186,10 @@ def main() -> None:
         rclpy.spin(TrustedPose())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except RuntimeError:  # of rclpy, where Ctrl-C comes while it takes a message
+        time.sleep(SHUTDOWN_S)  # its shutdown is on the way
+        if rclpy.ok():
+            raise
     uninstall_signal_handlers()  # ends rclpy's thread for signals first: it shuts down too, and twice is an error
     rclpy.try_shutdown()
 

@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import xml.etree.ElementTree as ElementTree
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -176,6 +177,25 @@ def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):
         assert program.stop(signal.SIGINT) == 0, program.log
         node.stop()
     assert "Traceback" not in program.log
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_message_that_comes_with_ctrl_c_is_no_failure_of_the_consumer_and_others_are(monkeypatch, stops):
+    module = loaded("trusted_pose", monkeypatch)
+
+    def interrupted(node):
+        raise RuntimeError("Unable to convert call argument '0' to Python object")
+
+    monkeypatch.setattr(sys, "argv", ["trusted_pose.py"])
+    monkeypatch.setattr(module, "SHUTDOWN_S", 0.0)
+    monkeypatch.setattr(module, "TrustedPose", lambda: None)
+    monkeypatch.setattr(module, "uninstall_signal_handlers", lambda: None)
+    monkeypatch.setattr(module.rclpy, "init", lambda args: None)
+    monkeypatch.setattr(module.rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(module.rclpy, "spin", interrupted)
+    monkeypatch.setattr(module.rclpy, "ok", lambda: not stops)
+    with nullcontext() if stops else pytest.raises(RuntimeError):
+        module.main()
 
 
 @pytest.mark.parametrize("name", ["trusted_pose", "planning_scene"])

@@ -3,9 +3,9 @@
 paper, overlap-40/50/60/70 and incomplete follow section III and the experiments of the paper (arXiv 2606.13488);
 L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gives them, and L2-region and L3-region
 the same of about half the size; L2-wave and so on have another smooth bias; sweep is the band that a probe covers on
-its way; pointer, ultrasound, depth-camera, laser, structured-light, stereo, photogrammetry, covered and moving are
-simulated sensors (see `sensors`), pointer-50 and ultrasound-4 the same with 50 dots and four slices; scene-C1 and so on
-are what a camera sees of a bone in a wound (see `scenes`); wrong and scene-wrong ones have no pose.
+its way; pointer, tracing, ultrasound, depth-camera, laser, structured-light, stereo, photogrammetry, covered and moving
+are simulated sensors (see `sensors`), pointer-50 and ultrasound-4 the same with 50 dots and four slices; scene-C1 and
+so on are what a camera sees of a bone in a wound (see `scenes`); wrong and scene-wrong ones have no pose.
 """
 
 from __future__ import annotations

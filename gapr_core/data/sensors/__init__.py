@@ -16,12 +16,14 @@ from gapr_core.data.sensors.photogrammetry import photogrammetry
 from gapr_core.data.sensors.pointer import pointer
 from gapr_core.data.sensors.stereo import stereo
 from gapr_core.data.sensors.structured_light import structured_light
+from gapr_core.data.sensors.tracing import tracing
 from gapr_core.data.sensors.ultrasound import ultrasound
 from gapr_core.data.specimen import Specimen
 
 Sensor = Callable[[Specimen, np.random.Generator], Acquired]
 SENSORS: dict[str, Sensor] = {
     "pointer": pointer,
+    "tracing": tracing,
     "ultrasound": ultrasound,
     "depth_camera": depth_camera,
     "laser": laser,

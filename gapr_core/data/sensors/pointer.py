@@ -56,18 +56,18 @@ def _touched(view: View, count: int, in_dots: int, rng: np.random.Generator) -> 
     touched = list(rng.choice(len(view.points), in_dots))
     while len(touched) < count:
         wanted = min(int(rng.integers(*STROKE_POINTS)), count - len(touched))
-        touched.extend(_stroke(view, wanted, rng))
+        row = stroke(view, STROKE_MM, rng)
+        touched.extend(row[np.unique(np.linspace(0, len(row) - 1, wanted).astype(np.intp))])
     return np.array(touched[:count], dtype=np.intp)
 
 
-def _stroke(view: View, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """At most `count` points in a row over the surface, from a random one in a random direction."""
+def stroke(view: View, length_mm: tuple[float, float], rng: np.random.Generator) -> NDArray[np.intp]:
+    """Indices of points in a row over the surface, from a random one in a random direction, as long as drawn."""
     start, tilt = int(rng.integers(len(view.points))), rng.normal(size=3)
     ahead = tilt - view.outward[start] * (tilt @ view.outward[start])
     ahead /= np.linalg.norm(ahead)
     offsets = view.points - view.points[start]
     across = np.abs(offsets @ np.cross(view.outward[start], ahead))
     along = offsets @ ahead
-    near = np.flatnonzero((across < STROKE_WIDTH_MM) & (along >= 0.0) & (along <= rng.uniform(*STROKE_MM)))
-    in_row = near[np.argsort(along[near], kind="stable")]
-    return in_row[np.unique(np.linspace(0, len(in_row) - 1, count).astype(np.intp))]
+    near = np.flatnonzero((across < STROKE_WIDTH_MM) & (along >= 0.0) & (along <= rng.uniform(*length_mm)))
+    return near[np.argsort(along[near], kind="stable")]

@@ -73,6 +73,63 @@ def test_a_pointer_strokes_in_rows(ball):
     assert min(np.median(gaps) for gaps in nearest) < 2.5  # dots alone would lie 5 mm apart and more
 
 
+@pytest.fixture
+def traced(ball, monkeypatch):
+    """Clouds of a pointer that is dragged with the errors named, and without all others."""
+    module = import_module("gapr_core.data.sensors.tracing")
+    none = dict.fromkeys(("STANDOFF_MM", "LIFT_MM", "NOISE_MM", "TIP_MM", "GRIP_DEG"), (0.0, 0.0))
+
+    def clouds(count=8, **errors):
+        for name, limits in {**none, "BIAS_MM": 0.0, "IN_THE_AIR": 0.0, **errors}.items():
+            monkeypatch.setattr(module, name, limits)
+        return drawn(module.tracing, ball, count)
+
+    return clouds
+
+
+def test_a_dragged_pointer_gives_hundreds_of_samples_in_rows(traced):
+    clouds = traced(24)
+    counts = [len(cloud.points) for cloud in clouds]
+    assert min(counts) >= 300 and max(counts) <= 4000 and len(set(counts)) > 20
+    for cloud in clouds:
+        steps = np.linalg.norm(np.diff(cloud.points[:-1], axis=0), axis=1)
+        assert np.median(steps) < 2.0 and 1 < cloud.parameters["strokes"] < 0.1 * len(cloud.points)
+        assert np.abs(heights(cloud)).max() < 0.3
+
+
+def test_a_dragged_pointer_lies_outside_by_its_standoff(traced):
+    for before, after in zip(traced(), traced(STANDOFF_MM=(0.7, 0.7)), strict=True):
+        np.testing.assert_allclose(np.quantile(heights(after) - heights(before), (0.02, 0.98)), 0.7, atol=0.01)
+        assert after.parameters["standoff_mm"] == pytest.approx(0.7)
+
+
+def test_a_dragged_tip_is_lifted_for_a_while_and_not_sample_by_sample(traced):
+    still, lifted, noisy = traced(), traced(LIFT_MM=(0.4, 0.4)), traced(NOISE_MM=(0.3, 0.3))
+    for before, after, rough in zip(still, lifted, noisy, strict=True):
+        lift, noise = heights(after) - heights(before), heights(rough) - heights(before)
+        assert np.quantile(lift, 0.02) > -1e-3 and lift.mean() == pytest.approx(after.parameters["standoff_mm"], rel=0.3)
+        assert np.corrcoef(lift[:-1], lift[1:])[0, 1] > 0.9
+        assert noise.std() == pytest.approx(0.3, rel=0.1) and abs(np.corrcoef(noise[:-1], noise[1:])[0, 1]) < 0.2
+
+
+def test_a_wrong_tip_shifts_a_whole_trace(traced):
+    still, wrong = traced(), traced(TIP_MM=(0.5, 0.5))
+    turned = traced(TIP_MM=(0.5, 0.5), GRIP_DEG=(20.0, 20.0))
+    for before, after, gripped in zip(still, wrong, turned, strict=True):
+        shift = after.points - before.points
+        assert np.ptp(shift, axis=0).max() < 1e-9
+        assert np.linalg.norm(shift[0]) == pytest.approx(after.parameters["tip_mm"]) and after.parameters["tip_mm"] > 0.1
+        each = np.linalg.norm(gripped.points - before.points, axis=1)
+        assert np.ptp(each) < 1e-9 and np.ptp(gripped.points - before.points, axis=0).max() > 0.05
+
+
+def test_a_dragged_pointer_leaves_the_bone_in_runs(traced):
+    for cloud in traced(IN_THE_AIR=0.3):
+        off = heights(cloud) > 0.5
+        assert off.mean() == pytest.approx(cloud.parameters["outlier_share"], abs=0.02)
+        assert np.count_nonzero(np.diff(off.astype(int)) > 0) <= max(0.15 * off.sum(), 1)
+
+
 def test_ultrasound_sees_the_bone_deeper_where_sound_is_slower_than_assumed(ball):
     too_high, depth_error = [], []
     for cloud in drawn(SENSORS["ultrasound"], ball, 16):

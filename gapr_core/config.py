@@ -149,7 +149,7 @@ class SensorConfig(Settings):
     tracking_deg: float | None = setting(
         None, "the same of its attitude, about its centroid", low=0, high=10, unit="deg"
     )
-    sparse_points: int = setting(400, "with more points the stand-off of an unknown sensor falls as 1 / N", low=1)
+    sparse_points: int = setting(2000, "with more points the stand-off of an unknown sensor falls as 1 / N", low=1)
     known_standoff_mm: float = setting(
         0.15, "standard deviation of a stand-off that is stated: contact is never full", low=1e-3, high=10, unit="mm"
     )

@@ -10,11 +10,17 @@ from gapr_core.config import SENSOR_KINDS, SensorConfig
 from gapr_core.registration import kernels, sensor
 
 
-@pytest.mark.parametrize(("points", "share"), [(1, 1.0), (400, 1.0), (401, 400 / 401), (800, 0.5), (4000, 0.1)])
+@pytest.mark.parametrize(("points", "share"), [(1, 1.0), (2000, 1.0), (2001, 2000 / 2001), (4000, 0.5), (8000, 0.25)])
 def test_the_standoff_of_an_unknown_sensor_falls_with_the_number_of_points(points, share):
     usual = sensor.KINDS["unknown"].standoff_mm
     assert sensor.errors(SensorConfig(), points).standoff_mm == pytest.approx(usual * share)
-    assert sensor.errors(SensorConfig(sparse_points=100), 100 * points).standoff_mm == pytest.approx(usual / points)
+    few = SensorConfig(sparse_points=50)
+    assert sensor.errors(few, 200).standoff_mm == pytest.approx(usual / 4)
+
+
+def test_an_unknown_sensor_is_no_surer_of_its_standoff_than_the_surest_that_is_named():
+    surest = min(known.standoff_mm for known in sensor.KINDS.values())
+    assert sensor.errors(SensorConfig(), 10**6).standoff_mm == surest > 0.0
 
 
 def test_no_points_at_all_are_sparse():

@@ -59,8 +59,8 @@ millimetre, a depth camera's range is wrong by 1 %, pictures of unknown making a
 def errors(sensor: SensorConfig, points: int) -> Errors:
     """The errors to expect of a source of so many points; what the user states replaces what is usual.
 
-    Who names no sensor and brings up to 2000 points (`sparse_points`) may have touched the bone: a pointer read at 60 Hz
-    gives as many in half a minute. A denser cloud is a camera's or a laser's, but no surer than these when they are named.
+    Who names no sensor and brings up to 2000 points (`sparse_points`) may have touched the bone: a pointer read at
+    60 Hz gives as many in half a minute. A denser cloud is a camera's or a laser's, but no surer than a named one.
     """
     usual = KINDS[sensor.kind]
     if sensor.kind == "unknown":

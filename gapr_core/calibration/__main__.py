@@ -28,7 +28,7 @@ from gapr_core.calibration.fit import (
     of_unseen_families,
     of_unseen_people,
 )
-from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes, traces
+from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
@@ -51,8 +51,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--scenes", type=int, default=0, help="more pairs of each family of scenes (default: %(default)s)"
     )
-    parser.add_argument("--traces", type=int, default=0,
-                        help="more of a pointer that is dragged over the bone (default: %(default)s)")  # fmt: skip
     parser.add_argument("--look-alikes", type=int, default=0,
                         help="more of subjects' femora and tibiae at L3, half of them against another subject's, and "
                         "as many seen by all other families, half as many thinned (default: %(default)s)")  # fmt: skip
@@ -67,7 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     which = (str(args.anatomy), args.split, args.seed)
     tasks = [Task(*which, number) for number in range(args.count)]
     tasks += scenes(*which, args.scenes)
-    tasks += traces(*which, args.traces)
     tasks += look_alikes(*which, args.look_alikes)
     tasks += streams.tasks(*which, args.streams)
     if not tasks:

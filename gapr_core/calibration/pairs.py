@@ -67,14 +67,12 @@ SCENES = {
     "scene-joint": {"scene-joint": 1.0},
     "scene-bare": {"depth-camera": 2.0, "stereo": 1.0},
 }  # those of `SEEN_AS`, and families that only lists of their own have
-DRAGGED = "tracing"  # a pointer that is read all the time: likewise
 AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # how a bone is seen with its neighbour, and where that cannot be
 HELD_OUT = ("laser", "structured-light")  # families that no model is fitted on, only judged
 WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # whose bone the source is of
 SHAPE_SHARE = 0.02  # of all pairs
 TARGETS = {"own": 60.0, "short": 25.0, "scanned": 15.0}  # what the target is: the whole bone, an end, another scan
 DESCRIBED = 0.5  # share of the sensors' sources of which the user says what measured them
-KIND_OF = {DRAGGED: "pointer"}  # what the user says of a family that is not named as its sensor is
 IN_A_ROW = 4  # pairs that share a target
 OWN_TARGET = ("paper", "incomplete")  # whose source is cut out of its own target
 SHORTEST = (0.15, 0.6)  # share of the bone's length that a short scan holds
@@ -144,11 +142,6 @@ def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
     return [Task(folder, split, seed, i % count, family, real=real) for i, (family, real) in enumerate(families)]
 
 
-def traces(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """So many traces of a pointer that is dragged over a bone."""
-    return [Task(folder, split, seed, number, DRAGGED) for number in range(count)]
-
-
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
     """Femora and tibiae of subjects, every other one of another subject, three times as many as `count`; and rib cages.
 
@@ -197,7 +190,7 @@ def draw(task: Task) -> Drawn:
         pair = view(seen_as := ELSEWHERE, stranger, seed)
     if what != "own" or seen_as not in OWN_TARGET:
         pair = before(setting, stranger, what, pair)
-    sensor = KIND_OF.get(family, family.replace("-", "_")) if rng.random() < DESCRIBED else "unknown"
+    sensor = family.replace("-", "_") if rng.random() < DESCRIBED else "unknown"
     people = tuple(dict.fromkeys((setting.whole.person, stranger.person)))
     return Drawn(pair, family, seen_as, what, people, sensor if sensor in SENSOR_KINDS else "unknown")
 
@@ -284,7 +277,7 @@ def _one_of(specimens: Sequence[Specimen], rng: np.random.Generator) -> Specimen
 
 def _choose_view(rng: np.random.Generator, only: str) -> tuple[str, str]:
     """(family, how the bone is seen); of one family where that is named."""
-    families = {only: (SEEN_AS | SCENES | {DRAGGED: {DRAGGED: 1.0}})[only]} if only else SEEN_AS
+    families = {only: (SEEN_AS | SCENES)[only]} if only else SEEN_AS
     shares = {(family, name): share for family, views in families.items() for name, share in views.items()}
     return _choose(shares, rng)
 

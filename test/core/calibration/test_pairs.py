@@ -224,15 +224,6 @@ def test_scenes_are_so_many_of_each_family_and_those_at_a_joint_are_of_subjects(
     assert {task.family for task in tasks if task.real} == {"scene-joint"}
 
 
-def test_traces_are_of_a_dragged_pointer_and_half_of_them_are_named_as_a_pointer(people, monkeypatch):
-    monkeypatch.setattr(pairs, "TARGETS", {"own": 1.0})
-    pairs.setting_of.cache_clear()
-    drawn = [pairs.draw(task) for task in pairs.traces(FOLDER, "train", 3, 16)]
-    assert {(each.family, each.seen_as) for each in drawn} == {("tracing", "tracing")}
-    assert {each.sensor for each in drawn} == {"unknown", "pointer"}
-    assert min(len(each.pair.source) for each in drawn) >= 300
-
-
 def test_a_bone_without_a_neighbour_is_seen_alone_and_one_with_gets_it(people, monkeypatch):
     monkeypatch.setattr(pairs, "SHAPE_SHARE", 1.0)
     monkeypatch.setattr(pairs, "before", lambda setting, stranger, what, pair: pair)

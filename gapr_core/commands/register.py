@@ -52,7 +52,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
     parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
-    parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
+    parser.add_argument("--axes", type=str.lower, default="auto",
+                        help="of a target mesh: lps, ras, as_is, lps_to_ras, or auto (what it says)")  # fmt: skip
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
     parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
     parser.add_argument("--reference", type=int, metavar="TOOL",

@@ -7,14 +7,14 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapr_core.commands import checks, options
 from gapr_core.commands.answer import as_json, guidance_json
 from gapr_core.errors import ConfigError
+from gapr_core.pages.registration import Registration
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import a_path
@@ -27,16 +27,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
-
-
-class Registration(NamedTuple):
-    """What was registered, and what came of it."""
-
-    target: Surface
-    source: NDArray[np.float64]
-    result: RegistrationResult
-    errors: list[TargetError]
-    spots: Sequence[Patch]
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -197,10 +187,8 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
     say(str(result))
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
-            say(
-                f"no pose: {path} is not written"
-                + (", and what is there is of an earlier run" if path.exists() else "")
-            )
+            earlier = ", and what is there is of an earlier run" if path.exists() else ""
+            say(f"no pose: {path} is not written{earlier}")
         return REFUSED
     if result.inferred_viewpoint is not None:
         x, y, z = result.inferred_viewpoint
@@ -219,10 +207,8 @@ def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
         return
     say(f"where to look next (the error bound over the bone is {result.guidance.now_mm:.2f} mm, rivals included):")
     for rank, spot in enumerate(spots, 1):
-        centre, normal = (
-            "({:.1f}, {:.1f}, {:.1f})".format(*spot.centre),
-            "({:.2f}, {:.2f}, {:.2f})".format(*spot.normal),
-        )
+        centre = "({:.1f}, {:.1f}, {:.1f})".format(*spot.centre)
+        normal = "({:.2f}, {:.2f}, {:.2f})".format(*spot.normal)
         say(f"{rank}. {centre} mm, normal {normal}: expected tre95 {spot.tre95_mm:.2f} mm, "
             f"gain {spot.gain_mm:.2f} mm, {100 * spot.rivals_excluded:.0f} % of the rivals excluded")  # fmt: skip
 
@@ -236,7 +222,7 @@ def _write(args: Namespace, done: Registration) -> None:
     if args.report:
         from gapr_core.pages import registration_report
 
-        registration_report.write(args.report, registration_report.Registration(*done))
+        registration_report.write(args.report, done)
     if args.rerun:
         from gapr_core.formats import recording
 

@@ -29,7 +29,7 @@ def setting(
     """A field of a settings class.
 
     Args:
-        default: also decides nothing about the type, which is the annotation's.
+        default: the value where none is given; the annotation of the field decides the type.
         text: help, a phrase without the unit and the range.
         low, high: ends of the range, both included; None where there is no end.
         unit: of the value; empty for counts and shares.

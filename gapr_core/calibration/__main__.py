@@ -29,13 +29,13 @@ from gapr_core.calibration.fit import (
     of_unseen_people,
 )
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
-from gapr_core.errors import ConfigError, GaprError
+from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
 from gapr_core.registration.precision_model import PRECISION_FEATURES
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import at_least_one
-from gapr_core.runtime.console import say
+from gapr_core.runtime.console import exit_code, say
 from gapr_core.runtime.files import write_json, write_text
 
 SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features that every round has
@@ -154,7 +154,4 @@ def _write(path: Path, kind: str, model: Additive, more: dict[str, Any], card: d
 
 
 if __name__ == "__main__":
-    try:
-        raise SystemExit(main())
-    except GaprError as error:
-        raise SystemExit(f"python -m gapr_core.calibration: {error}") from None
+    raise SystemExit(exit_code(main, "python -m gapr_core.calibration"))

@@ -74,7 +74,7 @@ def unturned(surface: Surface, path: Path, axes: str) -> Surface:
 def check(axes: str) -> None:
     """Raise `ConfigError` for a name that means no axes."""
     if axes not in CHOICES:
-        raise ConfigError(f"axes {' '.join(CHOICES)}", repr(axes), "name one of them")
+        raise ConfigError(f"axes that are one of {', '.join(CHOICES)}", repr(axes), "name one of them")
 
 
 def scaled(surface: Surface, factors: Array) -> Surface:

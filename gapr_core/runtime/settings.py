@@ -118,7 +118,7 @@ def from_dict(cls: type[T], values: Any, path: str = "") -> T:
         ConfigError: a name that the dataclass does not have, a value of another type or out of range, or a missing one.
     """
     if not isinstance(values, Mapping):
-        where = f" under {path}" if path else ""
+        where = f" under {path.rstrip('.')}" if path else ""
         raise ConfigError(f"a mapping of settings{where}", repr(values), "write `name: value` lines")
     known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
     unknown = [str(name) for name in values if name not in known]

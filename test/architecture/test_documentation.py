@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from gapr_core import baselines, load
+from gapr_core import baselines, cli, load
 from gapr_core.benchmark import methods
 from gapr_core.cli import main
 from gapr_core.config import SensorConfig
@@ -233,6 +233,15 @@ def test_the_options_that_the_pages_show_exist(capsys):
         missing = {word for word in words if word.startswith("--") and not re.search(rf"{word}\b", text)}
         assert not missing, f"{page}: {program} {name}"
     assert {"register", "evaluate", "benchmark", "make-pairs"} <= set(helps)
+
+
+def test_the_commands_that_the_pages_show_name_all_that_is_required():
+    """But for the pages of results, which quote what was run then, and lines that leave something out."""
+    shown = [words for page, (program, *words) in commands() if program == "gapr" and "docs/results" not in page]
+    whole = [words for words in shown if "..." not in words and "--help" not in words]
+    for words in whole:
+        assert cli._parser(words).run, words
+    assert len(whole) > 20
 
 
 def test_every_link_leads_to_a_file_of_the_repository():

@@ -93,7 +93,7 @@ def run(args: Namespace) -> int:
     Raises:
         GaprError: options or files that cannot be used, before the work; what a method did not say, at the end.
     """
-    from gapr_core import Registrar, Tracker, clouds
+    from gapr_core import Registrar, Tracker
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
@@ -102,30 +102,38 @@ def run(args: Namespace) -> int:
     config = replace(config, guide=config.guide or args.guide)
     method = methods.make(args.method, config)
     plan, hints = _plan(args), _hints(args, method)
-    target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
-    clouds.warn_of_size(args.target, target.extent_mm)
-    how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
-    how |= {"topic": args.topic, "clouds": args.clouds}
-    whole = _load(args.source, args.source_units or args.units, **how)
-    if whole.faces is not None and target.faces is None:
-        log.warning(
-            "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
-        )
-    checks.warn_of_units(args)
-    checks.warn_of_axes(args)
-    checks.warn_of_landmarks(args, whole.points, target.points)
-    if args.viewpoint == "none" or whole.joined or whole.faces is not None:
+    target, source = _read(args)
+    if args.viewpoint == "none" or source.joined or source.faces is not None:
         method = method.of_bone_alone() if isinstance(method, Registrar | Tracker) else method
-    hints |= _seen(args, method, whole)
-    result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
+    hints |= _seen(args, method, source)
+    result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     code = _show(args, result, errors)
     if config.guide:
         _say_where_next(result, spots)
-    _write(args, Registration(target, whole.points, result, errors, spots))
+    _write(args, Registration(target, source.points, result, errors, spots))
     checks.check_answer(args, result)
     return code
+
+
+def _read(args: Namespace) -> tuple[Surface, Surface]:
+    """Target and source, with a warning of everything that may be wrong and can be read nevertheless."""
+    from gapr_core import clouds
+
+    target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
+    clouds.warn_of_size(args.target, target.extent_mm)
+    how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
+    how |= {"topic": args.topic, "clouds": args.clouds}
+    source = _load(args.source, args.source_units or args.units, **how)
+    if source.faces is not None and target.faces is None:
+        log.warning(
+            "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
+        )
+    checks.warn_of_units(args)
+    checks.warn_of_axes(args)
+    checks.warn_of_landmarks(args, source.points, target.points)
+    return target, source
 
 
 def _load(path: Path, units: str | None, **how: Any) -> Surface:

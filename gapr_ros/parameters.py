@@ -50,12 +50,17 @@ class NodeParameters(Settings):
                               "lps_to_ras to RAS", choices=("as_is", "auto", "lps", "ras", "lps_to_ras"))  # fmt: skip
     model_frame: str = setting("bone_preop", "frame of the pre-operative bone, child of every pose", live=False)
     output_frame: str = setting("", "frame of the poses; empty: the frame of the cloud", live=False)
-    tf_timeout: float = setting(0.1, "longest wait for a transform into output_frame", unit="s", low=0.0, high=60.0)
+    tf_timeout: float = setting(
+        0.1, "longest wait for a transform: of output_frame, crop_frame, viewpoint, initialpose",
+        unit="s", low=0.0, high=60.0,
+    )  # fmt: skip
     cloud_type: str = setting("PointCloud2", "message type of the clouds", choices=tuple(INPUTS), live=False)
     cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "mm"))
     cloud_reliability: str = setting("auto", "auto: reliable, and best effort once a publisher offers only that",
                                      choices=("auto", "reliable", "best_effort"), live=False)  # fmt: skip
-    min_points: int = setting(200, "fewer usable points, of all clouds that are registered as one, are refused", low=3)
+    min_points: int = setting(
+        200, "fewer usable points are refused; counted over all clouds that are registered as one", low=3
+    )
     max_points: int = setting(200_000, "larger clouds are thinned to this, seeded; 0: never", low=0)
     range_min: float = setting(0.0, "nearer points are left out; 0: off", unit="m", low=0.0)
     range_max: float = setting(0.0, "farther points are left out; 0: off", unit="m", low=0.0)
@@ -76,9 +81,9 @@ class NodeParameters(Settings):
     max_tre: float = setting(0.0, "poses whose 95 % bound of the error over the bone is larger are refused; 0: off",
                              unit="m", low=0.0)  # fmt: skip
     require_consecutive: int = setting(1, "a pose goes out after this many good ones in a row", low=1, high=1000)
-    max_jump_translation: float = setting(0.0, "farther from the last pose is refused; 0: off", unit="m", low=0.0)
+    max_jump_translation: float = setting(0.0, "poses farther from the last one are refused; 0: off", unit="m", low=0.0)
     max_jump_rotation: float = setting(
-        0.0, "farther from the last pose is refused; 0: off", unit="rad", low=0.0, high=3.15
+        0.0, "poses turned farther from the last one are refused; 0: off", unit="rad", low=0.0, high=3.15
     )
     continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register")
     track: bool = setting(True, "start where the last pose was; false: every cloud by itself", live=False)

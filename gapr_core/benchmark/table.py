@@ -34,7 +34,7 @@ def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
 
 
 def summary(records: Sequence[Record]) -> Row:
-    """Every figure of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
+    """Every number of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
     row: Row = {"pairs": len(records), "persons": len({r.person for r in records})}
     row |= _answers(records) | _accuracy([r for r in records if r.has_truth])
     row |= _calibration(records) | _uncertainty([r for r in records if r.right]) | _times(records)

@@ -1,6 +1,6 @@
 """Fit what says how sure and how precise an answer is; one command makes the data, the models and their card.
 
-    python -m gapr_core.calibration --anatomy ../shared/anatomy --out runs/calibration --jobs 2 --count 3000
+    python -m gapr_core.calibration --anatomy DIR --out runs/calibration --jobs 2 --count 3000
 
 Pairs are drawn on the fly from subjects of the train split; finished ones stay in `records.jsonl`, so a stopped run
 goes on where it was. The fit itself is convex: the same records give the same models.
@@ -8,8 +8,8 @@ goes on where it was. The fit itself is convex: the same records give the same m
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,13 @@ from gapr_core.calibration.fit import (
     of_unseen_people,
 )
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
-from gapr_core.errors import ConfigError, GaprError
+from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
 from gapr_core.registration.precision_model import PRECISION_FEATURES
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import at_least_one
-from gapr_core.runtime.console import say
+from gapr_core.runtime.console import exit_code, say
 from gapr_core.runtime.files import write_json, write_text
 
 SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features that every round has
@@ -43,8 +43,25 @@ SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # feat
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Collect, fit, judge and write."""
-    parser = argparse.ArgumentParser(prog="python -m gapr_core.calibration", description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    given = sys.argv[1:] if arguments is None else arguments
+    args = _parser().parse_args(given)
+    tasks = _tasks(args)
+    if not tasks:
+        raise ConfigError("pairs, scenes or streams to collect", "none", "raise --count")
+    records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
+    commits = sorted({str(record.get("commit")) for record in records})
+    made = {"commit": origin.commit(), "commits_of_pairs": commits,
+            "command": " ".join(["python -m gapr_core.calibration", *given]),
+            "seed": args.seed, "split": args.split, "held_out_families": list(HELD_OUT)}  # fmt: skip
+    cards = write_models(records, args.out, made)
+    write_text(args.out / "confidence.md", as_markdown(cards, made))
+    say(f"{len(records)} pairs; models and confidence.md are in {args.out}")
+    return 0
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(prog="python -m gapr_core.calibration", description=__doc__,
+                            formatter_class=RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
     parser.add_argument("--out", required=True, type=Path, help="folder for records, models and their card")
     parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
@@ -61,24 +78,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
     parser.add_argument("--jobs", type=at_least_one, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
-    args = parser.parse_args(arguments)
+    return parser
+
+
+def _tasks(args: Namespace) -> list[Task]:
+    """The pairs that the options ask for, in the order in which they are registered."""
     which = (str(args.anatomy), args.split, args.seed)
     tasks = [Task(*which, number) for number in range(args.count)]
     tasks += scenes(*which, args.scenes)
     tasks += look_alikes(*which, args.look_alikes)
-    tasks += streams.tasks(*which, args.streams)
-    if not tasks:
-        raise ConfigError("pairs, scenes or streams to collect", "none", "raise --count")
-    records = collect(tasks, args.out / "records.jsonl", args.jobs, args.dask)
-    given = sys.argv[1:] if arguments is None else arguments
-    commits = sorted({str(record.get("commit")) for record in records})
-    made = {"commit": origin.commit(), "commits_of_pairs": commits,
-            "command": " ".join(["python -m gapr_core.calibration", *given]),
-            "seed": args.seed, "split": args.split, "held_out_families": list(HELD_OUT)}  # fmt: skip
-    cards = write_models(records, args.out, made)
-    write_text(args.out / "confidence.md", as_markdown(cards, made))
-    say(f"{len(records)} pairs; models and confidence.md are in {args.out}")
-    return 0
+    return tasks + streams.tasks(*which, args.streams)
 
 
 def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str, Any]) -> dict[str, Any]:
@@ -126,10 +135,8 @@ def fit_precision(rounds: Sequence[Answers]) -> tuple[Additive, float, dict[str,
         raise ConfigError("accepted answers with a truth", "none", "collect more pairs (--count)")
     answers = together(found)
     known = known_families(answers)
-    new_sensor, new_subject = (
-        conformal.scales_of_unseen_families(answers, known),
-        conformal.scales_of_unseen_people(answers, known),
-    )
+    new_sensor = conformal.scales_of_unseen_families(answers, known)
+    new_subject = conformal.scales_of_unseen_people(answers, known)
     scores = [answers.true_mm / (scale * answers.tre95_mm) for scale in (new_sensor, new_subject)]
     factor = max(
         conformal.factor_overall(scores[0][known]),
@@ -147,7 +154,4 @@ def _write(path: Path, kind: str, model: Additive, more: dict[str, Any], card: d
 
 
 if __name__ == "__main__":
-    try:
-        raise SystemExit(main())
-    except GaprError as error:
-        raise SystemExit(f"python -m gapr_core.calibration: {error}") from None
+    raise SystemExit(exit_code(main, "python -m gapr_core.calibration"))

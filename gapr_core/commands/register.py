@@ -7,14 +7,14 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapr_core.commands import checks, options
 from gapr_core.commands.answer import as_json, guidance_json
 from gapr_core.errors import ConfigError
+from gapr_core.pages.registration import Registration
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import a_path
@@ -27,16 +27,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
-
-
-class Registration(NamedTuple):
-    """What was registered, and what came of it."""
-
-    target: Surface
-    source: NDArray[np.float64]
-    result: RegistrationResult
-    errors: list[TargetError]
-    spots: Sequence[Patch]
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -52,7 +42,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
     parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
-    parser.add_argument("--axes", default="auto", help="of a target mesh: lps, ras, as_is, or auto (its comment)")
+    parser.add_argument("--axes", type=str.lower, default="auto",
+                        help="of a target mesh: lps, ras, as_is, lps_to_ras, or auto (what it says)")  # fmt: skip
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
     parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
     parser.add_argument("--reference", type=int, metavar="TOOL",
@@ -102,7 +93,7 @@ def run(args: Namespace) -> int:
     Raises:
         GaprError: options or files that cannot be used, before the work; what a method did not say, at the end.
     """
-    from gapr_core import Registrar, Tracker, clouds
+    from gapr_core import Registrar, Tracker
     from gapr_core.benchmark import methods
 
     checks.check_outputs(args)
@@ -111,30 +102,38 @@ def run(args: Namespace) -> int:
     config = replace(config, guide=config.guide or args.guide)
     method = methods.make(args.method, config)
     plan, hints = _plan(args), _hints(args, method)
-    target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
-    clouds.warn_of_size(args.target, target.extent_mm)
-    how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
-    how |= {"topic": args.topic, "clouds": args.clouds}
-    whole = _load(args.source, args.source_units or args.units, **how)
-    if whole.faces is not None and target.faces is None:
-        log.warning(
-            "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
-        )
-    checks.warn_of_units(args)
-    checks.warn_of_axes(args)
-    checks.warn_of_landmarks(args, whole.points, target.points)
-    if args.viewpoint == "none" or whole.joined or whole.faces is not None:
+    target, source = _read(args)
+    if args.viewpoint == "none" or source.joined or source.faces is not None:
         method = method.of_bone_alone() if isinstance(method, Registrar | Tracker) else method
-    hints |= _seen(args, method, whole)
-    result = method.register(whole.points, method.prepare(target), **hints)  # type: ignore[call-arg]
+    hints |= _seen(args, method, source)
+    result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     code = _show(args, result, errors)
     if config.guide:
         _say_where_next(result, spots)
-    _write(args, Registration(target, whole.points, result, errors, spots))
+    _write(args, Registration(target, source.points, result, errors, spots))
     checks.check_answer(args, result)
     return code
+
+
+def _read(args: Namespace) -> tuple[Surface, Surface]:
+    """Target and source, with a warning of everything that may be wrong and can be read nevertheless."""
+    from gapr_core import clouds
+
+    target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
+    clouds.warn_of_size(args.target, target.extent_mm)
+    how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
+    how |= {"topic": args.topic, "clouds": args.clouds}
+    source = _load(args.source, args.source_units or args.units, **how)
+    if source.faces is not None and target.faces is None:
+        log.warning(
+            "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
+        )
+    checks.warn_of_units(args)
+    checks.warn_of_axes(args)
+    checks.warn_of_landmarks(args, source.points, target.points)
+    return target, source
 
 
 def _load(path: Path, units: str | None, **how: Any) -> Surface:
@@ -196,10 +195,8 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
     say(str(result))
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
-            say(
-                f"no pose: {path} is not written"
-                + (", and what is there is of an earlier run" if path.exists() else "")
-            )
+            earlier = ", and what is there is of an earlier run" if path.exists() else ""
+            say(f"no pose: {path} is not written{earlier}")
         return REFUSED
     if result.inferred_viewpoint is not None:
         x, y, z = result.inferred_viewpoint
@@ -218,10 +215,8 @@ def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
         return
     say(f"where to look next (the error bound over the bone is {result.guidance.now_mm:.2f} mm, rivals included):")
     for rank, spot in enumerate(spots, 1):
-        centre, normal = (
-            "({:.1f}, {:.1f}, {:.1f})".format(*spot.centre),
-            "({:.2f}, {:.2f}, {:.2f})".format(*spot.normal),
-        )
+        centre = "({:.1f}, {:.1f}, {:.1f})".format(*spot.centre)
+        normal = "({:.2f}, {:.2f}, {:.2f})".format(*spot.normal)
         say(f"{rank}. {centre} mm, normal {normal}: expected tre95 {spot.tre95_mm:.2f} mm, "
             f"gain {spot.gain_mm:.2f} mm, {100 * spot.rivals_excluded:.0f} % of the rivals excluded")  # fmt: skip
 
@@ -235,7 +230,7 @@ def _write(args: Namespace, done: Registration) -> None:
     if args.report:
         from gapr_core.pages import registration_report
 
-        registration_report.write(args.report, registration_report.Registration(*done))
+        registration_report.write(args.report, done)
     if args.rerun:
         from gapr_core.formats import recording
 

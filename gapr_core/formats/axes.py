@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 LPS_RAS = np.array([-1.0, -1.0, 1.0])  # the same both ways
 FACTORS = {"lps": np.ones(3), "as_is": np.ones(3), "ras": LPS_RAS, "lps_to_ras": LPS_RAS}
 CHOICES = ("auto", *FACTORS)
-COMMENT = re.compile(rb"SPACE=(LPS|RAS)\b")
+COMMENT = re.compile(rb"SPACE[ \t]*=[ \t]*(LPS|RAS)\b")
 COMMENT_BYTES = 8192
 
 
@@ -74,7 +74,7 @@ def unturned(surface: Surface, path: Path, axes: str) -> Surface:
 def check(axes: str) -> None:
     """Raise `ConfigError` for a name that means no axes."""
     if axes not in CHOICES:
-        raise ConfigError(f"axes {' '.join(CHOICES)}", repr(axes), "name one of them")
+        raise ConfigError(f"axes that are one of {', '.join(CHOICES)}", repr(axes), "name one of them")
 
 
 def scaled(surface: Surface, factors: Array) -> Surface:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,7 +80,7 @@ def _error(label: str, point: Array, covariance: Array, draws: Array) -> TargetE
     return TargetError(label, (x, y, z), float(np.sqrt(variances.sum())), float(np.percentile(lengths, 95.0)))
 
 
-def save_targets(path: Path, errors: list[TargetError]) -> None:
+def save_targets(path: Path, errors: Sequence[TargetError]) -> None:
     """The targets as markups, each with its expected error as the description."""
     points = np.array([error.position_mm for error in errors]).reshape(-1, 3)
     words = [f"expected error {error.expected_mm:.2f} mm, 95 %: {error.bound95_mm:.2f} mm" for error in errors]

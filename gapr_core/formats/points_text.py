@@ -13,7 +13,6 @@ import numpy as np
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import columns, text, tracker
 from gapr_core.formats.columns import COMMENTS, FIRST, Columns, Header
-from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
@@ -27,14 +26,14 @@ SPLIT_DECIMALS = re.compile(r"-?\d+,\d+(,-?\d+,\d+){2}")  # as x,y,z: six whole 
 DEFINED, UNDEFINED = "defined", ("0", "false")  # of a control point of 3D Slicer that was never placed
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """X y z, or x y z nx ny nz, in the first columns or where a line of names says: x y z, l p s or r a s.
 
     Raises:
         InvalidPointCloudError: names that do not say which columns are the coordinates, numbers of the points in the
             first one, decimal commas, or a cell that is no number.
     """
-    return _surface(limits.read(path))
+    return _surface(options.limits.read(path))
 
 
 def read_csv(path: Path, options: ReadOptions) -> Surface:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.formats import axes, plugins, signatures
-from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
+
+Reader = Callable[[Path, ReadOptions], Surface]
 
 
 @dataclass(frozen=True)
@@ -19,20 +20,18 @@ class Format:
     """A kind of file.
 
     Attributes:
-        reader: `module:function` under `gapr_core.formats`; takes (path, limits), or (path, options).
-        in_mm: whether its numbers are mm, whatever unit is named; its axes are its own, and none are named for it.
-        in_lps: whether it says its axes by its kind, and comes out in LPS.
-        with_options: whether the reader of a file that is not always in mm takes all options.
-        unit: of its numbers, where the user names none.
+        reader: `module:function` under `gapr_core.formats`; takes (path, options) and gives a `Surface`.
+        in_mm: its numbers are mm, whatever unit is named; its axes are its own, and none are named for it.
+        in_lps: it says its axes by its kind, and comes out in LPS.
         uses: the choices (`CHOICES`) that its reader takes; another one is an error and not ignored.
+        unit: of its numbers, where the user names none.
     """
 
     reader: str
     in_mm: bool = False
     in_lps: bool = False
-    with_options: bool = False
-    unit: str = "mm"
     uses: tuple[str, ...] = ()
+    unit = "mm"
 
     @property
     def is_tracked(self) -> bool:
@@ -47,11 +46,9 @@ class Format:
         """The surface in the file's unit; in its own axes where it has some, otherwise turned as asked."""
         self._check(path, options)
         module, function = self.reader.split(":")
-        reader: Callable[[Path, FileLimits | ReadOptions], Surface]
-        reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
-        if self.in_mm:
-            return axes.unturned(reader(path, options), path, options.axes)
-        return axes.turned(reader(path, options if self.with_options else options.limits), path, options.axes)
+        reader: Reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
+        turn = axes.unturned if self.in_mm else axes.turned
+        return turn(reader(path, options), path, options.axes)
 
     def _check(self, path: Path, options: ReadOptions) -> None:
         """A choice that this kind of file cannot follow means that it is the wrong file, or the wrong choice."""
@@ -88,7 +85,7 @@ FORMATS = {
     ".dcm": LABEL_MAP,
     ".mrk.json": MARKUPS,
     ".fcsv": MARKUPS,
-    ".csv": Format("points_text:read_csv", with_options=True, uses=TRACKED),
+    ".csv": Format("points_text:read_csv", uses=TRACKED),
     ".txt": Format("points_text:read"),
     ".xyz": Format("points_text:read"),
     ".igs.mha": Format("sweeps:read_igs", in_mm=True, uses=TRACKED),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -54,7 +55,7 @@ def colours_of(distance_mm: Array) -> NDArray[np.int64]:
     return colours
 
 
-def write_slicer(folder: Path, target: Surface, result: RegistrationResult, errors: list[TargetError]) -> None:
+def write_slicer(folder: Path, target: Surface, result: RegistrationResult, errors: Sequence[TargetError]) -> None:
     """A folder with target, source, transform and planned targets, and the scene.mrml that loads them together.
 
     Args:

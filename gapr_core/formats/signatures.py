@@ -6,7 +6,7 @@ import gzip
 from pathlib import Path
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats.text import UTF_16
+from gapr_core.formats import text
 
 GZIP = b"\x1f\x8b"
 PACKED = ".nii.gz"  # the one packed kind that is read
@@ -14,6 +14,7 @@ NIFTI_BYTES = 348
 NIFTI_SIZES = (NIFTI_BYTES.to_bytes(4, "little"), NIFTI_BYTES.to_bytes(4, "big"))  # its first number
 STL_HEADER_BYTES, STL_FACET_BYTES = 84, 50
 SEQUENCE, SEQUENCE_BYTES = b"\nSeq_Frame", 8192  # after the fields of an image
+SEQUENCE_HINTS = {".mha": "rename it to .igs.mha", ".nrrd": "save it as .igs.mha in PLUS"}
 SIGNATURES = {
     b"ply": ".ply",
     b"solid": ".stl",
@@ -28,7 +29,7 @@ SIGNATURES = {
 
 
 def check_packed(path: Path, ending: str) -> None:
-    """Raise for a file that is gzip-compressed, or that is not, where its ending says the other.
+    """Raise for a file that is gzip-compressed where its ending says that it is not, or the other way round.
 
     Args:
         path: a file that is there.
@@ -56,9 +57,9 @@ def check_sequence(path: Path, ending: str) -> None:
     Raises:
         InvalidPointCloudError: what to rename it to.
     """
-    if ending == ".mha" and SEQUENCE in _head(path, SEQUENCE_BYTES):
-        given, how = f"{path.name}, a recording by PLUS", "rename it to .igs.mha, and give --tip"
-        raise InvalidPointCloudError("a label map as .mha", given, how)
+    if ending in SEQUENCE_HINTS and SEQUENCE in _head(path, SEQUENCE_BYTES):
+        given, how = f"{path.name}, a recording by PLUS", f"{SEQUENCE_HINTS[ending]}, and give --tip"
+        raise InvalidPointCloudError(f"a label map as {ending}", given, how)
 
 
 def _unpacks_to_nifti(path: Path) -> bool:
@@ -79,8 +80,8 @@ def _head(path: Path, size: int = STL_HEADER_BYTES) -> bytes:
 
 
 def is_utf_16(path: Path) -> bool:
-    """Whether a file that cannot be read begins with the byte order mark of UTF-16."""
-    return _head(path).startswith(UTF_16)
+    """Whether a file that cannot be read is text in UTF-16."""
+    return text.is_utf_16(_head(path))
 
 
 def ending_of(path: Path) -> str:

@@ -15,6 +15,7 @@ from gapr_core.errors import InvalidPointCloudError
 Array = NDArray[np.float64]
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+LOOKED_AT = 64  # bytes at the beginning: enough to see that every other one is zero
 
 
 def lines(data: bytes) -> Iterator[str]:
@@ -40,9 +41,15 @@ def check_end(data: bytes) -> None:
 
 
 def check_encoding(data: bytes) -> None:
-    """Raise `InvalidPointCloudError` for text that begins with the byte order mark of UTF-16."""
-    if data.startswith(UTF_16):
+    """Raise `InvalidPointCloudError` for text in UTF-16."""
+    if is_utf_16(data):
         raise InvalidPointCloudError("UTF-8 text", "UTF-16 text", "save it as UTF-8")
+
+
+def is_utf_16(data: bytes) -> bool:
+    """Whether a file begins with the byte order mark of UTF-16, or with letters of two bytes, one of which is zero."""
+    even, odd = data[:LOOKED_AT:2], data[1:LOOKED_AT:2]
+    return data.startswith(UTF_16) or any(len(a) > 1 and not any(a) and all(b) for a, b in ((even, odd), (odd, even)))
 
 
 def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None = None, quotes: bool = False) -> Array:

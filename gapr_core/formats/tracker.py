@@ -77,7 +77,7 @@ def read_poses(
     names = [name.strip().lower() for name in rows[0]] if rows else []
     starts = [i for i, name in enumerate(names) if name in (QUATERNION[0], ANGLES[0])]
     if not starts:
-        raise InvalidPointCloudError(COLUMNS, f"{path.name} without", "export it from NDI Track")
+        raise InvalidPointCloudError(COLUMNS, f"{path.name} without them", "export it from NDI Track")
     called = [_tool_name(rows[0][:start], i) for i, start in enumerate(starts)]
     used = chosen_with(tool, reference, called, path)
     columns = [_columns(names, starts[i], i, path) for i in used]

@@ -75,7 +75,7 @@ class Attention(nn.Module):
         """Queries of x_q look at keys and values of x_s; both in the layout of `pairs`."""
         if isinstance(self.encoder, FusedEncoder) and self.encoder.fits(pairs, x_q):
             return self.encoder.attend(self.query(x_q), self.key(x_s), self.value(x_s), pairs, self.heads)
-        if isinstance(self.encoder, VanillaEncoder) and isinstance(pairs, DensePairs) and steps.fit(x_q, x_s):
+        if isinstance(self.encoder, VanillaEncoder) and isinstance(pairs, DensePairs) and steps.can_take(x_q, x_s):
             return self._plain(self.query(x_q), self.key(x_s), self.value(x_s), pairs.valid)
         encoding = self.encoder(pairs)
         q = encoding.query(pairs.queries(self.query(x_q)))

@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gapr_core.model import attention_kernels
+from gapr_core.model import attention_kernels, steps
 from gapr_core.model.pairs import Pairs
 
 Arrays = list[NDArray[Any]]
 
 
 def fits(pairs: Pairs, *tensors: Tensor) -> bool:
-    """Whether the loops can take these tensors: float32 on a CPU, and no program is being exported."""
-    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, pairs.p_i))
-    return plain and not torch.compiler.is_compiling() and not torch.is_autocast_enabled("cpu")
+    """Whether the loops can take these tensors and the geometry of these pairs."""
+    return steps.can_take(*tensors, pairs.p_i)
 
 
 def attend(

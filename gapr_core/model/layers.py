@@ -25,7 +25,7 @@ class GroupNorm(nn.Module):
     def forward(self, x: Tensor, lengths: tuple[int, ...], slope: float = 1.0) -> Tensor:
         """The norm, and a leaky ReLU of this slope below zero after it."""
         x = x.float()
-        if steps.fit(x, self.weight):
+        if steps.can_take(x, self.weight):
             return steps.norm(x, lengths, self.groups, self.weight, self.bias, slope)
         centred = x - self._mean(x, lengths)
         variance = self._mean(centred * centred, lengths)

@@ -42,7 +42,7 @@ class Pairs:
     @cached_property
     def pgf(self) -> Tensor:
         """(B, n, m, 11) embedded PGF; shared by all layers that look at these pairs."""
-        if steps.fit(self.p_i, self.p_j, self.c_h, self.c_k, self.radius):
+        if steps.can_take(self.p_i, self.p_j, self.c_h, self.c_k, self.radius):
             return steps.embed(self.p_i, self.p_j, self.c_h, self.c_k, self.radius)
         with torch.no_grad():
             return pgf.embed(self.p_i, self.p_j, self.c_h, self.c_k, self.radius[..., None])

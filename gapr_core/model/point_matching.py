@@ -116,7 +116,7 @@ def log_optimal_transport(scores: Tensor, dustbin: Tensor, valid_p: Tensor, vali
         (P, a + 1, b + 1) log assignment: every existing point's row (column) sums to one.
     """
     mask_p, mask_q = (torch.nn.functional.pad(v, (0, 1), value=True) for v in (valid_p, valid_q))
-    if steps.fit(scores, dustbin):
+    if steps.can_take(scores, dustbin):
         return steps.transport(scores, dustbin, mask_p, mask_q, rounds - 1)
     padded = torch.nn.functional.pad(scores, (0, 1, 0, 1))
     bins = torch.zeros_like(padded)

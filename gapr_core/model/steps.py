@@ -14,7 +14,7 @@ from gapr_core.model.pgf import EMBEDDED
 from gapr_core.model.types import Level, Neighborhood
 
 
-def fit(*tensors: Tensor) -> bool:
+def can_take(*tensors: Tensor) -> bool:
     """Whether the loops can take these tensors: float32 on a CPU, not under autocast or export."""
     plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
     free = not torch.is_autocast_enabled("cpu") and not torch.compiler.is_compiling()

@@ -7,7 +7,6 @@ may name a patient.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,39 +15,19 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from gapr_core.formats.planning import TargetError
 from gapr_core.geometry import se3
 from gapr_core.pages import palette
 from gapr_core.pages.guidance import GuidedStep, guidance_figure
+from gapr_core.pages.registration import Registration
 from gapr_core.pages.report import Report, Step, alignment_figure
 from gapr_core.registration.words import WORDS
 from gapr_core.results import Patch, RegistrationResult
 from gapr_core.runtime import origin
-from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 NOWHERE = np.zeros((0, 3))
 MOST_HYPOTHESES = 5
 NONE = "–"
-
-
-@dataclass(frozen=True, eq=False)
-class Registration:
-    """What the page is about.
-
-    Attributes:
-        target: the bone, mm.
-        source: (N, 3) the source as read, source frame, mm.
-        result: of registering them.
-        errors: of the planned targets; none without a plan or a pose.
-        spots: the patches to look at next, the best first; none without guidance.
-    """
-
-    target: Surface
-    source: Array
-    result: RegistrationResult
-    errors: Sequence[TargetError] = ()
-    spots: Sequence[Patch] = ()
 
 
 def write(path: str | Path, registration: Registration) -> None:

@@ -51,16 +51,8 @@ def outcomes(
         ConfigError: nobody answers there, or a worker has several threads, which share a process's libraries.
     """
     distributed = _library()
-    try:
-        client = distributed.Client(address, timeout=PATIENCE_S)
-    except (OSError, ValueError) as error:
-        how = "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`"
-        raise ConfigError("the address of a Dask scheduler that answers", f"{address} ({error})", how) from error
-    with client:
-        workers = client.nthreads()
-        if not workers or max(workers.values()) > 1:
-            given = f"{len(workers)} workers, threads {sorted(set(workers.values()))}"
-            raise ConfigError("workers of one thread each", given, "start them with `--nthreads 1`, one for each core")
+    with _client(distributed, address) as client:
+        workers = _checked_workers(client)
         from gapr_core.runtime.short_profile import ShortProfile  # needs Dask
 
         client.register_plugin(ShortProfile())
@@ -71,7 +63,7 @@ def outcomes(
 
         def submit() -> list[Any]:
             new = []
-            while len(under_way) < WAITING * len(workers):
+            while len(under_way) < WAITING * workers:
                 turn = [alone.popleft()] if alone else [again.popleft() for _ in range(min(size, len(again)))]
                 turn = turn or list(islice(left, size))
                 if not turn:
@@ -94,6 +86,24 @@ def outcomes(
                 has_died = isinstance(raised, distributed.KilledWorker)
                 yield turn[0], WorkersDiedError(str(raised)) if has_died else raised
             finished.update(submit())
+
+
+def _client(distributed: Any, address: str) -> Any:
+    """A connection to the scheduler."""
+    try:
+        return distributed.Client(address, timeout=PATIENCE_S)
+    except (OSError, ValueError) as error:
+        how = "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`"
+        raise ConfigError("the address of a Dask scheduler that answers", f"{address} ({error})", how) from error
+
+
+def _checked_workers(client: Any) -> int:
+    """How many workers there are, each of one thread."""
+    threads = client.nthreads().values()
+    if not threads or max(threads) > 1:
+        given = f"{len(threads)} workers, threads {sorted(set(threads))}"
+        raise ConfigError("workers of one thread each", given, "start them with `--nthreads 1`, one for each core")
+    return len(threads)
 
 
 def _turn(call: Callable[..., Result], tasks: Sequence[Task], *shared: Any) -> tuple[list[Result | Exception], float]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
+
+from gapr_core.errors import GaprError
 
 
 def say(text: str) -> None:
@@ -18,3 +21,12 @@ def say(text: str) -> None:
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def exit_code(main: Callable[[], int], program: str) -> int:
+    """What a program returns; 1, and one line on standard error, for what its user must fix."""
+    try:
+        return main()
+    except GaprError as error:
+        sys.stderr.write(f"{program}: {error}\n")
+        return 1

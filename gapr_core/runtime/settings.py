@@ -29,7 +29,7 @@ def setting(
     """A field of a settings class.
 
     Args:
-        default: also decides nothing about the type, which is the annotation's.
+        default: the value where none is given; the annotation of the field decides the type.
         text: help, a phrase without the unit and the range.
         low, high: ends of the range, both included; None where there is no end.
         unit: of the value; empty for counts and shares.
@@ -118,7 +118,7 @@ def from_dict(cls: type[T], values: Any, path: str = "") -> T:
         ConfigError: a name that the dataclass does not have, a value of another type or out of range, or a missing one.
     """
     if not isinstance(values, Mapping):
-        where = f" under {path}" if path else ""
+        where = f" under {path.rstrip('.')}" if path else ""
         raise ConfigError(f"a mapping of settings{where}", repr(values), "write `name: value` lines")
     known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
     unknown = [str(name) for name in values if name not in known]

@@ -25,7 +25,7 @@ from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import pyramid, stage_radii, target_frame
 from gapr_core.pages.markdown import table
 from gapr_core.runtime.arguments import at_least_one
-from gapr_core.runtime.console import say
+from gapr_core.runtime.console import exit_code, say
 
 Array = NDArray[np.float64]
 Counts = list[NDArray[np.int64]]  # of each stage: points in every ball, however many there are
@@ -91,4 +91,4 @@ def _rows(bone: str, sizes: Counts, config: ModelConfig) -> list[list[str]]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(exit_code(main, "python -m gapr_core.training.balls"))

@@ -65,6 +65,8 @@ class TrainConfig(Settings):
         super().__post_init__()
         if self.batch % self.micro_batch:
             raise ConfigError("a batch of whole micro-batches", f"{self.batch} and {self.micro_batch}", "make them fit")
+        if not self.bones:
+            raise ConfigError("bones to train on", "none", "name some in `bones`")
 
     def network(self) -> ModelConfig:
         """What is trained: `model` with `model_settings` over it."""

@@ -35,7 +35,11 @@ LANES = 4  # the bone of a pair and its micro-batch have numbers that are the sa
 
 
 class People:
-    """Bones of one type: subjects of the split, and new ones from their shape model; parametric where there is none."""
+    """Bones of one type: subjects of the split, and new ones from their shape model; parametric where there is none.
+
+    Raises:
+        ConfigError: neither meshes of the split nor a parametric model.
+    """
 
     def __init__(self, bone: str, folder: Path | None, split: str) -> None:
         self.bone, self.split = bone, split
@@ -91,7 +95,7 @@ class TrainingPairs(Dataset[TrainingPair]):
     ) -> None:
         check_mix(train.mix)
         self.train, self.model, self.cache = train, model, cache
-        self.people = [People(bone, folder, split) for bone in available(train.bones, folder)]
+        self.people = [People(bone, folder, split) for bone in train.bones]
         self.protocols = list(train.mix)
         self.weights = np.array([train.mix[p] for p in self.protocols]) / sum(train.mix.values())
         self._pool: OrderedDict[int, PooledBone] = OrderedDict()
@@ -189,11 +193,6 @@ def check_mix(mix: Mapping[str, float]) -> None:
 def prune(folder: Path, train: TrainConfig, pairs: int) -> None:
     """Delete what the cache holds for pairs before number `pairs`."""
     bone_cache.prune(folder, pairs // train.reuse)
-
-
-def available(bones: tuple[str, ...], folder: Path | None) -> list[str]:
-    """The bones that there are meshes or a parametric model of."""
-    return [b for b in bones if b in parametric.BONES or (folder and anatomy.surfaces(folder, b))]
 
 
 def one_thread(worker: int) -> None:

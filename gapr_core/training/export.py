@@ -16,7 +16,7 @@ import torch
 from gapr_core.errors import WeightsError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
-from gapr_core.runtime.console import say
+from gapr_core.runtime.console import exit_code, say
 
 LICENCES = {
     "femur, tibia, pelvis (llp26)": "MAP client plug-in fieldworklowerlimb2sidegenerationstep, Apache-2.0",
@@ -85,4 +85,4 @@ def mean_of(networks: list[GAPRNet]) -> GAPRNet:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(exit_code(main, "python -m gapr_core.training.export"))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 
 class Conflicts:
@@ -32,3 +33,8 @@ class Conflicts:
         """Those that last, in the order in which their kinds were first seen."""
         now = time.monotonic()
         return tuple(text for kind, text in self._texts.items() if text and now < self._until[kind])
+
+
+def names_of(publishers: Iterable[Any]) -> str:
+    """The full names of the nodes that publish, with commas, from what the graph says of each publisher."""
+    return ", ".join(f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in publishers)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 LOST_IN_A_ROW = 20  # a larger gap may be another publisher that was not heard before
+MOST_PUBLISHERS = 8  # whose numbers are kept
 DOUBTED = 100  # numbers after a jump, in which one that was missed shows that it came from somebody else
 
 
@@ -29,8 +30,6 @@ class Gaps:
     that comes after it was missed shows that there are two publishers, and no gap.
     """
 
-    MOST_PUBLISHERS = 8
-
     def __init__(self) -> None:
         self._heard: list[Sender] = []  # the one heard last at the end
 
@@ -45,7 +44,7 @@ class Gaps:
         before = max((sender for sender in self._heard if sender.last < number), key=lambda s: s.last, default=None)
         missing = 0 if before is None else number - before.last - 1
         if before is None or (missing > LOST_IN_A_ROW and len(self._heard) < publishers):
-            kept = min(max(publishers, 1), self.MOST_PUBLISHERS)
+            kept = min(max(publishers, 1), MOST_PUBLISHERS)
             self._heard = [*self._heard, Sender(number)][-kept:]
             return -mistaken
         if missing:

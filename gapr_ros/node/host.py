@@ -1,4 +1,4 @@
-"""What a room of the node may ask of the node: six things, and nothing else."""
+"""What a part of the node may ask of the node: six members, and nothing else."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gapr_ros.parameters import NodeParameters
 
 
 class Host(Protocol):
-    """The node, as its rooms see it.
+    """The node, as its parts see it.
 
     Attributes:
         parameters: as they are now.

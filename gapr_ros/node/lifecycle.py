@@ -76,7 +76,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
 
     @property
     def ros(self) -> RegisterNode:
-        """The node itself, as its rooms advertise and subscribe with it."""
+        """The node itself, as its parts advertise and subscribe with it."""
         return self
 
     @property

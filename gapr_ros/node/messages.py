@@ -109,7 +109,7 @@ def vision_types() -> Any | None:
 
 
 def _metres(length_mm: float | None) -> float | None:
-    return None if length_mm is None else wire.metres_from_mm(length_mm)
+    return None if length_mm is None else wire.to_metres(length_mm)
 
 
 def _with_x(direction: Array) -> Array:

@@ -233,7 +233,7 @@ def _check_precision(result: RegistrationResult, most_m: float) -> None:
     """Refuse a pose whose error over the bone is not bounded by `max_tre`; a method that gives no bound has none."""
     if most_m <= 0.0:
         return
-    bound_m = wire.metres_from_mm(np.inf if result.tre95_mm is None else result.tre95_mm)
+    bound_m = wire.to_metres(np.inf if result.tre95_mm is None else result.tre95_mm)
     if not bound_m <= most_m:
         text = f"the 95 % bound of the error over the bone is {bound_m:.3g} m, max_tre is {most_m:g} m"
         raise RefusedError(Reason.IMPRECISE, text)

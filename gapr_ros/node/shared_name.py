@@ -6,7 +6,7 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
-from gapr_ros.node.conflicts import Conflicts
+from gapr_ros.node.conflicts import Conflicts, names_of
 from gapr_ros.node.guard import guarded
 from gapr_ros.node.host import Host
 
@@ -51,6 +51,5 @@ class SharedName:
         if self._host.ros.count_publishers(topic) <= 1:
             return ""
         found = self._host.ros.get_publishers_info_by_topic(topic)
-        names = ", ".join(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in found)
-        text = f"{len(found)} publishers on {topic} ({names}): its poses may be those of another bone"
+        text = f"{len(found)} publishers on {topic} ({names_of(found)}): its poses may be those of another bone"
         return f"{text}; give each node a name or a namespace of its own"

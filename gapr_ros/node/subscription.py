@@ -11,6 +11,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
+from gapr_ros.node.conflicts import names_of
 from gapr_ros.node.diagnostics import Input
 from gapr_ros.node.gaps import Gaps
 from gapr_ros.node.guard import guarded
@@ -71,8 +72,7 @@ class Subscriptions:
         others = {p.topic_type for p in publishers} - {_type_name(kind)}
         text = f"a publisher of {topic} sends {', '.join(sorted(others))}, cloud_type is {kind}: nothing of it comes"
         self._session.conflicts.note("type", text if others else "")
-        names = ", ".join(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
-        text = f"{len(publishers)} publishers on {topic} ({names}): a node follows one source of clouds"
+        text = f"{len(publishers)} publishers on {topic} ({names_of(publishers)}): a node follows one source of clouds"
         self._session.conflicts.note("publishers", text if len(publishers) > 1 else "")
         if any(p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for p in publishers):
             self._needed_at = time.monotonic()

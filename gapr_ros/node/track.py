@@ -1,4 +1,4 @@
-"""What the node remembers from cloud to cloud: the last pose, how many good ones in a row, the seed from outside."""
+"""What the node remembers from cloud to cloud: the last pose of each frame, and how many good ones came in a row."""
 
 from __future__ import annotations
 

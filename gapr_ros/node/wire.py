@@ -5,12 +5,15 @@ The target is the model (pre-operative bone), the source is the cloud: T_cloud_m
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
+Length = TypeVar("Length", Array, float)
 MM_PER_M = 1000.0
 MM_PER_UNIT = {"m": MM_PER_M, "mm": 1.0}
 
@@ -20,14 +23,9 @@ def to_mm(points: Array, unit: str) -> Array:
     return points * MM_PER_UNIT[unit]
 
 
-def to_metres(points_mm: Array) -> Array:
-    """Points in mm as metres."""
-    return points_mm / MM_PER_M
-
-
-def metres_from_mm(length_mm: float) -> float:
-    """A length in mm as metres."""
-    return length_mm / MM_PER_M
+def to_metres(lengths_mm: Length) -> Length:
+    """Points, or one length, in mm as metres."""
+    return lengths_mm / MM_PER_M
 
 
 def moved_mm(T: Array, points_mm: Array) -> Array:

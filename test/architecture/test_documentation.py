@@ -7,22 +7,28 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from gapr_core import baselines
+from gapr_core import baselines, cli, load
 from gapr_core.benchmark import methods
 from gapr_core.cli import main
+from gapr_core.config import SensorConfig
 from gapr_core.data import parametric, pool
 from gapr_core.data.protocols import PROTOCOLS, make_pair
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats import reading
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.encoding import TRANSFORMERS
 from gapr_core.model.network import GAPRNet
+from gapr_core.registration import sensor
 from gapr_core.results import RegistrationStatus
 from gapr_ros.demo.act import write_stl
 from gapr_ros.node.refusal import Reason
@@ -140,6 +146,24 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(page, here):
     CHECKS.get(name_of(page), lambda names: None)(names)
 
 
+def sensor_errors_are_usable(errors, monkeypatch):
+    """Whether registrations with a sensor of these errors have what its covariance needs."""
+    monkeypatch.setitem(sensor.KINDS, "laser", errors)
+    return sensor.errors(SensorConfig("laser", noise_mm=0.7), 1000) == replace(errors, noise_mm=0.7)
+
+
+def off_files_are_read(read, folder, monkeypatch):
+    """Whether a reader that is entered as the recipe says reads whole files, and refuses cut ones in one line."""
+    monkeypatch.setitem(sys.modules, "gapr_core.formats.meshes.off", SimpleNamespace(read=read))
+    monkeypatch.setitem(reading.FORMATS, ".off", reading.Format("meshes.off:read"))
+    whole = "OFF\n4 2 0\n0 0 0\n50 0 0\n0 40 0\n0 0 30\n3 0 1 2\n3 0 1 3\n"
+    (folder / "a.off").write_text(whole)
+    (folder / "cut.off").write_text(whole.removesuffix("3 0 1 3\n"))
+    with pytest.raises(InvalidPointCloudError, match="a readable OFF file; got cut.off .5 lines where 4 points and 2"):
+        load(folder / "cut.off")
+    return load(folder / "a.off").faces.tolist() == [[0, 1, 2], [0, 1, 3]]
+
+
 def test_the_recipes_of_contributing_work(here, monkeypatch):
     names = {}
     for block in blocks(CONTRIBUTING):
@@ -153,6 +177,8 @@ def test_the_recipes_of_contributing_work(here, monkeypatch):
         result = method.register(pair.source, method.prepare(pair.target))
         assert result.ok or result.reason
     assert result.proposer == "centroids"
+    assert sensor_errors_are_usable(names["tracked_camera"], monkeypatch)
+    assert off_files_are_read(names["read"], here, monkeypatch)
     message = names["polygon"]([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
     assert message.header.frame_id
     assert names["INPUT"].points(message).tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
@@ -207,6 +233,15 @@ def test_the_options_that_the_pages_show_exist(capsys):
         missing = {word for word in words if word.startswith("--") and not re.search(rf"{word}\b", text)}
         assert not missing, f"{page}: {program} {name}"
     assert {"register", "evaluate", "benchmark", "make-pairs"} <= set(helps)
+
+
+def test_the_commands_that_the_pages_show_name_all_that_is_required():
+    """But for the pages of results, which quote what was run then, and lines that leave something out."""
+    shown = [words for page, (program, *words) in commands() if program == "gapr" and "docs/results" not in page]
+    whole = [words for words in shown if "..." not in words and "--help" not in words]
+    for words in whole:
+        assert cli._parser(words).run, words
+    assert len(whole) > 20
 
 
 def test_every_link_leads_to_a_file_of_the_repository():

@@ -25,6 +25,11 @@ def test_three_landmarks_are_enough_and_their_misfit_is_reported():
     assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(1.0)
 
 
+def test_the_misfit_is_the_root_mean_square_of_the_distances_of_the_pairs():
+    square = np.array([[30.0, 30.0, 0.0], [-30.0, 30.0, 0.0], [-30.0, -30.0, 0.0], [30.0, -30.0, 0.0]])
+    assert paired_pose(square, 1.1 * square).rms_mm == pytest.approx(3.0 * np.sqrt(2.0))  # 3 mm along x and along y
+
+
 def test_mirrored_landmarks_give_a_rotation_and_a_large_misfit():
     found = paired_pose(POINTS, POINTS * [1.0, 1.0, -1.0])
     assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(1.0)
@@ -36,6 +41,10 @@ def test_mirrored_landmarks_give_a_rotation_and_a_large_misfit():
     [
         (POINTS[:2], POINTS[:2]),
         (POINTS, POINTS[:3]),
+        (POINTS[:3], POINTS),
+        (POINTS[None], POINTS[None]),
+        (np.tile(POINTS, 2)[:, :4], POINTS),
+        (POINTS * [1.0, 0.02, 0.02] + [900.0, -400.0, 70.0], POINTS),
         (POINTS[:, :2], POINTS[:, :2]),
         (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), POINTS),
         (np.full((4, 3), np.nan), POINTS),

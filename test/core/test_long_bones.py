@@ -42,6 +42,12 @@ def test_two_long_bones_are_found_with_their_lengths(surface):
     assert len(lengths) == 2 and all(300.0 < length < 520.0 for length in lengths)
 
 
+@pytest.mark.parametrize(("count", "found"), [(3, 3), (4, 4), (5, 0)])
+def test_up_to_four_long_bones_are_found_and_more_are_a_hand_or_a_foot(count, found):
+    lengths = lengths_of(joined(*(moved(TIBIA, (90.0 * number, 0.0, 0.0)) for number in range(count))))
+    assert len(lengths) == found and np.ptp([350.0, *lengths]) < 2.0
+
+
 @pytest.mark.parametrize(
     "surface",
     [

@@ -89,6 +89,12 @@ def test_files_in_lps_of_a_bone_that_is_turned_to_ras_are_refused(folder, capsys
     assert f"--axes lps or ras with {option.split()[0]}, which is LPS" in capsys.readouterr().err
 
 
+def test_axes_may_be_named_in_capitals(folder, caplog, capsys):
+    assert register("--out pose.tfm --axes RAS") == 0 and "give --axes ras" not in caplog.text
+    assert register("--axes SRA") == 1
+    assert "one of auto, lps, as_is, ras, lps_to_ras; got 'sra'; name one of them" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("source", "is_known"), [
     ("s.npy", False), ("bone.ply", False), ("sweep", False), ("lps.ply", True), ("ras.ply", True), ("p.mrk.json", True),
 ])  # fmt: skip

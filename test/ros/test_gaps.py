@@ -8,7 +8,7 @@ from harness import node_in_thread, wait_until
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from gapr_ros.node.gaps import DOUBTED, LOST_IN_A_ROW, Gaps
+from gapr_ros.node.gaps import DOUBTED, LOST_IN_A_ROW, MOST_PUBLISHERS, Gaps
 from msg_adapters import xyz_to_cloud
 
 GOOD = np.random.default_rng(1).normal(size=(300, 3)).astype("f4") * 0.02
@@ -60,7 +60,7 @@ def test_publishers_that_came_and_went_are_forgotten():
     gaps = Gaps()
     for start in range(1000, 0, -10):
         gaps.note(start, 100)
-    assert len(gaps._heard) == Gaps.MOST_PUBLISHERS
+    assert len(gaps._heard) == MOST_PUBLISHERS
     gaps.note(0, 0)
     assert len(gaps._heard) == 1, "the last one is gone before its last cloud is taken"
 

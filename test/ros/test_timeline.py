@@ -53,6 +53,14 @@ def test_a_cloud_from_the_future_leaves_no_trace():
     assert judged(timeline, 100.2, now_s=100.2) is False
 
 
+def test_a_cloud_is_too_old_beyond_the_limit_and_not_within_it():
+    assert judged(Timeline(), 99.1, now_s=100.0, max_cloud_age=1.0) is False
+    assert judged(Timeline(), 98.9, now_s=100.0, max_cloud_age=1.0) is Reason.STALE
+    assert judged(Timeline(), 1.0, now_s=100.0, max_cloud_age=0.0) is False, "0 is off"
+    assert judged(Timeline(), 0.0, now_s=100.0, max_cloud_age=1.0) is False, "it has no stamp"
+    assert judged(Timeline(), 1.0, now_s=0.0, max_cloud_age=1.0) is False, "the clock does not run yet"
+
+
 def test_a_cloud_that_is_old_by_age_leaves_no_trace():
     timeline = Timeline()
     assert judged(timeline, 100.0, now_s=100.0) is False

@@ -29,6 +29,11 @@ def test_points_are_converted_by_their_unit():
     np.testing.assert_array_equal(wire.to_mm(np.ones((1, 3)), "mm"), np.ones((1, 3)))
 
 
+def test_lengths_and_points_are_converted_to_metres():
+    assert wire.to_metres(2500.0) == 2.5
+    np.testing.assert_array_equal(wire.to_metres(np.full((1, 3), 10.0)), np.full((1, 3), 0.01))
+
+
 def random_covariance(rng, translation_mm=0.5, rotation=2e-3):
     root = rng.normal(size=(6, 6)) * np.array([translation_mm] * 3 + [rotation] * 3)[:, None]
     return root @ root.T
@@ -77,6 +82,11 @@ def test_the_wired_covariance_is_symmetric_and_positive_definite_with_its_floors
 def test_points_in_mm_are_moved_by_a_transform_in_metres():
     T = se3.from_rotation_translation(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, -0.5])
     np.testing.assert_allclose(wire.moved_mm(T, np.array([[10.0, 20.0, 30.0]])), [[980.0, 10.0, -470.0]], atol=1e-12)
+
+
+def test_no_error_at_all_becomes_the_floors():
+    floored = wire.floor_covariance(np.zeros((6, 6)), 1e-4, 1e-3)
+    np.testing.assert_allclose(floored, np.diag([1e-8] * 3 + [1e-6] * 3), rtol=1e-12)
 
 
 def test_a_covariance_above_its_floors_is_not_touched():

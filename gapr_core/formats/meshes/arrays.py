@@ -11,16 +11,18 @@ import numpy as np
 from numpy.lib import format as npy
 
 from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface, as_points
 
 
-def read_npy(path: Path, limits: FileLimits) -> Surface:
+def read_npy(path: Path, options: ReadOptions) -> Surface:
     """An (N, 3) array."""
-    return Surface(as_points(array_of(limits.read(path), limits)))
+    return Surface(as_points(array_of(options.limits.read(path), options.limits)))
 
 
-def read_npz(path: Path, limits: FileLimits) -> Surface:
+def read_npz(path: Path, options: ReadOptions) -> Surface:
     """The arrays `points` (N, 3) and, where there is one, `faces` (F, 3) integers."""
+    limits = options.limits
     with zipfile.ZipFile(io.BytesIO(limits.read(path))) as archive:
         names = {name.removesuffix(".npy"): name for name in archive.namelist()}
         if "points" not in names:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.formats import text
-from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.meshes.polygons import fans
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
 
 log = logging.getLogger(__name__)
@@ -21,13 +21,13 @@ ANNOUNCED = re.compile(r"#.*?(vertices|triangles|faces)\s*:\s*(\d+)\s*$", re.IGN
 FEWEST_USED = 0.95  # share of the vertices that belong to a face; the file ends too early, where fewer do
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """A mesh. The format says nothing of its own length, so a file without faces or with unused vertices is refused.
 
     A cut at the end of a line that leaves every vertex with a face cannot be known: an open mesh is logged.
     """
     vertices, corners, ends, announced = array("d"), array("q"), array("q", [0]), {}
-    for line in text.lines(limits.read(path)):
+    for line in text.lines(options.limits.read(path)):
         kind, rest = (*line.split(None, 1), "", "")[:2]
         if kind == "v":
             vertices.extend(_coordinates(rest))
@@ -36,7 +36,7 @@ def read(path: Path, limits: FileLimits) -> Surface:
             ends.append(len(corners))
         elif found := ANNOUNCED.match(line):
             announced[found[1].lower()] = int(found[2])
-    limits.check_counts(len(vertices) // 3, len(corners))
+    options.limits.check_counts(len(vertices) // 3, len(corners))
     surface = Surface(np.array(vertices).reshape(-1, 3), fans(np.array(ends), np.array(corners)))
     _check_whole(surface, len(ends) - 1, announced)
     if not announced and (open_edges := _open_edges(surface.triangles)):

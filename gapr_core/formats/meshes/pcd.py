@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gapr_core.formats import text
-from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry import pinhole
 from gapr_core.surface import Array, Surface
 
@@ -19,8 +19,9 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # VIEWPOINT: translation, then t
 KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """A cloud, with its normals where all three components are there, and its camera where it is an image that says."""
+    limits = options.limits
     data = limits.read(path)
     header, start = _header(data)
     count, fields = _whole(header, "POINTS"), _fields(header)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gapr_core.formats import text
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.meshes.polygons import fans
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
 BYTES = {
@@ -27,10 +28,10 @@ CORNERS = ("vertex_indices", "vertex_index")
 MOST_LISTS = 3  # of one element: vertices, texture coordinates, and one more
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """A mesh, or a cloud with its normals."""
-    data = limits.read(path)
-    _check_header(data, limits)
+    data = options.limits.read(path)
+    _check_header(data, options.limits)
     ply = _parse(data)
     columns = ply["vertex"].data
     points = _columns(columns, "xyz")

@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from gapr_core.formats import text
-from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
 HEADER_BYTES, FACET_BYTES = 84, 50
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """Vertices that facets share become one."""
-    data = limits.read(path)
+    data = options.limits.read(path)
     if len(data) < HEADER_BYTES and not data.lstrip().startswith(b"solid"):
         raise ValueError(f"{len(data)} bytes, less than a header")
     facets = int.from_bytes(data[80:84], "little")
     if len(data) == HEADER_BYTES + FACET_BYTES * facets:
-        limits.check_counts(0, facets)
+        options.limits.check_counts(0, facets)
         corners = np.frombuffer(data, FACET, offset=HEADER_BYTES)["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid":
         corners = _corners_of_text(data)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.meshes.polygons import fans, offsets_of_counted, strips
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
 TYPES = {
@@ -23,19 +24,19 @@ DONE = ("POINT_DATA", "CELL_DATA")
 CLOUD = "save a cloud as PLY, NPY or VTP, or with VERTICES; export a mesh again"
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """A mesh; a cloud has its points as VERTICES.
 
     Raises:
         InvalidPointCloudError: points without cells, as those of a mesh that is cut.
         ValueError: a file that is damaged or cut.
     """
-    file = _File(limits.read(path), limits)
+    file = _File(options.limits.read(path), options.limits)
     points, cells = np.empty((0, 3)), {}
     while (words := file.words()) and words[0] not in DONE:
         if words[0] == "POINTS":
             (count,) = _counts(words, 3, 1)
-            limits.check_counts(count)
+            options.limits.check_counts(count)
             points = file.numbers(3 * count, words[2]).reshape(-1, 3)
         elif words[0] in CELLS:
             first, second = _counts(words, 3, 1, 2)

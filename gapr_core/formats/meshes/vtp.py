@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.meshes.polygons import fans, strips
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
 TYPES = {f"{name}{8 * n}": f"{letter}{n}" for name, letter in (("Int", "i"), ("UInt", "u")) for n in (1, 2, 4, 8)}
@@ -24,9 +25,9 @@ DECOMPRESSORS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompre
 RAW = re.compile(rb'<AppendedData\s+encoding="raw"\s*>\s*_')
 
 
-def read(path: Path, limits: FileLimits) -> Surface:
+def read(path: Path, options: ReadOptions) -> Surface:
     """A mesh, or a cloud where it has no polygons: XML says its own end, so that a cut file is no cloud."""
-    file = _File(limits.read(path), limits)
+    file = _File(options.limits.read(path), options.limits)
     points, faces, start = [], [], 0
     for piece in file.pieces():
         count = int(piece.get("NumberOfPoints", "0"))
@@ -37,7 +38,7 @@ def read(path: Path, limits: FileLimits) -> Surface:
     if not points:
         raise ValueError("no piece in it")
     joined = np.concatenate(faces)
-    limits.check_counts(start, len(joined))
+    options.limits.check_counts(start, len(joined))
     return Surface(np.concatenate(points), joined if len(joined) else None)
 
 

@@ -75,7 +75,7 @@ class KPConv(nn.Module):
         self.register_buffer("kernel", kernel_layout(), persistent=False)
 
     def forward(self, x: Tensor, pairs: LocalPairs) -> Tensor:
-        if self.places is surface_places and steps.fit(x, self.kernel):
+        if self.places is surface_places and steps.can_take(x, self.kernel):
             influence = steps.surface_influences(pairs.centres, pairs.support, pairs.hood, self.kernel, self.sigma)
         else:
             with torch.no_grad(), torch.autocast(x.device.type, enabled=False):

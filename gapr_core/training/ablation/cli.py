@@ -46,7 +46,6 @@ from gapr_core.runtime.parallel import end_with_parent
 from gapr_core.training import run_folder
 from gapr_core.training.ablation.table import FIGURES, folder_of, write
 from gapr_core.training.config import TrainConfig, Variant, default_plan, read_plan, trained_as
-from gapr_core.training.dataset import available
 from gapr_core.training.targets import training_pair
 from gapr_core.training.trainer import train
 from gapr_core.training.validation import inlier_ratios
@@ -86,9 +85,8 @@ def run(args: Namespace) -> int:
     """Train and examine what is missing, and say where the table is."""
     config = replace(TrainConfig.from_yaml(args.config) if args.config else TrainConfig(), pairs=args.pairs)
     plan = read_plan(args.plan or default_plan())
-    bones = tuple(available(config.bones, args.anatomy))
     origin = "anatomy" if args.anatomy else "parametric"
-    recipe = Recipe(tuple(args.protocols.split(",")), bones, args.count, 0, args.split, args.count, origin)
+    recipe = Recipe(tuple(args.protocols.split(",")), config.bones, args.count, 0, args.split, args.count, origin)
     missing = ablate(plan, config, args.out, args.anatomy, recipe, args.seeds, args.jobs, args.minutes, args.pose)
     say(f"table in {args.out / 'table.md'}" + (f"; {missing} networks are left, call again" if missing else ""))
     return 0

@@ -36,7 +36,7 @@ def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recip
     """table.md, table.json, table.csv and the curves of each table, from whatever is finished."""
     trained = trained_as(plan, config.model_settings)
     folders = {v: [folder_of(out, trained[v.model], seed) for seed in range(seeds)] for v in plan}
-    rows = [row(v, protocol, folders[v], recipe) for v in plan for protocol in _protocols(recipe)]
+    rows = [row(v, protocol, folders[v]) for v in plan for protocol in _protocols(recipe)]
     last = {v.table: v for v in plan}
     rivals = [v for v in plan if v is not last[v.table]]
     apart = [difference(v, last[v.table], protocol, folders) for v in rivals for protocol in _protocols(recipe)]
@@ -52,7 +52,7 @@ def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recip
     files.write_text(out / "table.md", markdown(rows, apart, pictures, settings))
 
 
-def row(variant: Variant, protocol: str, folders: Sequence[Path], recipe: Recipe) -> Record:
+def row(variant: Variant, protocol: str, folders: Sequence[Path]) -> Record:
     """Means over pairs and seeds with 95 % intervals over subjects; None where no seed is finished."""
     exams = [_records(folder, protocol) for folder in folders if (folder / "exam.json").exists()]
     chosen = [r for records in exams for r in records]

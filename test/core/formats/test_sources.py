@@ -356,6 +356,7 @@ MESH = (
     ("bone", "ras", LPS_RAS), ("bone", "lps_to_ras", LPS_RAS), ("bone", "lps", [1, 1, 1]),
     ("SPACE=RAS", "as_is", [1, 1, 1]), ("SPACE=RAS", "lps", [1, 1, 1]), ("SPACE=RAS", "ras", LPS_RAS),
     ("SPACE=LPS", "ras", LPS_RAS), ("SPACE=LPS", "lps_to_ras", LPS_RAS), ("SPACE=LPS", "as_is", [1, 1, 1]),
+    ("SPACE = RAS", "auto", LPS_RAS), ("SPACE =LPS", "lps_to_ras", LPS_RAS), ("SPACE", "auto", [1, 1, 1]),
 ])  # fmt: skip
 def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title, axes, factors):
     (tmp_path / "a.vtk").write_text(MESH.format(title))
@@ -558,10 +559,17 @@ def test_what_is_no_number_is_named_by_its_line(tmp_path, content, said):
 
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
 @pytest.mark.parametrize("ending", ["csv", "txt", "fcsv", "mrk.json", "obj", "ply", "pcd", "vtk", "stl", "igs.mha"])
-def test_utf_16_is_said_to_be_so(tmp_path, ending, encoding):
-    (tmp_path / f"a.{ending}").write_bytes(("\ufeffx,y,z\n" + 20 * "1,2,3\n").encode(encoding))
+@pytest.mark.parametrize("mark", ["\ufeff", ""])
+def test_utf_16_is_said_to_be_so(tmp_path, mark, ending, encoding):
+    (tmp_path / f"a.{ending}").write_bytes((f"{mark}x,y,z\n" + 20 * "1,2,3\n").encode(encoding))
     with pytest.raises(InvalidPointCloudError, match=f"UTF-8 text; got a.{ending}: UTF-16 text; save it as UTF-8"):
         reading.read(tmp_path / f"a.{ending}")
+
+
+def test_one_byte_of_zero_makes_no_utf_16(tmp_path):
+    (tmp_path / "a.txt").write_bytes(b"1 2 3\n\0 5 6\n")
+    with pytest.raises(InvalidPointCloudError, match="a number; got a.txt: text in column 1 of line 2"):
+        reading.read(tmp_path / "a.txt")
 
 
 UNCLEAR = {
@@ -619,7 +627,7 @@ def test_files_that_say_their_own_axes_are_not_turned_by_those_of_a_mesh(tmp_pat
     np.testing.assert_allclose(reading.read(path, ReadOptions(axes="lps_to_ras")).points, POINTS)
     with pytest.raises(ConfigError, match="ras for a.fcsv, which has its own"):
         reading.read(path, ReadOptions(axes="ras"))
-    with pytest.raises(ConfigError, match="axes auto lps"):
+    with pytest.raises(ConfigError, match="axes that are one of auto, lps"):
         reading.read(path, ReadOptions(axes="up"))
 
 

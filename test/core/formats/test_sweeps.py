@@ -95,6 +95,14 @@ def test_a_sequence_that_is_named_as_a_label_map_is_to_be_renamed(tmp_path, tip)
         reading.read(tmp_path / "a.mha", ReadOptions(tip_mm=tip))
 
 
+@pytest.mark.parametrize("name", ["a.nrrd", "a.igs.nrrd"])
+def test_a_sequence_as_nrrd_is_to_be_saved_as_mha(tmp_path, name):
+    (tmp_path / name).write_text("NRRD0004\ntype: unsigned char\nSeq_Frame0000_ProbeToTrackerTransform:=1 0 0 0\n\n")
+    said = f"a label map as .nrrd; got {name}, a recording by PLUS; save it as .igs.mha in PLUS, and give --tip"
+    with pytest.raises(InvalidPointCloudError, match=said):
+        reading.read(tmp_path / name, ReadOptions(tip_mm=(0.0, 0.0, 0.0)))
+
+
 def test_an_empty_sequence_is_called_empty_before_a_tip_is_asked_for(tmp_path):
     (tmp_path / "a.igs.mha").touch()
     with pytest.raises(InvalidPointCloudError, match=r"a\.igs\.mha \(0 bytes, an empty file\)"):

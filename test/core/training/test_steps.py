@@ -34,7 +34,7 @@ def with_tensors(monkeypatch):
     def call(work, *arguments):
         with monkeypatch.context() as patched:
             for module in USERS:
-                patched.setattr(module.steps, "fit", lambda *tensors: False)
+                patched.setattr(module.steps, "can_take", lambda *tensors: False)
             return work(*arguments)
 
     return call

@@ -122,6 +122,13 @@ def test_a_run_of_less_than_one_step_is_refused(settings, anatomy, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_bone_of_which_nothing_is_known_is_named_and_not_left_out(settings, anatomy, tmp_path):
+    with pytest.raises(ConfigError, match="a parametric model of horn; got neither; leave it out of `bones`"):
+        trainer.train(replace(settings, bones=(*settings.bones, "horn")), tmp_path / "run", anatomy)
+    with pytest.raises(ConfigError, match="bones to train on; got none"):
+        replace(settings, bones=())
+
+
 def test_a_protocol_that_the_network_never_sees_is_named(settings, anatomy):
     """Points far away span many times the target: such a share of the mix would silently be drawn as something else."""
     model = ModelConfig.from_yaml(settings.model)

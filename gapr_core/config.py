@@ -129,6 +129,7 @@ class CovarianceConfig(Settings):
             raise ConfigError("two or more ascending sizes_mm", str(self.sizes_mm), "name the smallest size first")
 
 
+# Each has an entry in `KINDS` of registration/sensor.py.
 SENSOR_KINDS = ("unknown", "pointer", "ultrasound", "depth_camera", "laser", "structured_light")
 
 

@@ -92,7 +92,7 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ConfigError("a folder with anatomy", f"{folder}, which is none", "name it with --anatomy")
+        raise ConfigError("a folder with anatomy", f"{folder}, which does not exist", "name it with --anatomy")
     sets = corresponded(folder, bone)
     specimens = [s for c in sets for s in c.specimens() if cohort in (None, c.cohort)]
     if cohort is not None and not specimens:
@@ -118,10 +118,12 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
     fixed seed (adding subjects changes it: write `splits.json` to freeze it).
 
     Raises:
-        ConfigError: no meshes there, or an unknown split.
+        ConfigError: no such folder, no meshes there, or an unknown split.
         InvalidPointCloudError: an unreadable file, one without faces, or one of a size that no bone has.
     """
     folder = Path(folder)
+    if not folder.is_dir():
+        raise ConfigError("a folder with meshes", f"{folder}, which does not exist", "check the path")
     flat, nested = _mesh_files(folder), {d.name: _mesh_files(d) for d in sorted(folder.glob("*")) if d.is_dir()}
     of_bone = {bone or folder.resolve().name: flat} if flat else {b: f for b, f in nested.items() if bone in (None, b)}
     specimens = [Specimen(load(f, units), b, f.stem, "meshes") for b, files in of_bone.items() for f in files]

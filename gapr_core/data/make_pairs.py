@@ -46,7 +46,9 @@ class Recipe:
     def __post_init__(self) -> None:
         unknown = [name for name in self.protocols if name not in PROTOCOLS]
         if unknown or not self.protocols:
-            raise ConfigError(f"protocols of {', '.join(PROTOCOLS)}", ", ".join(unknown) or "none", "choose of these")
+            raise ConfigError(
+                f"protocols among {', '.join(PROTOCOLS)}", ", ".join(unknown) or "none", "choose of these"
+            )
         if self.count < 1 or self.people < 1 or self.seed < 0 or not self.bones:
             raise ConfigError("count and subjects of at least 1, a seed from 0, a bone", str(self), "correct it")
 

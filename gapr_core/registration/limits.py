@@ -28,7 +28,7 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 
 NEARLY_ALL = 0.9  # share of the points
-ASKED = 1000  # points
+MOST_COMPARED = 1000  # points whose feet are looked at
 SAME_CONTACT_MM = 1.0
 DRAWS = 4096
 
@@ -71,13 +71,13 @@ def with_neighbours(assessment: Assessment) -> int:
     """How many points that count for the pose have another one within 6 mm, foot point to foot point.
 
     Points within a millimetre are one: a pointer that is held still sends the same contact again and again. Of many
-    points some `ASKED` are looked at, evenly taken: these are enough to say that they are not few.
+    points some `MOST_COMPARED` are looked at, evenly taken: these are enough to say that they are not few.
     """
     feet = assessment.fit.feet[assessment.fit.weights > 0.0]
     if not len(feet):
         return 0
     feet = feet[sampling.voxel_indices(feet, SAME_CONTACT_MM)]
-    asked = feet[:: max(1, len(feet) // ASKED)]
+    asked = feet[:: max(1, len(feet) // MOST_COMPARED)]
     return int((cKDTree(feet).query(asked, k=2)[0][:, 1] <= NEAR_MM[1]).sum())
 
 

@@ -104,9 +104,12 @@ class Registrar:
 
         Raises:
             MethodUnavailableError: torch is not installed; `Registrar()` works without.
-            ConfigError: no such device.
+            ConfigError: no such device, or something else than a `RegistrarConfig`.
         """
-        config = config or RegistrarConfig()
+        config = RegistrarConfig() if config is None else config
+        if not isinstance(config, RegistrarConfig):
+            how = "pass RegistrarConfig(...); weights of your own go into NetworkProposer.from_weights"
+            raise ConfigError("a RegistrarConfig", repr(config), how)
         return cls(config, (shipped_network(device), _search(config)))
 
     @cached_property

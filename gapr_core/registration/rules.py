@@ -61,7 +61,7 @@ def by_geometry(
 
 
 def asking_the_unit(refusal: Refusal, source: Array, target: Array) -> Refusal:
-    """The refusal; of a cloud that shows too little, and would have the bone's size in another unit, it asks for that.
+    """The refusal; where the cloud would have the bone's size in another unit, it also asks for the unit.
 
     A short scan of a long bone is as small as a whole one in cm that is taken for mm: no rule can tell them apart.
 

@@ -227,3 +227,8 @@ GOLDEN_POINTS = {
     "paper": [[28.87, 115.43, -87.58], [44.43, 97.72, -51.10], [24.47, 127.45, -102.36]],
     "L2": [[-4.15, -48.02, 58.96], [-58.42, -27.72, 51.82], [-30.27, -25.81, 28.71]],
 }
+
+
+def test_meshes_in_a_folder_that_does_not_exist_are_named_as_such(tmp_path):
+    with pytest.raises(ConfigError, match="expected a folder with meshes; got .*nowhere, which does not exist"):
+        anatomy.meshes(tmp_path / "nowhere")

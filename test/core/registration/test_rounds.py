@@ -164,6 +164,11 @@ def test_what_a_stream_may_still_accept_is_checked_against_its_image_and_correct
     assert done == (["mirror", "bias"] if is_checked else [])
 
 
+def test_a_path_in_place_of_the_settings_names_where_weights_go():
+    with pytest.raises(ConfigError, match=r"expected a RegistrarConfig; got 'net.safetensors'; .*from_weights"):
+        Registrar.from_pretrained("net.safetensors")
+
+
 @pytest.mark.parametrize("name", ["gapr", "gapr_search", "gapr_network", "gapr_tracker"])
 def test_an_answer_and_a_refusal_name_their_method(pair, name):
     method = methods.make(name, ONE_THREAD)

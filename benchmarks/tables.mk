@@ -39,6 +39,8 @@ of_mix-pointer    = --protocol pointer --count 26 --seed 3 $(FOUR)
 of_mix-ultrasound = --protocol ultrasound --count 26 --seed 3 $(FOUR)
 of_mix-laser      = --protocol laser --count 24 --seed 3 $(FOUR)
 of_fresh          = --protocol structured-light,stereo,photogrammetry,covered,moving --count 16 --seed 3 $(FOUR)
+of_traced         = --protocol tracing --count 24 --seed 3 $(FOUR)
+of_traced-named   = $(of_traced)
 of_few-pointer    = --protocol pointer-50 --count 24 --seed 5 $(FOUR)
 of_few-ultrasound = --protocol ultrasound-4 --count 24 --seed 5 $(FOUR)
 of_few-femora     = --protocol L3 --bones femur --split test --count 96 --seed 5
@@ -48,12 +50,14 @@ sensor_mix-depth = depth_camera
 sensor_mix-pointer = pointer
 sensor_mix-ultrasound = ultrasound
 sensor_mix-laser = laser
+sensor_traced-named = pointer
 sensor_few-pointer = pointer
 sensor_few-ultrasound = ultrasound
 
 # Tables that `gapr benchmark` writes, that benchmarks/trust.py makes of its records, and of scripts
 BENCHMARKS := one_sided clean scenes scene_stereo scene_joint scene_table scene_variants scene_wrong scene_wrong_stereo scene_image
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
+TRACED     := traced traced-named
 FEW        := $(addprefix few-,pointer ultrasound femora)
 SCRIPTS    := strangers mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described \
               guidance hollow unknowable proposals proposals_clean viewpoint viewpoint_wrong
@@ -76,11 +80,12 @@ WRONG                     := scene_wrong scene_wrong_stereo
 made_by_viewpoint_wrong   = viewpoint.py --pairs $(WRONG:%=$(OUT)/pairs/%) --ways inferred
 made_by_mix               = trust.py $(MIX:%=$(OUT)/bench/%) --plot $(OUT)/figures/reliability.png
 made_by_mix_fresh         = trust.py $(OUT)/bench/fresh
+made_by_tracing           = trust.py $(TRACED:%=$(OUT)/bench/%)
 made_by_few               = trust.py $(FEW:%=$(OUT)/bench/%)
 made_by_real_pieces       = real.py $(REAL:%=--real %)
 made_by_real_pieces_described = $(made_by_real_pieces) --sensor depth_camera
 
-ALL  := $(BENCHMARKS) mix mix_fresh few $(SCRIPTS)
+ALL  := $(BENCHMARKS) mix mix_fresh tracing few $(SCRIPTS)
 done  = $(OUT)/done/$(1)
 
 .PHONY: all list real publish $(ALL)
@@ -93,6 +98,7 @@ $(ALL): %: $(call done,%)
 
 $(call done,mix): $(MIX:%=$(OUT)/bench/%/table.md)
 $(call done,mix_fresh): $(OUT)/bench/fresh/table.md
+$(call done,tracing): $(TRACED:%=$(OUT)/bench/%/table.md)
 $(call done,few): $(FEW:%=$(OUT)/bench/%/table.md)
 $(call done,proposals): $(OUT)/pairs/one_sided.txt
 $(call done,proposals_clean): $(OUT)/pairs/clean.txt

@@ -98,6 +98,21 @@ def is_beyond_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
     return residual_mm(assessment) > limits.noise_exceeded * np.hypot(noise_mm, limits.model_mm)
 
 
+def is_beyond_bias(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where near points share more than the smooth errors of the sensor that is named, and of a bone's model.
+
+    Noise averages out of it, so that of a precise sensor another subject's bone shows here first. It takes more points
+    than one average is of.
+    """
+    limits, kind = config.limits, config.sensor
+    enough = np.count_nonzero(assessment.fit.weights) > config.covariance.smooth_neighbours
+    if not enough or (kind.kind == "unknown" and kind.bias_mm is None):
+        return False
+    known = sensor.errors(kind, len(assessment.source.points))
+    expected_mm = np.sqrt(known.bias_mm**2 + known.local_mm**2 + limits.model_bias_mm**2)
+    return bool(assessment.uncertainty.smooth_mm > limits.bias_exceeded * expected_mm)
+
+
 def residual_mm(assessment: Assessment) -> float:
     """Root mean square residual of the points that count for the pose, whose unknowns count; infinite without any."""
     signed = assessment.fit.signed_mm[assessment.fit.weights > 0.0]
@@ -141,6 +156,12 @@ LIMITS = (
         is_beyond_noise,
         "the residuals are far larger than the noise of the sensor; check that it is this subject's bone, and what is "
         "said of the sensor",
+    ),
+    Limit(
+        "beyond_bias",
+        is_beyond_bias,
+        "near points err alike, by more than the smooth error of the sensor; check that it is this subject's bone, and "
+        "what is said of the sensor (bias_mm)",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),

@@ -120,6 +120,27 @@ def test_residuals_far_beyond_the_noise_of_a_sensor_may_be_of_another_bone(made,
     assert list(found.contributions)[-1] == "beyond_noise"
 
 
+@pytest.mark.parametrize(
+    ("sensor", "squares"),
+    [({"kind": "laser"}, 0.15**2), ({"bias_mm": 0.3}, 0.3**2), ({"kind": "ultrasound"}, 0.2**2 + 0.3**2)],
+)
+def test_what_near_points_share_beyond_a_sensor_may_be_of_another_bone(made, sensor, squares):
+    """At most 1.5 times the root of the squares of smooth and local error, and of 0.1^2 (a model of a bone)."""
+    most = 1.5 * np.sqrt(squares + 0.1**2)
+
+    def sharing(smooth_mm, count=1000):
+        answer = made(count)
+        return replace(answer, uncertainty=replace(answer.uncertainty, smooth_mm=smooth_mm))
+
+    for times, probability in ((0.99, SURE), (1.01, 0.89)):
+        found = limits.limited(sharing(times * most), named(**sensor))
+        assert found.probability == probability
+        assert limits.limited(sharing(times * most), RegistrarConfig()).probability == SURE  # nobody named a sensor
+    assert list(found.contributions)[-1] == "beyond_bias"
+    for count, holds in ((30, False), (31, True)):  # no more than one average is of
+        assert limits.is_beyond_bias(sharing(1.01 * most, count), named(**sensor)) is holds
+
+
 def test_no_pose_is_surer_than_its_covariance(made):
     loose = made(covariance=np.diag([2.0**2] * 3 + [1e-6] * 3))
     assert list(limits.limited(loose, RegistrarConfig()).contributions)[-1] == "uncertain"

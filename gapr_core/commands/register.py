@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
+NOT_NAMED = (
+    "the sensor is not named: an error of the whole cloud's place, such as a tracker's, is not in tre95 "
+    "(--set sensor.kind=...; docs/sensors.md)"
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -110,6 +114,8 @@ def run(args: Namespace) -> int:
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     code = _show(args, result, errors)
+    if result.tre95_mm is not None and config.sensor.kind == "unknown":
+        say(NOT_NAMED)
     if config.guide:
         _say_where_next(result, spots)
     _write(args, Registration(target, source.points, result, errors, spots))

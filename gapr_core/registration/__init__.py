@@ -9,7 +9,8 @@ Where to read on, in the order in which a source passes:
   of one point, `block_kernels` the normal equations of many, `kernels` a Gauss-Newton step, `fit_kernels` the weights.
 - `assessment` puts the answer together, of: `covariance` (with `bias_field`), `features` (with `mirror`, `other_size`,
   `roughness`), `confidence` (an `additive` model of the features), `rules` (what refuses a pose, however probable;
-  `checks` asks the costly ones), `limits` (what keeps it from being sure), `words` for all of these.
+  `checks` asks the costly ones), `limits` (what keeps it from being sure), `words` for all of these; `standoff` asks
+  a refused source for the radius of a tip.
 - `smooth_bias`, `precision` and `precision_model` correct what is accepted: its pose, and the error that is expected.
 - `guidance`: where to look next. `cortices`: bones whose model has an inner surface.
 

@@ -29,6 +29,7 @@ from gapr_core.registration.refinement import refine_fully, rest_on_whole
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.standoff import asking_the_standoff
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import verify
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
@@ -165,9 +166,9 @@ class Registrar:
         named = explained.named_clutter(limits.limited(assessment, self.config), self.config)
         inferred = assessment.inferred_viewpoint is not None
         asked = replace(self.config, min_confidence=self.config.least_inferred) if inferred else self.config
-        result = replace(answer(named, asked), guidance=guidance)
+        result = asking_the_standoff(answer(named, asked), named, self.config)
         clock.lap("assess")
-        return replace(result, method=self.name, stage_ms=clock.stages)
+        return replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages)
 
     @single_threaded_libraries
     def assess(

@@ -36,6 +36,12 @@ def test_register_prints_a_pose_and_writes_it_as_json(tmp_path, files, pair, cap
     assert rte_mm < 0.5 and rre_deg < 0.5
 
 
+def test_register_says_what_the_bound_leaves_out_while_the_sensor_is_not_named(files, capsys):
+    for more, said in (([], True), (["--set", "sensor.kind=laser"], False)):
+        assert cli.main(["register", *map(str, files), *more]) == 0
+        assert ("the sensor is not named" in capsys.readouterr().out) is said
+
+
 def test_a_refusal_exits_with_2_and_has_no_transform(tmp_path, files, capsys):
     np.save(tmp_path / "partial.npy", np.random.default_rng(0).uniform(0, 40, (500, 3)))
     assert cli.main(["register", *files, "--json", str(tmp_path / "out.json")]) == 2

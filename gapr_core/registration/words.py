@@ -35,6 +35,7 @@ WORDS = {
     "rival_margin": "lead over the next hypothesis of the scene",
     "sparse": "limit: few points, or points far apart, do not say whose bone it is",
     "beyond_noise": "limit: residuals far larger than the noise of the sensor",
+    "beyond_bias": "limit: near points err alike by more than the smooth error of the sensor",
     "uncertain": "limit: the covariance leaves the pose loose",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits

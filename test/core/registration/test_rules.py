@@ -86,7 +86,7 @@ def test_what_was_not_observed_is_uncertain_and_not_exact():
     assert rules.is_loose(uncertainty)
     assert uncertainty.largest_shift_mm > 100.0 and uncertainty.largest_turn_deg > 100.0
     np.linalg.cholesky(uncertainty.covariance)
-    assert np.sqrt(uncertainty.covariance[2, 2]) < 0.5  # across the plane it is known
+    assert np.sqrt(uncertainty.covariance[2, 2]) < 0.6  # across the plane it is known, but for a pointer's stand-off
     nothing = estimate(fit_of_plane(weights=np.zeros(500)), CovarianceConfig())
     assert rules.is_loose(nothing)
 

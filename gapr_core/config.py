@@ -231,8 +231,9 @@ class LimitsConfig(Settings):
     )
     model_mm: float = setting(0.3, "standard deviation of the model of a bone", low=0, high=10, unit="mm")
     bias_exceeded: float = setting(
-        1.5, "smooth misfit over that of a named sensor and the model from which on they do not", low=0, high=100
+        1.25, "smooth misfit over that of a named sensor and the model from which on they do not", low=0, high=100
     )
+    shared_noise: float = setting(0.5, "share of a sensor's noise that near points may share", low=0, high=1)
     model_bias_mm: float = setting(0.1, "smooth error of the model of a bone", low=0, high=10, unit="mm")
     covered: float = setting(0.9, "least share of the covariance within 4 mm and 5 deg", low=0, high=1)
 

@@ -101,15 +101,16 @@ def is_beyond_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
 def is_beyond_bias(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True where near points share more than the smooth errors of the sensor that is named, and of a bone's model.
 
-    Noise averages out of it, so that of a precise sensor another subject's bone shows here first. It takes more points
-    than one average is of.
+    Noise averages out of it, but for what near points share of it, so that of a precise sensor another subject's bone
+    shows here first. It takes more points than one average is of.
     """
     limits, kind = config.limits, config.sensor
     enough = np.count_nonzero(assessment.fit.weights) > config.covariance.smooth_neighbours
     if not enough or (kind.kind == "unknown" and kind.bias_mm is None):
         return False
     known = sensor.errors(kind, len(assessment.source.points))
-    expected_mm = np.sqrt(known.bias_mm**2 + known.local_mm**2 + limits.model_bias_mm**2)
+    shared_mm = limits.shared_noise * known.noise_mm
+    expected_mm = np.sqrt(known.bias_mm**2 + known.local_mm**2 + shared_mm**2 + limits.model_bias_mm**2)
     return bool(assessment.uncertainty.smooth_mm > limits.bias_exceeded * expected_mm)
 
 

@@ -42,10 +42,15 @@ class Course:
         return self._track.place
 
     def begin_again(self, seed: Seed | None = None) -> None:
-        """Forget the track; clouds on their way will be refused, and none before is registered with new ones."""
+        """Forget the track; clouds on their way will be refused, and none before is registered with new ones.
+
+        With a seed, whose frame may never come, jumps are still measured against the poses before it until a good pose
+        was found from there.
+        """
         self.refuse_all()
         self.oldest, self.seed = self.epoch, seed
-        self._track.clear()
+        if seed is None:
+            self._track.clear()
 
     def refuse_all(self) -> None:
         """Clouds on their way will be refused, and say nothing about those to come."""
@@ -93,6 +98,8 @@ class Course:
         header, points_m = outcome.header, wire.to_metres(model.points_mm)
         self.timeline.check_answer(T_frame_model, header, points_m)
         cloud = timeline.stamp_ns(header) or hash(outcome.job.cloud)  # while no clock runs
+        if outcome.seeded:
+            self._track.forget_accepted()
         self._track.judge(T_frame_model, header.frame_id, points_m.mean(axis=0), cloud, parameters)
         self.timeline.note_answer(T_frame_model, header)
         self.seed = None

@@ -135,7 +135,8 @@ class Registration:
 
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
         initial = self._seeding.start(now.seed, partial(self._initial, outcome=outcome, now=now))
-        options = {} if initial is None else {"initial": initial}
+        outcome.seeded = initial is not None
+        options = {"initial": initial} if outcome.seeded else {}
         viewpoint_mm = self._viewpoint_mm(outcome, now)
         if viewpoint_mm is not None:
             options["viewpoint"] = viewpoint_mm

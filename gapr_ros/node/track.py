@@ -66,6 +66,10 @@ class Track:
         """A cloud was refused, or none was looked at: the row of good poses ends, and the bone may be elsewhere."""
         self._row, self._candidate, self.place = set(), None, None
 
+    def forget_accepted(self) -> None:
+        """The next good pose is no jump, wherever it is: it was found from where somebody says the bone is."""
+        self._accepted = {}
+
     def _check_jump(self, T_frame_model: Array, centre_m: Array, parameters: NodeParameters) -> None:
         accepted = self._accepted.get(self._frame)
         if accepted is None:

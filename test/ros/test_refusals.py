@@ -281,6 +281,24 @@ def test_a_seed_whose_frame_does_not_come_is_given_up_and_no_cloud_is_registered
     assert [call["initial"] for call in method.calls[registered:]] == [None]
 
 
+@pytest.mark.parametrize(("frame", "is_a_jump"), [("probe", False), ("map", True)])
+def test_a_jump_is_none_where_the_pose_was_found_from_a_seed_and_only_there(live, frame, is_a_jump):
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("max_jump_translation", value=0.01)])
+    expect_good(live)
+    wait_until(client.seeds.get_subscription_count)
+    client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id=frame)))
+    wait_until(lambda: node.session.course.seed)
+    method.answer = accepted(pose_mm([0, 0, 0], [30.0, 0, 0]))
+    if is_a_jump:
+        assert client.ask(GOOD)["last_refusal"].startswith("tf_missing: the initialpose is in map")
+        time.sleep(seeding.PATIENCE_S)
+        client.poses.clear()
+        assert client.ask(GOOD)["last_refusal"].startswith("jump: moved 0.03 m") and not client.poses
+    else:
+        expect_good(live)
+
+
 def test_a_seed_in_the_bones_own_frame_changes_nothing(live):
     node, client, method = live
     wait_until(client.seeds.get_subscription_count)

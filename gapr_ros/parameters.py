@@ -141,6 +141,9 @@ def plain(value: Any) -> Any:
 def remarks(parameters: NodeParameters) -> list[str]:
     """One sentence for each thing that was decided for the user, or that they may not expect."""
     sensor, sentences = parameters.sensor, []
+    if sensor == "unknown" and not parameters.settings_file:
+        missing = "an error of the whole cloud's place, such as a tracker's, is not in tre95"
+        sentences.append(f"sensor is not set: {missing}; set it to what measures the clouds")
     if sensor in TOGETHER and parameters.accumulate > 1:
         sentences.append(f"sensor {sensor}: the last {parameters.accumulate} clouds are registered as one")
     elif sensor in TOGETHER and not parameters.output_frame:

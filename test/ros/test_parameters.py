@@ -155,7 +155,7 @@ def test_live_parameters_change_while_running_and_the_others_say_how(blob_path, 
 @pytest.mark.parametrize(
     ("sensor", "output_frame", "accumulate", "together", "sentence"),
     [
-        ("unknown", "", 0, 1, ""),
+        ("unknown", "", 0, 1, "sensor is not set: an error of the whole cloud's place"),
         ("depth_camera", "tracker", 0, 1, ""),
         ("ultrasound", "reference", 0, 50, "the last 50 clouds are registered as one"),
         ("pointer", "reference", 0, 500, "the last 500 clouds are registered as one"),
@@ -177,6 +177,10 @@ def test_slices_and_touched_points_are_registered_together_where_the_bone_rests_
     node.close()
 
 
+def test_a_sensor_may_be_named_in_the_settings_of_the_library():
+    assert not parameters.remarks(parameters.NodeParameters(accumulate=1, settings_file="settings.yaml"))
+
+
 @pytest.mark.parametrize(
     ("low", "high", "said"),
     [
@@ -189,4 +193,4 @@ def test_slices_and_touched_points_are_registered_together_where_the_bone_rests_
 )
 def test_a_box_that_no_point_can_be_in_is_said_when_it_is_configured(low, high, said):
     remarks = parameters.remarks(parameters.NodeParameters(crop_min=low, crop_max=high))
-    assert ["crop_min" in remark for remark in remarks] == [True] * said
+    assert sum("crop_min" in remark for remark in remarks) == said

@@ -91,7 +91,8 @@ class Replay:
             self._node.destroy_publisher(publisher)
 
     def _advertise(self, connection: Connection) -> Any:
-        qos = recorded_qos(connection.ext.offered_qos_profiles)
+        of_ros2: Any = connection.ext
+        qos = recorded_qos(of_ros2.offered_qos_profiles)
         return self._node.create_publisher(self._bag.types[connection.msgtype], connection.topic, qos)
 
     def _wait_for_listeners(self) -> None:
@@ -126,13 +127,17 @@ class Replay:
                 if not self._node.context.ok():
                     break
                 if connection is None:
-                    self._clock.publish(Clock(clock=Time(nanoseconds=stamp_ns).to_msg()))
+                    self._tick(stamp_ns)
                     continue
                 self._publishers[connection.topic].publish(data)
                 sent += bar.update() is not False
                 if self._on_message:
                     self._on_message(connection.topic, stamp_ns)
         return sent
+
+    def _tick(self, stamp_ns: int) -> None:
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=Time(nanoseconds=stamp_ns).to_msg()))
 
     def _events(self) -> Iterator[tuple[int, Connection | None, bytes]]:
         """Messages and ticks of the clock, in the order of time."""

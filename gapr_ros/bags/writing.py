@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 from msg_adapters import xyz_to_cloud
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-BAG_VERSION = 9
+BAG_VERSION: Final = 9
 UNLIMITED = QosTime(2147483647, 4294967295)
 
 

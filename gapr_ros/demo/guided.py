@@ -146,7 +146,7 @@ def _steps(probe: LookingProbe, looks: Sequence[Look]) -> list[GuidedStep]:
             _line(number, look),
             se3.apply(probe.T_target_source, look.cloud),
             look.newest,
-            look.advice and (look.advice.points, look.advice.gain_mm, look.advice.centre),
+            (look.advice.points, look.advice.gain_mm, look.advice.centre) if look.advice else None,
         )
         for number, look in enumerate(looks, 1)
     ]
@@ -154,8 +154,9 @@ def _steps(probe: LookingProbe, looks: Sequence[Look]) -> list[GuidedStep]:
 
 def _bound_mm(look: Look) -> float:
     answer = look.answer
-    posed = answer is not None and answer.T_target_source is not None and answer.tre95_mm is not None
-    return float(answer.tre95_mm) if posed else float("nan")
+    if answer is None or answer.T_target_source is None or answer.tre95_mm is None:
+        return float("nan")
+    return float(answer.tre95_mm)
 
 
 def _error_over_bone_mm(probe: LookingProbe, look: Look) -> float:

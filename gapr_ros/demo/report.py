@@ -114,9 +114,9 @@ def judge(act: Act, answers: Mapping[int, Answer]) -> list[Row]:
 
 def _taken(cloud: np.ndarray, is_bone: NDArray[np.bool_], answer: Answer | None) -> Taken:
     """What the node says of the points that it used, for every point of the cloud; of a refused cloud none is taken."""
-    used = answer.used if answer is not None else None
-    if used is None or not len(used.points):
+    if answer is None or answer.used is None or not len(answer.used.points):
         return Taken(np.zeros(len(cloud), dtype=bool), np.zeros(len(cloud), dtype=bool), is_bone)
+    used = answer.used
     distance, nearest = cKDTree(used.points).query(cloud)
     looked_at = distance <= NEAR_MM
     return Taken(looked_at, looked_at & used.is_taken[nearest] & (answer.T_target_source is not None), is_bone)

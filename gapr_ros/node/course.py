@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.results import RegistrationResult
 from gapr_ros.node import timeline, wire
 from gapr_ros.node.following import continues
 from gapr_ros.node.model import Model
@@ -69,27 +70,27 @@ class Course:
             return
         if outcome.reason is Reason.STALE:  # it grew old in the mailbox, and changes nothing
             return
-        if not outcome.ok:
+        if outcome.found is None or outcome.result is None:
             self._track.miss()
             return
         try:
-            self._check_limits(outcome, parameters)
-            self._judge(outcome.pose, outcome, model, parameters)
+            self._check_limits(outcome.result, parameters)
+            self._judge(outcome.found.pose, outcome, model, parameters)
         except RefusedError as refusal:
             outcome.refuse(refusal.reason, refusal.text)
 
-    def may_show(self, outcome: Outcome, model: Model, parameters: NodeParameters) -> bool:
+    def may_show(self, T_frame_model: Array, outcome: Outcome, model: Model, parameters: NodeParameters) -> bool:
         """Whether a followed pose is of now, what it rests on still stands, and nothing newer went out."""
         if outcome.job.epoch != self.epoch:
             return False
-        T_frame_model, header = outcome.followed, outcome.header
+        header = outcome.header
         stands = continues(self.place, T_frame_model, header.frame_id, model, parameters)
         return stands and self.timeline.is_next(T_frame_model, header, wire.to_metres(model.points_mm))
 
-    def _check_limits(self, outcome: Outcome, parameters: NodeParameters) -> None:
+    def _check_limits(self, result: RegistrationResult, parameters: NodeParameters) -> None:
         """Limits may have been set while the cloud was on its way."""
         try:
-            check_limits(outcome.result, parameters)
+            check_limits(result, parameters)
         except RefusedError:
             self._track.miss()
             raise

@@ -19,7 +19,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -41,7 +41,7 @@ from gapr_ros.parameters import NodeParameters
 LIBRARIES = ("gapr_core", "gapr_ros")  # whose logs go to the node's log
 
 
-class RegisterNode(LifecycleNodeMixin, Node):
+class RegisterNode(LifecycleNode):
     """Lifecycle, parameters and clock of the node; a `Session` does the rest.
 
     Args:
@@ -84,6 +84,13 @@ class RegisterNode(LifecycleNodeMixin, Node):
         """unconfigured, inactive, active or finalized."""
         return str(self._state_machine.current_state[1])
 
+    @property
+    def _configured(self) -> Session:
+        """The session of a node that is inactive or active."""
+        if self.session is None:
+            raise RuntimeError("the node is not configured")
+        return self.session
+
     def now_ns(self) -> int:
         """The node's time, ns; 0 while simulated time has not started."""
         return int(self.get_clock().now().nanoseconds)
@@ -119,7 +126,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
     def _load_before_configuring(self) -> None:
         """Who asks to configure waits until the bone is read, the executor does not; then the state changes."""
         service = self._service_change_state
-        service.callback = partial(self._on_change_asked, service.callback)
+        service.callback = partial(self._on_change_asked, service.callback)  # type: ignore[assignment]  # it is awaited
 
     async def _on_change_asked(self, change: Callable[..., Any], request: Any, response: Any) -> Any:
         if not self._is_to_configure(request.transition):
@@ -183,8 +190,8 @@ class RegisterNode(LifecycleNodeMixin, Node):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen to clouds."""
         result = super().on_activate(state)
-        self.session.send_model()
-        self.subscriptions_in = Subscriptions(self, self.session)
+        self._configured.send_model()
+        self.subscriptions_in = Subscriptions(self, self._configured)
         kind, unit = self.parameters.cloud_type, self.parameters.cloud_unit
         self.get_logger().info(f"active, waits for clouds on {self.resolve_topic_name(CLOUDS)} ({kind}, in {unit})")
         return result
@@ -193,7 +200,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen no more; clouds on their way are refused, and the last pose is withdrawn."""
         self._stop_listening()
-        self.session.withdraw()
+        self._configured.withdraw()
         return super().on_deactivate(state)
 
     @transition
@@ -228,7 +235,7 @@ class RegisterNode(LifecycleNodeMixin, Node):
         listening, self.subscriptions_in = self.subscriptions_in, None
         if listening is not None:
             listening.close()
-            self.session.stop_waiting("the node stopped listening")
+            self._configured.stop_waiting("the node stopped listening")
 
     def _end_session(self) -> None:
         self._stop_listening()

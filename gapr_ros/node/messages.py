@@ -84,15 +84,15 @@ def detection(types: Any, outcome: Outcome, class_id: str, points_mm: Array) -> 
         points_mm: (M, 3) of the bone in its own frame, whose box is sent.
     """
     message = types.Detection3DArray(header=outcome.header)
-    if not outcome.ok:
+    if outcome.found is None:
         return message
     low, high = wire.to_metres(points_mm.min(axis=0)), wire.to_metres(points_mm.max(axis=0))
-    found = types.ObjectHypothesisWithPose()
-    found.hypothesis.class_id, found.hypothesis.score = class_id, outcome.confidence
-    found.pose.pose = matrix_to_pose(outcome.pose)
-    found.pose.covariance = [float(value) for value in outcome.covariance.ravel()]
-    one = types.Detection3D(header=outcome.header, results=[found], id=class_id)
-    middle = outcome.pose @ se3.from_rotation_translation(np.eye(3), 0.5 * (low + high))
+    sole = types.ObjectHypothesisWithPose()
+    sole.hypothesis.class_id, sole.hypothesis.score = class_id, outcome.confidence
+    sole.pose.pose = matrix_to_pose(outcome.found.pose)
+    sole.pose.covariance = [float(value) for value in outcome.found.covariance.ravel()]
+    one = types.Detection3D(header=outcome.header, results=[sole], id=class_id)
+    middle = outcome.found.pose @ se3.from_rotation_translation(np.eye(3), 0.5 * (low + high))
     one.bbox.center = matrix_to_pose(middle)
     one.bbox.size.x, one.bbox.size.y, one.bbox.size.z = (high - low).tolist()
     message.detections = [one]

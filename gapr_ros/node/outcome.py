@@ -15,6 +15,19 @@ from gapr_ros.node.worker import Job
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where the bone is.
+
+    Attributes:
+        pose: (4, 4) T_frame_model, metres.
+        covariance: (6, 6) of that pose, metres and radians, fixed axes of the frame.
+    """
+
+    pose: Array
+    covariance: Array
+
+
 @dataclass
 class Outcome:
     """Filled step by step while a cloud is processed; a pose only when there is no reason against it.
@@ -25,8 +38,7 @@ class Outcome:
         header: frame of the pose (`output_frame` or that of the cloud) and stamp of the cloud.
         reason: why there is no pose, or None.
         text: the reason in full.
-        pose: (4, 4) T_frame_model, metres; None when refused.
-        covariance: (6, 6) of that pose, metres and radians, fixed axes of the frame.
+        found: where the bone is in the frame; None when refused.
         followed: (4, 4) T_frame_model, metres, of a cloud that was not assessed; it then has no pose and no reason.
         confidence: of the registration, 0 to 1, whatever was decided later.
         points_in, points_used: of the message; given to registration, those of clouds that are registered with it too.
@@ -44,8 +56,7 @@ class Outcome:
     header: Header = field(default_factory=Header)
     reason: Reason | None = None
     text: str = ""
-    pose: Array | None = None
-    covariance: Array | None = None
+    found: Found | None = None
     followed: Array | None = None
     confidence: float = 0.0
     points_in: int = 0
@@ -63,7 +74,7 @@ class Outcome:
     @property
     def ok(self) -> bool:
         """True when the pose goes out."""
-        return self.reason is None and self.pose is not None
+        return self.found is not None
 
     @property
     def confidence_out(self) -> float:
@@ -73,7 +84,7 @@ class Outcome:
     def refuse(self, reason: Reason, text: str) -> None:
         """Take the pose away."""
         self.reason, self.text = reason, text
-        self.pose = self.covariance = self.followed = None
+        self.found = self.followed = None
 
     @classmethod
     def refused(cls, job: Job, header: Header, reason: Reason, text: str) -> Outcome:

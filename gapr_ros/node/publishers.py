@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from numpy.typing import NDArray
 from rclpy.lifecycle import LifecyclePublisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
@@ -15,9 +17,10 @@ from gapr_ros.node import messages, timeline, wire
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model
-from gapr_ros.node.outcome import Outcome
+from gapr_ros.node.outcome import Found, Outcome
 from msg_adapters import covariance_to_list, matrix_to_pose, matrix_to_transform, xyz_to_cloud
 
+Array = NDArray[np.float64]
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TOPICS = {
     "pose": (PoseWithCovarianceStamped, LATCHED),
@@ -54,17 +57,17 @@ class Publishers:
         self._topics["confidence"].publish(Float64(data=outcome.confidence_out))
         name = self._host.ros.get_fully_qualified_name()
         self._topics["status"].publish(messages.status(outcome, name, model.file))
-        if outcome.ok:
-            self._send_pose(outcome)
-            self._send_aligned(outcome, model)
+        if outcome.found is not None:
+            self._send_pose(outcome.found, outcome.header)
+            self._send_aligned(outcome.found, outcome.header, model)
         self._send_seen(outcome)
         if self._vision is not None:
-            found = messages.detection(self._vision, outcome, model.name, model.points_mm)
-            self._topics["detection"].publish(found)
+            detection = messages.detection(self._vision, outcome, model.name, model.points_mm)
+            self._topics["detection"].publish(detection)
 
-    def send_followed(self, outcome: Outcome) -> None:
-        """Where the bone is by a cloud that was not assessed: to be shown."""
-        self._topics["followed_pose"].publish(PoseStamped(header=outcome.header, pose=matrix_to_pose(outcome.followed)))
+    def send_followed(self, T_frame_model: Array, header: Header) -> None:
+        """Where the bone is, (4, 4), metres, by a cloud that was not assessed: to be shown."""
+        self._topics["followed_pose"].publish(PoseStamped(header=header, pose=matrix_to_pose(T_frame_model)))
 
     def withdraw(self, *names: str) -> None:
         """No late listener gets the last message of these any more: they are given up and advertised again."""
@@ -89,20 +92,20 @@ class Publishers:
     def _is_heard(self, name: str) -> bool:
         return self._topics[name].get_subscription_count() > 0
 
-    def _send_pose(self, outcome: Outcome) -> None:
-        message = PoseWithCovarianceStamped(header=outcome.header)
-        message.pose.pose = matrix_to_pose(outcome.pose)
-        message.pose.covariance = covariance_to_list(outcome.covariance)
+    def _send_pose(self, found: Found, header: Header) -> None:
+        message = PoseWithCovarianceStamped(header=header)
+        message.pose.pose = matrix_to_pose(found.pose)
+        message.pose.covariance = covariance_to_list(found.covariance)
         self._topics["pose"].publish(message)
-        transform = TransformStamped(header=outcome.header, child_frame_id=self._host.parameters.model_frame)
-        transform.transform = matrix_to_transform(outcome.pose)
+        transform = TransformStamped(header=header, child_frame_id=self._host.parameters.model_frame)
+        transform.transform = matrix_to_transform(found.pose)
         self._topics["transform"].publish(transform)
-        self._frames.send(transform, timeline.stamp_ns(outcome.header))
+        self._frames.send(transform, timeline.stamp_ns(header))
 
-    def _send_aligned(self, outcome: Outcome, model: Model) -> None:
+    def _send_aligned(self, found: Found, header: Header, model: Model) -> None:
         if self._is_heard("aligned"):
-            points = se3.apply(outcome.pose, wire.to_metres(model.points_mm))
-            self._topics["aligned"].publish(xyz_to_cloud(points.astype("f4"), outcome.header))
+            points = se3.apply(found.pose, wire.to_metres(model.points_mm))
+            self._topics["aligned"].publish(xyz_to_cloud(points.astype("f4"), header))
 
     def _send_seen(self, outcome: Outcome) -> None:
         """What users look at: with refusals above all."""

@@ -34,7 +34,7 @@ class Reason(str, Enum):
 
 
 # the node has the core's own words for what the data decided
-OF_STATUS = {
+OF_STATUS: dict[RegistrationStatus, Reason] = {
     status: Reason(status.value.lower()) for status in RegistrationStatus if status is not RegistrationStatus.OK
 }
 

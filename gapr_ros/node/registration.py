@@ -21,7 +21,7 @@ from gapr_ros.node.collection import Late, forget
 from gapr_ros.node.following import Following
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.guard import describe
-from gapr_ros.node.outcome import Outcome
+from gapr_ros.node.outcome import Found, Outcome
 from gapr_ros.node.refusal import OF_STATUS, Reason, RefusedError
 from gapr_ros.node.region import Crop
 from gapr_ros.node.seeding import Seeding
@@ -245,5 +245,4 @@ def _note_pose(outcome: Outcome, result: RegistrationResult, points_mm: Array, p
     assert T is not None and covariance is not None
     centre_mm = se3.apply(T, points_mm.mean(axis=0)[None])[0] if result.centre_mm is None else result.centre_mm
     floors = (parameters.covariance_floor_translation, parameters.covariance_floor_rotation)
-    outcome.pose = wire.wire_pose(T)
-    outcome.covariance = wire.wire_covariance(covariance, T, centre_mm, floors)
+    outcome.found = Found(wire.wire_pose(T), wire.wire_covariance(covariance, T, centre_mm, floors))

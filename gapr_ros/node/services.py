@@ -11,6 +11,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
 from gapr_ros.node.guard import describe
@@ -52,7 +53,8 @@ class Answers:
     """
 
     def __init__(self, host: Host) -> None:
-        self._host, self._pause = host, None
+        self._host = host
+        self._pause: Timer | None = None
         self._waiting: deque[Future] = deque()
 
     async def in_turn(self, known: Future | None = None) -> None:
@@ -73,8 +75,9 @@ class Answers:
     def _next(self) -> None:
         if self._waiting:
             self._waiting.popleft().set_result(None)
-        else:
-            pause, self._pause = self._pause, None
+            return
+        pause, self._pause = self._pause, None
+        if pause is not None:
             self._host.ros.destroy_timer(pause)
 
 

@@ -173,17 +173,18 @@ class Session:
     def _conclude(self, outcome: Outcome) -> None:
         """Decide on an outcome of the worker and answer."""
         if outcome.followed is not None:
-            self._show(outcome)
+            self._show(outcome.followed, outcome)
             return
         self.course.decide(outcome, self.model, self._host.parameters)
         self._answer(outcome)
 
-    def _show(self, outcome: Outcome) -> None:
+    def _show(self, T_frame_model: Array, outcome: Outcome) -> None:
         """Send a pose that was followed where what it rests on still stands. It is no answer and changes nothing."""
-        shown = not self._closed and self.course.may_show(outcome, self.model, self._host.parameters)
+        stands = self.course.may_show(T_frame_model, outcome, self.model, self._host.parameters)
+        shown = stands and not self._closed
         self._host.counters.show(shown)
         if shown:
-            self._publishers.send_followed(outcome)
+            self._publishers.send_followed(T_frame_model, outcome.header)
         self._host.report()
 
     def _answer(self, outcome: Outcome) -> None:

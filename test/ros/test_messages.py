@@ -22,7 +22,7 @@ from gapr_core.geometry import se3
 from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
 from gapr_ros.node import messages, wire
 from gapr_ros.node.guard import RosLogHandler
-from gapr_ros.node.outcome import Outcome
+from gapr_ros.node.outcome import Found, Outcome
 from gapr_ros.node.publishers import TOPICS
 from gapr_ros.node.refusal import OF_STATUS, Reason
 from gapr_ros.node.worker import Job
@@ -35,9 +35,9 @@ REFUSED = RegistrationResult(RegistrationStatus.AMBIGUOUS, hypotheses=RANKED, re
 
 
 def outcome(result=None, pose=None, reason=None):
-    covariance = None if pose is None else np.diag([1e-6] * 6)
+    found = None if pose is None else Found(pose, np.diag([1e-6] * 6))
     job, header = Job(b"", 0, 0), Header(frame_id="probe")
-    return Outcome(job, "probe", header, reason, "", pose, covariance, confidence=0.9, result=result)
+    return Outcome(job, "probe", header, reason, "", found, confidence=0.9, result=result)
 
 
 def test_every_status_of_the_core_but_ok_has_a_reason_of_the_same_name():

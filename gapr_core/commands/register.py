@@ -46,6 +46,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
     parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
+    parser.add_argument("--source-label", action="append", default=[], metavar="LABEL",
+                        help="the same in a label map that is the source")  # fmt: skip
     parser.add_argument("--axes", type=str.lower, default="auto",
                         help="of a target mesh: lps, ras, as_is, lps_to_ras, or auto (what it says)")  # fmt: skip
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
@@ -130,7 +132,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
     how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
-    how |= {"topic": args.topic, "clouds": args.clouds}
+    how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
     source = _load(args.source, args.source_units or args.units, **how)
     if source.faces is not None and target.faces is None:
         log.warning(

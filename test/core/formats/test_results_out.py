@@ -84,6 +84,27 @@ def test_a_mask_becomes_a_transform_that_itk_maps_the_right_way_round(
     assert off.max() < 0.3 * max(spacing) + 0.5, off.max()
 
 
+def test_a_source_in_a_label_map_has_a_label_of_its_own(tmp_path, femur, capsys):
+    """As the bone of an intra-operative scan, next to metal."""
+    image = voxelised(femur, np.array([2.0, 2.0, 2.0]), (0.0, 0.0, 0.0), (1, 1, 1))
+    sitk.WriteImage(image * 76, str(tmp_path / "ct.nii.gz"))
+    voxels = sitk.GetArrayFromImage(image)
+    voxels[voxels.shape[0] // 2 :] = 0
+    voxels[:4, :4, :4] = 2
+    part = sitk.GetImageFromArray(voxels)
+    part.CopyInformation(image)
+    for key, value in {"Segment0_Name": "Bone", "Segment1_Name": "Metal"}.items():
+        part.SetMetaData(key, value)
+        part.SetMetaData(key.replace("Name", "LabelValue"), str(int(key[7]) + 1))
+    sitk.WriteImage(part, str(tmp_path / "scan.seg.nrrd"))
+    command = ["register", "--source", str(tmp_path / "scan.seg.nrrd"), "--target", str(tmp_path / "ct.nii.gz")]
+    command += ["--method", "gapr_search", "--label", "76", "--out", str(tmp_path / "pose.txt")]
+    assert main(command) == 1
+    assert "(Bone, Metal); name one with --label (--source-label of the source)" in capsys.readouterr().err
+    assert main([*command, "--source-label", "bone"]) == 0
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "pose.txt"), np.eye(4), atol=0.5)
+
+
 def result_with(covariance=None, residuals=None):
     centre, status = np.array([5.0, 0.0, 0.0]), RegistrationStatus.OK
     return RegistrationResult(status, T, covariance, 0.99, 0.5, 1.0, 0.9, centre_mm=centre, residuals=residuals)

@@ -25,9 +25,12 @@ TFM = (
 
 
 def check(path: Path) -> None:
-    """Raise `ConfigError` for an ending that no pose is written to."""
+    """Raise `ConfigError` for an ending that no pose is written to, or that ITK does not read for its capitals."""
     if path.suffix.lower() not in ENDINGS:
         raise ConfigError(f"a pose as {' '.join(ENDINGS)}", path.name, "choose one of these")
+    if path.suffix not in ENDINGS:
+        how = "write the ending in small letters: ITK and 3D Slicer know no other"
+        raise ConfigError(f"a pose as {' '.join(ENDINGS)}", path.name, how)
 
 
 def write(path: Path, T_target_source: ArrayLike) -> None:

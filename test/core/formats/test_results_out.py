@@ -37,6 +37,14 @@ def test_a_matrix_as_text_is_the_pose_itself(tmp_path):
         transforms.write(tmp_path / "pose.mat", T)
 
 
+@pytest.mark.parametrize("name", ["pose.TFM", "pose.H5", "pose.Tfm"])
+def test_an_ending_in_capitals_that_itk_does_not_read_is_refused_before_the_work(tmp_path, capsys, name):
+    np.save(tmp_path / "a.npy", POINTS)
+    files = ["--source", str(tmp_path / "a.npy"), "--target", str(tmp_path / "a.npy"), "--method", "gapr_search"]
+    assert main(["register", *files, "--out", str(tmp_path / name)]) == 1
+    assert f"got {name}; write the ending in small letters" in capsys.readouterr().err
+
+
 def voxelised(surface, spacing, turn, flip):
     """The image of a closed mesh on an oblique grid."""
     mask, affine = mask_of(surface, spacing, Rotation.from_rotvec(turn).as_matrix() @ np.diag(flip))

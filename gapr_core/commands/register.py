@@ -141,6 +141,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     checks.warn_of_units(args)
     checks.warn_of_axes(args)
     checks.warn_of_landmarks(args, source.points, target.points)
+    checks.warn_of_frames(args, source.points, target.points)
     return target, source
 
 

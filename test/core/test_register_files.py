@@ -138,6 +138,28 @@ def test_landmarks_that_are_near_or_as_far_with_other_axes_are_not_warned_of(fol
     assert ("with x and y negated" in caplog.text) is is_warned
 
 
+@pytest.mark.parametrize(("line", "at_mm", "said"), [
+    ("--landmarks s t", 300.0, ""),
+    ("--landmarks t s", 300.0, "t.mrk.json is near t.npy, and s.mrk.json near s.npy: are the files of --landmarks ex"),
+    ("--landmarks t s", 40.0, ""),
+    ("--landmarks t t", 300.0, ""),
+    ("--targets s", 300.0, "s.mrk.json is near s.npy, and far from t.npy: --targets are in the frame of the target"),
+    ("--targets t", 300.0, ""),
+    ("--targets far", 300.0, ""),
+])  # fmt: skip
+def test_markups_in_the_frame_of_the_other_cloud_are_warned_of(folder, caplog, line, at_mm, said):
+    """No residual shows it: landmarks fit in either order. One file alone may be of a part that was not seen."""
+    clouds = {"s": np.zeros((1, 3)), "t": np.array([[0.0, 0.0, at_mm]])}
+    for name, points in (clouds | {"far": np.array([[900.0, 0.0, 0.0]])}).items():
+        save(folder / f"{name}.mrk.json", Markups(points, ("a",)))
+    option, *names = line.split()
+    paths = [Path(f"{name}.mrk.json") for name in names]
+    landmarks, targets = (paths, None) if option == "--landmarks" else (None, paths[0])
+    args = Namespace(source=Path("s.npy"), target=Path("t.npy"), landmarks=landmarks, targets=targets)
+    checks.warn_of_frames(args, clouds["s"], clouds["t"])
+    assert [said in message for message in caplog.messages] == [True] * bool(said)
+
+
 def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkeypatch):
     seen = SimpleNamespace(at=None)
 

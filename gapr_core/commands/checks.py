@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import files
 
@@ -65,6 +66,7 @@ def _inputs(args: Namespace) -> list[Named]:
     """The option and the path of every file or folder that is read."""
     named = [("--source", args.source), ("--target", args.target), ("--targets", args.targets)]
     named += [("--landmarks", path) for path in args.landmarks or ()] + [("--config", args.config)]
+    named += [("--initial", args.initial)]
     return [(option, path) for option, path in named if path]
 
 
@@ -133,7 +135,7 @@ def files_in_lps(args: Namespace) -> dict[str, Path]:
     residuals = args.residuals if args.residuals and args.residuals.suffix.lower() == ".ply" else None
     landmarks = args.landmarks[1] if args.landmarks else None
     named = {"--out": args.out, "--slicer": args.slicer, "--residuals": residuals, "--targets": args.targets,
-             "--landmarks": landmarks}  # fmt: skip
+             "--landmarks": landmarks, "--initial": args.initial}  # fmt: skip
     return {option: path for option, path in named.items() if path}
 
 
@@ -196,6 +198,16 @@ def warn_of_frames(args: Namespace, source: Array, target: Array) -> None:
     if args.targets and _is_elsewhere(args.targets, target, source):
         near = f"{args.targets.name} is near {args.source.name}, and far from {args.target.name}"
         log.warning("%s: --targets are in the frame of the target", near)
+
+
+def warn_of_start(args: Namespace, start: Array | None, source: Array, target: Array) -> None:
+    """Warn of a transform whose inverse would lay the source (N, 3) on the target (M, 3), mm, and which does not."""
+    if start is None or not args.initial:
+        return
+    apart_mm, turned_mm = (_median_mm(se3.apply(T, source), target) for T in (start, se3.inverse(start)))
+    if apart_mm > FAR_LANDMARKS_MM and turned_mm < MUCH_NEARER * apart_mm:
+        said = f"lays the source {apart_mm:.0f} mm from the bone, and its inverse {turned_mm:.0f} mm"
+        log.warning("%s %s: is it the other way round? docs/formats.md says which is meant", args.initial.name, said)
 
 
 def _is_elsewhere(path: Path, cloud: Array, other: Array) -> bool:

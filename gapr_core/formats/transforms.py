@@ -1,4 +1,4 @@
-"""Poses for other tools: ITK transforms (.tfm, .h5), and 4x4 matrices as text.
+"""Poses for and from other tools: ITK transforms (.tfm, .h5), and 4x4 matrices as text.
 
 ITK maps points of the FIXED image to the MOVING one, in LPS: what is written is the inverse of T_target_source. 3D
 Slicer inverts it again as it reads, so that the source, placed under the transform, lies on the target.
@@ -52,6 +52,55 @@ def write(path: Path, T_target_source: ArrayLike) -> None:
         files.write_text(path, TFM.format(" ".join(repr(float(x)) for x in _itk_parameters(T))))
     else:
         _write_h5(path, _itk_parameters(T))
+
+
+def read(path: Path) -> Array:
+    """(4, 4) T_target_source, LPS mm, as `write` writes it: .tfm and .h5 hold the inverse, .txt holds itself.
+
+    Raises:
+        ConfigError: not there, another ending, damaged, or no rigid motion.
+        MethodUnavailableError: .tfm or .h5 without SimpleITK.
+    """
+    check(path)
+    if not path.is_file():
+        raise ConfigError("a file that exists", str(path), "check the path")
+    T = _matrix_of_text(path) if path.suffix == ".txt" else _matrix_of_itk(path)
+    if not np.isfinite(T).all() or (why := se3.why_not_rigid(T)):
+        given = f"{path.name} whose {why}" if np.isfinite(T).all() else f"{path.name} with numbers that are not finite"
+        raise ConfigError("a rigid motion", given, "save a transform without scale or shear")
+    T = se3.nearest_rigid(T)
+    return T if path.suffix == ".txt" else se3.inverse(T)
+
+
+def _matrix_of_text(path: Path) -> Array:
+    try:
+        T = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        given = f"{path.name} with other content"
+        how = "write T_target_source so, or rename an ITK transform to .tfm"
+        raise ConfigError("four lines of four numbers", given, how) from error
+    if T.shape != (4, 4):
+        raise ConfigError("four lines of four numbers", f"{path.name} with {T.shape[0]} by {T.shape[1]}", "correct it")
+    return T
+
+
+def _matrix_of_itk(path: Path) -> Array:
+    """(4, 4) of a linear transform of any kind, about any centre, alone or composed of such."""
+    try:
+        import SimpleITK
+    except ImportError as error:
+        how = "pip install 'gapr_ros[medical]'"
+        raise MethodUnavailableError(f"reading {path.suffix} files", "no SimpleITK", how) from error
+    try:
+        transform = SimpleITK.ReadTransform(str(path))
+    except RuntimeError as error:
+        given = f"{path.name}, which ITK cannot read"
+        raise ConfigError("an ITK transform", given, "save it from 3D Slicer as .tfm or .h5") from error
+    if transform.GetDimension() != 3 or not transform.IsLinear():
+        raise ConfigError("a linear transform in 3-D", path.name, "harden or save the linear part alone")
+    origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
+    columns = [np.array(transform.TransformPoint(row.tolist())) - origin for row in np.eye(3)]
+    return se3.from_rotation_translation(np.column_stack(columns), origin)
 
 
 def _itk_parameters(T_target_source: Array) -> Array:

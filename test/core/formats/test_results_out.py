@@ -45,6 +45,39 @@ def test_an_ending_in_capitals_that_itk_does_not_read_is_refused_before_the_work
     assert f"got {name}; write the ending in small letters" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["pose.tfm", "pose.h5", "pose.txt"])
+def test_what_is_written_is_read_as_the_same_pose(tmp_path, name):
+    transforms.write(tmp_path / name, T)
+    np.testing.assert_allclose(transforms.read(tmp_path / name), T, atol=1e-9)
+
+
+def test_transforms_about_a_centre_and_composed_ones_are_read_as_a_start(tmp_path):
+    """As elastix and 3D Slicer write them."""
+    euler = sitk.Euler3DTransform((30.0, -40.0, 50.0), 0.3, -0.2, 0.9, (5.0, 6.0, -7.0))
+    both = sitk.CompositeTransform([euler, sitk.TranslationTransform(3, (1.0, 2.0, 3.0))])
+    for transform, name in ((euler, "a.tfm"), (both, "b.tfm"), (both, "c.h5")):
+        sitk.WriteTransform(transform, str(tmp_path / name))
+        moved = [transform.TransformPoint(point.tolist()) for point in POINTS]
+        np.testing.assert_allclose(se3.apply(transforms.read(tmp_path / name), moved), POINTS, atol=1e-6)
+
+
+def test_a_start_that_is_no_rigid_motion_is_refused_by_its_name(tmp_path):
+    sitk.WriteTransform(sitk.ScaleTransform(3, (1.1, 1.0, 1.0)), str(tmp_path / "scaled.tfm"))
+    sitk.WriteTransform(sitk.BSplineTransform(3), str(tmp_path / "bent.tfm"))
+    sitk.WriteTransform(sitk.Euler2DTransform(), str(tmp_path / "flat.tfm"))
+    (tmp_path / "damaged.tfm").write_text("#Insight Transform File V1.0\nTransform: Aff")
+    (tmp_path / "itk.txt").write_text("#Insight Transform File V1.0\nTransform: AffineTransform_double_3_3\n")
+    np.savetxt(tmp_path / "three.txt", T[:3])
+    np.savetxt(tmp_path / "nan.txt", T * np.nan)
+    for name, said in {
+        "scaled.tfm": "scaled.tfm whose rotation part has determinant", "bent.tfm": "linear transform in 3-D",
+        "flat.tfm": "linear transform in 3-D", "damaged.tfm": "which ITK cannot read", "itk.txt": "rename an ITK",
+        "three.txt": "with 3 by 4", "nan.txt": "not finite", "none.tfm": "a file that exists", "a.mat": ".tfm .h5 .txt",
+    }.items():  # fmt: skip
+        with pytest.raises(ConfigError, match=said):
+            transforms.read(tmp_path / name)
+
+
 def voxelised(surface, spacing, turn, flip):
     """The image of a closed mesh on an oblique grid."""
     mask, affine = mask_of(surface, spacing, Rotation.from_rotvec(turn).as_matrix() @ np.diag(flip))

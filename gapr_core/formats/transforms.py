@@ -6,6 +6,11 @@ Slicer inverts it again as it reads, so that the source, placed under the transf
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +23,7 @@ from gapr_core.runtime import files
 Array = NDArray[np.float64]
 
 ENDINGS = (".tfm", ".h5", ".txt")
+PACKAGES = str(Path(__file__).parents[2])
 TFM = (
     "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
     "Parameters: {}\nFixedParameters: 0 0 0\n"
@@ -85,22 +91,19 @@ def _matrix_of_text(path: Path) -> Array:
 
 
 def _matrix_of_itk(path: Path) -> Array:
-    """(4, 4) of a linear transform of any kind, about any centre, alone or composed of such."""
-    try:
-        import SimpleITK
-    except ImportError as error:
+    """(4, 4) of a linear transform, read in a process of its own."""
+    if find_spec("SimpleITK") is None:
         how = "pip install 'gapr_ros[medical]'"
-        raise MethodUnavailableError(f"reading {path.suffix} files", "no SimpleITK", how) from error
-    try:
-        transform = SimpleITK.ReadTransform(str(path))
-    except RuntimeError as error:
+        raise MethodUnavailableError(f"reading {path.suffix} files", "no SimpleITK", how)
+    command = [sys.executable, "-m", "gapr_core.formats.itk_child", str(path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode != 0:
         given = f"{path.name}, which ITK cannot read"
-        raise ConfigError("an ITK transform", given, "save it from 3D Slicer as .tfm or .h5") from error
-    if transform.GetDimension() != 3 or not transform.IsLinear():
-        raise ConfigError("a linear transform in 3-D", path.name, "harden or save the linear part alone")
-    origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
-    columns = [np.array(transform.TransformPoint(row.tolist())) - origin for row in np.eye(3)]
-    return se3.from_rotation_translation(np.column_stack(columns), origin)
+        raise ConfigError("an ITK transform", given, "save it from 3D Slicer as .tfm or .h5")
+    if (matrix := json.loads(done.stdout)) is None:
+        raise ConfigError("a linear transform in 3-D", path.name, "save the linear part alone")
+    return np.array(matrix, dtype=np.float64)
 
 
 def _itk_parameters(T_target_source: Array) -> Array:

@@ -1,6 +1,9 @@
 """From a CT mask to files that other tools read the right way round."""
 
 import json
+import os
+import subprocess
+import sys
 from xml.etree import ElementTree
 
 import numpy as np
@@ -76,6 +79,19 @@ def test_a_start_that_is_no_rigid_motion_is_refused_by_its_name(tmp_path):
     }.items():  # fmt: skip
         with pytest.raises(ConfigError, match=said):
             transforms.read(tmp_path / name)
+
+
+def test_a_damaged_start_is_refused_in_one_line(tmp_path):
+    """HDF5 writes lines of its own, which Python does not see."""
+    transforms.write(tmp_path / "pose.h5", T)
+    data = (tmp_path / "pose.h5").read_bytes()
+    (tmp_path / "cut.h5").write_bytes(data[: len(data) // 2])
+    np.save(tmp_path / "a.npy", POINTS)
+    files = ["--source", "a.npy", "--target", "a.npy", "--method", "gapr_search", "--initial", "cut.h5"]
+    command = [sys.executable, "-m", "gapr_core.cli", "register", *files]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([transforms.PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cut.h5, which ITK cannot read" in done.stderr
 
 
 def voxelised(surface, spacing, turn, flip):

@@ -160,4 +160,5 @@ def _key(name: str) -> str:
 
 
 def _listed(names: list[str]) -> str:
+    names = [f'"{name}"' if "," in name else name for name in names]
     return ", ".join(names[:MOST_LISTED]) + (" ..." if len(names) > MOST_LISTED else "")

@@ -41,6 +41,11 @@ def test_a_model_is_turned_once_at_most_whatever_its_file_says(tmp_path, said, a
     assert np.allclose(points, 2.0 * POINTS * [sign, sign, 1.0])
 
 
+def test_a_file_in_ras_that_is_read_as_it_is_names_the_parameter_whose_default_that_is(tmp_path, caplog):
+    loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"))
+    assert "says SPACE=RAS and is read as AS_IS: --axes or model_axes says so" in caplog.text
+
+
 def test_a_model_that_is_ras_already_is_not_turned_by_lps_to_ras(tmp_path):
     with pytest.raises(ConfigError, match="which says SPACE=RAS; use as_is"):
         loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"), model_axes="lps_to_ras")

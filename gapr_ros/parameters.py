@@ -155,6 +155,9 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
     if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
         sentences.append(f"assess_every is not used: {why}")
+    if 0.0 < parameters.range_max <= parameters.range_min:
+        limits = f"range_min {parameters.range_min} is not below range_max {parameters.range_max}"
+        sentences.append(f"{limits}: every cloud is refused until it is")
     low, high = parameters.crop_min, parameters.crop_max
     if low != high and any(least >= most for least, most in zip(low, high, strict=True)):
         sentences.append(f"crop_min {low} is not below crop_max {high}: every cloud is refused until it is")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import files
 
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 Named = tuple[str, Path]  # an option, and what it names
 
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
-MUCH_NEARER = 0.3  # share of that distance that is left when the axes are turned, and were wrong
+MUCH_NEARER = 0.3  # share of that distance that is left with the axes turned, or to the other cloud, and it was wrong
 
 
 def check_outputs(args: Namespace) -> None:
@@ -65,6 +66,7 @@ def _inputs(args: Namespace) -> list[Named]:
     """The option and the path of every file or folder that is read."""
     named = [("--source", args.source), ("--target", args.target), ("--targets", args.targets)]
     named += [("--landmarks", path) for path in args.landmarks or ()] + [("--config", args.config)]
+    named += [("--initial", args.initial)]
     return [(option, path) for option, path in named if path]
 
 
@@ -133,7 +135,7 @@ def files_in_lps(args: Namespace) -> dict[str, Path]:
     residuals = args.residuals if args.residuals and args.residuals.suffix.lower() == ".ply" else None
     landmarks = args.landmarks[1] if args.landmarks else None
     named = {"--out": args.out, "--slicer": args.slicer, "--residuals": residuals, "--targets": args.targets,
-             "--landmarks": landmarks}  # fmt: skip
+             "--landmarks": landmarks, "--initial": args.initial}  # fmt: skip
     return {option: path for option, path in named.items() if path}
 
 
@@ -186,12 +188,46 @@ def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:
             )  # fmt: skip
 
 
+def warn_of_frames(args: Namespace, source: Array, target: Array) -> None:
+    """Warn of landmarks that were exchanged, and of a plan in the frame of the source (N, 3), not of the target, mm."""
+    clouds = (source, target)
+    if args.landmarks and all(map(_is_elsewhere, args.landmarks, clouds, clouds[::-1])):
+        first, second = (path.name for path in args.landmarks)
+        near = f"{first} is near {args.target.name}, and {second} near {args.source.name}"
+        log.warning("%s: are the files of --landmarks exchanged? That of the source comes first", near)
+    if args.targets and _is_elsewhere(args.targets, target, source):
+        near = f"{args.targets.name} is near {args.source.name}, and far from {args.target.name}"
+        log.warning("%s: --targets are in the frame of the target", near)
+
+
+def warn_of_start(args: Namespace, start: Array | None, source: Array, target: Array) -> None:
+    """Warn of a transform whose inverse would lay the source (N, 3) on the target (M, 3), mm, and which does not."""
+    if start is None or not args.initial:
+        return
+    apart_mm, turned_mm = (_median_mm(se3.apply(T, source), target) for T in (start, se3.inverse(start)))
+    if apart_mm > FAR_LANDMARKS_MM and turned_mm < MUCH_NEARER * apart_mm:
+        said = f"lays the source {apart_mm:.0f} mm from the bone, and its inverse {turned_mm:.0f} mm"
+        log.warning("%s %s: is it the other way round? docs/formats.md says which is meant", args.initial.name, said)
+
+
+def _is_elsewhere(path: Path, cloud: Array, other: Array) -> bool:
+    """Whether markups are far from the cloud (N, 3), mm, in whose frame they should be, and near the other one."""
+    from gapr_core.formats import markups
+
+    points = markups.load(path).points
+    apart_mm = _median_mm(points, cloud)
+    return apart_mm > FAR_LANDMARKS_MM and _median_mm(points, other) < MUCH_NEARER * apart_mm
+
+
 def _apart_mm(landmarks: Array, cloud: Array) -> tuple[float, float]:
     """Median distance, mm, of landmarks (K, 3) to a cloud (N, 3): as they are, and with x and y negated."""
-    from scipy.spatial import cKDTree
-
     from gapr_core.formats.axes import LPS_RAS
 
-    tree = cKDTree(cloud)
-    as_is, turned = (float(np.median(tree.query(points)[0])) for points in (landmarks, landmarks * LPS_RAS))
-    return as_is, turned
+    return _median_mm(landmarks, cloud), _median_mm(landmarks * LPS_RAS, cloud)
+
+
+def _median_mm(points: Array, cloud: Array) -> float:
+    """Median distance, mm, of points (K, 3) to the nearest ones of a cloud (N, 3)."""
+    from scipy.spatial import cKDTree
+
+    return float(np.median(cKDTree(cloud).query(points)[0]))

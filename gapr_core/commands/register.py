@@ -46,6 +46,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
     parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
+    parser.add_argument("--source-label", action="append", default=[], metavar="LABEL",
+                        help="the same in a label map that is the source")  # fmt: skip
     parser.add_argument("--axes", type=str.lower, default="auto",
                         help="of a target mesh: lps, ras, as_is, lps_to_ras, or auto (what it says)")  # fmt: skip
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
@@ -55,9 +57,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--viewpoint", type=_place, default="auto", metavar="X,Y,Z|auto|none",
                         help="of the camera in the source's frame, mm; auto: its pixels or its surface may show it; "
                         "none: all is bone")  # fmt: skip
-    parser.add_argument(
+    guess = parser.add_mutually_exclusive_group()
+    guess.add_argument(
         "--landmarks", nargs=2, type=a_path, metavar=("SOURCE", "TARGET"), help="paired markups: a first guess"
     )
+    guess.add_argument("--initial", type=a_path, metavar="POSE", help="a first guess: a file as --out writes it")
     parser.add_argument("--targets", type=a_path, help="markups of a plan, target frame: the error to expect there")
     parser.add_argument("--out", type=a_path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
     parser.add_argument("--residuals", type=a_path, help="signed distance of every point, as .json or coloured .ply")
@@ -109,6 +113,7 @@ def run(args: Namespace) -> int:
     target, source = _read(args)
     if args.viewpoint == "none" or source.joined or source.faces is not None:
         method = method.of_bone_alone() if isinstance(method, Registrar | Tracker) else method
+    checks.warn_of_start(args, hints.get("initial"), source.points, target.points)
     hints |= _seen(args, method, source)
     result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
@@ -130,7 +135,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
     how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
-    how |= {"topic": args.topic, "clouds": args.clouds}
+    how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
     source = _load(args.source, args.source_units or args.units, **how)
     if source.faces is not None and target.faces is None:
         log.warning(
@@ -139,6 +144,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     checks.warn_of_units(args)
     checks.warn_of_axes(args)
     checks.warn_of_landmarks(args, source.points, target.points)
+    checks.warn_of_frames(args, source.points, target.points)
     return target, source
 
 
@@ -168,6 +174,10 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
         start = planning.start_of(*args.landmarks)
         say(f"landmarks lie {start.rms_mm:.2f} mm apart (rms) at the start")
         hints["initial"] = start.T_target_source
+    elif args.initial:
+        from gapr_core.formats import transforms
+
+        hints["initial"] = transforms.read(args.initial)
     if not isinstance(args.viewpoint, str):
         hints["viewpoint"] = np.array(args.viewpoint)
     for name in (hint for hint in hints if not takes(method, hint)):

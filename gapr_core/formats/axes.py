@@ -53,9 +53,9 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
     if axes == "auto" and said == "ras":
         log.warning("%s %s: x and y are negated, to LPS", path.name, how)
     elif said == "ras" and axes != "ras":
-        log.warning("%s %s and is read as %s, as you say", path.name, how, axes.upper())
+        log.warning("%s %s and is read as %s: --axes or model_axes says so", path.name, how, axes.upper())
     elif said == "lps" and axes == "ras":
-        log.warning("%s %s and is read as RAS, as you say", path.name, how)
+        log.warning("%s %s and is read as RAS: --axes or model_axes says so", path.name, how)
     return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])
 
 

@@ -59,7 +59,7 @@ class Format:
 
 
 CHOICES = {  # choice of `ReadOptions` -> the files that have it, and how a user names it
-    "labels": ("a label map", "--label (model_label of the node)"),
+    "labels": ("a label map", "--label (--source-label of the source, model_label of the node)"),
     "tip_mm": ("a recording of a tracked tool", "--tip"),
     "tool": ("a recording of a tracked tool", "--tool"),
     "reference": ("a recording of tracked tools", "--reference"),

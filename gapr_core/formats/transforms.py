@@ -1,4 +1,4 @@
-"""Poses for other tools: ITK transforms (.tfm, .h5), and 4x4 matrices as text.
+"""Poses for and from other tools: ITK transforms (.tfm, .h5), and 4x4 matrices as text.
 
 ITK maps points of the FIXED image to the MOVING one, in LPS: what is written is the inverse of T_target_source. 3D
 Slicer inverts it again as it reads, so that the source, placed under the transform, lies on the target.
@@ -6,6 +6,11 @@ Slicer inverts it again as it reads, so that the source, placed under the transf
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +23,7 @@ from gapr_core.runtime import files
 Array = NDArray[np.float64]
 
 ENDINGS = (".tfm", ".h5", ".txt")
+PACKAGES = str(Path(__file__).parents[2])
 TFM = (
     "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
     "Parameters: {}\nFixedParameters: 0 0 0\n"
@@ -25,9 +31,12 @@ TFM = (
 
 
 def check(path: Path) -> None:
-    """Raise `ConfigError` for an ending that no pose is written to."""
+    """Raise `ConfigError` for an ending that no pose is written to, or that ITK does not read for its capitals."""
     if path.suffix.lower() not in ENDINGS:
         raise ConfigError(f"a pose as {' '.join(ENDINGS)}", path.name, "choose one of these")
+    if path.suffix not in ENDINGS:
+        how = "write the ending in small letters: ITK and 3D Slicer know no other"
+        raise ConfigError(f"a pose as {' '.join(ENDINGS)}", path.name, how)
 
 
 def write(path: Path, T_target_source: ArrayLike) -> None:
@@ -49,6 +58,52 @@ def write(path: Path, T_target_source: ArrayLike) -> None:
         files.write_text(path, TFM.format(" ".join(repr(float(x)) for x in _itk_parameters(T))))
     else:
         _write_h5(path, _itk_parameters(T))
+
+
+def read(path: Path) -> Array:
+    """(4, 4) T_target_source, LPS mm, as `write` writes it: .tfm and .h5 hold the inverse, .txt holds itself.
+
+    Raises:
+        ConfigError: not there, another ending, damaged, or no rigid motion.
+        MethodUnavailableError: .tfm or .h5 without SimpleITK.
+    """
+    check(path)
+    if not path.is_file():
+        raise ConfigError("a file that exists", str(path), "check the path")
+    T = _matrix_of_text(path) if path.suffix == ".txt" else _matrix_of_itk(path)
+    if not np.isfinite(T).all() or (why := se3.why_not_rigid(T)):
+        given = f"{path.name} whose {why}" if np.isfinite(T).all() else f"{path.name} with numbers that are not finite"
+        raise ConfigError("a rigid motion", given, "save a transform without scale or shear")
+    T = se3.nearest_rigid(T)
+    return T if path.suffix == ".txt" else se3.inverse(T)
+
+
+def _matrix_of_text(path: Path) -> Array:
+    try:
+        T = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        given = f"{path.name} with other content"
+        how = "write T_target_source so, or rename an ITK transform to .tfm"
+        raise ConfigError("four lines of four numbers", given, how) from error
+    if T.shape != (4, 4):
+        raise ConfigError("four lines of four numbers", f"{path.name} with {T.shape[0]} by {T.shape[1]}", "correct it")
+    return T
+
+
+def _matrix_of_itk(path: Path) -> Array:
+    """(4, 4) of a linear transform, read in a process of its own."""
+    if find_spec("SimpleITK") is None:
+        how = "pip install 'gapr_ros[medical]'"
+        raise MethodUnavailableError(f"reading {path.suffix} files", "no SimpleITK", how)
+    command = [sys.executable, "-m", "gapr_core.formats.itk_child", str(path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode != 0:
+        given = f"{path.name}, which ITK cannot read"
+        raise ConfigError("an ITK transform", given, "save it from 3D Slicer as .tfm or .h5")
+    if (matrix := json.loads(done.stdout)) is None:
+        raise ConfigError("a linear transform in 3-D", path.name, "save the linear part alone")
+    return np.array(matrix, dtype=np.float64)
 
 
 def _itk_parameters(T_target_source: Array) -> Array:

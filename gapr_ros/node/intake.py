@@ -69,11 +69,12 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
     Raises:
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
     """
-    points = _finite_points(cloud, parameters.cloud_type)
-    points = _within_range(wire.to_mm(points, parameters.cloud_unit), parameters)
+    whole = wire.to_mm(_finite_points(cloud, parameters.cloud_type), parameters.cloud_unit)
+    points = in_range = _within_range(whole, parameters)
     for crop in crops:
         points = crop(points)
-    check_count(len(points), 1 if parameters.accumulate > 1 else parameters.min_points)
+    left_out = _left_out(len(whole), len(in_range), len(points))
+    check_count(len(points), 1 if parameters.accumulate > 1 else parameters.min_points, left_out)
     points = thin(points, parameters.max_points, parameters.seed)
     if parameters.accumulate <= 1:
         check_unit(points, model_extent_mm, parameters.cloud_unit)
@@ -104,10 +105,18 @@ def check_together(points_mm: Array, model_extent_mm: float, parameters: NodePar
     check_unit(points_mm, model_extent_mm, parameters.cloud_unit)
 
 
-def check_count(count: int, least: int) -> None:
-    """Refuse too few points."""
+def check_count(count: int, least: int, left_out: str = "") -> None:
+    """Refuse too few points; a cloud that is registered with others needs one, whatever min_points is."""
     if count < least:
-        raise RefusedError(Reason.TOO_FEW_POINTS, f"{count} usable points, min_points is {least}")
+        limit = f", min_points is {least}" if least > 1 else ""
+        raise RefusedError(Reason.TOO_FEW_POINTS, f"{count} usable points{limit}{left_out}")
+
+
+def _left_out(whole: int, in_range: int, kept: int) -> str:
+    """What the region of interest took away from a cloud, by the parameters that did; empty where it took nothing."""
+    by = {"range_min and range_max": whole - in_range, "the crop (crop_min, crop_max, crop_to_track)": in_range - kept}
+    said = " and ".join(f"{count} by {names}" for names, count in by.items() if count)
+    return f"; of {whole} points are left out: {said}" if said else ""
 
 
 def is_one_bone(points_mm: Array, model_extent_mm: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,8 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     """
     if not parameters.model_path:
         raise ConfigError("model_path", "nothing", "give -p model_path:=/path/to/bone.stl")
+    if "://" in parameters.model_path:
+        raise ConfigError("model_path: a path", parameters.model_path, "write it without scheme: /path/to/bone.stl")
     options = ReadOptions(axes=parameters.model_axes, labels=labels_of(parameters.model_label))
     path = Path(parameters.model_path).expanduser()  # a shell leaves the ~ of model_path:=~/bone.stl as it is
     surface = clouds.load(path, units=parameters.model_unit, options=options)
@@ -72,8 +75,9 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
 
 
 def labels_of(text: str) -> tuple[str, ...]:
-    """The names or numbers of a parameter, which may hold several with commas between them."""
-    return tuple(word.strip() for word in text.split(",") if word.strip())
+    """The names or numbers of a parameter, with commas between them; a name with a comma in it is in double quotes."""
+    words = next(csv.reader([text], skipinitialspace=True), [])
+    return tuple(word.strip() for word in words if word.strip())
 
 
 @dataclass(frozen=True)

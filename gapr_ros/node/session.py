@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -49,6 +50,7 @@ class Session:
 
     def __init__(self, host: Host, ready: Ready, method_factory: Callable[[NodeParameters], Any]) -> None:
         self._host, self._ready, self._method_factory = host, ready, method_factory
+        self._swapping = threading.Lock()  # both threads put another `_ready`; neither may lose what the other put
         self._changes = Changes(ready.parameters, host.parameters)
         self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
@@ -152,8 +154,10 @@ class Session:
         return Situation(ready.method, ready.model, host.parameters, *since, course.seed, course.place, host.now_ns())
 
     def _renew_method(self) -> None:
+        """Before the next cloud, which may wait already: it is not registered by the limits of before."""
         method = self._method_factory(self._host.parameters)
-        self._host.call_soon(lambda: setattr(self, "_ready", replace(self._ready, method=method)))
+        with self._swapping:
+            self._ready = replace(self._ready, method=method)
 
     def _held(self) -> bool:
         return not self._host.parameters.continuous
@@ -235,7 +239,8 @@ class Session:
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self._begin_again("another bone")
-        self._ready = ready
+        with self._swapping:
+            self._ready = ready
         self._changes = Changes(ready.parameters, self._host.parameters)
         self.worker.outdate(self.course.epoch)
         self.parameters_changed()

@@ -57,6 +57,7 @@ def folder(tmp_path, monkeypatch):
         (tmp_path / f"{name}.ply").write_text("\n".join([*head, *rows]) + "\n")
     save(tmp_path / "p.mrk.json", Markups(POINTS[:4], ("a", "b", "c", "d")))
     (tmp_path / "a_file").write_text("")
+    np.savetxt("start.txt", np.eye(4))
     return tmp_path
 
 
@@ -69,7 +70,7 @@ def register(line, target="bone.ply", source="s.npy"):
 
 
 IN_LPS = ["--out p.tfm", "--slicer scene", "--residuals r.ply", "--targets p.mrk.json",
-          "--landmarks p.mrk.json p.mrk.json"]  # fmt: skip
+          "--landmarks p.mrk.json p.mrk.json", "--initial start.txt"]  # fmt: skip
 
 
 @pytest.mark.parametrize("option", IN_LPS)
@@ -136,6 +137,48 @@ def test_landmarks_that_are_near_or_as_far_with_other_axes_are_not_warned_of(fol
     args = Namespace(landmarks=[Path("q.mrk.json")], source=Path("s.npy"), target=Path("t.npy"))
     checks.warn_of_landmarks(args, np.array([at]), np.array([at]))
     assert ("with x and y negated" in caplog.text) is is_warned
+
+
+def test_a_start_in_a_file_goes_to_the_method_and_one_the_other_way_round_is_warned_of(folder, caplog, monkeypatch):
+    seen = SimpleNamespace(at=None)
+
+    def look(self, source, target, initial=None):
+        seen.at = initial
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
+
+    monkeypatch.setattr(Known, "register", look)
+    T = np.eye(4)
+    T[:3, 3] = [400.0, 0.0, 0.0]
+    np.save("aside.npy", POINTS - T[:3, 3])
+    for T_given, is_warned in ((T, False), (np.linalg.inv(T), True)):
+        caplog.clear()
+        np.savetxt("start.txt", T_given)
+        assert register("--initial start.txt", "lps.ply", "aside.npy") == 0 and np.array_equal(seen.at, T_given)
+        assert ("and its inverse 0 mm: is it the other way round?" in caplog.text) is is_warned
+    assert register("--initial start.txt --landmarks p.mrk.json p.mrk.json") == 1
+    assert register("--initial start.txt --out start.txt") == 1, "it is read"
+
+
+@pytest.mark.parametrize(("line", "at_mm", "said"), [
+    ("--landmarks s t", 300.0, ""),
+    ("--landmarks t s", 300.0, "t.mrk.json is near t.npy, and s.mrk.json near s.npy: are the files of --landmarks ex"),
+    ("--landmarks t s", 40.0, ""),
+    ("--landmarks t t", 300.0, ""),
+    ("--targets s", 300.0, "s.mrk.json is near s.npy, and far from t.npy: --targets are in the frame of the target"),
+    ("--targets t", 300.0, ""),
+    ("--targets far", 300.0, ""),
+])  # fmt: skip
+def test_markups_in_the_frame_of_the_other_cloud_are_warned_of(folder, caplog, line, at_mm, said):
+    """No residual shows it: landmarks fit in either order. One file alone may be of a part that was not seen."""
+    clouds = {"s": np.zeros((1, 3)), "t": np.array([[0.0, 0.0, at_mm]])}
+    for name, points in (clouds | {"far": np.array([[900.0, 0.0, 0.0]])}).items():
+        save(folder / f"{name}.mrk.json", Markups(points, ("a",)))
+    option, *names = line.split()
+    paths = [Path(f"{name}.mrk.json") for name in names]
+    landmarks, targets = (paths, None) if option == "--landmarks" else (None, paths[0])
+    args = Namespace(source=Path("s.npy"), target=Path("t.npy"), landmarks=landmarks, targets=targets)
+    checks.warn_of_frames(args, clouds["s"], clouds["t"])
+    assert [said in message for message in caplog.messages] == [True] * bool(said)
 
 
 def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkeypatch):

@@ -164,6 +164,31 @@ def test_a_limit_that_is_set_while_a_bone_is_read_holds_for_it(blob_path, client
     assert made[:2] == [0.9, 0.9]
 
 
+def test_a_cloud_that_comes_after_a_limit_was_set_is_registered_by_it(blob_path, client):
+    """Its method was made before it, and it went to the old one where the executor was busy: refused once more."""
+    made, gate, busy = [StandIn(), StandIn()], threading.Event(), threading.Event()
+
+    def factory(parameters):
+        if parameters.max_tre == 0.0:
+            return made[0]
+        assert gate.wait(PATIENCE_S)
+        return made[1]
+
+    with node_in_thread(None, blob_path, factory=factory) as node:
+        client.wait_for_state("active")
+        made[0].calls.clear()  # its warm-up
+        assert node.set_parameters([Parameter("max_tre", value=0.5)])[0].successful
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 1, PATIENCE_S, "the cloud")
+        node.call_soon(lambda: busy.wait(PATIENCE_S))
+        gate.set()
+        try:
+            wait_until(lambda: made[0].calls or made[1].calls, PATIENCE_S, "the registration")
+        finally:
+            busy.set()
+        assert not made[0].calls and len(made[1].calls) == 1
+
+
 def test_a_parameter_that_is_set_just_as_the_bone_is_ready_does_not_miss_the_method(blob_path, client, method):
     """It was taken, and the method was made without it: between the end of the reading and the change of state."""
     with node_in_thread(method, blob_path, autostart=False) as node:

@@ -41,6 +41,11 @@ def test_a_model_is_turned_once_at_most_whatever_its_file_says(tmp_path, said, a
     assert np.allclose(points, 2.0 * POINTS * [sign, sign, 1.0])
 
 
+def test_a_file_in_ras_that_is_read_as_it_is_names_the_parameter_whose_default_that_is(tmp_path, caplog):
+    loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"))
+    assert "says SPACE=RAS and is read as AS_IS: --axes or model_axes says so" in caplog.text
+
+
 def test_a_model_that_is_ras_already_is_not_turned_by_lps_to_ras(tmp_path):
     with pytest.raises(ConfigError, match="which says SPACE=RAS; use as_is"):
         loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"), model_axes="lps_to_ras")
@@ -56,3 +61,26 @@ def test_the_bone_of_a_label_map_is_named_by_its_label(tmp_path):
         assert (z.min() + z.max()) / 2.0 == pytest.approx(middle, abs=0.1)
     with pytest.raises(InvalidPointCloudError, match="2 of them .75, 76.; name one"):
         loaded(tmp_path / "seg.nrrd")
+
+
+def test_a_segment_with_a_comma_in_its_name_is_named_in_quotes(tmp_path):
+    """A comma parts the names of several segments; 3D Slicer allows it in one."""
+    sitk = pytest.importorskip("SimpleITK", reason="it writes the label map: pip install SimpleITK")
+    voxels = np.zeros((40, 30, 30), dtype=np.uint8)
+    voxels[5:15, 8:20, 8:20], voxels[25:35, 8:20, 8:20] = 1, 2
+    image = sitk.GetImageFromArray(voxels)
+    for number, name in enumerate(("Femur, left", "Tibia")):
+        image.SetMetaData(f"Segment{number}_Name", name)
+        image.SetMetaData(f"Segment{number}_LabelValue", str(number + 1))
+    sitk.WriteImage(image, str(tmp_path / "seg.nrrd"))
+    for label, middle in (('"Femur, left"', 9.5), ('Tibia, "Femur, left"', 19.5), ("tibia,", 29.5)):
+        z = loaded(tmp_path / "seg.nrrd", model_label=label)[:, 2]
+        assert (z.min() + z.max()) / 2.0 == pytest.approx(middle, abs=0.1)
+    with pytest.raises(InvalidPointCloudError, match='a segment Femur; got seg.nrrd: "Femur, left"; choose'):
+        loaded(tmp_path / "seg.nrrd", model_label="Femur, left")
+
+
+@pytest.mark.parametrize("path", ["file:///data/bone.stl", "package://bones/bone.stl"])
+def test_a_model_path_with_a_scheme_is_said_to_be_none(path):
+    with pytest.raises(ConfigError, match=f"model_path: a path; got {path}; write it without scheme"):
+        loaded(path)

@@ -181,6 +181,13 @@ def test_a_sensor_may_be_named_in_the_settings_of_the_library():
     assert not parameters.remarks(parameters.NodeParameters(accumulate=1, settings_file="settings.yaml"))
 
 
+@pytest.mark.parametrize(("least", "most", "said"), [(5.0, 1.0, True), (1.0, 1.0, True), (0.5, 1.0, False),
+                                                    (5.0, 0.0, False), (0.0, 1.0, False)])  # fmt: skip
+def test_a_range_that_no_point_can_be_in_is_said_when_it_is_configured(least, most, said):
+    remarks = parameters.remarks(parameters.NodeParameters(range_min=least, range_max=most))
+    assert sum(f"range_min {least} is not below range_max {most}" in remark for remark in remarks) == said
+
+
 @pytest.mark.parametrize(
     ("low", "high", "said"),
     [

@@ -13,11 +13,11 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import frames, region, wire
+from gapr_ros.node import frames, intake, region, wire
 from gapr_ros.node.model import load_model
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
-from msg_adapters import matrix_to_transform
+from msg_adapters import matrix_to_transform, xyz_to_cloud
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 FAR = np.random.default_rng(2).normal(size=(800, 3)) * 0.02 + [3.0, 0.0, 0.0]
@@ -69,6 +69,21 @@ def test_a_box_that_no_point_fits_in_names_its_corners_in_metres(highest):
         region.box(parameters, np.eye(4))
     assert refused.value.reason is Reason.TOO_FEW_POINTS
     assert f"crop_min [0.0, 0.1, 0.2] is not below crop_max {list(highest)}" in refused.value.text
+
+
+@pytest.mark.parametrize(("given", "crop", "said"), [
+    ({"range_min": 5.0}, False, "0 usable points, min_points is 200; of 1000 points are left out: 1000 by range_min"),
+    ({}, True, "0 usable points, min_points is 200; of 1000 points are left out: 1000 by the crop (crop_min, crop_max"),
+    ({"accumulate": 5}, True, "0 usable points; of 1000 points are left out: 1000 by the crop"),
+    ({"min_points": 1001}, False, "1000 usable points, min_points is 1001"),
+])  # fmt: skip
+def test_a_refusal_for_too_few_points_says_which_limits_left_them_out(given, crop, said):
+    """A box in the wrong place looks like a sensor that sees nothing."""
+    crops = [lambda points: points[:0]] if crop else []
+    with pytest.raises(RefusedError) as refused:
+        intake.take_in(xyz_to_cloud(GOOD), 250.0, NodeParameters(**given), crops)
+    assert refused.value.reason is Reason.TOO_FEW_POINTS
+    assert refused.value.text.startswith(said) and ("left out" in said or "left out" not in refused.value.text)
 
 
 def test_the_neighbourhood_of_the_bone_is_where_its_last_pose_puts_it():

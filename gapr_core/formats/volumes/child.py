@@ -61,7 +61,13 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
         nifti.check_length(path, limits)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
-    reader.ReadImageInformation()
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError as error:
+        if is_nifti and "orthonormal" in str(error):  # ITK reads such a grid from the other kinds of files
+            how = "save it as .nrrd or .mha, or resample it"
+            raise InvalidPointCloudError("voxels at right angles in NIfTI", "a sheared grid", how) from error
+        raise
     size = int(np.prod(reader.GetSize(), dtype=np.float64)) * reader.GetNumberOfComponents()
     limits.check_unpacked(size * 8)
     image = reader.Execute()

@@ -425,6 +425,20 @@ def test_a_nifti_with_two_sizes_of_a_voxel_is_refused(tmp_path):
         clouds.load(wrong)
 
 
+def test_a_sheared_grid_is_read_of_a_nrrd_and_refused_by_its_name_of_a_nifti(tmp_path):
+    """As of a CT with a tilted gantry; exporting such a NIfTI once more would not help."""
+    sheared = {"srow_y": [0.0, 3.0, 0.8, -36.0], "pixdim": [1.0, 3.0, 3.0, np.hypot(3.0, 0.8), 1.0, 1.0, 1.0, 1.0]}
+    with pytest.raises(InvalidPointCloudError, match=r"right angles in NIfTI; got a.nii: a sheared grid; .*\.nrrd"):
+        clouds.load(nifti_with(tmp_path / "a.nii", qform_code=0, **sheared))
+    voxels = voxels_of(*affine_of((3.0, 3.0, 3.0))).astype(np.uint8)
+    where = "space directions: (3,0,0) (0,3,0) (0,0.8,3)\nspace origin: (0,0,0)\n"
+    head = HEADS["nrrd"].format(" ".join(map(str, voxels.shape[::-1])), where)
+    (tmp_path / "b.nrrd").write_bytes(head.encode() + voxels.tobytes())
+    points = clouds.load(tmp_path / "b.nrrd").points
+    straight = points - np.outer(points[:, 2], [0.0, 0.8 / 3.0, 0.0])
+    np.testing.assert_allclose(np.ptp(straight, axis=0), 2.0 * RADII, atol=2.0)
+
+
 WHERE = "space directions: (3,0,0) (0,3,0) (0,0,3)\n", "space origin: (-30,-80,-40)\n"
 PLACES = {
     "a.nrrd": ("".join(WHERE), None), "b.nrrd": (WHERE[0], "no space origin"),

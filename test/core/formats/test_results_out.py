@@ -1,6 +1,9 @@
 """From a CT mask to files that other tools read the right way round."""
 
 import json
+import os
+import subprocess
+import sys
 from xml.etree import ElementTree
 
 import numpy as np
@@ -35,6 +38,60 @@ def test_a_matrix_as_text_is_the_pose_itself(tmp_path):
     assert np.array_equal(np.loadtxt(tmp_path / "pose.txt"), T)
     with pytest.raises(ConfigError, match=".tfm .h5 .txt"):
         transforms.write(tmp_path / "pose.mat", T)
+
+
+@pytest.mark.parametrize("name", ["pose.TFM", "pose.H5", "pose.Tfm"])
+def test_an_ending_in_capitals_that_itk_does_not_read_is_refused_before_the_work(tmp_path, capsys, name):
+    np.save(tmp_path / "a.npy", POINTS)
+    files = ["--source", str(tmp_path / "a.npy"), "--target", str(tmp_path / "a.npy"), "--method", "gapr_search"]
+    assert main(["register", *files, "--out", str(tmp_path / name)]) == 1
+    assert f"got {name}; write the ending in small letters" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["pose.tfm", "pose.h5", "pose.txt"])
+def test_what_is_written_is_read_as_the_same_pose(tmp_path, name):
+    transforms.write(tmp_path / name, T)
+    np.testing.assert_allclose(transforms.read(tmp_path / name), T, atol=1e-9)
+
+
+def test_transforms_about_a_centre_and_composed_ones_are_read_as_a_start(tmp_path):
+    """As elastix and 3D Slicer write them."""
+    euler = sitk.Euler3DTransform((30.0, -40.0, 50.0), 0.3, -0.2, 0.9, (5.0, 6.0, -7.0))
+    both = sitk.CompositeTransform([euler, sitk.TranslationTransform(3, (1.0, 2.0, 3.0))])
+    for transform, name in ((euler, "a.tfm"), (both, "b.tfm"), (both, "c.h5")):
+        sitk.WriteTransform(transform, str(tmp_path / name))
+        moved = [transform.TransformPoint(point.tolist()) for point in POINTS]
+        np.testing.assert_allclose(se3.apply(transforms.read(tmp_path / name), moved), POINTS, atol=1e-6)
+
+
+def test_a_start_that_is_no_rigid_motion_is_refused_by_its_name(tmp_path):
+    sitk.WriteTransform(sitk.ScaleTransform(3, (1.1, 1.0, 1.0)), str(tmp_path / "scaled.tfm"))
+    sitk.WriteTransform(sitk.BSplineTransform(3), str(tmp_path / "bent.tfm"))
+    sitk.WriteTransform(sitk.Euler2DTransform(), str(tmp_path / "flat.tfm"))
+    (tmp_path / "damaged.tfm").write_text("#Insight Transform File V1.0\nTransform: Aff")
+    (tmp_path / "itk.txt").write_text("#Insight Transform File V1.0\nTransform: AffineTransform_double_3_3\n")
+    np.savetxt(tmp_path / "three.txt", T[:3])
+    np.savetxt(tmp_path / "nan.txt", T * np.nan)
+    for name, said in {
+        "scaled.tfm": "scaled.tfm whose rotation part has determinant", "bent.tfm": "linear transform in 3-D",
+        "flat.tfm": "linear transform in 3-D", "damaged.tfm": "which ITK cannot read", "itk.txt": "rename an ITK",
+        "three.txt": "with 3 by 4", "nan.txt": "not finite", "none.tfm": "a file that exists", "a.mat": ".tfm .h5 .txt",
+    }.items():  # fmt: skip
+        with pytest.raises(ConfigError, match=said):
+            transforms.read(tmp_path / name)
+
+
+def test_a_damaged_start_is_refused_in_one_line(tmp_path):
+    """HDF5 writes lines of its own, which Python does not see."""
+    transforms.write(tmp_path / "pose.h5", T)
+    data = (tmp_path / "pose.h5").read_bytes()
+    (tmp_path / "cut.h5").write_bytes(data[: len(data) // 2])
+    np.save(tmp_path / "a.npy", POINTS)
+    files = ["--source", "a.npy", "--target", "a.npy", "--method", "gapr_search", "--initial", "cut.h5"]
+    command = [sys.executable, "-m", "gapr_core.cli", "register", *files]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([transforms.PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cut.h5, which ITK cannot read" in done.stderr
 
 
 def voxelised(surface, spacing, turn, flip):
@@ -82,6 +139,27 @@ def test_a_mask_becomes_a_transform_that_itk_maps_the_right_way_round(
     mapped = np.array([inverse.TransformPoint(point.tolist()) for point in source[::20]])
     off = np.linalg.norm(mapped - distal[::20], axis=1)
     assert off.max() < 0.3 * max(spacing) + 0.5, off.max()
+
+
+def test_a_source_in_a_label_map_has_a_label_of_its_own(tmp_path, femur, capsys):
+    """As the bone of an intra-operative scan, next to metal."""
+    image = voxelised(femur, np.array([2.0, 2.0, 2.0]), (0.0, 0.0, 0.0), (1, 1, 1))
+    sitk.WriteImage(image * 76, str(tmp_path / "ct.nii.gz"))
+    voxels = sitk.GetArrayFromImage(image)
+    voxels[voxels.shape[0] // 2 :] = 0
+    voxels[:4, :4, :4] = 2
+    part = sitk.GetImageFromArray(voxels)
+    part.CopyInformation(image)
+    for key, value in {"Segment0_Name": "Bone", "Segment1_Name": "Metal"}.items():
+        part.SetMetaData(key, value)
+        part.SetMetaData(key.replace("Name", "LabelValue"), str(int(key[7]) + 1))
+    sitk.WriteImage(part, str(tmp_path / "scan.seg.nrrd"))
+    command = ["register", "--source", str(tmp_path / "scan.seg.nrrd"), "--target", str(tmp_path / "ct.nii.gz")]
+    command += ["--method", "gapr_search", "--label", "76", "--out", str(tmp_path / "pose.txt")]
+    assert main(command) == 1
+    assert "(Bone, Metal); name one with --label (--source-label of the source)" in capsys.readouterr().err
+    assert main([*command, "--source-label", "bone"]) == 0
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "pose.txt"), np.eye(4), atol=0.5)
 
 
 def result_with(covariance=None, residuals=None):

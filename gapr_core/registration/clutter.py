@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 
 NAME = "scene"
 AT_THE_BONE = ("pointer", "ultrasound")  # sensors without lines of sight
+GIVEN = -1  # in place of the index of a region
 SMALLEST_SCORE = 1e-4  # a score below, and so one below 0, counts as this
 
 
@@ -58,7 +59,7 @@ class Pool:
 
     Attributes:
         poses: (K, 4, 4) T_target_source, mm.
-        region: (K,) index of the region that proposed each; -1 for a pose that was given.
+        region: (K,) index of the region that proposed each; `GIVEN` for a pose that was given.
         scores: (K,) of lines of sight (`Visible.score`), large is good; 0 before the first stage, and comparable within
             one stage, since each has tolerances of its own.
     """
@@ -66,6 +67,14 @@ class Pool:
     poses: Array
     region: NDArray[np.int64]
     scores: Array
+
+    @property
+    def given(self) -> Pool:
+        """Those that no region proposed."""
+        return self[np.flatnonzero(self.region == GIVEN)]
+
+    def __getitem__(self, some: NDArray[np.int64]) -> Pool:
+        return Pool(self.poses[some], self.region[some], self.scores[some])
 
 
 def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) -> Scene:
@@ -110,15 +119,18 @@ def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterC
         return steps.refined(poses, region.source, region.source.order[: config.region_points])
 
     found = in_threads(work, scene.regions, num_threads=num_threads)
-    label = np.repeat(np.arange(-1, len(found)), [len(given), *map(len, found)])
+    label = np.repeat(np.arange(GIVEN, len(found)), [len(given), *map(len, found)])
     return Pool(np.concatenate([given, *found]), label, np.zeros(len(label)))
 
 
 def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Candidates:
-    """From all hypotheses to a few distinct ones, refined and ranked; the best comes first."""
+    """From all hypotheses to a few distinct ones, refined and ranked; the best comes first.
+
+    A pose that is given reaches the last step as it is, too: around it there may be little bone to refine it on.
+    """
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
-    best = refine_on_all(best, scene, target, config, num_threads)
+    best = refine_on_all(_together(pool.given, best), scene, target, config, num_threads)
     shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
     return Candidates(best.poses, small_is_good(best.scores), shares)
 
@@ -148,7 +160,8 @@ def refine_around(
 
     def work(label: int) -> None:
         of_it = np.flatnonzero(pool.region == label)
-        near = _around(tree, scene.regions[label].centre, config) if label >= 0 else np.arange(config.middle_points)
+        is_given = label == GIVEN
+        near = np.arange(config.middle_points) if is_given else _around(tree, scene.regions[label].centre, config)
         some = scene.source.order[near[near < len(scene.source.order)]]
         poses[of_it] = steps.refined(pool.poses[of_it], scene.source, some)
 
@@ -215,4 +228,9 @@ def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
 def _best_distinct(pool: Pool, scene: Scene, config: ClutterConfig, most: int) -> Pool:
     ranked = np.argsort(-pool.scores, kind="stable")
     kept = distinct(markers(pool.poses, scene.source, config.markers), ranked, config.same_pose_mm, most)
-    return Pool(pool.poses[kept], pool.region[kept], pool.scores[kept])
+    return pool[kept]
+
+
+def _together(first: Pool, second: Pool) -> Pool:
+    pairs = (first.poses, second.poses), (first.region, second.region), (first.scores, second.scores)
+    return Pool(*map(np.concatenate, pairs))

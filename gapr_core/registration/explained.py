@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
 VIEWPOINT = (
-    "check that the viewpoint, given or read off the pixels, is the camera's place in the frame of the cloud "
-    "(none: no camera saw it), "
+    ". It also looks so where bone was cut away since the scan, and where the viewpoint, given or read off the pixels, "
+    "is not the camera's place in the frame of the cloud (none: no camera saw it)"
 )
-SAY_WHERE = "say where the camera was, "
+SAY_WHERE = ", or say where the camera was"
 RIVAL_IF_ALONE = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 
 
@@ -117,8 +117,8 @@ def _clutter(share: float, other: Refusal | None, more: str) -> Refusal:
     why = "no pose of it is certain" if other is None else other.reason
     return Refusal(
         RegistrationStatus.CLUTTER,
-        f"at most {100.0 * share:.0f} % of the cloud is this bone, and {why}: {more}crop the cloud with a box around "
-        "the wound or around the last pose (crop_to_track), or expose more of the bone",
+        f"in the best pose {100.0 * share:.0f} % of the cloud is this bone, and {why}: crop the cloud with a box around "
+        f"the wound or around the last pose (crop_to_track) or expose more of the bone{more}",
     )
 
 

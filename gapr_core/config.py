@@ -235,6 +235,9 @@ class LimitsConfig(Settings):
     )
     shared_noise: float = setting(0.5, "share of a sensor's noise that near points may share", low=0, high=1)
     model_bias_mm: float = setting(0.1, "smooth error of the model of a bone", low=0, high=10, unit="mm")
+    rough_exceeded: float = setting(
+        0.4, "rough misfit in a scene over the scale of its residuals from which on they do not", low=0, high=100
+    )
     covered: float = setting(0.9, "least share of the covariance within 4 mm and 5 deg", low=0, high=1)
 
 

@@ -76,6 +76,10 @@ class Pool:
     def __getitem__(self, some: NDArray[np.int64]) -> Pool:
         return Pool(self.poses[some], self.region[some], self.scores[some])
 
+    def __add__(self, other: Pool) -> Pool:
+        poses = np.concatenate([self.poses, other.poses])
+        return Pool(poses, np.append(self.region, other.region), np.append(self.scores, other.scores))
+
 
 def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) -> Scene:
     """The scene that a camera at `viewpoint` (3,), mm, source frame, saw; no regions yet."""
@@ -130,7 +134,7 @@ def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConf
     """
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
-    best = refine_on_all(_together(pool.given, best), scene, target, config, num_threads)
+    best = refine_on_all(pool.given + best, scene, target, config, num_threads)
     shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
     return Candidates(best.poses, small_is_good(best.scores), shares)
 
@@ -229,8 +233,3 @@ def _best_distinct(pool: Pool, scene: Scene, config: ClutterConfig, most: int) -
     ranked = np.argsort(-pool.scores, kind="stable")
     kept = distinct(markers(pool.poses, scene.source, config.markers), ranked, config.same_pose_mm, most)
     return pool[kept]
-
-
-def _together(first: Pool, second: Pool) -> Pool:
-    pairs = (first.poses, second.poses), (first.region, second.region), (first.scores, second.scores)
-    return Pool(*map(np.concatenate, pairs))

@@ -114,6 +114,17 @@ def is_beyond_bias(assessment: Assessment, config: RegistrarConfig) -> bool:
     return bool(assessment.uncertainty.smooth_mm > limits.bias_exceeded * expected_mm)
 
 
+def is_rough(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where near points of a scene err alike, by much of what a point errs by.
+
+    The confidence of scenes knows the misfit in mm. A precise camera's is small in mm on another subject's bone, too.
+    """
+    if assessment.seen is None:
+        return False
+    rough_mm, sigma_mm = assessment.features["rough_misfit"], np.exp(assessment.features["log_sigma"])
+    return bool(rough_mm > config.limits.rough_exceeded * sigma_mm)
+
+
 def residual_mm(assessment: Assessment) -> float:
     """Root mean square residual of the points that count for the pose, whose unknowns count; infinite without any."""
     signed = assessment.fit.signed_mm[assessment.fit.weights > 0.0]
@@ -163,6 +174,12 @@ LIMITS = (
         is_beyond_bias,
         "near points err alike, by more than the smooth error of the sensor; check that it is this subject's bone, and "
         "what is said of the sensor (bias_mm)",
+    ),
+    Limit(
+        "rough",
+        is_rough,
+        "near points err alike, by much of what each errs by; check that it is this subject's bone, or measure it from "
+        "nearer",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),

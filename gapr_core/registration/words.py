@@ -36,6 +36,7 @@ WORDS = {
     "sparse": "limit: few points, or points far apart, do not say whose bone it is",
     "beyond_noise": "limit: residuals far larger than the noise of the sensor",
     "beyond_bias": "limit: near points err alike by more than the smooth error of the sensor",
+    "rough": "limit: near points of a camera's cloud err alike",
     "uncertain": "limit: the covariance leaves the pose loose",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits

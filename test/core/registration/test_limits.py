@@ -146,6 +146,18 @@ def test_what_near_points_share_beyond_a_sensor_may_be_of_another_bone(made, sen
         assert limits.is_beyond_bias(sharing(1.01 * most, count), named(**sensor)) is holds
 
 
+@pytest.mark.parametrize(("rough_mm", "in_scene", "probability"), [(0.19, True, SURE), (0.21, True, 0.89),
+                                                                   (0.21, False, SURE)])  # fmt: skip
+def test_near_points_of_a_scene_that_err_alike_may_be_of_another_bone(made, rough_mm, in_scene, probability):
+    """At most 0.4 times the scale of the residuals, 0.5 mm."""
+    answer = made()
+    features = dict(answer.features) | {"rough_misfit": rough_mm, "log_sigma": np.log(0.5)}
+    answer = replace(answer, features=features, seen=answer.source if in_scene else None)
+    found = limits.limited(answer, RegistrarConfig())
+    assert found.probability == probability
+    assert (list(found.contributions)[-1] == "rough") is (probability < SURE)
+
+
 def test_no_pose_is_surer_than_its_covariance(made):
     loose = made(covariance=np.diag([2.0**2] * 3 + [1e-6] * 3))
     assert list(limits.limited(loose, RegistrarConfig()).contributions)[-1] == "uncertain"

@@ -68,11 +68,6 @@ class Pool:
     region: NDArray[np.int64]
     scores: Array
 
-    @property
-    def given(self) -> Pool:
-        """Those that no region proposed."""
-        return self[np.flatnonzero(self.region == GIVEN)]
-
     def __getitem__(self, some: NDArray[np.int64]) -> Pool:
         return Pool(self.poses[some], self.region[some], self.scores[some])
 
@@ -127,14 +122,21 @@ def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterC
     return Pool(np.concatenate([given, *found]), label, np.zeros(len(label)))
 
 
-def verify(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Candidates:
+def verify(
+    pool: Pool,
+    scene: Scene,
+    target: PreparedTarget,
+    config: ClutterConfig,
+    num_threads: int = 0,
+    start: Array | None = None,
+) -> Candidates:
     """From all hypotheses to a few distinct ones, refined and ranked; the best comes first.
 
-    A pose that is given reaches the last step as it is, too: around it there may be little bone to refine it on.
+    Poses to start from (K, 4, 4) reach the last step as they are, too: around them there may be little bone.
     """
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
-    best = refine_on_all(pool.given + best, scene, target, config, num_threads)
+    best = refine_on_all(best if start is None else _given(start) + best, scene, target, config, num_threads)
     shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
     return Candidates(best.poses, small_is_good(best.scores), shares)
 
@@ -227,6 +229,10 @@ def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
         normals = target.normals[some]
         target.cache[key] = target.points[some] + target.offset_mm * normals, normals
     return target.cache[key]  # type: ignore[no-any-return]
+
+
+def _given(poses: Array) -> Pool:
+    return Pool(poses, np.full(len(poses), GIVEN), np.zeros(len(poses)))
 
 
 def _best_distinct(pool: Pool, scene: Scene, config: ClutterConfig, most: int) -> Pool:

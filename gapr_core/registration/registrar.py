@@ -315,7 +315,7 @@ class Registrar:
             clock.lap("propose")
             if not len(pool.poses):
                 continue
-            candidates = clutter.verify(pool, scene, target, settings, threads)
+            candidates = clutter.verify(pool, scene, target, settings, threads, poses if number == 1 else None)
             poses = candidates.poses
             clock.lap("verify")
             part = explained.refine(poses[0], scene, target, config)

@@ -146,9 +146,9 @@ def test_verification_gives_scores_that_are_small_for_good_and_the_support_of_th
     assert far.scores == pytest.approx([1e4, 1e4])  # a share below 0 counts as next to nothing
 
 
-def test_a_given_pose_reaches_the_last_step_as_it_is_whatever_the_steps_before_say(scene, target, scored, refined):
+def test_a_pose_to_start_from_reaches_the_last_step_as_it_is(scene, target, scored, refined):
     config = replace(CONFIG, middle_poses=2, kept_poses=3)
-    found = clutter.verify(pool_of(60.0, 9.0, 16.0, region=[-1, 0, 0]), scene, target, config, 1)
+    found = clutter.verify(pool_of(60.0, 9.0, 16.0, region=[-1, 0, 0]), scene, target, config, 1, shifts(60.0))
     assert dict(zip(places(found.poses), found.poses[:, 1, 3], strict=True)) == {9.0: 2.0, 16.0: 2.0, 60.0: 1.0}
 
 

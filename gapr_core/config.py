@@ -367,7 +367,7 @@ class ClutterConfig(Settings):
     inferred_points: int = setting(2000, "points by whose normals the place of its camera is inferred", low=10)
     inferred_rounds: tuple[int, int] = setting((2, 1), "rounds of regions for each place, the likelier first", low=1)
     inferred_least: float = setting(0.85, "least confidence of a pose that rests on such a place", low=0, high=1)
-    least_cos: float = setting(0.2, "cosine of incidence that nearly all points of such a cloud exceed", low=0, high=1)
+    least_cos: float = setting(0.3, "cosine of incidence that nearly all points of such a cloud exceed", low=0, high=1)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
 
     def __post_init__(self) -> None:

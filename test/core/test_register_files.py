@@ -139,21 +139,28 @@ def test_landmarks_that_are_near_or_as_far_with_other_axes_are_not_warned_of(fol
     assert ("with x and y negated" in caplog.text) is is_warned
 
 
-def test_a_start_in_a_file_goes_to_the_method_and_one_the_other_way_round_is_warned_of(folder, caplog, monkeypatch):
-    seen = SimpleNamespace(at=None)
+@pytest.fixture
+def hints(monkeypatch):
+    """What the method was given besides source and target, the last time that it was asked."""
+    given = {}
 
-    def look(self, source, target, initial=None):
-        seen.at = initial
+    def look(self, source, target, initial=None, viewpoint=None):
+        given.update(initial=initial, viewpoint=viewpoint)
         return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
 
     monkeypatch.setattr(Known, "register", look)
+    return given
+
+
+def test_a_start_in_a_file_goes_to_the_method_and_one_the_other_way_round_is_warned_of(folder, caplog, hints):
     T = np.eye(4)
     T[:3, 3] = [400.0, 0.0, 0.0]
     np.save("aside.npy", POINTS - T[:3, 3])
     for T_given, is_warned in ((T, False), (np.linalg.inv(T), True)):
         caplog.clear()
         np.savetxt("start.txt", T_given)
-        assert register("--initial start.txt", "lps.ply", "aside.npy") == 0 and np.array_equal(seen.at, T_given)
+        assert register("--initial start.txt", "lps.ply", "aside.npy") == 0
+        assert np.array_equal(hints["initial"], T_given)
         assert ("and its inverse 0 mm: is it the other way round?" in caplog.text) is is_warned
     assert register("--initial start.txt --landmarks p.mrk.json p.mrk.json") == 1
     assert register("--initial start.txt --out start.txt") == 1, "it is read"
@@ -181,15 +188,8 @@ def test_markups_in_the_frame_of_the_other_cloud_are_warned_of(folder, caplog, l
     assert [said in message for message in caplog.messages] == [True] * bool(said)
 
 
-def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkeypatch):
-    seen = SimpleNamespace(at=None)
-
-    def look(self, source, target, viewpoint=None):
-        seen.at = viewpoint
-        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
-
-    monkeypatch.setattr(Known, "register", look)
-    assert register("--viewpoint 1,2,3", source="ras.ply") == 0 and list(seen.at) == [1.0, 2.0, 3.0]
+def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, hints):
+    assert register("--viewpoint 1,2,3", source="ras.ply") == 0 and list(hints["viewpoint"]) == [1.0, 2.0, 3.0]
     assert "--viewpoint is taken to be in LPS" in caplog.text
     caplog.clear()
     assert register("--viewpoint 1,2,3", source="lps.ply") == 0 and "--viewpoint" not in caplog.text
@@ -199,23 +199,16 @@ def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, monkey
     ("option", "expected_mm"),
     [("", (100.0, 50.0, -400.0)), ("--viewpoint none", None), ("--viewpoint 1,2,3", (1.0, 2.0, 3.0))],
 )
-def test_an_organised_cloud_says_where_its_camera_was(folder, image, monkeypatch, capsys, option, expected_mm):
+def test_an_organised_cloud_says_where_its_camera_was(folder, image, hints, capsys, option, expected_mm):
     """Here in metres, as cameras write; a viewpoint that is given is one in mm."""
-    seen = SimpleNamespace(at=None)
-
-    def look(self, source, target, viewpoint=None):
-        seen.at = viewpoint
-        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
-
-    monkeypatch.setattr(Known, "register", look)
     write_pcd("camera.pcd", image / 1000.0)
     assert register(f"--source-units m {option}", source="camera.pcd") == 0
     said = "camera.pcd is an image seen from 100,50,-400 mm (--viewpoint none" in capsys.readouterr().out
     assert said is (not option)
     if expected_mm is None:
-        assert seen.at is None
+        assert hints["viewpoint"] is None
     else:
-        np.testing.assert_allclose(seen.at, expected_mm, atol=0.01)
+        np.testing.assert_allclose(hints["viewpoint"], expected_mm, atol=0.01)
 
 
 def test_a_cloud_on_the_pixels_of_a_camera_in_the_origin_shows_it_and_a_mesh_does_not(

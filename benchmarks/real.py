@@ -1,6 +1,6 @@
 """Real clouds, whole and cut: the answer, its errors against the pose that the data set states, and its own bound.
 
-    python benchmarks/real.py [--real DIR] [--sensor depth_camera]
+    python benchmarks/real.py [--real DIR] [--sensor depth_camera] [--model-mm 0.3]
 
 DIR is as for `gapr demo --real` (docs/real_data.md). Of every cloud with a stated pose: all of it, windows of 40, 75
 and 120 mm along it where it is longer, and 12 to 200 points drawn from all of it, as a digitiser would take them.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationResult, metrics
-from gapr_core.config import SENSOR_KINDS, SensorConfig
+from gapr_core.config import SENSOR_KINDS, CovarianceConfig, SensorConfig
 from gapr_core.data import real
 from gapr_core.geometry import extent
 from gapr_core.pages import markdown
@@ -35,8 +35,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--real", type=Path, default=real.default_folder(), help="folder with the data")
     parser.add_argument("--sensor", choices=SENSOR_KINDS, default="unknown", help="what is said of the sensor")
+    parser.add_argument("--model-mm", type=float, default=0.0, help="what is said of the models: `covariance.model_mm`")
     args = parser.parse_args()
-    registrar = Registrar.from_pretrained(RegistrarConfig(sensor=SensorConfig(kind=args.sensor)))
+    said = RegistrarConfig(sensor=SensorConfig(kind=args.sensor), covariance=CovarianceConfig(model_mm=args.model_mm))
+    registrar = Registrar.from_pretrained(said)
     lines = [markdown.head(HEAD)]
     for pair in real.pairs(args.real):
         truth = pair.T_target_source

@@ -123,11 +123,12 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
 
 
 def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
-    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 1 1^T + h^2 S S^T) + e^2 E E^T + o^2 d d^T + q^2 r r^T) G^T + T + P.
+    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P.
 
-    G is the gain of the fit, s the noise, b the bias with fields F, of which all points share a (`long_share`) and h
-    strains the source (`linear_share`, `strains`), e the local error with fields E, o the stand-off and q the scale
-    (see `directions`), T what the place of the whole cloud adds and P the prior.
+    G is the gain of the fit, U = 1 1^T what all points share, s the noise, b the bias with fields F, of which all
+    points share a (`long_share`) and h strains the source (`linear_share`, `strains`), e the local error with fields E,
+    o the stand-off and q the scale (see `directions`), m the error of the bone's model (`model_mm`), T what the place
+    of the whole cloud adds and P the prior.
     """
     inlier = fit.weights > 0.0
     gain, prior = gain_of(fit, fields, errors.noise_mm)
@@ -139,6 +140,7 @@ def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) 
             config.linear_share * errors.bias_mm * gain @ strains(fit),
             errors.local_mm * gain @ _local_fields(fit, errors, config)[inlier],
             errors.standoff_mm * gain @ shift,
+            config.model_mm * gain.sum(axis=1),
             errors.scale * gain @ growth,
         ]
     )

@@ -58,11 +58,15 @@ def configured(config: RegistrarConfig, parameters: NodeParameters) -> Registrar
     sensor = config.sensor if parameters.sensor == "unknown" else replace(config.sensor, kind=parameters.sensor)
     if parameters.standoff:
         sensor = replace(sensor, standoff_mm=parameters.standoff * MM_PER_M)
+    covariance = config.covariance
+    if parameters.model_error:
+        covariance = replace(covariance, model_mm=parameters.model_error * MM_PER_M)
     is_inferred = config.clutter.infer_viewpoint and parameters.viewpoint != "none"
     clutter = replace(config.clutter, infer_viewpoint=is_inferred)
     return replace(
         config,
         sensor=sensor,
+        covariance=covariance,
         clutter=clutter,
         min_confidence=parameters.min_confidence,
         max_tre_mm=parameters.max_tre * MM_PER_M,

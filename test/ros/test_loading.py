@@ -16,7 +16,7 @@ from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from gapr_core.config import ClutterConfig, RegistrarConfig
+from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, SensorConfig
 from gapr_ros.node.method import ShippedMethod, configured
 from gapr_ros.node.model import load_model
 from gapr_ros.parameters import NodeParameters
@@ -67,6 +67,15 @@ def test_a_bone_of_an_uncommon_size_is_warned_of(tmp_path, caplog, scale, is_odd
 def test_where_a_camera_was_is_inferred_unless_all_is_bone(file, given, is_inferred):
     settings = RegistrarConfig(clutter=ClutterConfig(**file))
     assert configured(settings, replace(NodeParameters(), **given)).clutter.infer_viewpoint is is_inferred
+
+
+def test_what_is_said_of_sensor_and_model_is_in_metres_and_wins_over_the_file():
+    file = RegistrarConfig(sensor=SensorConfig("laser", 0.5), covariance=CovarianceConfig(model_mm=0.2))
+    said = configured(file, replace(NodeParameters(), sensor="pointer", standoff=0.001, model_error=0.0003))
+    assert (said.sensor.kind, said.sensor.standoff_mm) == ("pointer", pytest.approx(1.0))
+    assert said.covariance.model_mm == pytest.approx(0.3)
+    kept = configured(file, NodeParameters())
+    assert (kept.sensor, kept.covariance) == (file.sensor, file.covariance)
 
 
 def test_the_settings_file_is_read_when_configuring_and_limits_hold_whatever_has_become_of_it(tmp_path, client):

@@ -23,22 +23,34 @@ STEP_MM = (0.05, 0.5)  # of depth
 EDGE_MM, BESIDE = 8.0, 7  # a step between a pixel's neighbours that is an edge, and how many neighbours there are
 FLYING = (0.0, 0.6)  # share of the pixels at an edge that fly
 SMOOTH_MM = 0.6  # largest smooth error
+NOISIER, WIDER_MM = (1.0, 2.5), (1.0, 5.0)  # of a poor camera: times the noise, and windows
 WET, WET_MM = (0, 6), (2.0, 8.0)  # spots that give nothing: how many, and their radius
 
 
 def seen_in_stereo(view: View, rng: np.random.Generator) -> View:
     """What a stereo camera makes of a view: fewer points, with errors; those that fly are on no surface."""
+    return _in_stereo(view, rng, 1.0, WINDOW_MM)
+
+
+def seen_by_a_poor_camera(view: View, rng: np.random.Generator) -> View:
+    """As in stereo, with .6 to 1.6 mm of noise that is alike over up to 5 mm: of small, moving or wet scenes."""
+    times = float(np.exp(rng.uniform(*np.log(NOISIER))))
+    return _in_stereo(view, rng, times, WIDER_MM)
+
+
+def _in_stereo(view: View, rng: np.random.Generator, times: float, windows_mm: tuple[float, float]) -> View:
+    """With `times` the noise of `camera.noise_mm`, alike within a window of a size between `windows_mm`."""
     view = view.of(_dry(view, rng))
     sight = view.points - view.camera
     depth_mm = np.linalg.norm(sight, axis=1)
     sight /= depth_mm[:, None]
     towards = -sight.mean(axis=0) / np.linalg.norm(sight.mean(axis=0))
-    over = depth_maps.windows(acquired.View(view.points, -sight, towards, {}), rng.uniform(*WINDOW_MM))
+    over = depth_maps.windows(acquired.View(view.points, -sight, towards, {}), rng.uniform(*windows_mm))
     patchy = rng.uniform(*PATCHY)
     noise = over.patchy(np.sqrt(patchy), rng) + np.sqrt(1.0 - patchy) * rng.normal(size=len(depth_mm))
     smooth_mm, _ = acquired.smooth_offsets(view.points, SMOOTH_MM, rng)
     flies, between_mm = _flying(depth_mm, sight, rng)
-    measured = np.where(flies, between_mm, over.mean(depth_mm) + smooth_mm + noise * noise_mm(depth_mm))
+    measured = np.where(flies, between_mm, over.mean(depth_mm) + smooth_mm + times * noise * noise_mm(depth_mm))
     step = rng.uniform(*STEP_MM)
     points = view.camera + (np.round(measured / step) * step)[:, None] * sight
     return replace(view, points=points, part=np.where(flies, NOTHING, view.part))

@@ -19,7 +19,7 @@ from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import limb, things
 from gapr_core.data.scenes import wound as wounds
 from gapr_core.data.scenes.camera import Camera, View, looking_at, see, seen_in_depth
-from gapr_core.data.scenes.errors import seen_in_stereo, seen_on_layers
+from gapr_core.data.scenes.errors import seen_by_a_poor_camera, seen_in_stereo, seen_on_layers
 from gapr_core.data.scenes.wound import Shape, Wound
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
@@ -74,6 +74,7 @@ SCENE_LEVELS = {
     "scene-drape": SceneLevel((0.10, 0.60), things=(things.drape,)),
     "scene-image": SceneLevel((0.03, 0.12), things=(things.hand,), whole_image=True),
     "scene-stereo": SceneLevel(errors=seen_in_stereo),
+    "scene-noisy": SceneLevel(errors=seen_by_a_poor_camera),
     "scene-layers": SceneLevel(errors=seen_on_layers),
 }
 

@@ -134,3 +134,13 @@ def test_by_default_the_bone_under_layers_has_the_noise_of_the_depth_too():
     view = camera.View(view.points, np.append(np.zeros(10, dtype=int), view.part[10:]), view.camera)
     found = errors.seen_on_layers(view, np.random.default_rng(0))
     assert off_mm(found)[10:].std() == pytest.approx(0.75, rel=0.3)
+
+
+def test_a_poor_camera_has_up_to_two_and_a_half_times_the_noise_alike_over_wider_windows(only, monkeypatch):
+    only(noise_mm=0.5, PATCHY=(1.0, 1.0))
+    asked = []
+    windows = depth_maps.windows
+    monkeypatch.setattr(depth_maps, "windows", lambda view, size_mm: asked.append(size_mm) or windows(view, size_mm))
+    noise = [off_mm(errors.seen_by_a_poor_camera(plate(), np.random.default_rng(seed))).std() for seed in range(24)]
+    assert 0.5 * 0.95 < min(noise) < 0.7 and 0.95 < max(noise) < 0.5 * 2.5 * 1.05
+    assert 1.0 <= min(asked) < 1.8 and 4.0 < max(asked) <= 5.0

@@ -182,6 +182,16 @@ def test_what_the_bias_has_in_common_is_a_standoff_of_its_own():
     np.testing.assert_allclose(shared, standoff, rtol=1e-9, atol=1e-15)
 
 
+def test_a_model_that_is_too_thick_is_a_standoff_along_the_normals_for_every_sensor():
+    """A size other than 1: entering as m instead of m^2, or along the beam, fails."""
+    fit, fields = curved_fit(), np.zeros((300, 1))
+    standoff = covariance.sandwich(fit, fields, replace(NOTHING, standoff_mm=0.3), CONFIG)
+    for along_beam in (False, True):
+        errors = replace(NOTHING, along_beam=along_beam)
+        thick = covariance.sandwich(fit, fields, errors, replace(CONFIG, model_mm=0.3))
+        np.testing.assert_allclose(thick, standoff, rtol=1e-9, atol=1e-15)
+
+
 def test_what_the_bias_has_in_common_also_strains_the_source():
     """Errors of 0.8 mm x 0.7: symmetric matrices whose entries vary by 1 on the diagonal, by sqrt(1/2) beside it."""
     fit, fields, rng = curved_fit(), np.zeros((300, 1)), np.random.default_rng(2)

@@ -1,8 +1,11 @@
 """Bones that are not the target's: how many sources of another subject, or of the other side, are accepted.
 
-    `python benchmarks/strangers.py --anatomy DIR --out DIR [--split val] [--count 2000] [--mirrored 300] [--sides 60]`
+    `python benchmarks/strangers.py --anatomy DIR --out DIR [--split val] [--count 2000] [--mirrored 300] [--sides 60]
+    [--similar 300]`
 
-Sources are of the same bone of another subject, seen as at L3, of every target and subject in turn; or of the mirrored
+Sources are of the same bone of another subject, seen as at L3, of every target and subject in turn; or the target is
+the most similar bone of all other subjects, of any split, grown to the size of the source's own, seen as at L1, L2 and
+L3 in turn; or sources are of the mirrored
 femur or tibia, which has no pose on this one; or of the mirrored pelvis or rib cage, which is much the same bone and is
 judged against the pose of its other side. Mirrored bones are seen as at L1, L2 and L3 in turn.
 
@@ -36,6 +39,7 @@ from gapr_core.data.pair_files import pair_hash
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
+from gapr_core.data.twins import most_similar
 from gapr_core.geometry import se3
 from gapr_core.metrics.confidence import SURE
 from gapr_core.pages import markdown
@@ -46,10 +50,11 @@ from gapr_core.runtime.parallel import end_with_parent
 
 Array = NDArray[np.float64]
 Bones = dict[tuple[str, str], Specimen]  # of a bone's name and a subject
-SUBJECT, MIRRORED, SIDE = "another-subject", "mirrored", "other-side"
+SUBJECT, MIRRORED, SIDE, SIMILAR = "another-subject", "mirrored", "other-side", "most-similar"
 LONG, SYMMETRIC = ("femur", "tibia"), ("pelvis", "thoracic")
 LEVELS = ("L1", "L2", "L3")
 PEOPLE, PARAMETRIC = 20, 5  # parametric subjects: where a bone has no others, and of the long bones as well
+MOST_SIMILAR = 3  # other subjects for each source
 COMPARED = 5000  # points, for the distance between two bones
 _bones: Bones = {}  # of this process
 
@@ -80,11 +85,16 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=2000, help="pairs of another subject's bone")
     parser.add_argument("--mirrored", type=int, default=300, help="pairs of a mirrored femur or tibia")
     parser.add_argument("--sides", type=int, default=60, help="pairs of a mirrored pelvis or rib cage")
+    parser.add_argument("--similar", type=int, default=0, help="pairs with the most similar bone of another subject")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, required=True, help="folder for the records")
     args = parser.parse_args()
     bones = bones_of(args.bones.split(","), args.split, args.anatomy)
     cases = cases_of(bones, args.count, args.mirrored, args.sides)
+    if args.similar:
+        grown = similar_to(bones, args.bones.split(","), args.anatomy)
+        cases = sorted(cases + cases_of_similar(grown, args.similar))
+        bones = bones | {(bone, target): specimen for (bone, _, target), specimen in grown.items()}
     args.out.mkdir(parents=True, exist_ok=True)
     found = run(cases, bones, args.out / records.FILE, args.jobs)
     say(table(found))
@@ -116,6 +126,29 @@ def cases_of(bones: Bones, count: int, mirrored: int, sides: int) -> list[Case]:
             hands = dealt(number // len(names), seen)
             cases += [Case(bone, who, kind, who, level, seed) for seed, (who, level) in hands]
     return sorted(cases)
+
+
+def similar_to(bones: Bones, names: Sequence[str], folder: Path | None) -> dict[tuple[str, str, str], Specimen]:
+    """The most similar bones of other subjects, grown to the size of each subject's own: by (bone, subject, name)."""
+    found = {}
+    for bone in names:
+        everybody = specimens(bone, "all", PEOPLE, folder)
+        for (name, subject), specimen in bones.items():
+            if name == bone:
+                alike = most_similar(specimen, without_twins(specimen, everybody), MOST_SIMILAR)
+                found |= {(bone, subject, f"{other.person}-as-large-as-{subject}"): other for other in alike}
+    return found
+
+
+def cases_of_similar(grown: dict[tuple[str, str, str], Specimen], count: int) -> list[Case]:
+    """As many of each bone, at every level in turn."""
+    known = list(dict.fromkeys(bone for bone, _, _ in grown))
+    cases = []
+    for bone in known:
+        pairs = [(source, target) for of_bone, source, target in grown if of_bone == bone]
+        for seed, hand in dealt(count // len(known), pairs):
+            cases += [Case(bone, hand[1], SIMILAR, hand[0], LEVELS[seed % len(LEVELS)], seed)]
+    return cases
 
 
 def others(bones: Bones, bone: str) -> list[tuple[str, str]]:
@@ -163,7 +196,7 @@ def record_of(case: Case) -> Record:
 def pair_of(case: Case, bones: Bones) -> Pair:
     """The case's source before the target that all cases of the bone share; only of the other side a pose is right."""
     bone, source_of = bones[case.bone, case.target], bones[case.bone, case.source]
-    seen = source_of if case.kind == SUBJECT else anatomy.mirrored(source_of)
+    seen = source_of if case.kind in (SUBJECT, SIMILAR) else anatomy.mirrored(source_of)
     pair = make_pair(case.level, seen, case.seed)
     cloud = cloud_of(bone)
     origin_mm, truth = cloud.mean(axis=0), np.full((4, 4), np.nan)
@@ -213,7 +246,7 @@ def table(found: Sequence[Record]) -> str:
     head = ("source", "bone", "target subjects", "pairs", "right and accepted", "wrong and accepted",
             "wrong and accepted, % (95 % interval by subject)", "of these at >= 0.9")  # fmt: skip
     lines = []
-    for kind in (SUBJECT, MIRRORED, SIDE):
+    for kind in (SUBJECT, SIMILAR, MIRRORED, SIDE):
         of_kind = [r for r in found if r.protocol == kind]
         bones = [bone for bone in anatomy.BONES if any(r.bone == bone for r in of_kind)]
         lines += [line(kind, bone, [r for r in of_kind if r.bone == bone]) for bone in bones]

@@ -1,14 +1,18 @@
-"""Near-duplicates among subjects: bones that are more alike than two subjects of their cohort ever are by chance."""
+"""Who is like whom: near-duplicates among subjects, and the most similar bones of others."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.data import scans
 from gapr_core.data.anatomy import Corresponded
+from gapr_core.data.specimen import Specimen
 
 Array = NDArray[np.float64]
 SUSPICIOUS = 0.5  # of the median distance to the most similar other subject of the cohort
@@ -46,3 +50,28 @@ def _rms(p: Array, q: Array) -> float:
     u, s, vt = np.linalg.svd(p.T @ q)
     turned = s[0] + s[1] + np.sign(np.linalg.det(u @ vt)) * s[2]
     return float(np.sqrt(max((p * p).sum() + (q * q).sum() - 2.0 * turned, 0.0) / len(p)))
+
+
+def most_similar(specimen: Specimen, others: Sequence[Specimen], count: int) -> list[Specimen]:
+    """Of the same bones of others, those whose shape is most like the specimen's, grown to its size; the nearest first.
+
+    Only bones of its cohort whose vertices correspond to its own are compared, so there may be fewer than `count`.
+    """
+    own = specimen.surface.points
+    alike = [o for o in others if (o.bone, o.cohort) == (specimen.bone, specimen.cohort)
+             and o.person != specimen.person and len(o.surface.points) == len(own)]  # fmt: skip
+    fits = [without_size(o.surface.points, own) for o in alike]
+    nearest = sorted(range(len(alike)), key=lambda i: fits[i][0])[:count]
+    return [replace(alike[i], surface=scans.of_size(fits[i][1])(alike[i].surface)) for i in nearest]
+
+
+def without_size(points: Array, others: Array) -> tuple[float, float]:
+    """How far corresponding points (N, 3) stay apart after the best similarity, and its factor from `points` to others.
+
+    The distance is a share of the others' size (Procrustes; Umeyama 1991).
+    """
+    p, q = (each - each.mean(axis=0) for each in (points, others))
+    u, s, vt = np.linalg.svd(p.T @ q)
+    along = float(s[0] + s[1] + np.sign(np.linalg.det(u @ vt)) * s[2])
+    size = along / float((p * p).sum())
+    return float(np.sqrt(max(1.0 - size * along / float((q * q).sum()), 0.0))), size

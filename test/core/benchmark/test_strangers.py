@@ -18,7 +18,7 @@ from gapr_core.results import RegistrationResult, RegistrationStatus
 sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
 
 import strangers  # noqa: E402
-from strangers import MIRRORED, SIDE, SUBJECT, Case  # noqa: E402
+from strangers import MIRRORED, SIDE, SIMILAR, SUBJECT, Case  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,23 @@ def test_a_source_is_the_same_as_its_own_subjects_protocol_gives(bones):
     pair = strangers.pair_of(Case("tibia", "parametric_0", SUBJECT, "parametric_1", "L3", 4), bones)
     own = strangers.make_pair("L3", bones["tibia", "parametric_1"], 4)
     np.testing.assert_array_equal(pair.source, own.source)
+
+
+def test_targets_that_are_most_similar_are_of_others_and_have_no_true_pose(bones, monkeypatch):
+    tibiae = {key: bone for key, bone in bones.items() if key[0] == "tibia"}
+    monkeypatch.setattr(strangers, "specimens", lambda *_: list(tibiae.values()))
+    grown = strangers.similar_to(tibiae, ["tibia"], None)
+    assert len(grown) == 6 and all(grown[key].person != key[1] for key in grown)
+    cases = strangers.cases_of_similar(grown, 18)
+    assert Counter(case.level for case in cases) == dict.fromkeys(strangers.LEVELS, 6)
+    case = cases[0]
+    pair = strangers.pair_of(case, tibiae | {(bone, target): one for (bone, _, target), one in grown.items()})
+    assert case.kind == SIMILAR and not pair.has_truth and case.source in case.target
+    np.testing.assert_array_equal(pair.source, strangers.make_pair("L1", tibiae["tibia", case.source], 0).source)
+    grown_to = grown["tibia", case.source, case.target].surface.points
+    assert np.ptp(grown_to, axis=0).max() == pytest.approx(
+        np.ptp(tibiae["tibia", case.source].surface.points, axis=0).max(), rel=0.05
+    )
 
 
 def test_real_subjects_are_not_mixed_with_parametric_ones(bones):

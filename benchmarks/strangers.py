@@ -1,7 +1,6 @@
 """Bones that are not the target's: how many sources of another subject, or of the other side, are accepted.
 
-    `python benchmarks/strangers.py --anatomy DIR --out DIR [--split val] [--count 2000] [--mirrored 300] [--sides 60]
-    [--similar 300]`
+    `python benchmarks/strangers.py --anatomy DIR --out DIR [--split val] [--count 2000] [--mirrored 300] [--similar 0]`
 
 Sources are of the same bone of another subject, seen as at L3, of every target and subject in turn; or the target is
 the most similar bone of all other subjects, of any split, grown to the size of the source's own, seen as at L1, L2 and

@@ -1,12 +1,11 @@
 """Bones that are not the target's: how many sources of another subject, or of the other side, are accepted.
 
-    `python benchmarks/strangers.py --anatomy DIR --out DIR [--split val] [--count 2000] [--mirrored 300] [--similar 0]`
+    `python benchmarks/strangers.py --anatomy DIR --out DIR [--count 2000] [--mirrored 300] [--sides 60] [--similar 0]`
 
-Sources are of the same bone of another subject, seen as at L3, of every target and subject in turn; or the target is
-the most similar bone of all other subjects, of any split, grown to the size of the source's own, seen as at L1, L2 and
-L3 in turn; or sources are of the mirrored
+Sources are of the same bone of another subject, seen as at L3, of every target and subject in turn; or of the mirrored
 femur or tibia, which has no pose on this one; or of the mirrored pelvis or rib cage, which is much the same bone and is
-judged against the pose of its other side. Mirrored bones are seen as at L1, L2 and L3 in turn.
+judged against the pose of its other side. Mirrored bones are seen as at L1, L2 and L3 in turn. So are those whose
+target is the most similar bone of the other subjects, of any split, grown to their own size.
 
 Finished pairs stay in DIR/records.jsonl, so that a stopped run goes on where it was.
 """
@@ -91,7 +90,7 @@ def main() -> int:
     bones = bones_of(args.bones.split(","), args.split, args.anatomy)
     cases = cases_of(bones, args.count, args.mirrored, args.sides)
     if args.similar:
-        grown = similar_to(bones, args.bones.split(","), args.anatomy)
+        grown = similar_to(bones, args.anatomy)
         cases = sorted(cases + cases_of_similar(grown, args.similar))
         bones = bones | {(bone, target): specimen for (bone, _, target), specimen in grown.items()}
     args.out.mkdir(parents=True, exist_ok=True)
@@ -127,27 +126,24 @@ def cases_of(bones: Bones, count: int, mirrored: int, sides: int) -> list[Case]:
     return sorted(cases)
 
 
-def similar_to(bones: Bones, names: Sequence[str], folder: Path | None) -> dict[tuple[str, str, str], Specimen]:
+def similar_to(bones: Bones, folder: Path | None) -> dict[tuple[str, str, str], Specimen]:
     """The most similar bones of other subjects, grown to the size of each subject's own: by (bone, subject, name)."""
-    found = {}
-    for bone in names:
-        everybody = specimens(bone, "all", PEOPLE, folder)
-        for (name, subject), specimen in bones.items():
-            if name == bone:
-                alike = most_similar(specimen, without_twins(specimen, everybody), MOST_SIMILAR)
-                found |= {(bone, subject, f"{other.person}-as-large-as-{subject}"): other for other in alike}
-    return found
+    everybody = {bone: specimens(bone, "all", PEOPLE, folder) for bone in dict.fromkeys(bone for bone, _ in bones)}
+    return {
+        (bone, subject, f"{other.person}-as-large-as-{subject}"): other
+        for (bone, subject), specimen in bones.items()
+        for other in most_similar(specimen, without_twins(specimen, everybody[bone]), MOST_SIMILAR)
+    }
 
 
 def cases_of_similar(grown: dict[tuple[str, str, str], Specimen], count: int) -> list[Case]:
     """As many of each bone, at every level in turn."""
     known = list(dict.fromkeys(bone for bone, _, _ in grown))
-    cases = []
-    for bone in known:
-        pairs = [(source, target) for of_bone, source, target in grown if of_bone == bone]
-        for seed, hand in dealt(count // len(known), pairs):
-            cases += [Case(bone, hand[1], SIMILAR, hand[0], LEVELS[seed % len(LEVELS)], seed)]
-    return cases
+    return [
+        Case(bone, target, SIMILAR, source, LEVELS[seed % len(LEVELS)], seed)
+        for bone in known
+        for seed, (source, target) in dealt(count // len(known), [key[1:] for key in grown if key[0] == bone])
+    ]
 
 
 def others(bones: Bones, bone: str) -> list[tuple[str, str]]:
@@ -242,7 +238,7 @@ def commit() -> str | None:
 
 def table(found: Sequence[Record]) -> str:
     """Markdown: one line for each kind and bone, and one for each kind."""
-    head = ("source", "bone", "target subjects", "pairs", "right and accepted", "wrong and accepted",
+    head = ("source", "bone", "subjects", "pairs", "right and accepted", "wrong and accepted",
             "wrong and accepted, % (95 % interval by subject)", "of these at >= 0.9")  # fmt: skip
     lines = []
     for kind in (SUBJECT, SIMILAR, MIRRORED, SIDE):
@@ -255,7 +251,8 @@ def table(found: Sequence[Record]) -> str:
 
 def line(kind: str, bone: str, of_bone: Sequence[Record]) -> list[object]:
     """One row of the table."""
-    subjects, wrong = [r.person for r in of_bone], [r.false_accept for r in of_bone]
+    subjects = [r.source_person if kind == SIMILAR else r.person for r in of_bone]  # whose bone was grown to many sizes
+    wrong = [r.false_accept for r in of_bone]
     low, high = (100.0 * end for end in metrics.interval(wrong, subjects))
     right = sum(r.right for r in of_bone) if kind == SIDE else "-"
     share = f"{100.0 * np.mean(wrong):.2f} ({low:.2f} to {high:.2f})"

@@ -45,13 +45,6 @@ def near_duplicates(subjects: Corresponded) -> list[Twins]:
     return sorted(found, key=lambda twins: twins.rms_mm)
 
 
-def _rms(p: Array, q: Array) -> float:
-    """Root mean square distance of corresponding points (N, 3), centred, after the best rotation of one of them."""
-    u, s, vt = np.linalg.svd(p.T @ q)
-    turned = s[0] + s[1] + np.sign(np.linalg.det(u @ vt)) * s[2]
-    return float(np.sqrt(max((p * p).sum() + (q * q).sum() - 2.0 * turned, 0.0) / len(p)))
-
-
 def most_similar(specimen: Specimen, others: Sequence[Specimen], count: int) -> list[Specimen]:
     """Of the same bones of others, those whose shape is most like the specimen's, grown to its size; the nearest first.
 
@@ -71,7 +64,17 @@ def without_size(points: Array, others: Array) -> tuple[float, float]:
     The distance is a share of the others' size (Procrustes; Umeyama 1991).
     """
     p, q = (each - each.mean(axis=0) for each in (points, others))
-    u, s, vt = np.linalg.svd(p.T @ q)
-    along = float(s[0] + s[1] + np.sign(np.linalg.det(u @ vt)) * s[2])
+    along = _along(p, q)
     size = along / float((p * p).sum())
     return float(np.sqrt(max(1.0 - size * along / float((q * q).sum()), 0.0))), size
+
+
+def _rms(p: Array, q: Array) -> float:
+    """Root mean square distance of corresponding points (N, 3), centred, after the best rotation of one of them."""
+    return float(np.sqrt(max((p * p).sum() + (q * q).sum() - 2.0 * _along(p, q), 0.0) / len(p)))
+
+
+def _along(p: Array, q: Array) -> float:
+    """Sum of the products of corresponding points (N, 3), centred, after the rotation that makes it largest."""
+    u, s, vt = np.linalg.svd(p.T @ q)
+    return float(s[0] + s[1] + np.sign(np.linalg.det(u @ vt)) * s[2])

@@ -57,7 +57,7 @@ def test_a_source_is_the_same_as_its_own_subjects_protocol_gives(bones):
 def test_targets_that_are_most_similar_are_of_others_and_have_no_true_pose(bones, monkeypatch):
     tibiae = {key: bone for key, bone in bones.items() if key[0] == "tibia"}
     monkeypatch.setattr(strangers, "specimens", lambda *_: list(tibiae.values()))
-    grown = strangers.similar_to(tibiae, ["tibia"], None)
+    grown = strangers.similar_to(tibiae, None)
     assert len(grown) == 6 and all(grown[key].person != key[1] for key in grown)
     cases = strangers.cases_of_similar(grown, 18)
     assert Counter(case.level for case in cases) == dict.fromkeys(strangers.LEVELS, 6)
@@ -120,6 +120,15 @@ def test_accepted_answers_are_counted_by_kind_and_bone_and_named_by_subject(bone
     (line,) = strangers.alike(found, bones)
     assert line.startswith("tibia of parametric_0, source of parametric_1, ")
     assert line.endswith("2 of 4 accepted, at most at 0.95")
+
+
+def test_most_similar_bones_are_counted_by_the_subject_whose_size_they_have(bones):
+    cases = [Case("tibia", f"{other}-as-large-as-a", SIMILAR, "a", "L1", 0) for other in "bcd"]
+    found = [made(case, ok(np.eye(4), 0.6)) for case in cases]
+    assert (
+        strangers.table(found).splitlines()[-2]
+        == f"| {SIMILAR} | tibia | 1 | 3 | - | 3 | 100.00 (100.00 to 100.00) | 0 |"
+    )
 
 
 def test_the_distance_between_bones_is_that_of_their_surfaces_wherever_they_lie(bones):

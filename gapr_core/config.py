@@ -359,6 +359,9 @@ class ClutterConfig(Settings):
     final_points: int = setting(1200, "points of the final step", low=10)
     final_limits_mm: tuple[float, float, int] = setting((5.0, 2.0, 8), TUKEY, low=0.1, unit="mm")
     final_target_points: int = setting(4000, "target points of the final step", low=10)
+    front_share: float = setting(
+        0.6, "of the middle and the final limits for points in front of the bone, where tissue lies", low=0.05, high=1
+    )
     on_mm: float = setting(0.6, "as coarse_on_mm, in the final step", low=0.01, unit="mm")
     front_mm: float = setting(3.0, "as coarse_front_mm, in the middle and the final step", low=0.01, unit="mm")
     same_pose_mm: float = setting(4.0, "closer poses are the same", low=0, unit="mm")

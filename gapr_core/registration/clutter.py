@@ -2,7 +2,8 @@
 
 Regions propose, lines of sight decide. Every region of the cloud proposes poses as if it were bone; all of them are
 ranked by what the camera would have seen of the target, first roughly, then, refined on more and more points, at the
-scale of the noise.
+scale of the noise. What is left of soft tissue lies in front of the bone, never inside it: there a point has to be
+nearer to count.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:
 
 def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
     """Hypotheses of all regions, each refined on its own region; and those that are given (K, 4, 4)."""
-    steps = _Steps(target, np.linspace(*config.region_limits_mm), config.free_space.same_surface_cos)
+    steps = _steps(target, config.region_limits_mm, config)
 
     def work(region: Region) -> Array:
         poses = regions.search(region, target, config).poses
@@ -159,8 +160,8 @@ def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: Clutt
 def refine_around(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
-    """Each refined on what lies around its region, and scored again."""
-    steps = _Steps(target, np.linspace(*config.middle_limits_mm), config.free_space.same_surface_cos)
+    """Each refined on what lies around its region and hardly in front of the bone, and scored again."""
+    steps = _steps(target, config.middle_limits_mm, config, config.front_share)
     tree = cKDTree(scene.source.points[scene.source.order])
     poses = pool.poses.copy()
 
@@ -179,10 +180,16 @@ def refine_around(
 def refine_on_all(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
-    """Each refined on all points whose normals agree, ranked at the scale of the noise."""
-    steps = _Steps(target, np.linspace(*config.final_limits_mm), config.free_space.same_surface_cos)
-    work = partial(steps.refined, source=scene.source, some=scene.source.order[: config.final_points])
-    pool = replace(pool, poses=np.concatenate(in_pieces(work, pool.poses, num_threads)))
+    """Each refined on all points whose normals agree, ranked at the scale of the noise.
+
+    Twice: on those hardly in front of the bone, which tissue pulls at less, and on both sides alike, which noise does
+    not shift. The score decides.
+    """
+    some, refined = scene.source.order[: config.final_points], []
+    for front_share in (1.0, config.front_share):
+        steps = _steps(target, config.final_limits_mm, config, front_share)
+        refined += in_pieces(partial(steps.refined, source=scene.source, some=some), pool.poses, num_threads)
+    pool = replace(pool + pool, poses=np.concatenate(refined))
     pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
     return _best_distinct(pool, scene, config, config.kept_poses)
 
@@ -200,7 +207,10 @@ def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.i
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Gauss-Newton steps on a target: one per limit (K,), mm, on points whose normals agree up to a cosine."""
+    """Gauss-Newton steps on a target: one per row of limits (I, 2), mm, on points whose normals agree up to a cosine.
+
+    The limits are those of points inside and outside of the target.
+    """
 
     target: PreparedTarget
     limits_mm: Array
@@ -211,6 +221,14 @@ class _Steps:
         points, normals, surface = source.points[some], source.normals[some], self.target.kernel_view
         how = source.oriented, *surface, self.limits_mm, self.same_surface_cos
         return np.asarray(refine_agreeing(np.ascontiguousarray(poses), points, normals, *how))
+
+
+def _steps(
+    target: PreparedTarget, limits_mm: tuple[float, float, int], config: ClutterConfig, front_share: float = 1.0
+) -> _Steps:
+    """Of falling limits (first, last, how many), mm, and a share of each for points in front of the bone."""
+    both = np.outer(np.linspace(*limits_mm), [1.0, front_share])
+    return _Steps(target, both, config.free_space.same_surface_cos)
 
 
 def _scored(

@@ -68,7 +68,8 @@ def compare_with_image(
 def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same):
     """Gauss-Newton from every pose (K, 4, 4) on the points (N, 3) whose normals (N, 3) agree with the surface's.
 
-    One iteration per entry of `limits` (Tukey scale); normals agree from the cosine `same`.
+    One iteration per row of `limits` (I, 2), the Tukey scales of points inside and outside of the surface; normals
+    agree from the cosine `same`.
     """
     out = poses.copy()
     surface = elements, nearest, origin, per_cell, spacing
@@ -85,7 +86,7 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
 
 @numba.njit(**FAST)
 def accumulate_agreeing(
-    T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limit, same, middle, rows, H, g
+    T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same, middle, rows, H, g
 ):
     """Normal equations H twist = g about the moved `middle` (3,), filled in place; returns the sum of the weights."""
     middle = moved(T, middle)
@@ -103,7 +104,7 @@ def accumulate_agreeing(
         if cosine < same and (signed or cosine > -same):
             continue
         r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, 0.0)
-        w = tukey(r * r + aside * aside, limit)
+        w = tukey(r * r + aside * aside, limits[1] if r > 0.0 else limits[0])
         total += w
         put_row(rows, count, w, x, y, z, middle, r, nx, ny, nz)
         count += 1

@@ -70,11 +70,16 @@ def refined(monkeypatch):
     asked = []
 
     def refine_agreeing(poses, points, normals, signed, *rest):
-        asked.append((len(poses), len(points), tuple(rest[-2]), rest[-1], signed))
+        asked.append((len(poses), len(points), rest[-2], rest[-1], signed))
         return poses + np.eye(4)[1][:, None] * np.eye(4)[3]
 
     monkeypatch.setattr(clutter, "refine_agreeing", refine_agreeing)
     return asked
+
+
+def limits(first_last_count, front_share=1.0):
+    """(I, 2) as the kernel gets them: inside and in front of the bone."""
+    return np.linspace(*first_last_count)[:, None] * [1.0, front_share]
 
 
 def spread_to(target, count):
@@ -109,7 +114,7 @@ def test_each_region_refines_its_own_hypotheses_on_what_lies_around_it(scene, ta
     around = [(np.linalg.norm(scene.source.points - r.centre, axis=1) <= 15.0).sum() for r in scene.regions]
     some = [len(range(0, n, max(1, n // 10))) for n in around]
     assert [(poses, points) for poses, points, *_ in refined] == [(1, 10), (1, some[0]), (1, some[1])]
-    assert refined[0][2] == pytest.approx(np.linspace(*CONFIG.middle_limits_mm)) and refined[0][3] == 0.6
+    assert refined[0][2] == pytest.approx(limits(CONFIG.middle_limits_mm, 0.6)) and refined[0][3] == 0.6
 
 
 def test_a_given_pose_is_refined_on_the_first_points_of_a_small_cloud(scene, target, scored, refined):
@@ -130,9 +135,23 @@ def test_what_lies_around_is_thinned_evenly(scene, source):
 def test_the_last_step_refines_on_many_points_and_ranks_at_the_scale_of_the_noise(scene, target, scored, refined):
     found = clutter.refine_on_all(pool_of(0.0, 30.0, 9.0, 16.0), scene, target, CONFIG, 1)
     assert places(found.poses) == [9.0, 16.0] and found.poses[:, 1, 3] == pytest.approx([1.0, 1.0])
-    assert {points for _, points, *_ in refined} == {20} and sum(poses for poses, *_ in refined) == 4
-    assert refined[0][2] == pytest.approx(np.linspace(*CONFIG.final_limits_mm))
+    assert {points for _, points, *_ in refined} == {20} and sum(poses for poses, *_ in refined) == 8
+    half = len(refined) // 2
+    for k, how in enumerate(refined):
+        assert how[2] == pytest.approx(limits(CONFIG.final_limits_mm, 1.0 if k < half else 0.6))
     assert scored == [(spread_to(target, 50), CONFIG.on_mm, CONFIG.front_mm)]
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_of_the_two_last_refinements_the_better_score_decides(scene, target, scored, monkeypatch, side):
+    """Of one pose one refinement leads to x = 9 mm, the other to 2 mm; the score is best at 10 mm."""
+
+    def refine_agreeing(poses, points, normals, signed, *rest):
+        in_front = rest[-2][0, 1] < rest[-2][0, 0]
+        return shifts(*[9.0 if in_front == bool(side) else 2.0] * len(poses))
+
+    monkeypatch.setattr(clutter, "refine_agreeing", refine_agreeing)
+    assert places(clutter.refine_on_all(pool_of(5.0), scene, target, CONFIG, 1).poses) == [9.0, 2.0]
 
 
 def test_verification_gives_scores_that_are_small_for_good_and_the_support_of_the_crowd(scene, target, scored, refined):
@@ -173,7 +192,7 @@ def test_given_poses_come_first_and_each_hypothesis_names_its_region(scene, targ
     assert places(pool.poses) == [7.0, 1.0, 2.0, 3.0] and pool.region.tolist() == [-1, 0, 0, 1]
     assert pool.poses[:, 1, 3] == pytest.approx([0.0, 1.0, 1.0, 1.0]) and pool.scores.tolist() == [0.0] * 4
     assert {points for _, points, *_ in refined} == {12}
-    assert refined[0][2] == pytest.approx(np.linspace(*CONFIG.region_limits_mm))
+    assert refined[0][2] == pytest.approx(limits(CONFIG.region_limits_mm))
 
 
 def test_the_points_of_a_target_are_spread_once_for_each_count(target):

@@ -24,19 +24,25 @@ def cloud(egg):
     return points, egg.normals[egg.tree.query(points)[1]]
 
 
-def equations(T, points, normals, signed, egg, limit, same=SAME):
+def both(*limits):
+    """The same limits (I,) inside and outside of the surface."""
+    return np.outer(limits, [1.0, 1.0])
+
+
+def equations(T, points, normals, signed, egg, limit, same=SAME, front=None):
     middle, H, g = points.mean(axis=0), np.full((6, 6), 7.0), np.full(6, 7.0)
+    limits = np.array([limit, front or limit])
     total = kernels.accumulate_agreeing(
-        T, points, normals, signed, *egg.kernel_view, limit, same, middle, tiny.rows(points), H, g
+        T, points, normals, signed, *egg.kernel_view, limits, same, middle, tiny.rows(points), H, g
     )
     return total, H, g
 
 
-def expected(T, points, normals, signed, egg, limit, same=SAME):
+def expected(T, points, normals, signed, egg, limit, same=SAME, front=None):
     r, n, aside, q = residuals_at(T, points, *egg.kernel_view, 0.0)
     cosine = ((normals @ T[:3, :3].T) * egg.normals[q]).sum(axis=1)
     agrees = (cosine if signed else np.abs(cosine)) >= same
-    square = (r**2 + aside**2) / limit**2
+    square = (r**2 + aside**2) / np.where(r > 0.0, front or limit, limit) ** 2
     weight = np.where(agrees & (q >= 0) & (square < 1.0), (1.0 - square) ** 2, 0.0)
     arm = se3.apply(T, points) - se3.apply(T, points.mean(axis=0)[None])
     J = np.hstack([n, np.cross(arm, n)])
@@ -52,6 +58,18 @@ def test_the_normal_equations_are_those_of_weighted_least_squares(egg, cloud, si
     found, wanted = (of(T, points, flipped, signed, egg, limit) for of in (equations, expected))
     assert found[0] == pytest.approx(wanted[0]) and 0.0 < wanted[0] < len(points)
     assert found[1] == pytest.approx(wanted[1]) and found[2] == pytest.approx(wanted[2])
+
+
+def test_outside_of_the_surface_a_limit_of_its_own_holds(egg, cloud):
+    points, normals = cloud
+    T = se3.exp([0.3, -0.2, 0.4, 0.02, -0.03, 0.05])
+    found, wanted = (of(T, points, normals, True, egg, 2.0, front=0.7) for of in (equations, expected))
+    assert found[0] == pytest.approx(wanted[0]) and 0.0 < wanted[0] < len(points)
+    assert found[1] == pytest.approx(wanted[1]) and found[2] == pytest.approx(wanted[2])
+    up = np.array([[0.0, 0.0, 1.0]])
+    for height, weight in ((0.5, 0.0), (-0.5, 0.75**2), (0.3, 0.64**2), (-1.0, 0.0)):
+        point = np.array([[0.0, 0.0, height]])
+        assert equations(np.eye(4), point, up, True, tiny.plane(), 1.0, front=0.5)[0] == pytest.approx(weight)
 
 
 @pytest.mark.parametrize(("cosine", "signed", "counts"), [
@@ -87,7 +105,7 @@ def test_a_step_is_that_of_the_damped_equations_about_the_middle_of_the_points(e
     damped = H + np.diag([1e-4 * weight] * 3 + list(1e-4 * np.diag(H)[3:] + 1.0))
     centre = se3.apply(T, points.mean(axis=0)[None])[0]
     wanted = se3.exp(np.linalg.solve(damped, g), centre) @ T
-    found = kernels.refine_agreeing(T[None], points, normals, True, *egg.kernel_view, np.array([2.0]), SAME)[0]
+    found = kernels.refine_agreeing(T[None], points, normals, True, *egg.kernel_view, both(2.0), SAME)[0]
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
 
 
@@ -172,7 +190,7 @@ def test_poses_come_home_and_what_lies_far_off_pulls_at_none(egg, cloud):
     poses = np.array([np.eye(4), se3.exp([0.8, -0.6, 0.5, 0.03, 0.02, -0.04]), se3.exp([200.0, 0, 0, 0, 0, 0])])
     start = poses.copy()
     found = kernels.refine_agreeing(
-        poses, far, turned, True, *egg.kernel_view, np.array([6.0, 4.0, 3.0, 2.0, 2.0, 2.0]), SAME
+        poses, far, turned, True, *egg.kernel_view, both(6.0, 4.0, 3.0, 2.0, 2.0, 2.0), SAME
     )
     assert np.array_equal(poses, start)
     for T in found[:2]:
@@ -185,8 +203,22 @@ def test_each_iteration_takes_its_own_limit(egg, cloud):
     start = se3.exp([2.5, -1.0, 0.5, 0.0, 0.02, 0.0])[None]
 
     def refined(pose, *limits):
-        return kernels.refine_agreeing(pose, points, normals, True, *egg.kernel_view, np.array(limits), SAME)
+        return kernels.refine_agreeing(pose, points, normals, True, *egg.kernel_view, both(*limits), SAME)
 
     in_turn = refined(refined(start, 5.0), 2.0)
     assert refined(start, 5.0, 2.0) == pytest.approx(in_turn)
     assert refined(start, 2.0, 5.0) != pytest.approx(in_turn, abs=1e-4)
+
+
+def test_what_lies_in_front_pulls_less_than_the_bone_beside_it():
+    """A plane of bone with tissue 1 mm in front of every third point: with closer limits there, the bone is found."""
+    plane, up = tiny.plane(), np.array([0.0, 0.0, 1.0])
+    points = np.random.default_rng(0).uniform(-4.0, 4.0, (90, 3)) * [1.0, 1.0, 0.0]
+    points[::3, 2] = 1.0
+    normals, limits = np.tile(up, (90, 1)), np.full(8, 2.0)
+
+    def height(front_share):
+        how = np.outer(limits, [1.0, front_share]), SAME
+        return kernels.refine_agreeing(np.eye(4)[None], points, normals, True, *plane.kernel_view, *how)[0][2, 3]
+
+    assert height(1.0) < -0.2 and abs(height(0.5)) < 0.01

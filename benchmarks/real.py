@@ -35,7 +35,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--real", type=Path, default=real.default_folder(), help="folder with the data")
     parser.add_argument("--sensor", choices=SENSOR_KINDS, default="unknown", help="what is said of the sensor")
-    parser.add_argument("--model-mm", type=float, default=0.0, help="what is said of the models: `covariance.model_mm`")
+    parser.add_argument("--model-mm", type=float, default=CovarianceConfig.model_mm,
+                        help="what is said of the models: `covariance.model_mm` (default: %(default)s)")  # fmt: skip
     args = parser.parse_args()
     said = RegistrarConfig(sensor=SensorConfig(kind=args.sensor), covariance=CovarianceConfig(model_mm=args.model_mm))
     registrar = Registrar.from_pretrained(said)

@@ -119,8 +119,8 @@ class CovarianceConfig(Settings):
     )
     local_centres: int = setting(160, "points that span that error", low=1, high=10_000)
     model_mm: float = setting(
-        0.0, "standard deviation of an error by which the bone's model is too thick or too thin", low=0, high=10,
-        unit="mm",
+        0.3, "standard deviation of an error by which the bone's model is too thick or too thin; 0: it is exact",
+        low=0, high=10, unit="mm",
     )  # fmt: skip
     one_sided: float = setting(0.3, "mean normal from which on a view has a beam", low=0, high=1)
     noise_points: float = setting(4.0, "points that the usual noise of the sensor is worth", low=0, high=1000)

@@ -77,8 +77,9 @@ class NodeParameters(Settings):
                           choices=SENSOR_KINDS, live=False)  # fmt: skip
     standoff: float = setting(0.0, "how far outside of the bone the points lie; 0: what is usual for the sensor",
                               unit="m", low=-0.01, high=0.01, live=False)  # fmt: skip
-    model_error: float = setting(0.0, "standard deviation of how much too thick or too thin the bone's model is",
-                                 unit="m", low=0.0, high=0.01, live=False)  # fmt: skip
+    model_error: float = setting(-1.0, "standard deviation of how much too thick or too thin the bone's model is; 0: it "
+                                 "is exact; below 0: 0.0003, or what the file of settings says",
+                                 unit="m", low=-1.0, high=0.01, live=False)  # fmt: skip
     min_confidence: float = setting(0.5, "poses below are refused", low=0.0, high=1.0)
     max_tre: float = setting(0.0, "poses whose 95 % bound of the error over the bone is larger are refused; 0: off",
                              unit="m", low=0.0)  # fmt: skip

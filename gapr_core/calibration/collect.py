@@ -23,7 +23,7 @@ from gapr_core import metrics
 from gapr_core.calibration import pairs, streams
 from gapr_core.calibration.answers import round_of
 from gapr_core.calibration.pairs import Drawn, Task
-from gapr_core.config import ClutterConfig, RegistrarConfig, RulesConfig, SensorConfig
+from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, RulesConfig, SensorConfig
 from gapr_core.data.pair import Pair
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -57,6 +57,7 @@ ALONE = 4  # every fourth pair is searched without the network's poses, as a use
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
 AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # what is refused as bone is recorded as that
+EXACT_MODELS = CovarianceConfig(model_mm=0.0)  # a simulated source lies on its model
 ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
 
@@ -225,7 +226,9 @@ def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: Clutte
     """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     calibrations = [Calibration(proposer.name, ACCEPTING, {}) for proposer in proposers]
     sensor_config = SensorConfig(kind=sensor)
-    config = RegistrarConfig(num_threads=1, sensor=sensor_config, clutter=clutter_config, rules=UNCHECKED)
+    config = RegistrarConfig(
+        num_threads=1, sensor=sensor_config, clutter=clutter_config, rules=UNCHECKED, covariance=EXACT_MODELS
+    )
     of_scenes = Calibration(clutter.NAME, ACCEPTING, {})
     return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
 

@@ -59,7 +59,7 @@ def configured(config: RegistrarConfig, parameters: NodeParameters) -> Registrar
     if parameters.standoff:
         sensor = replace(sensor, standoff_mm=parameters.standoff * MM_PER_M)
     covariance = config.covariance
-    if parameters.model_error:
+    if parameters.model_error >= 0.0:
         covariance = replace(covariance, model_mm=parameters.model_error * MM_PER_M)
     is_inferred = config.clutter.infer_viewpoint and parameters.viewpoint != "none"
     clutter = replace(config.clutter, infer_viewpoint=is_inferred)

@@ -74,6 +74,7 @@ def test_what_is_said_of_sensor_and_model_is_in_metres_and_wins_over_the_file():
     said = configured(file, replace(NodeParameters(), sensor="pointer", standoff=0.001, model_error=0.0003))
     assert (said.sensor.kind, said.sensor.standoff_mm) == ("pointer", pytest.approx(1.0))
     assert said.covariance.model_mm == pytest.approx(0.3)
+    assert configured(file, replace(NodeParameters(), model_error=0.0)).covariance.model_mm == 0.0
     kept = configured(file, NodeParameters())
     assert (kept.sensor, kept.covariance) == (file.sensor, file.covariance)
 

@@ -11,6 +11,7 @@ from gapr_core.calibration import collect, pairs
 from gapr_core.calibration import shapes as odd_shapes
 from gapr_core.calibration.answers import answers_of
 from gapr_core.calibration.pairs import Drawn, Task
+from gapr_core.config import RegistrarConfig
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
@@ -84,6 +85,12 @@ def test_a_pose_without_a_truth_is_wrong_and_has_no_error(truth, monkeypatch):
 def test_the_network_is_asked_once_for_both_rounds(truth):
     collect.record_of(TASK)
     assert truth.asked == 1
+
+
+def test_simulated_models_are_exact_in_the_fit_and_others_are_not(truth):
+    registrars = collect._registrars("pointer").values()
+    assert {registrar.config.covariance.model_mm for registrar in registrars} == {0.0}
+    assert RegistrarConfig().covariance.model_mm == 0.3
 
 
 def test_records_know_nothing_of_the_models_that_ship(truth, monkeypatch):

@@ -11,7 +11,7 @@ from gapr_core.geometry.twists import covariance_about, error_twist, nees
 from gapr_core.registration import bias_field, covariance, refinement
 from gapr_core.registration.sensor import Errors
 
-CONFIG = CovarianceConfig()
+CONFIG = CovarianceConfig(model_mm=0.0)
 NO_COMMON_BIAS = replace(CONFIG, long_share=0.0, linear_share=0.0)
 NOTHING = Errors(offset_mm=0.0, standoff_mm=0.0, noise_mm=1e-6, bias_mm=0.0, scale=0.0)
 

@@ -21,7 +21,7 @@ MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
 CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header"
 OF_ARRAY = "pass units={unit!r}, or convert it to {read_as}"
-OPTIONS = "--units {unit}, of both files; --source-units {unit}, of the source; model_unit"
+OPTIONS = "--source-units {unit}, of the source; --units {unit}, of both files; model_unit"
 OF_FILE = f"pass units={{unit!r}} ({OPTIONS}), or convert it to {{read_as}}"
 WHOLE_BONE_MM = (60.0, 700.0)  # smaller are a patella, bones of hand and foot, the neck's vertebrae; larger is no bone
 

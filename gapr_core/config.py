@@ -375,6 +375,11 @@ class ClutterConfig(Settings):
     inferred_rounds: tuple[int, int] = setting((2, 1), "rounds of regions for each place, the likelier first", low=1)
     inferred_least: float = setting(0.85, "least confidence of a pose that rests on such a place", low=0, high=1)
     least_cos: float = setting(0.3, "cosine of incidence that nearly all points of such a cloud exceed", low=0, high=1)
+    origin_deg: float = setting(
+        35.0, "a cloud so near to the z axis may be in the frame of its camera; 0: none is", low=0, high=90, unit="deg"
+    )
+    origin_cos: float = setting(0.15, "cosine of incidence that nearly all points exceed there", low=0, high=1)
+    origin_rounds: int = setting(4, "rounds of regions for that place", low=1, high=100)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
 
     def __post_init__(self) -> None:

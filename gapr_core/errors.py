@@ -16,6 +16,10 @@ class InvalidPointCloudError(GaprError):
     """A cloud or mesh that cannot be used: unreadable, wrong shape, nothing finite, wrong unit."""
 
 
+class InvalidViewpointError(InvalidPointCloudError):
+    """A place of the camera that no camera can have, such as one in the middle of what it saw."""
+
+
 class ConfigError(GaprError):
     """A setting, option or file of settings that cannot be used: unknown, out of range, missing or contradictory."""
 

@@ -138,6 +138,7 @@ class RegistrationResult:
             refused pose.
         tre_mm: expected target registration error, root mean square over the target's points; None unless `OK`.
         tre95_mm: its 95 % bound, mm; None unless `OK`.
+        factor95: that the bound of `covariance` is taken times, since 95 % of errors of known size stay below it then.
         inlier_ratio: share of the source points that the best hypothesis explains, 0 to 1.
         hypotheses: distinct refined poses, best first; on refusals too, to look at, not to use.
         guidance: where on the target another look would help most; None unless `RegistrarConfig.guide` asks for it.
@@ -174,6 +175,7 @@ class RegistrationResult:
     contributions: Mapping[str, float] = field(default_factory=dict)
     residuals: Residuals | None = None
     inferred_viewpoint: Array | None = None
+    factor95: float = 1.0
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):

@@ -55,7 +55,7 @@ class NodeParameters(Settings):
         unit="s", low=0.0, high=60.0,
     )  # fmt: skip
     cloud_type: str = setting("PointCloud2", "message type of the clouds", choices=tuple(INPUTS), live=False)
-    cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "mm"))
+    cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "cm", "mm"))
     cloud_reliability: str = setting("auto", "auto: reliable, and best effort once a publisher offers only that",
                                      choices=("auto", "reliable", "best_effort"), live=False)  # fmt: skip
     min_points: int = setting(
@@ -77,8 +77,8 @@ class NodeParameters(Settings):
                           choices=SENSOR_KINDS, live=False)  # fmt: skip
     standoff: float = setting(0.0, "how far outside of the bone the points lie; 0: what is usual for the sensor",
                               unit="m", low=-0.01, high=0.01, live=False)  # fmt: skip
-    model_error: float = setting(-1.0, "standard deviation of how much too thick or too thin the bone's model is; 0: it "
-                                 "is exact; below 0: 0.0003, or what the file of settings says",
+    model_error: float = setting(-1.0, "standard deviation of how much too thick or too thin the bone's model is; 0: "
+                                 "it is exact; below 0: 0.0003, or what the file of settings says",
                                  unit="m", low=-1.0, high=0.01, live=False)  # fmt: skip
     min_confidence: float = setting(0.5, "poses below are refused", low=0.0, high=1.0)
     max_tre: float = setting(0.0, "poses whose 95 % bound of the error over the bone is larger are refused; 0: off",
@@ -144,9 +144,13 @@ def plain(value: Any) -> Any:
 def remarks(parameters: NodeParameters) -> list[str]:
     """One sentence for each thing that was decided for the user, or that they may not expect."""
     sensor, sentences = parameters.sensor, []
-    if sensor == "unknown" and not parameters.settings_file:
-        missing = "an error of the whole cloud's place, such as a tracker's, is not in tre95"
-        sentences.append(f"sensor is not set: {missing}; set it to what measures the clouds")
+    if sensor == "unknown":
+        sentences.append("sensor is not set, and tre95 allows for any: set it to what measures the clouds")
+    if sensor != "structured_light":
+        stated = "where settings_file states it (sensor: tracking_mm, tracking_deg)"
+        sentences.append(f"an error of the whole cloud's place, such as a tracker's, is in tre95 only {stated}")
+    if parameters.max_tre == 0.0:
+        sentences.append("max_tre is 0: a pose goes out however large its tre95 over the bone is")
     if sensor in TOGETHER and parameters.accumulate > 1:
         sentences.append(f"sensor {sensor}: the last {parameters.accumulate} clouds are registered as one")
     elif sensor in TOGETHER and not parameters.output_frame:

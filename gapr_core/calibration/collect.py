@@ -58,11 +58,12 @@ FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
 AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # what is refused as bone is recorded as that
 EXACT_MODELS = CovarianceConfig(model_mm=0.0)  # a simulated source lies on its model
+SETTINGS = RegistrarConfig(num_threads=1, clutter=AS_IT_IS, rules=UNCHECKED, covariance=EXACT_MODELS)
 ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
 
 
 def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = None) -> list[Record]:
-    """Register every pair that the records file does not hold yet, or holds of other bones or with other features.
+    """Register every pair that the records file does not hold yet, or holds of other bones, settings or features.
 
     Args:
         tasks: of one folder and split.
@@ -112,7 +113,8 @@ def _records_of(tasks: Sequence[Task], shared: Shared) -> list[Record]:
 
 def record_of(task: Task) -> Record:
     """One pair registered in every way, or the frames of a stream one after another; judged, with their features."""
-    named = {"name": _name(task), "anatomy": _anatomy(task), "split": task.split, "commit": origin.commit()}
+    named = {"name": _name(task), "anatomy": _anatomy(task), "split": task.split, "commit": origin.commit(),
+             "settings": origin.settings(SETTINGS)}  # fmt: skip
     if task.family == STREAM:
         return named | streams.record_of_stream(task)
     drawn = pairs.draw(task)
@@ -157,7 +159,7 @@ def _viewpoints(pair: Pair) -> Array:
     prepared = sources.prepare(pair.source, in_scene=True)
     if isinstance(prepared, Refusal):
         return np.empty((0, 3))
-    return clutter.inferred_viewpoints(prepared, RegistrarConfig())
+    return np.reshape([place for place, _ in clutter.inferred_places(prepared, RegistrarConfig())], (-1, 3))
 
 
 def judged_answer(assessment: Assessment, pair: Pair) -> Record:
@@ -225,10 +227,7 @@ class AskedOnce:
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig = AS_IT_IS) -> Registrar:
     """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     calibrations = [Calibration(proposer.name, ACCEPTING, {}) for proposer in proposers]
-    sensor_config = SensorConfig(kind=sensor)
-    config = RegistrarConfig(
-        num_threads=1, sensor=sensor_config, clutter=clutter_config, rules=UNCHECKED, covariance=EXACT_MODELS
-    )
+    config = replace(SETTINGS, sensor=SensorConfig(kind=sensor), clutter=clutter_config)
     of_scenes = Calibration(clutter.NAME, ACCEPTING, {})
     return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
 
@@ -290,4 +289,6 @@ def _read(path: Path) -> list[Record]:
 
 def _is_current(record: Record) -> bool:
     answers = record.get("answers", {}).items()
-    return all(set(FEATURES_OF.get(round_of(name), ())) == answer["features"].keys() for name, answer in answers)
+    return record.get("settings") == origin.settings(SETTINGS) and all(
+        set(FEATURES_OF.get(round_of(name), ())) == answer["features"].keys() for name, answer in answers
+    )

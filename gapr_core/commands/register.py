@@ -21,15 +21,17 @@ from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
+    from gapr_core.config import SensorConfig
     from gapr_core.formats.planning import TargetError
     from gapr_core.surface import Surface
 
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
-NOT_NAMED = (
-    "the sensor is not named: an error of the whole cloud's place, such as a tracker's, is not in tre95 "
-    "(--set sensor.kind=...; docs/sensors.md)"
+NOT_NAMED = "the sensor is not named, and tre95 allows for any (--set sensor.kind=...; docs/sensors.md)"
+PLACE_IS_EXACT = (
+    "an error of the whole cloud's place, such as a tracker's, is not in tre95 "
+    "(--set sensor.tracking_mm=... --set sensor.tracking_deg=...)"
 )
 
 
@@ -119,13 +121,23 @@ def run(args: Namespace) -> int:
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     code = _show(args, result, errors)
-    if result.tre95_mm is not None and config.sensor.kind == "unknown":
-        say(NOT_NAMED)
+    if result.tre95_mm is not None:
+        _say_what_the_bound_leaves_out(config.sensor)
     if config.guide:
         _say_where_next(result, spots)
     _write(args, Registration(target, source.points, result, errors, spots))
     checks.check_answer(args, result)
     return code
+
+
+def _say_what_the_bound_leaves_out(sensor: SensorConfig) -> None:
+    from gapr_core.registration.sensor import errors
+
+    known = errors(sensor, 0)
+    if sensor.kind == "unknown":
+        say(NOT_NAMED)
+    if known.tracking_mm == 0.0 and known.tracking_deg == 0.0:
+        say(PLACE_IS_EXACT)
 
 
 def _read(args: Namespace) -> tuple[Surface, Surface]:

@@ -56,6 +56,8 @@ def start_of(source: Path, target: Path) -> LandmarkPose:
 def errors_at(plan: Markups, result: RegistrationResult) -> list[TargetError]:
     """What the covariance of an accepted pose means at each target: J Sigma J^T of the point (Fitzpatrick 1998).
 
+    The bound is taken times `RegistrationResult.factor95`, as `tre95_mm` is.
+
     Raises:
         InvalidPointCloudError: a result without a covariance.
     """
@@ -64,7 +66,8 @@ def errors_at(plan: Markups, result: RegistrationResult) -> list[TargetError]:
         raise InvalidPointCloudError("a pose with a covariance", given, "use --method gapr")
     covariances = covariances_at(plan.points, result.covariance, result.centre_mm)
     draws = np.random.default_rng(0).standard_normal((DRAWS, 3))
-    return [_error(*row, draws) for row in zip(plan.labels, plan.points, covariances, strict=True)]
+    targets = zip(plan.labels, plan.points, covariances, strict=True)
+    return [_error(*target, draws, result.factor95) for target in targets]
 
 
 def covariances_at(points: Array, covariance: Array, centre_mm: Array) -> Array:
@@ -73,11 +76,12 @@ def covariances_at(points: Array, covariance: Array, centre_mm: Array) -> Array:
     return np.asarray(jacobians @ covariance @ jacobians.transpose(0, 2, 1))
 
 
-def _error(label: str, point: Array, covariance: Array, draws: Array) -> TargetError:
+def _error(label: str, point: Array, covariance: Array, draws: Array, factor95: float) -> TargetError:
     variances = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     lengths = np.sqrt(draws**2 @ variances)
     x, y, z = (float(v) for v in point)
-    return TargetError(label, (x, y, z), float(np.sqrt(variances.sum())), float(np.percentile(lengths, 95.0)))
+    bound95_mm = factor95 * float(np.percentile(lengths, 95.0))
+    return TargetError(label, (x, y, z), float(np.sqrt(variances.sum())), bound95_mm)
 
 
 def save_targets(path: Path, errors: Sequence[TargetError]) -> None:

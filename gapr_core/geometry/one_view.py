@@ -23,6 +23,7 @@ DIRECTIONS = 400  # over the sphere: 10 degrees apart
 STEEPEST_SHARE = 0.05  # of the points: the normals of so many may be wrong, at edges and in noise
 DISTANCE_MM = 450.0  # of a depth camera from what it looks at
 CLEAR_OF_CLOUD = 1.5  # radii of the cloud, from its middle: a camera is no nearer
+NEAREST_MM = 50.0  # that a camera sees
 SMALLEST_PIXEL_MM = 1.0
 PIXEL_SPACINGS = 1.5  # typical distances between neighbours: closes the surface
 BULGE = 2.0  # how much more a share that bulges counts than one that is visible
@@ -66,6 +67,26 @@ def seen_from_one_place(
         for end in ends
     ]
     return OneView(ends[np.argsort(likely)[::-1]], float(steepest[best]))
+
+
+def seen_from_origin(points: Array, normals: Array, widest_deg: float, least_cos: float) -> bool:
+    """Whether a cloud may be in the optical frame of the camera that saw it: z ahead (REP 103), the origin its place.
+
+    Everything lies ahead, its middle about the z axis, and nearly nothing is grazed from the origin, as little of a
+    camera's image is. By chance all of this holds for about one cloud in a hundred whose frame is another one.
+
+    Args:
+        points: (N, 3), mm.
+        normals: (N, 3), unit; the sign does not matter.
+        widest_deg: largest angle between the z axis and the middle of the points.
+        least_cos: cosine of incidence that nearly all points exceed.
+    """
+    middle, distances_mm = points.mean(axis=0), np.linalg.norm(points, axis=1)
+    is_ahead = middle[2] > np.cos(np.radians(widest_deg)) * np.linalg.norm(middle)
+    if not is_ahead or points[:, 2].min() < NEAREST_MM:
+        return False
+    incidence = np.abs(np.einsum("ni,ni->n", points, normals)) / distances_mm
+    return bool(np.quantile(incidence, STEEPEST_SHARE) >= least_cos)
 
 
 def visible_share(points: Array, normals: Array, viewpoint: Array, spacing_mm: float) -> float:

@@ -39,14 +39,14 @@ class Accumulator:
         most: how many sources are kept, the newest among them.
 
     Raises:
-        ConfigError: `most` is less than 1.
+        ConfigError: `most` is no whole number, or less than 1.
     """
 
     name = "gapr_accumulator"
 
     def __init__(self, method: Registrar | Tracker, most: int) -> None:
-        if most < 1:
-            raise ConfigError("at least 1 source to keep", str(most), "1 registers every source by itself")
+        if not isinstance(most, int | np.integer) or most < 1:
+            raise ConfigError("a whole number of sources to keep, at least 1", repr(most), "1 registers each by itself")
         self.method, self.most = _of_many_places(method), most
         self.config = (self.method.registrar if isinstance(self.method, Tracker) else self.method).config
         self._target: PreparedTarget | None = None
@@ -158,8 +158,8 @@ class Accumulator:
         if len(self._off_in_a_row) >= self.config.accumulation.most_off:
             return self._restart(result)
         if new and self._off_in_a_row:
-            count, newest = len(self._kept), "newest source lies" if _is_among(new[-1], off) else "sources before lie"
-            return _refused(result, f"the {newest} off the bone where {count} others found it: left out")
+            newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
+            return _refused(result, f"the {newest} off the bone where the others found it: left out")
         return result
 
     def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:

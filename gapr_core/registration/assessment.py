@@ -208,5 +208,6 @@ def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResul
         covariance=a.uncertainty.covariance,
         tre_mm=a.tre_mm,
         tre95_mm=tre95_mm,
+        factor95=a.factor95,
         centre_mm=a.centre_mm,
     )

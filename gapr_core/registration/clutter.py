@@ -91,18 +91,25 @@ def sees_from_afar(config: RegistrarConfig) -> bool:
     return config.clutter.infer_viewpoint and config.sensor.kind not in AT_THE_BONE
 
 
-def inferred_viewpoints(source: PreparedSource, config: RegistrarConfig) -> Array:
-    """(2, 3) mm, source frame: where a cloud was seen from if nobody says it, the likelier place first.
+def inferred_places(source: PreparedSource, config: RegistrarConfig) -> list[tuple[Array, int]]:
+    """Where a cloud was seen from if nobody says it: (3,) mm, source frame, and rounds of regions; the likeliest first.
 
-    (0, 3) where it cannot be a camera's: too few points, some that are grazed from wherever the others are seen, or a
-    sensor that sees nothing from afar.
+    The origin, where the cloud may be in the frame of its camera, and both ends of the line of sight that its surface
+    shows. None where it cannot be a camera's: too few points, some that are grazed from wherever the others are seen,
+    or a sensor that sees nothing from afar.
     """
     settings = config.clutter
     if not sees_from_afar(config) or len(source.points) < config.source.dense_points:
-        return np.empty((0, 3))
+        return []
+    points, normals = source.points, source.normals
+    places = []
+    if one_view.seen_from_origin(points, normals, settings.origin_deg, settings.origin_cos):
+        places.append((np.zeros(3), settings.origin_rounds))
     some = source.order[: settings.inferred_points]
-    view = one_view.seen_from_one_place(source.points, source.normals, source.neighbours, some, source.spacing_mm)
-    return view.viewpoints if view.steepest_cos >= settings.least_cos else np.empty((0, 3))
+    view = one_view.seen_from_one_place(points, normals, source.neighbours, some, source.spacing_mm)
+    if view.steepest_cos >= settings.least_cos:
+        places += zip(view.viewpoints, settings.inferred_rounds, strict=True)
+    return places
 
 
 def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:

@@ -15,7 +15,7 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from gapr_core.config import FreeSpaceConfig
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import InvalidViewpointError
 from gapr_core.geometry import quadrics, se3
 from gapr_core.registration.clutter_kernels import compare_with_image
 from gapr_core.runtime.parallel import in_pieces
@@ -82,7 +82,7 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceCo
         config: of the image, and of what is compared with it.
 
     Raises:
-        InvalidPointCloudError: when the viewpoint lies in the middle of the points, so that no camera sees them.
+        InvalidViewpointError: when the viewpoint lies in the middle of the points, so that no camera sees them.
     """
     config = config or FreeSpaceConfig()
     eye = np.asarray(viewpoint, dtype=np.float64)
@@ -90,7 +90,7 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceCo
     seen = se3.apply(T, points)
     in_view = seen[:, 2] > config.widest_cos * np.linalg.norm(seen, axis=1)
     if in_view.sum() < min(quadrics.FEWEST_NEIGHBOURS, len(points)):
-        raise InvalidPointCloudError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
+        raise InvalidViewpointError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
     seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
     turned = quadrics.orient(turned, -seen)
     rays = seen[:, :2] / seen[:, 2:]

@@ -78,7 +78,7 @@ class Registrar:
         scene_calibration: Calibration | None = None,
         precision: Precision | None = None,
     ) -> None:
-        self.config = config or RegistrarConfig()
+        self.config = RegistrarConfig() if config is None else _checked(config)
         self.proposers: tuple[Proposer, ...] = (_search(self.config),) if proposers is None else tuple(proposers)
         if not self.proposers:
             raise ConfigError("at least one proposer", "an empty list", "leave `proposers` out for the search")
@@ -107,10 +107,7 @@ class Registrar:
             MethodUnavailableError: torch is not installed; `Registrar()` works without.
             ConfigError: no such device, or something else than a `RegistrarConfig`.
         """
-        config = RegistrarConfig() if config is None else config
-        if not isinstance(config, RegistrarConfig):
-            how = "pass RegistrarConfig(...); weights of your own go into NetworkProposer.from_weights"
-            raise ConfigError("a RegistrarConfig", repr(config), how)
+        config = RegistrarConfig() if config is None else _checked(config)
         return cls(config, (shipped_network(device), _search(config)))
 
     @cached_property
@@ -243,13 +240,12 @@ class Registrar:
 
         It is asked all that one of bone alone is asked, since nobody said that it is a scene.
         """
-        config, settings = self.config, self.config.clutter
-        scene = self._scene_of_unknown(source)
+        config, scene = self.config, self._scene_of_unknown(source)
         if scene is None:
             return None
-        viewpoints = clutter.inferred_viewpoints(scene, config)
+        places = clutter.inferred_places(scene, config)
         clock.lap("prepare")
-        for viewpoint, rounds in zip(viewpoints, settings.inferred_rounds, strict=False):
+        for viewpoint, rounds in places:
             found = self._in_scene(scene, target, poses, viewpoint, clock, rounds)
             if found is None or not found.is_sure(config.least_inferred):
                 continue
@@ -326,6 +322,14 @@ class Registrar:
             if assessment.is_sure(max(config.sure, config.min_confidence)):
                 break
         return assessment
+
+
+def _checked(config: object) -> RegistrarConfig:
+    """The settings, if they are some."""
+    if not isinstance(config, RegistrarConfig):
+        how = "pass RegistrarConfig(...); weights of your own go into NetworkProposer.from_weights"
+        raise ConfigError("a RegistrarConfig", repr(config), how)
+    return config
 
 
 def shipped_network(device: str = "cpu") -> Proposer:

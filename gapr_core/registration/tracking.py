@@ -46,7 +46,8 @@ class Tracker:
         stream: the one of a source in the light of those before it; the shipped one when not given.
 
     Raises:
-        ConfigError: `recheck` is less than 1, or a calibration is for other answers.
+        ConfigError: `recheck` is no whole number or less than 1, the registrar is none, or a calibration is for other
+            answers.
     """
 
     name = "gapr_tracker"
@@ -58,8 +59,12 @@ class Tracker:
         calibration: Calibration | None = None,
         stream: Calibration | None = None,
     ) -> None:
-        if recheck < 1:
-            raise ConfigError("recheck of at least 1", str(recheck), "1 registers every source in full")
+        if not isinstance(recheck, int | np.integer) or recheck < 1:
+            raise ConfigError(
+                "a whole number for recheck, at least 1", repr(recheck), "1 registers every source in full"
+            )
+        if not isinstance(registrar, Registrar | None):
+            raise ConfigError("a Registrar", repr(registrar), "pass Registrar.from_pretrained(config)")
         self.registrar = registrar or Registrar.from_pretrained()
         self.recheck = recheck
         self._memory = Memory()
@@ -171,7 +176,7 @@ class Tracker:
         follower, self._follower = self._follower, None
         found = follower.follow(source) if follower is not None and target is self._bone else None
         if follower is not None and found is not None:
-            self._follower, self._memory.motion = follower, follower.motion()
+            self._follower, self._memory.motion, self._last = follower, follower.motion(), found.T_target_source
         return found
 
     def _assess(

@@ -38,9 +38,14 @@ def of_answers(config: Any) -> dict[str, str]:
     """
     return {
         "version": f"{__version__} {commit() or ''}".strip(),
-        "settings": _digest([json.dumps(asdict(config), sort_keys=True).encode()]),
+        "settings": settings(config),
         "weights": _digest(path.read_bytes() for path in sorted(WEIGHTS.iterdir()) if path.suffix != ".md"),
     }
+
+
+def settings(config: Any) -> str:
+    """A short text that changes with any setting of a dataclass."""
+    return _digest([json.dumps(asdict(config), sort_keys=True).encode()])
 
 
 def _digest(parts: Iterable[bytes]) -> str:

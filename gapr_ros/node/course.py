@@ -56,7 +56,6 @@ class Course:
     def refuse_all(self) -> None:
         """Clouds on their way will be refused, and say nothing about those to come."""
         self.epoch += 1
-        self.seed = None
         self._track.miss()
 
     def forget_place(self) -> None:

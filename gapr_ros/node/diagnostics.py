@@ -43,6 +43,10 @@ class Counters:
         self.received += 1
         self.last_cloud_at = time.monotonic()
 
+    def forget_refusals(self) -> None:
+        """Nothing was refused yet of what comes now; the counts go on."""
+        self.consecutive_refusals, self.last_refusal = 0, ""
+
     def leave(self, merged: bool) -> None:
         """A cloud that was pushed out is registered with a newer one, or could not be."""
         self.merged += merged

@@ -35,6 +35,7 @@ def transition(callback: Callable[..., TransitionCallbackReturn]) -> Callable[..
     def wrapper(self: Any, state: Any) -> TransitionCallbackReturn:
         try:
             result = callback(self, state)
+            self.failure = ""
             self.call_soon(self.report)  # after the state has changed
             return result
         except Exception as error:

@@ -20,6 +20,7 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import INPUTS, InvalidMessageError
 
 Array = NDArray[np.float64]
+UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
 
 
@@ -183,7 +184,7 @@ def _within_range(points_mm: Array, parameters: NodeParameters) -> Array:
 
 
 def _looks_like(extent_mm: float, model_extent_mm: float, unit: str) -> str:
-    """The other unit's name when the cloud would fit the bone in it; empty otherwise."""
-    other, name = ("mm", "millimetres") if unit == "m" else ("m", "metres")
-    share = extent_mm / wire.MM_PER_UNIT[unit] * wire.MM_PER_UNIT[other] / model_extent_mm
-    return name if LEAST_SHARE <= share <= MOST_SHARE else ""
+    """The names of the other units in which the cloud would fit the bone; empty where none is."""
+    per_mm = extent_mm / wire.MM_PER_UNIT[unit] / model_extent_mm
+    shares = {name: per_mm * wire.MM_PER_UNIT[other] for other, name in UNIT_NAMES.items() if other != unit}
+    return " or ".join(name for name, share in shares.items() if LEAST_SHARE <= share <= MOST_SHARE)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from gapr_core.errors import ConfigError
 from gapr_ros.node.wire import MM_PER_M
 from gapr_ros.parameters import NodeParameters
 
@@ -30,12 +32,14 @@ class ShippedMethod:
         """Make a method.
 
         Raises:
-            ConfigError: the file cannot be read, or holds what no setting is.
+            ConfigError: the file cannot be read, holds what no setting is, or what a parameter decides otherwise.
         """
         from gapr_core import Accumulator, Registrar, Tracker
 
         if self._settings is None:
-            self._settings = read_settings(parameters.settings_file)
+            settings = read_settings(parameters.settings_file)
+            check_file(settings, parameters)
+            self._settings = settings
         registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device)
         method = Tracker(registrar) if parameters.track else registrar
         return Accumulator(method, parameters.accumulate) if parameters.accumulate > 1 else method
@@ -53,9 +57,37 @@ def read_settings(path: str) -> RegistrarConfig:
     return settings.load(RegistrarConfig, path or None)
 
 
+def check_file(config: RegistrarConfig, parameters: NodeParameters) -> None:
+    """Refuse a file that says something else than the parameters that decide: nothing it says is dropped in silence.
+
+    Raises:
+        ConfigError: such a setting; the text names its parameter.
+    """
+    said, used, usual = (_decided(each) for each in (config, configured(config, parameters), type(config)()))
+    for (setting, parameter), value in said.items():
+        decides = used[setting, parameter]
+        is_alike = math.isclose(value, decides) if isinstance(value, float) else value == decides  # mm of metres round
+        if not is_alike and value != usual[setting, parameter]:
+            what = f"{setting} from the node's parameter '{parameter}', which decides ({decides})"
+            how = f"set the parameter '{parameter}' so, and leave it out of the file"
+            raise ConfigError(what, f"{value} in settings_file", how)
+
+
+def _decided(config: RegistrarConfig) -> dict[tuple[str, str], Any]:
+    """What parameters of the node decide, by (setting, parameter)."""
+    return {
+        ("sensor.kind", "sensor"): config.sensor.kind,
+        ("min_confidence", "min_confidence"): config.min_confidence,
+        ("max_tre_mm", "max_tre"): config.max_tre_mm,
+        ("guide", "guide"): config.guide,
+        ("num_threads", "num_threads"): config.num_threads,
+        ("seed", "seed"): config.seed,
+    }
+
+
 def configured(config: RegistrarConfig, parameters: NodeParameters) -> RegistrarConfig:
     """The library's settings with the node's own parameters over them."""
-    sensor = config.sensor if parameters.sensor == "unknown" else replace(config.sensor, kind=parameters.sensor)
+    sensor = replace(config.sensor, kind=parameters.sensor)
     if parameters.standoff:
         sensor = replace(sensor, standoff_mm=parameters.standoff * MM_PER_M)
     covariance = config.covariance

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 
 from gapr_core.baselines.base import takes
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_ros.node import intake, region, timeline, wire
@@ -57,6 +57,8 @@ class Registration:
             self._run(outcome, self._situation(), start)
         except RefusedError as refusal:
             outcome.refuse(refusal.reason, refusal.text)
+        except InvalidViewpointError as error:
+            outcome.refuse(Reason.BAD_FRAME, f"{error}: set the parameter viewpoint")
         except InvalidPointCloudError as error:  # sizes and values that the method itself rejects
             outcome.refuse(Reason.UNIT_MISMATCH, str(error))
         except Exception as error:

@@ -110,7 +110,7 @@ class Services:
         if not session.enabled:
             raise NotNowError("the node is disabled: call ~/set_enabled")
         if not session.register_newest(waiter):
-            raise NotNowError("no cloud has come yet, or none since the last reset or reload")
+            raise NotNowError("no cloud has come yet, or none since the last reset, reload or pause")
         await self._answers.in_turn(waiter)
         outcome = waiter.result()
         return outcome.ok, str(outcome)

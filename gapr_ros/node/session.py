@@ -61,6 +61,7 @@ class Session:
         self._shared = SharedFrame(host, self.conflicts) if publish else None
         self._named = SharedName(host, self.conflicts)
         note_sent = self._shared.note_own if self._shared else None
+        host.counters.forget_refusals()
         self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future)
         self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
         self._publishers = Publishers(host, self._frames)

@@ -53,8 +53,10 @@ class Subscriptions:
         return Input(qos if self._second is None else "reliable and best_effort", publishers, mismatch)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Listen no more; who publishes is no conflict then."""
         self._closed = True
+        for about in ("type", "publishers"):
+            self._session.conflicts.note(about, "")
         self._host.ros.destroy_timer(self._looking)
         for subscription in (self._clouds, self._second, self._seeds):
             if subscription is not None:

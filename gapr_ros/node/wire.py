@@ -15,7 +15,7 @@ from gapr_core.geometry import se3
 Array = NDArray[np.float64]
 Length = TypeVar("Length", Array, float)
 MM_PER_M = 1000.0
-MM_PER_UNIT = {"m": MM_PER_M, "mm": 1.0}
+MM_PER_UNIT = {"m": MM_PER_M, "cm": 10.0, "mm": 1.0}
 
 
 def to_mm(points: Array, unit: str) -> Array:

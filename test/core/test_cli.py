@@ -36,10 +36,23 @@ def test_register_prints_a_pose_and_writes_it_as_json(tmp_path, files, pair, cap
     assert rte_mm < 0.5 and rre_deg < 0.5
 
 
-def test_register_says_what_the_bound_leaves_out_while_the_sensor_is_not_named(files, capsys):
-    for more, said in (([], True), (["--set", "sensor.kind=laser"], False)):
-        assert cli.main(["register", *map(str, files), *more]) == 0
-        assert ("the sensor is not named" in capsys.readouterr().out) is said
+@pytest.mark.parametrize(
+    ("settings", "unnamed", "placed"),
+    [
+        ([], True, True),
+        (["sensor.kind=laser"], False, True),
+        (["sensor.kind=structured_light"], False, False),
+        (["sensor.tracking_mm=0.2"], True, False),
+        (["sensor.tracking_deg=0.2"], True, False),
+    ],
+)
+def test_register_says_what_the_bound_leaves_out(files, capsys, settings, unnamed, placed):
+    more = [word for setting in settings for word in ("--set", setting)]
+    assert cli.main(["register", *map(str, files), *more]) == 0
+    said = capsys.readouterr().out
+    assert ("the sensor is not named" in said) is unnamed and (
+        "place, such as a tracker's, is not in" in said
+    ) is placed
 
 
 def test_a_refusal_exits_with_2_and_has_no_transform(tmp_path, files, capsys):

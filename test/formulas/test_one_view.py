@@ -157,3 +157,41 @@ def test_the_camera_is_never_in_a_large_cloud():
     view = seen_from_one_place(points, normals)
     away = np.linalg.norm(view.viewpoints - points.mean(axis=0), axis=1)
     np.testing.assert_allclose(away, 1.5 * 400.0 * np.sqrt(2.0))
+
+
+AHEAD = {"widest_deg": 35.0, "least_cos": 0.5}
+
+
+def seen_from_origin(points, normals, **how):
+    return one_view.seen_from_origin(points, normals, **(AHEAD | how))
+
+
+@pytest.mark.parametrize(
+    ("normal", "at", "may_be"),
+    [
+        ((0.0, 0.0, 1.0), (0.0, 0.0, 300.0), True),
+        ((0.0, 0.0, 1.0), (0.0, 0.0, -300.0), False),  # behind
+        ((0.0, 0.0, 1.0), (0.0, 0.0, 45.0), False),  # nearer than a camera sees
+        ((0.0, 0.0, 1.0), (0.0, 0.0, 55.0), True),
+        (
+            (0.0, np.sin(np.radians(33.0)), np.cos(np.radians(33.0))),
+            (0.0, 300.0 * np.tan(np.radians(33.0)), 300.0),
+            True,
+        ),
+        (
+            (0.0, np.sin(np.radians(37.0)), np.cos(np.radians(37.0))),
+            (0.0, 300.0 * np.tan(np.radians(37.0)), 300.0),
+            False,
+        ),
+        ((0.0, np.sin(np.radians(50.0)), np.cos(np.radians(50.0))), (0.0, 0.0, 900.0), True),  # cos 50 deg is .64
+        ((0.0, np.sin(np.radians(70.0)), np.cos(np.radians(70.0))), (0.0, 0.0, 900.0), False),  # cos 70 deg is .34
+    ],
+)
+def test_a_cloud_ahead_of_the_origin_that_nothing_grazes_may_be_in_its_camera_s_frame(normal, at, may_be):
+    assert seen_from_origin(*patch(normal, at, half_mm=10.0)) is may_be
+
+
+def test_a_twentieth_of_a_camera_s_cloud_may_be_grazed():
+    flat, wall = patch((0.0, 0.0, 1.0), (0.0, 0.0, 300.0)), patch((1.0, 0.0, 0.0), (0.0, 0.0, 300.0))
+    for count, may_be in ((60, True), (120, False)):  # of 1681
+        assert seen_from_origin(*joined(flat, [each[:count] for each in wall])) is may_be

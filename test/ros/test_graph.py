@@ -10,6 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray, TransformStamped
 from harness import Client, Collecting, Spinner, StandIn, context, node_in_thread, wait_until
+from lifecycle_msgs.msg import Transition
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
@@ -132,6 +133,16 @@ def test_a_second_publisher_is_named_until_it_goes(blob_path, client, method):
         assert client.values("input")["level"] == 1
         client.forget(second)
         wait_until(lambda: "2 publishers" not in client.values("input")["conflicts"])
+
+
+def test_who_publishes_is_no_conflict_of_a_node_that_does_not_listen(blob_path, client, method):
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        second = client.node.create_publisher(PointCloud2, "points", 1)
+        wait_until(lambda: "2 publishers on /points" in client.values("input")["conflicts"])
+        assert client.change_state(Transition.TRANSITION_DEACTIVATE)
+        wait_until(lambda: "2 publishers" not in client.values("input")["conflicts"])
+        client.forget(second)
 
 
 def test_clouds_in_two_frames_are_a_conflict_unless_they_meet_in_an_output_frame(blob_path, client, method, capfd):

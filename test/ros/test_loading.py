@@ -17,7 +17,8 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, SensorConfig
-from gapr_ros.node.method import ShippedMethod, configured
+from gapr_core.errors import ConfigError
+from gapr_ros.node.method import ShippedMethod, check_file, configured
 from gapr_ros.node.model import load_model
 from gapr_ros.parameters import NodeParameters
 
@@ -75,8 +76,46 @@ def test_what_is_said_of_sensor_and_model_is_in_metres_and_wins_over_the_file():
     assert (said.sensor.kind, said.sensor.standoff_mm) == ("pointer", pytest.approx(1.0))
     assert said.covariance.model_mm == pytest.approx(0.3)
     assert configured(file, replace(NodeParameters(), model_error=0.0)).covariance.model_mm == 0.0
-    kept = configured(file, NodeParameters())
+    kept = configured(file, replace(NodeParameters(), sensor="laser"))
     assert (kept.sensor, kept.covariance) == (file.sensor, file.covariance)
+
+
+@pytest.mark.parametrize(
+    ("file", "given", "parameter"),
+    [
+        (RegistrarConfig(min_confidence=0.99), {}, "min_confidence"),
+        (RegistrarConfig(max_tre_mm=2.0), {"max_tre": 0.003}, "max_tre"),
+        (RegistrarConfig(guide=True), {}, "guide"),
+        (RegistrarConfig(seed=3), {}, "seed"),
+        (RegistrarConfig(num_threads=1), {}, "num_threads"),
+        (RegistrarConfig(sensor=SensorConfig("pointer", 0.0)), {}, "sensor"),
+    ],
+)
+def test_a_file_must_not_say_otherwise_than_a_parameter_that_decides(file, given, parameter):
+    """A limit in the file that the parameter's default takes back would be dropped in silence."""
+    parameters = replace(NodeParameters(), **given)
+    with pytest.raises(ConfigError, match=f"set the parameter '{parameter}' so"):
+        check_file(file, parameters)
+    check_file(RegistrarConfig(), parameters)
+
+
+def test_a_file_may_say_the_same_as_the_parameters_and_what_they_leave_open():
+    file = RegistrarConfig(
+        min_confidence=0.9,
+        max_tre_mm=2.0,
+        sensor=SensorConfig("pointer", 0.0),
+        covariance=CovarianceConfig(model_mm=0.1),
+    )
+    check_file(file, replace(NodeParameters(), min_confidence=0.9, max_tre=0.002, sensor="pointer"))
+    check_file(RegistrarConfig(max_tre_mm=4.1), replace(NodeParameters(), max_tre=0.0041))  # 4.1000000000000005 mm
+
+
+def test_a_file_that_was_refused_is_refused_again(tmp_path):
+    (tmp_path / "settings.yaml").write_text("min_confidence: 0.99\n")
+    factory = ShippedMethod()
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="min_confidence"):
+            factory(replace(NodeParameters(), settings_file=str(tmp_path / "settings.yaml")))
 
 
 def test_the_settings_file_is_read_when_configuring_and_limits_hold_whatever_has_become_of_it(tmp_path, client):

@@ -494,7 +494,7 @@ def test_a_cloud_from_before_a_reset_or_another_bone_is_not_registered_on_reques
         assert client.call("register").success, "once more, on the same cloud"
         assert client.call(service).success
         answer = client.call("register")
-        assert not answer.success and answer.message == "no cloud has come yet, or none since the last reset or reload"
+        assert not answer.success and answer.message == "no cloud has come yet, or none since the last reset, reload or pause"
         client.send(GOOD)
         wait_until(lambda: node.counters.received == 2)
         assert client.call("register").success
@@ -562,6 +562,29 @@ def test_a_disabled_node_counts_clouds_and_answers_none(live):
     assert not client.confidences
     assert client.call("set_enabled", SetBool.Request(data=True)).success
     assert client.ask(GOOD)["level"] == 0
+
+
+def test_a_failed_transition_is_over_once_one_succeeds(live, monkeypatch):
+    node, client, method = live
+    assert client.change_state(Transition.TRANSITION_DEACTIVATE)
+    with monkeypatch.context() as broken:
+        broken.setattr(node.session, "send_model", lambda: 1 / 0)
+        assert not client.change_state(Transition.TRANSITION_ACTIVATE)
+        wait_until(lambda: client.values()["message"].startswith("activate failed: ZeroDivisionError"))
+    assert client.change_state(Transition.TRANSITION_ACTIVATE)
+    values = client.ask(GOOD)
+    assert values["level"] == 0 and "failed" not in values["message"]
+
+
+def test_a_node_that_is_configured_again_has_refused_nothing_yet(live):
+    node, client, method = live
+    method.answer = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="nope")
+    assert "nope" in client.ask(GOOD)["last_refusal"]
+    for name in ("DEACTIVATE", "CLEANUP", "CONFIGURE", "ACTIVATE"):
+        assert client.change_state(getattr(Transition, f"TRANSITION_{name}"))
+    values = wait_until(lambda: values if (values := client.values())["state"] == "active" else None)
+    assert values["last_refusal"] == "" and "nope" not in values["message"]
+    assert values["frames_refused"] == "1"  # the counts go on
 
 
 def test_a_seed_reaches_the_method_until_a_pose_is_accepted(live):

@@ -53,7 +53,7 @@ def ros():
         ("continuous", "yes", "write true"),
         ("min_confidence", 1.5, "within 0 to 1"),
         ("timeout", float("nan"), "must be at least 0.001 s, got nan"),
-        ("cloud_unit", "cm", "one of m, mm, got 'cm'"),
+        ("cloud_unit", "inch", "one of m, cm, mm, got 'inch'"),
         ("seed", -1, "within 0 to"),
         ("crop_min", [0.0, 1.0], "must be three finite doubles"),
         ("crop_max", [0.0, 1.0, float("nan")], "must be three finite doubles"),
@@ -134,7 +134,7 @@ def test_descriptions_ranges_and_choices_can_be_asked_for(ros):
     assert all(d.description for d in described.values())
     assert described["min_confidence"].floating_point_range[0].to_value == 1.0
     assert described["min_points"].integer_range[0].from_value == 3
-    assert described["cloud_unit"].additional_constraints == "one of: m, mm"
+    assert described["cloud_unit"].additional_constraints == "one of: m, cm, mm"
     node.close()
 
 
@@ -147,7 +147,7 @@ def test_live_parameters_change_while_running_and_the_others_say_how(blob_path, 
         refused = ask([Parameter("seed", value=3)])
         assert not refused.successful and "deactivate" in refused.reason
         refused = ask([Parameter("cloud_unit", value="inch")])
-        assert not refused.successful and "one of m, mm" in refused.reason
+        assert not refused.successful and "one of m, cm, mm" in refused.reason
         assert not ask([Parameter("max_rate", value=5)]).successful
         assert node.parameters.seed == 0 and node.parameters.cloud_unit == "m"
 
@@ -155,7 +155,7 @@ def test_live_parameters_change_while_running_and_the_others_say_how(blob_path, 
 @pytest.mark.parametrize(
     ("sensor", "output_frame", "accumulate", "together", "sentence"),
     [
-        ("unknown", "", 0, 1, "sensor is not set: an error of the whole cloud's place"),
+        ("unknown", "", 0, 1, "sensor is not set, and tre95 allows for any"),
         ("depth_camera", "tracker", 0, 1, ""),
         ("ultrasound", "reference", 0, 50, "the last 50 clouds are registered as one"),
         ("pointer", "reference", 0, 500, "the last 500 clouds are registered as one"),
@@ -172,13 +172,21 @@ def test_slices_and_touched_points_are_registered_together_where_the_bone_rests_
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     node = RegisterNode(lambda _: StandIn(), context=ros, parameter_overrides=overrides)
     assert node.parameters.accumulate == together
-    assert sentence in " ".join(parameters.remarks(node.parameters))
-    assert bool(sentence) == bool(parameters.remarks(node.parameters))
+    others = ("an error of the whole cloud's place", "max_tre is 0")
+    remarks = [remark for remark in parameters.remarks(node.parameters) if not remark.startswith(others)]
+    assert sentence in " ".join(remarks)
+    assert bool(sentence) == bool(remarks)
     node.close()
 
 
-def test_a_sensor_may_be_named_in_the_settings_of_the_library():
-    assert not parameters.remarks(parameters.NodeParameters(accumulate=1, settings_file="settings.yaml"))
+@pytest.mark.parametrize(("given", "place", "bound"), [
+    ({}, True, True), ({"sensor": "pointer"}, True, True), ({"sensor": "structured_light"}, False, True),
+    ({"max_tre": 0.002}, True, False),
+])  # fmt: skip
+def test_what_tre95_leaves_out_and_that_none_is_too_large_is_said(given, place, bound):
+    remarks = " ".join(parameters.remarks(parameters.NodeParameters(**given)))
+    assert ("place, such as a tracker's, is in tre95 only where settings_file" in remarks) is place
+    assert ("max_tre is 0" in remarks) is bound
 
 
 @pytest.mark.parametrize(("least", "most", "said"), [(5.0, 1.0, True), (1.0, 1.0, True), (0.5, 1.0, False),

@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import diagnostics, seeding
 from gapr_ros.node.outcome import Outcome
@@ -119,7 +119,7 @@ def test_bad_input_is_refused_with_its_reason_and_survived(live, name):
 
 
 def test_millimetres_are_named(live):
-    expect_refusal(live, GOOD * 1000.0, Reason.UNIT_MISMATCH, "looks like millimetres")
+    expect_refusal(live, GOOD * 1000.0, Reason.UNIT_MISMATCH, "looks like centimetres or millimetres")
 
 
 def test_metres_given_as_millimetres_are_named(live):
@@ -199,6 +199,11 @@ def test_what_the_method_refuses_or_cannot_stand_for_has_no_pose(live, answer, r
     [
         (RuntimeError("singular"), Reason.NOT_CONVERGED, "RuntimeError: singular"),
         (InvalidPointCloudError("a bone", "3 m", "check the unit"), Reason.UNIT_MISMATCH, "got 3 m"),
+        (
+            InvalidViewpointError("a viewpoint outside the cloud", "0 0 0", "move it"),
+            Reason.BAD_FRAME,
+            "parameter viewpoint",
+        ),
         (MemoryError(), Reason.NOT_CONVERGED, "MemoryError"),
     ],
 )
@@ -386,6 +391,15 @@ def test_neither_another_frame_nor_a_pause_takes_the_limit_of_jumps_away(live):
     assert client.ask(GOOD, frame="other")["last_refusal"].startswith("jump: moved 0.05 m")
     method.answer = accepted()
     assert client.ask(GOOD)["level"] == 0
+
+
+def test_a_pause_does_not_forget_where_to_start(live):
+    node, client, method = live
+    client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="probe")))
+    wait_until(lambda: node.session.course.seed is not None)
+    for enabled in (False, True):
+        assert client.call("set_enabled", SetBool.Request(data=enabled)).success
+    assert node.session.course.seed is not None
 
 
 def test_a_pause_ends_the_row_of_good_poses(live):

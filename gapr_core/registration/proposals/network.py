@@ -143,6 +143,8 @@ def _available(device: str) -> str:
 
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
+    if device != "cpu" and not device.startswith("cuda"):
+        raise ConfigError("a device: cpu, cuda or auto", repr(device), "choose cpu or auto")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError("a device of this machine", f"{device}, but torch sees no GPU", "choose cpu or auto")
     return device

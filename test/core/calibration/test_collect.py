@@ -20,6 +20,7 @@ from gapr_core.registration.features import FEATURES, FEATURES_OF
 from gapr_core.registration.memory import Memory
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.results import Hypothesis, Refusal, RegistrationStatus
+from gapr_core.runtime import origin
 
 TASK = Task("folder", "train", 0, 1)
 NAMES = ("network", "search", "search alone", "first round")
@@ -120,7 +121,7 @@ def test_a_scene_is_registered_from_its_camera_or_from_both_ends_of_its_line_of_
     monkeypatch.setattr(pairs, "draw", lambda task: drawn)
     monkeypatch.setattr(collect, "_prepared", lambda cloud: None)
     monkeypatch.setattr(collect, "_registrars", lambda sensor: dict.fromkeys(NAMES, Registrar()))
-    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: ends)
+    monkeypatch.setattr(clutter, "inferred_places", lambda *_: [(end, 1) for end in ends])
     collect.record_of(replace(TASK, number=collect.LOOKED_AT))
     assert asked == ([eye.tolist()] if given else ends.tolist())
 
@@ -156,7 +157,7 @@ def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tm
     old = {name: value for name, value in features.items() if name != "mirror_margin"}
     answer = {"refusal": None, "right": True}
     path = tmp_path / "records.jsonl"
-    bones = {"anatomy": "folder", "split": "train"}
+    bones = {"anatomy": "folder", "split": "train", "settings": origin.settings(collect.SETTINGS)}
     lines = [json.dumps(bones | {"name": f"0-{number}", "answers": {"search": answer | {"features": values}}}) + "\n"
              for number, values in enumerate((features, old, features))]  # fmt: skip
     path.write_text("".join(lines) + '{"name": "0-3", "answ')
@@ -170,10 +171,11 @@ def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tm
     assert collect.collect(tasks, path, 1) and len(asked) == 2
 
 
-@pytest.mark.parametrize("other", [{"split": "val"}, {"anatomy": "others"}, {"split": None}])
-def test_records_of_other_bones_are_made_again(tmp_path, monkeypatch, other):
+@pytest.mark.parametrize("other", [{"split": "val"}, {"anatomy": "others"}, {"split": None}, {"settings": "others"}])
+def test_records_of_other_bones_or_settings_are_made_again(tmp_path, monkeypatch, other):
     path, asked = tmp_path / "records.jsonl", []
     record = {"name": "0-1", "anatomy": "folder", "split": "train", "answers": {}}
+    record["settings"] = origin.settings(collect.SETTINGS)
     monkeypatch.setattr(pairs, "bones_of", lambda folder, split: {})
     monkeypatch.setattr(collect, "ProcessPoolExecutor", lambda *_: nullcontext(_Pool(asked)))
     task = Task(str(tmp_path / "folder"), "train", 0, 1)
@@ -192,4 +194,5 @@ class _Pool:
     def map(self, _, tasks, chunksize):
         for task in tasks:
             self.asked.append(task)
-            yield {"name": f"{task.seed}-{task.number}", "anatomy": "folder", "split": task.split, "answers": {}}
+            named = {"name": f"{task.seed}-{task.number}", "anatomy": "folder", "split": task.split}
+            yield named | {"settings": origin.settings(collect.SETTINGS), "answers": {}}

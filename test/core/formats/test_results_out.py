@@ -186,6 +186,16 @@ def test_95_of_100_poses_stay_below_the_bound_at_a_target():
     assert np.mean(np.array(off) < bound) == pytest.approx(0.95, abs=0.015)
 
 
+def test_the_bound_at_a_target_is_the_assessment_s_own(registrar, target, femur):
+    """With what was learned from errors of known size (`factor95`): without, it is too small by a fifth."""
+    source = femur.sample(3000, np.random.default_rng(5))[0]
+    assessment, result = registrar.assess(source, target), registrar.register(source, target)
+    for point in target.points[::4000]:
+        bound_mm = planning.errors_at(markups.Markups(point[None], ("a",)), result)[0].bound95_mm
+        assert bound_mm == pytest.approx(assessment.bound_mm(point[None]), rel=0.05)
+    assert result.factor95 > 1.1
+
+
 def test_landmarks_are_paired_by_name_and_else_in_their_order(tmp_path):
     points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 30, 0], [0, 0, 20]])
     moved, order = se3.apply(T, points), [2, 0, 3, 1]

@@ -71,7 +71,7 @@ def test_a_call_that_cannot_be_answered_loses_nothing(registrar, frames, prepare
 def test_what_was_seen_from_several_places_has_no_camera(registrar, frames, prepared, alone, monkeypatch, tracked):
     """A source that is refused alone: as a camera's it is not tried; by the registrar itself it is."""
     refused, asked = next(pair.source for pair, result in zip(frames, alone, strict=True) if not result.ok), []
-    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: asked.append(1) or np.empty((0, 3)))
+    monkeypatch.setattr(clutter, "inferred_places", lambda *_: asked.append(1) or [])
     accumulator = Accumulator(Tracker(registrar) if tracked else registrar, most=20)
     assert not accumulator.register(refused, prepared).ok and not asked
     assert not registrar.register(np.vstack([refused, refused + 0.1, refused - 0.1]), prepared).ok and asked

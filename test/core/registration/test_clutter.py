@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import ClutterConfig, SensorConfig, SourceConfig
@@ -119,14 +120,14 @@ def test_a_pose_that_rests_on_an_inferred_place_needs_more_than_half(target, sce
 @pytest.mark.parametrize(("kind", "asked"), [("unknown", 2), ("depth_camera", 2), ("pointer", 0), ("ultrasound", 0)])
 def test_sensors_that_touch_the_bone_or_skin_have_no_lines_of_sight(scene, kind, asked):
     config = RegistrarConfig(sensor=SensorConfig(kind=kind))
-    assert len(clutter.inferred_viewpoints(prepare(scene[0], in_scene=True), config)) == asked
+    assert len(clutter.inferred_places(prepare(scene[0], in_scene=True), config)) == asked
     assert (Registrar(config)._scene_of_unknown(scene[0]) is not None) is bool(asked), "nothing is prepared in vain"
 
 
 @pytest.mark.parametrize(("least", "is_asked"), [(0.5, True), (0.89, True), (0.9, False)])
 def test_no_camera_is_looked_for_where_none_would_be_sure_enough(target, scene, monkeypatch, least, is_asked):
     asked = []
-    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: asked.append(1) or np.empty((0, 3)))
+    monkeypatch.setattr(clutter, "inferred_places", lambda *_: asked.append(1) or [])
     Registrar(RegistrarConfig(num_threads=1, min_confidence=least)).register(scene[0], target)
     assert bool(asked) is is_asked
 
@@ -177,7 +178,7 @@ def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
 
 
 def test_a_cloud_that_is_sure_as_bone_is_not_asked_for_its_camera(target, femur, monkeypatch):
-    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: pytest.fail("asked"))
+    monkeypatch.setattr(clutter, "inferred_places", lambda *_: pytest.fail("asked"))
     seen = femur.sample(3000, np.random.default_rng(5))[0]
     assert Registrar(RegistrarConfig(num_threads=1)).register(seen, target).ok
 
@@ -191,11 +192,11 @@ def test_what_is_not_sure_as_a_camera_s_either_keeps_its_first_refusal(target, s
 
 
 def test_both_ends_of_the_line_of_sight_are_tried(target, scene, monkeypatch):
-    ways = clutter.inferred_viewpoints(prepare(scene[0], in_scene=True), RegistrarConfig())
-    monkeypatch.setattr(clutter, "inferred_viewpoints", lambda *_: ways[::-1])  # as if the wrong one was likelier
+    ways = clutter.inferred_places(prepare(scene[0], in_scene=True), RegistrarConfig())
+    monkeypatch.setattr(clutter, "inferred_places", lambda *_: ways[::-1])  # as if the wrong one was likelier
     result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0], target)
     assert result.ok
-    np.testing.assert_array_equal(result.inferred_viewpoint, ways[0])
+    np.testing.assert_array_equal(result.inferred_viewpoint, ways[0][0])
 
 
 def test_a_refusal_of_clutter_with_a_viewpoint_behind_the_surface_asks_to_check_it(target, femur):
@@ -232,3 +233,29 @@ def test_normals_of_a_camera_point_to_it(scene):
     axes = facing.axes(np.arange(len(facing.points)))
     assert np.linalg.det(axes) == pytest.approx(np.ones(len(axes)))
     assert np.einsum("ni,ni->n", axes[:, 2], facing.normals) == pytest.approx(np.ones(len(axes)))
+
+
+def in_the_frame_of_its_camera(scene):
+    """The points of a scene, moved so that the camera is in the origin and looks along z."""
+    points, viewpoint, _ = scene
+    ahead = points.mean(axis=0) - viewpoint
+    return (points - viewpoint) @ Rotation.align_vectors([[0.0, 0.0, 1.0]], [ahead])[0].as_matrix().T
+
+
+@pytest.mark.parametrize("settings", [{}, {"origin_deg": 0.0}])
+def test_the_frame_of_a_camera_says_where_it_was_where_its_surface_does_not(target, scene, settings):
+    """With `least_cos` 1 no cloud is seen so squarely that the surface says it."""
+    config = ClutterConfig(least_cos=1.0, **settings)
+    result = Registrar(RegistrarConfig(num_threads=1, clutter=config)).register(
+        in_the_frame_of_its_camera(scene), target
+    )
+    assert result.ok is not bool(settings)
+    if result.ok:
+        assert np.array_equal(result.inferred_viewpoint, np.zeros(3)) and 0.85 <= result.confidence <= 0.89
+
+
+def test_the_origin_comes_first_and_has_rounds_of_its_own(scene):
+    config = ClutterConfig(origin_rounds=3, inferred_rounds=(2, 1))
+    source = prepare(in_the_frame_of_its_camera(scene), in_scene=True)
+    places = clutter.inferred_places(source, RegistrarConfig(clutter=config))
+    assert [rounds for _, rounds in places] == [3, 2, 1] and not places[0][0].any()

@@ -317,7 +317,7 @@ def test_another_bone_in_the_same_place_is_not_followed(sure, frames, prepared, 
 
 def test_following_changes_nothing_that_the_tracker_knows(sure, frames, prepared):
     def known():
-        arrays = {"poses": sure._memory.poses, "last": sure._last, "seen": sure._seen}
+        arrays = {"poses": sure._memory.poses, "seen": sure._seen}
         flags = sure._tracked, sure._is_sure, sure._has_track, sure._shared_for_bone, sure._shared_mm
         return {name: array.tolist() for name, array in arrays.items()} | vars(sure._evidence) | {"flags": flags}
 
@@ -325,6 +325,14 @@ def test_following_changes_nothing_that_the_tracker_knows(sure, frames, prepared
     for pair in frames[1:4]:
         assert sure.follow(pair.source, prepared) is not None
     assert known() == before
+
+
+def test_a_bone_that_was_followed_far_continues_its_track(sure, frames, prepared):
+    """Four steps of 5 mm are more than `evidence.agree_mm` from the last assessed source, and not from the followed."""
+    at = [frames[0].source + [5.0 * number, 0.0, 0.0] for number in range(6)]
+    for source in at[1:5]:
+        assert sure.follow(source, prepared) is not None
+    assert sure.register(at[5], prepared).ok and sure._agreed
 
 
 def test_the_next_assessment_begins_where_the_bone_was_followed_to_with_its_rivals(sure, frames, prepared):

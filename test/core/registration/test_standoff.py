@@ -43,6 +43,11 @@ def test_a_standoff_that_is_stated_is_not_asked_for_and_counts_with_what_is_foun
     assert "it fits better 2.5 mm outside" in registered(seen(2.5), target, registrar, standoff_mm=1.0).reason
 
 
+def test_a_standoff_that_is_stated_wrong_is_asked_about(registrar, target, seen):
+    reason = registered(seen(0.0), target, registrar, standoff_mm=1.5).reason
+    assert "it fits better on the bone: is the standoff_mm of 1.5 right?" in reason
+
+
 def test_it_has_to_fit_clearly_better(registrar, target, seen, monkeypatch):
     answer = registrar.assess(seen(1.5), target)
     best = {1.5: np.exp(-0.16)}

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
+from gapr_core.registration import rest
 from gapr_core.registration.kernels import residuals_at
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.sensor import offset_surface
@@ -31,7 +32,8 @@ class Accumulator:
     together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
     what lies off the bone is left out, and refused if it is the newest. After three of them in a row the bone or its
-    reference has moved, and only these three are kept.
+    reference has moved, and only these three are kept. Where it creeps, so that the first and the last third of the
+    sources lie apart (see `rest`), the answer is refused and only the last third kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -160,7 +162,22 @@ class Accumulator:
         if new and self._off_in_a_row:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
             return _refused(result, f"the {newest} off the bone where the others found it: left out")
-        return result
+        return self._unless_it_creeps(result, target)
+
+    def _unless_it_creeps(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
+        """The answer; a refusal, and only the last third of the sources left, where that and the first lie apart."""
+        limits, third = self.config.accumulation, len(self._kept) // 3
+        oldest, newest = self._kept[:third], self._kept[len(self._kept) - third :]
+        first, last = _together(oldest), _together(newest)
+        if result.T_target_source is None or not limits.creep or min(len(first), len(last)) < limits.creep_points:
+            return result
+        found = rest.apart(first, last, result.T_target_source, target, self.config)
+        if found.nees <= limits.creep:
+            return result
+        self.reset()
+        self._kept = newest
+        how = f"{found.shift_mm:.1f} mm and {found.turn_deg:.1f} deg apart"
+        return _refused(result, f"the first and the last sources lie {how}: the bone moves; only the last are kept")
 
     def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.

@@ -494,7 +494,8 @@ def test_a_cloud_from_before_a_reset_or_another_bone_is_not_registered_on_reques
         assert client.call("register").success, "once more, on the same cloud"
         assert client.call(service).success
         answer = client.call("register")
-        assert not answer.success and answer.message == "no cloud has come yet, or none since the last reset, reload or pause"
+        why = "no cloud has come yet, or none since the last reset, reload or pause"
+        assert not answer.success and answer.message == why
         client.send(GOOD)
         wait_until(lambda: node.counters.received == 2)
         assert client.call("register").success

@@ -267,8 +267,8 @@ class AccumulationConfig(Settings):
     fewest_points: int = setting(20, "points of a source that is checked by itself; of fewer with those before", low=3)
     most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
     creep: float = setting(
-        22.5, "squared distance of the poses of the first and the last third, in standard deviations, beyond which the "
-        "bone has moved (chi-square of 6, 99.9 %); 0: not asked", low=0, high=1e6,
+        0.0, "squared distance of the poses of the first and the last third, in standard deviations, beyond which the "
+        "bone creeps: 22.5 is the 99.9 % of a chi-square of 6; 0: not asked", low=0, high=1e6,
     )  # fmt: skip
     creep_points: int = setting(100, "points of such a third, or it is not asked", low=6, high=1_000_000)
 

@@ -20,6 +20,8 @@ from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
+KNOWN_MM, KNOWN_DEG = 1.0, 1.5  # standard deviations up to which the pose of a part says something
+
 
 @dataclass(frozen=True)
 class Apart:
@@ -27,6 +29,7 @@ class Apart:
 
     Attributes:
         nees: squared distance in standard deviations of both; of poses alike it has the chi-square distribution of 6.
+            0 where one of them is hardly known: far from the common pose a covariance says little.
         shift_mm: at the middle of the second source.
         turn_deg: of one against the other.
     """
@@ -43,9 +46,10 @@ def apart(first: Array, last: Array, T: Array, target: PreparedTarget, config: R
     """
     surface, exact = offset_surface(target, config.sensor), replace(config.covariance, model_mm=0.0)
     fits = [refine_fully(T, np.ascontiguousarray(points), surface, config.refinement) for points in (first, last)]
-    of_first, of_last = (covariance.estimate(fit, exact, config.sensor).covariance for fit in fits)
+    found = [covariance.estimate(fit, exact, config.sensor) for fit in fits]
+    is_known = all(each.largest_shift_mm < KNOWN_MM and each.largest_turn_deg < KNOWN_DEG for each in found)
     middles = [fit.moved.mean(axis=0) for fit in fits]
-    both = covariance_about(middles[1] - middles[0], of_first) + of_last
+    both = covariance_about(middles[1] - middles[0], found[0].covariance) + found[1].covariance
     twist = error_twist(fits[0].T, fits[1].T, last)
     shift_mm, turn_rad = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
-    return Apart(nees(twist, both), float(shift_mm), float(np.degrees(turn_rad)))
+    return Apart(nees(twist, both) if is_known else 0.0, float(shift_mm), float(np.degrees(turn_rad)))

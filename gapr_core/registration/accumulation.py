@@ -32,8 +32,8 @@ class Accumulator:
     together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
     what lies off the bone is left out, and refused if it is the newest. After three of them in a row the bone or its
-    reference has moved, and only these three are kept. With `accumulation.creep`, where the first and the last third of the
-    sources lie apart (see `rest`), the answer is refused and only the last third kept.
+    reference has moved, and only these three are kept. With `accumulation.creep`, where the first and the last third
+    of the sources lie apart (see `rest`), the answer is refused and only the last third kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one

@@ -33,14 +33,13 @@ def asking_the_standoff(
     found_mm = better_mm(assessment, config)
     if found_mm is None:
         return result
-    where = (
-        f"{abs(found_mm):g} mm {'outside' if found_mm > 0.0 else 'inside'} of the bone" if found_mm else "on the bone"
-    )
+    side = "outside" if found_mm > 0.0 else "inside"
+    where = f"{abs(found_mm):g} mm {side} of the bone" if found_mm else "on the bone"
+    stated_mm = config.sensor.standoff_mm
     question = "is the radius of the tip subtracted, or is there a standoff_mm to state?"
-    if config.sensor.standoff_mm is not None:
-        question = f"is the standoff_mm of {config.sensor.standoff_mm:g} right?"
-    question = f"it fits better {where}: {question}"
-    return replace(result, reason=f"{result.reason}; {question}")
+    if stated_mm is not None:
+        question = f"is the standoff_mm of {stated_mm:g} right?"
+    return replace(result, reason=f"{result.reason}; it fits better {where}: {question}")
 
 
 def better_mm(assessment: Assessment, config: RegistrarConfig) -> float | None:

@@ -93,6 +93,12 @@ class RefinementConfig(Settings):
     smallest_sigma_mm: float = setting(0.15, "least standard deviation of the residuals", low=1e-9, high=10, unit="mm")
     largest_sigma_mm: float = setting(3.0, "largest standard deviation of the residuals", low=1e-9, high=50, unit="mm")
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.smallest_sigma_mm > self.largest_sigma_mm:
+            what, given = "a smallest_sigma_mm that is not above largest_sigma_mm", f"{self.smallest_sigma_mm:g}"
+            raise ConfigError(what, f"{given} and {self.largest_sigma_mm:g}", "lower it, or raise the other")
+
 
 @dataclass(frozen=True)
 class CovarianceConfig(Settings):
@@ -129,8 +135,12 @@ class CovarianceConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.sizes_mm) < 2 or any(small >= large for small, large in pairwise(self.sizes_mm)):
-            raise ConfigError("two or more ascending sizes_mm", str(self.sizes_mm), "name the smallest size first")
+        _check_ascending(self.sizes_mm)
+
+
+def _check_ascending(sizes_mm: tuple[float, ...]) -> None:
+    if len(sizes_mm) < 2 or any(small >= large for small, large in pairwise(sizes_mm)):
+        raise ConfigError("two or more ascending sizes_mm", str(sizes_mm), "name the smallest size first")
 
 
 # Each has an entry in `KINDS` of registration/sensor.py.
@@ -186,6 +196,10 @@ class SmoothBiasConfig(Settings):
     iterations: int = setting(2, "steps of the pose", low=1, high=100)
     fewest_points: int = setting(200, "inliers without which no bias is looked for", low=10)
     largest_move: float = setting(22.5, "largest squared Mahalanobis distance of a move (chi square: 99.9 %)", low=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_ascending(self.sizes_mm)
 
 
 @dataclass(frozen=True)
@@ -266,11 +280,24 @@ class AccumulationConfig(Settings):
     most_off: int = setting(3, "after so many of them in a row the bone has moved", low=1, high=1000)
     fewest_points: int = setting(20, "points of a source that is checked by itself; of fewer with those before", low=3)
     most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
-    creep: float = setting(
-        0.0, "squared distance of the poses of the first and the last third, in standard deviations, beyond which the "
-        "bone creeps: 22.5 is the 99.9 % of a chi-square of 6; 0: not asked", low=0, high=1e6,
-    )  # fmt: skip
-    creep_points: int = setting(100, "points of such a third, or it is not asked", low=6, high=1_000_000)
+
+
+@dataclass(frozen=True)
+class RigidityConfig(Settings):
+    """Whether what was measured is one rigid piece (`gapr_core.registration.rigidity`)."""
+
+    creeps: float = setting(
+        6.0, "log likelihood ratio from which collected sources show that the bone moves; infinity: never", low=0
+    )
+    strained: float = setting(
+        3.0, "log likelihood ratio from which a source shows that it is strained; infinity: never", low=0
+    )
+    fewest_points: int = setting(200, "inliers without which neither is looked for", low=12, high=1_000_000)
+    cells: int = setting(40, "cells over which residuals are averaged", low=12, high=1000)
+    groups: int = setting(6, "groups of sources in time, whose residuals are averaged apart", low=2, high=100)
+    correlation_mm: float = setting(
+        20.0, "l of a smooth bias's correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm"
+    )
 
 
 @dataclass(frozen=True)
@@ -392,6 +419,8 @@ class ClutterConfig(Settings):
         if len(self.seeds) != len(self.radii_mm):
             given = f"{self.seeds} for {self.radii_mm}"
             raise ConfigError("seeds for each of radii_mm", given, "name as many seeds as radii_mm")
+        if not self.radii_mm:
+            raise ConfigError("at least one of radii_mm", "none", "name one, and its seeds")
 
 
 @dataclass(frozen=True)
@@ -427,6 +456,7 @@ class RegistrarConfig(Settings):
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     cortices: CorticesConfig = field(default_factory=CorticesConfig)
     accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
+    rigidity: RigidityConfig = field(default_factory=RigidityConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     following: FollowingConfig = field(default_factory=FollowingConfig)
     guide: bool = setting(False, "say with every answer where another look would help most")

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
-from gapr_core.registration import rest
+from gapr_core.registration import rigidity
 from gapr_core.registration.kernels import residuals_at
+from gapr_core.registration.refinement import refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.target import PreparedTarget
@@ -24,6 +25,8 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+FEWEST_IN_TIME = 6  # sources in which a steady motion is looked for
+
 
 class Accumulator:
     """Registers each source together with those before it.
@@ -32,8 +35,8 @@ class Accumulator:
     together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
     what lies off the bone is left out, and refused if it is the newest. After three of them in a row the bone or its
-    reference has moved, and only these three are kept. With `accumulation.creep`, where the first and the last third
-    of the sources lie apart (see `rest`), the answer is refused and only the last third kept.
+    reference has moved, and only these three are kept. Where all show that the bone creeps (see `rigidity`), the answer
+    is refused and only the last third kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -165,19 +168,23 @@ class Accumulator:
         return self._unless_it_creeps(result, target)
 
     def _unless_it_creeps(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
-        """The answer; a refusal, and only the last third of the sources left, where that and the first lie apart."""
-        limits, third = self.config.accumulation, len(self._kept) // 3
-        oldest, newest = self._kept[:third], self._kept[len(self._kept) - third :]
-        first, last = _together(oldest), _together(newest)
-        if result.T_target_source is None or not limits.creep or min(len(first), len(last)) < limits.creep_points:
+        """The answer; a refusal, and only the last third of the sources left, where they show that the bone moves."""
+        T, kept, limits = result.T_target_source, self._kept, self.config.rigidity
+        if T is None or len(kept) < FEWEST_IN_TIME:
             return result
-        found = rest.apart(first, last, result.T_target_source, target, self.config)
-        if found.nees <= limits.creep:
+        order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
+        some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
+        points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
+        found = rigidity.of_creep(refine_fully(T, points, seen, self.config.refinement), order[some], limits)
+        if found.log_ratio < limits.creeps:
             return result
         self.reset()
-        self._kept = newest
-        how = f"{found.shift_mm:.1f} mm and {found.turn_deg:.1f} deg apart"
-        return _refused(result, f"the first and the last sources lie {how}: the bone moves; only the last are kept")
+        self._kept = kept[-(len(kept) // 3) :]
+        return _refused(
+            result,
+            f"the bone moves against the frame of the sources, by some {found.size_mm:.1f} mm from the first to the "
+            "last: only the last are kept; look at what is fixed to the bone",
+        )
 
     def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.

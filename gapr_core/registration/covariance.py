@@ -94,14 +94,27 @@ def estimate(
     sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
     noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, config.noise_points)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
-    covariance = sandwich(rests, spanned, expected, config)
-    if rests is not fit:
-        covariance = covariance_about(fit.moved.mean(axis=0) - rests.moved.mean(axis=0), covariance)
+    covariance = _about_middle(fit, sandwich(rests, spanned, expected, config))
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     counts = config.smooth_neighbours, config.short_neighbours
     smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)
     turn, shift = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm, turn, shift)
+
+
+def covariance_of_strain(fit: Fit, size_mm: float, config: CovarianceConfig) -> Array:
+    """(6, 6) what `strains` of this size add to the covariance of a fit."""
+    rests = fit.rests_on
+    spanned = fields(rests, config.correlation_mm, config.centres)
+    moved = size_mm * gain_of(rests, spanned, rests.sigma_mm)[0] @ strains(rests)
+    return _about_middle(fit, moved @ moved.T)
+
+
+def _about_middle(fit: Fit, covariance: Array) -> Array:
+    """The covariance (6, 6) of what a fit rests on, about the middle of its own points."""
+    if fit.rests_on is fit:
+        return covariance
+    return covariance_about(fit.moved.mean(axis=0) - fit.rests_on.moved.mean(axis=0), covariance)
 
 
 def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:

@@ -126,6 +126,11 @@ def is_rough(assessment: Assessment, config: RegistrarConfig) -> bool:
     return bool(rough_mm > config.limits.rough_exceeded * sigma_mm)
 
 
+def is_strained(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the residuals show that the source is strained (see `rigidity`)."""
+    return assessment.strain_mm > 0.0
+
+
 def residual_mm(assessment: Assessment) -> float:
     """Root mean square residual of the points that count for the pose, whose unknowns count; infinite without any."""
     signed = assessment.fit.signed_mm[assessment.fit.weights > 0.0]
@@ -181,6 +186,12 @@ LIMITS = (
         is_rough,
         "near points err alike, by much of what each errs by; check that it is this subject's bone, or measure it from "
         "nearer",
+    ),
+    Limit(
+        "strained",
+        is_strained,
+        "the source is longer, wider or slanted against the bone; check that nothing moved while it was measured, and "
+        "the spacing of the slices of both",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),

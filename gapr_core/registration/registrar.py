@@ -26,6 +26,7 @@ from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.refinement import refine_fully, rest_on_whole
+from gapr_core.registration.rigidity import allowing_for_strain
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
@@ -217,7 +218,8 @@ class Registrar:
         if assessment.is_sure(config.may_pass):
             assessment = bias_corrected(assessment, config)
             clock.lap("refine")
-        return assessment.corrected(self.precision)
+        corrected = assessment.corrected(self.precision)
+        return allowing_for_strain(corrected, config) if corrected.is_sure(config.may_pass) else corrected
 
     def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough

@@ -19,6 +19,7 @@ Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neigh
 
 SPREAD_OUT = 512  # points that are spread evenly, before the others in any order
 TRUSTED_SHARE = 0.8  # of the points, those most in the middle of their neighbours: of them the spread-out ones are
+STRAY = 4.0  # a point so many times farther from the middle than most is looked at; at the end of a bar it is 2
 SMALLEST_MM = 1.0  # across: less is a cloud in metres, and not too short a piece
 SPARE_NEIGHBOURS = 6  # of a point, for means over those that lie on the bone
 
@@ -123,10 +124,10 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
 
     Not evenly spread: some stay so near to each other that what near residuals share is seen (`roughness`).
     """
-    whole = points
-    if len(points) > config.most_points:
-        clean = without_isolated(points, config)
-        whole = clean[sampling.thin(clean, config.most_points)]
+    is_clean = len(points) <= config.most_points and not _has_strays(points)
+    whole = points if is_clean else without_isolated(points, config)
+    if len(whole) > config.most_points:
+        whole = whole[sampling.thin(whole, config.most_points)]
     count = min(config.fitted_points, len(whole))
     some = whole[np.sort(np.random.default_rng(0).choice(len(whole), count, replace=False))]
     k = _neighbour_count(len(whole), config)
@@ -172,6 +173,12 @@ def without_isolated(points: Array, config: SourceConfig) -> Array:
         return points
     some = points[:: -(-len(points) // config.most_compared)]
     return points[_has_companions(cKDTree(some).query(points, k=config.companions + 1)[0][:, -1], config)]
+
+
+def _has_strays(points: Array) -> bool:
+    """True where one of the points (N, 3) is so far from most that it would change the extent of the cloud."""
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return bool(away.max() > STRAY * np.median(away))
 
 
 def _has_companions(gaps: Array, config: SourceConfig) -> NDArray[np.bool_]:

@@ -115,7 +115,7 @@ class Tracker:
             self._shared.forget()
 
     def _forget_track(self) -> None:
-        self._has_track = self._is_sure = False  # there are poses to follow; the last source was sure
+        self._has_track = self._is_sure = self._was_sure = False  # there are poses to follow; the last source was sure
         self._last: Array | None = None  # pose of the last source that no rule refused, (4, 4) T_target_source
         self._heard: Array = np.empty((0, 3))  # its points
         self._agreed, self._said = False, 1.0  # it continued the one before it; what was said of it
@@ -144,6 +144,7 @@ class Tracker:
             self._bone = target
         if initial is not None:
             self._forget_track()
+        self._was_sure, self._is_sure = self._is_sure, False  # and stays so where this source is refused
         self._follower, clock = None, Clock()
         assessment = self._assess(source, target, initial, viewpoint, clock)
         if isinstance(assessment, Assessment):
@@ -197,7 +198,7 @@ class Tracker:
     def _stands(self, assessment: Assessment) -> bool:
         """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""
         stands = assessment.proposer == Memory.name and assessment.is_sure(self.registrar.config.evidence.stands)
-        return self._is_sure and stands and self._agrees(assessment)
+        return self._was_sure and stands and self._agrees(assessment)
 
     def _agrees(self, assessment: Assessment) -> bool:
         """True when the pose continues that of the last source."""

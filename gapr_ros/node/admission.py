@@ -13,7 +13,7 @@ from gapr_ros.node.timeline import Timeline
 
 NO_CLOCK = "use_sim_time is true and no /clock has come: neither max_future nor max_cloud_age is checked"
 STAMPS_WENT_BACK = "the stamps of the clouds went back"
-CLOCK_WENT_BACK = "the clock jumped back"
+CLOCK_WENT_BACK, CLOCK_CHANGED = "the clock jumped back", "the node's clock is another one now"
 OVER = "time starts over and the track is cleared"
 BEHIND = (
     "/tf waits for stamps 10 s newer than those it had before, or tf2 would mix the poses of both rounds: "
@@ -52,11 +52,11 @@ class Admission:
         self._cloud_frames.note(frame, parameters.output_frame)
         return starts_over
 
-    def start_over(self) -> None:
-        """The clock went back, which everybody knows who uses it: whatever comes next is the newest."""
+    def start_over(self, why: str) -> None:
+        """The clock jumped, which everybody knows who uses it: whatever comes next is the newest."""
         self.forget()
         self._frames.start_over()
-        self._host.ros.get_logger().warning(f"{CLOCK_WENT_BACK}: {OVER}")
+        self._host.ros.get_logger().warning(f"{why}: {OVER}")
 
     def forget(self) -> None:
         """Whatever comes next is the newest, on /tf too: its listeners are started again."""

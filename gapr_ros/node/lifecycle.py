@@ -16,7 +16,7 @@ from typing import Any
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -180,10 +180,11 @@ class RegisterNode(LifecycleNode):
         if loaded is None:
             self._forget_settings()
         ready = loaded or make_ready(self._method_factory, self.parameters)
-        self.session = Session(self, ready, self._method_factory)
+        model = str(ready.model)
         for sentence in parameters.remarks(self.parameters):
             self.get_logger().info(sentence)
-        self.get_logger().info(str(ready.model))
+        self.get_logger().info(model)
+        self.session = Session(self, ready, self._method_factory)
         return super().on_configure(state)
 
     @transition
@@ -276,7 +277,7 @@ class RegisterNode(LifecycleNode):
     @guarded
     def _on_jump(self, jump: Any) -> None:
         if self.session is not None:
-            self.session.clock_jumped()
+            self.session.clock_jumped(is_another=jump.clock_change != ClockChange.ROS_TIME_NO_CHANGE)
 
     def _on_bell(self) -> None:
         while self._calls:

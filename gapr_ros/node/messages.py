@@ -53,7 +53,10 @@ def hypotheses(outcome: Outcome) -> PoseArray:
 
 
 def residuals(found: Residuals, header: Header) -> PointCloud2:
-    """The used points with their signed distance from the bone, m, NaN where none is near, and 1 for inliers."""
+    """The used points with their signed distance from the bone, m, NaN where none is near, and 1 for inliers.
+
+    The stand-off of the sensor is taken off.
+    """
     fields = {
         "distance": wire.to_metres(found.distance_mm).astype("f4"),
         "inlier": found.inlier.astype("u1"),

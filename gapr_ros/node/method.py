@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,7 @@ class ShippedMethod:
 
         if self._settings is None:
             settings = read_settings(parameters.settings_file)
-            check_file(settings, parameters)
+            check_file(settings, parameters, _named_in(parameters.settings_file))
             self._settings = settings
         registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device)
         method = Tracker(registrar) if parameters.track else registrar
@@ -57,25 +58,44 @@ def read_settings(path: str) -> RegistrarConfig:
     return settings.load(RegistrarConfig, path or None)
 
 
-def check_file(config: RegistrarConfig, parameters: NodeParameters) -> None:
+def check_file(config: RegistrarConfig, parameters: NodeParameters, named: Collection[str]) -> None:
     """Refuse a file that says something else than the parameters that decide: nothing it says is dropped in silence.
+
+    Args:
+        config: what the file says.
+        parameters: of the node.
+        named: dotted names of the settings that stand in the file.
 
     Raises:
         ConfigError: such a setting; the text names its parameter.
     """
-    said, used, usual = (_decided(each) for each in (config, configured(config, parameters), type(config)()))
+    said, used = (_decided(each, parameters) for each in (config, configured(config, parameters)))
     for (setting, parameter), value in said.items():
         decides = used[setting, parameter]
         is_alike = math.isclose(value, decides) if isinstance(value, float) else value == decides  # mm of metres round
-        if not is_alike and value != usual[setting, parameter]:
+        if setting in named and not is_alike:
             what = f"{setting} from the node's parameter '{parameter}', which decides ({decides})"
             how = f"set the parameter '{parameter}' so, and leave it out of the file"
             raise ConfigError(what, f"{value} in settings_file", how)
 
 
-def _decided(config: RegistrarConfig) -> dict[tuple[str, str], Any]:
-    """What parameters of the node decide, by (setting, parameter)."""
-    return {
+def _named_in(path: str) -> set[str]:
+    """Dotted names of all that stands in a YAML file; none without one."""
+    from gapr_core.runtime import settings
+
+    waiting: list[tuple[str, Any]] = list(settings.read_yaml(path).items()) if path else []
+    names = set()
+    while waiting:
+        name, value = waiting.pop()
+        names.add(name)
+        if isinstance(value, dict):
+            waiting += [(f"{name}.{key}", inner) for key, inner in value.items()]
+    return names
+
+
+def _decided(config: RegistrarConfig, parameters: NodeParameters) -> dict[tuple[str, str], Any]:
+    """What parameters of the node decide, by (setting, parameter); some of them leave it to the file."""
+    decided: dict[tuple[str, str], Any] = {
         ("sensor.kind", "sensor"): config.sensor.kind,
         ("min_confidence", "min_confidence"): config.min_confidence,
         ("max_tre_mm", "max_tre"): config.max_tre_mm,
@@ -83,6 +103,11 @@ def _decided(config: RegistrarConfig) -> dict[tuple[str, str], Any]:
         ("num_threads", "num_threads"): config.num_threads,
         ("seed", "seed"): config.seed,
     }
+    if parameters.standoff:
+        decided["sensor.standoff_mm", "standoff"] = config.sensor.standoff_mm
+    if parameters.model_error >= 0.0:
+        decided["covariance.model_mm", "model_error"] = config.covariance.model_mm
+    return decided
 
 
 def configured(config: RegistrarConfig, parameters: NodeParameters) -> RegistrarConfig:

@@ -14,7 +14,7 @@ from rclpy.time import Time
 
 from gapr_core.baselines.base import takes
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
-from gapr_core.geometry import se3
+from gapr_core.geometry import sampling, se3
 from gapr_core.results import RegistrationResult
 from gapr_ros.node import intake, region, timeline, wire
 from gapr_ros.node.collection import Late, forget
@@ -31,6 +31,8 @@ from gapr_ros.parameters import NO_FRAME, NodeParameters
 from msg_adapters import INPUTS
 
 Array = NDArray[np.float64]
+
+SEARCHED_FOR_DOUBLES = 20_000  # of more points there are enough, and sorting them takes time
 
 
 class Registration:
@@ -183,6 +185,8 @@ def needs_frames(parameters: NodeParameters) -> bool:
 def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
     """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
     together = np.vstack([now.method.collected, points_mm])
+    if len(together) < SEARCHED_FOR_DOUBLES:
+        together = sampling.distinct(together)  # a cloud that comes again makes no more of them
     if not intake.is_one_bone(together, now.model.extent_mm):
         together = points_mm  # the method leaves this cloud out, or starts again with it
     outcome.points_used = len(together)

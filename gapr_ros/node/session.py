@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 
 from gapr_ros.node import intake, timeline
-from gapr_ros.node.admission import CLOCK_WENT_BACK, STAMPS_WENT_BACK, Admission
+from gapr_ros.node.admission import CLOCK_CHANGED, CLOCK_WENT_BACK, STAMPS_WENT_BACK, Admission
 from gapr_ros.node.changes import Changes
 from gapr_ros.node.collection import forget
 from gapr_ros.node.conflicts import Conflicts
@@ -220,10 +220,11 @@ class Session:
         self.worker.outdate(self.course.epoch)
         self._publishers.withdraw("pose")
 
-    def clock_jumped(self) -> None:
-        """The node's clock went back."""
-        self._admission.start_over()
-        self._clear(CLOCK_WENT_BACK)
+    def clock_jumped(self, is_another: bool) -> None:
+        """The node's clock went back, or is another one: `use_sim_time` was set."""
+        why = CLOCK_CHANGED if is_another else CLOCK_WENT_BACK
+        self._admission.start_over(why)
+        self._clear(why)
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""

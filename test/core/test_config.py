@@ -72,8 +72,20 @@ def test_a_value_out_of_range_is_refused_with_the_range(values):
 
 @pytest.mark.parametrize("sizes_mm", [(), (0.1,), (0.1, 0.1), (0.5, 0.1, 0.2)])
 def test_sizes_of_the_bias_that_do_not_ascend_are_refused(sizes_mm):
-    with pytest.raises(ConfigError, match="ascending sizes_mm"):
-        CovarianceConfig(sizes_mm=sizes_mm)
+    for config in (CovarianceConfig, SmoothBiasConfig):
+        with pytest.raises(ConfigError, match="ascending sizes_mm"):
+            config(sizes_mm=sizes_mm)
+
+
+def test_a_least_deviation_above_the_largest_is_refused():
+    with pytest.raises(ConfigError, match="smallest_sigma_mm that is not above largest_sigma_mm"):
+        RefinementConfig(smallest_sigma_mm=5.0, largest_sigma_mm=3.0)
+    RefinementConfig(smallest_sigma_mm=3.0, largest_sigma_mm=3.0)
+
+
+def test_regions_have_a_radius():
+    with pytest.raises(ConfigError, match="at least one of radii_mm"):
+        ClutterConfig(radii_mm=(), seeds=())
 
 
 def test_radii_and_seeds_of_regions_go_in_pairs():

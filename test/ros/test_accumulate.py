@@ -33,10 +33,12 @@ def test_slices_of_a_probe_that_are_too_small_alone_give_the_pose_together(clien
         client.wait_for_state("active")
         before = client.ask(slices[0])
         assert before["last_refusal"].startswith("too_few_points: 60 usable points")
+        again = client.ask(slices[0])
+        assert again["last_refusal"].startswith("too_few_points: 60 usable points"), "sent again, it is no new one"
         for points in slices[1:]:
             client.send(points)
             time.sleep(0.02)
-        wait_until(lambda: sum(int(client.values()[f"frames_{kind}"]) for kind in KINDS) == 50, PATIENCE_S)
+        wait_until(lambda: sum(int(client.values()[f"frames_{kind}"]) for kind in KINDS) == 51, PATIENCE_S)
         wait_until(lambda: client.poses and stamp_of(client.poses[-1]) == client.values()["cloud_stamp"])
         estimate = wire.core_pose(pose_to_matrix(client.poses[-1]))
         translation_mm, rotation_deg = se3.pose_error(estimate, T, cloud * 1000.0)

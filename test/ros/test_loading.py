@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 
 from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, SensorConfig
 from gapr_core.errors import ConfigError
+from gapr_core.runtime.settings import changes
 from gapr_ros.node.method import ShippedMethod, check_file, configured
 from gapr_ros.node.model import load_model
 from gapr_ros.parameters import NodeParameters
@@ -89,14 +90,34 @@ def test_what_is_said_of_sensor_and_model_is_in_metres_and_wins_over_the_file():
         (RegistrarConfig(seed=3), {}, "seed"),
         (RegistrarConfig(num_threads=1), {}, "num_threads"),
         (RegistrarConfig(sensor=SensorConfig("pointer", 0.0)), {}, "sensor"),
+        (RegistrarConfig(sensor=SensorConfig(standoff_mm=1.0)), {"standoff": 0.002}, "standoff"),
+        (RegistrarConfig(covariance=CovarianceConfig(model_mm=0.1)), {"model_error": 0.0005}, "model_error"),
     ],
 )
 def test_a_file_must_not_say_otherwise_than_a_parameter_that_decides(file, given, parameter):
     """A limit in the file that the parameter's default takes back would be dropped in silence."""
     parameters = replace(NodeParameters(), **given)
     with pytest.raises(ConfigError, match=f"set the parameter '{parameter}' so"):
-        check_file(file, parameters)
-    check_file(RegistrarConfig(), parameters)
+        check_file(file, parameters, named_in(file))
+    check_file(file, parameters, ["refinement.rounds"])
+
+
+def named_in(config):
+    return [change.partition("=")[0] for change in changes(config)]
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "parameter"),
+    [
+        ("min_confidence: 0.5", {"min_confidence": 0.1}, "min_confidence"),
+        ("guide: false", {"guide": True}, "guide"),
+        ("sensor: {kind: unknown}", {"sensor": "pointer"}, "sensor"),
+    ],
+)
+def test_what_a_file_says_counts_where_it_is_the_default_too(tmp_path, text, given, parameter):
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=f"set the parameter '{parameter}' so"):
+        ShippedMethod()(replace(NodeParameters(), settings_file=str(tmp_path / "settings.yaml"), **given))
 
 
 def test_a_file_may_say_the_same_as_the_parameters_and_what_they_leave_open():
@@ -106,8 +127,10 @@ def test_a_file_may_say_the_same_as_the_parameters_and_what_they_leave_open():
         sensor=SensorConfig("pointer", 0.0),
         covariance=CovarianceConfig(model_mm=0.1),
     )
-    check_file(file, replace(NodeParameters(), min_confidence=0.9, max_tre=0.002, sensor="pointer"))
-    check_file(RegistrarConfig(max_tre_mm=4.1), replace(NodeParameters(), max_tre=0.0041))  # 4.1000000000000005 mm
+    same = replace(NodeParameters(), min_confidence=0.9, max_tre=0.002, sensor="pointer")
+    check_file(file, same, named_in(file))
+    rounded = RegistrarConfig(max_tre_mm=4.1)
+    check_file(rounded, replace(NodeParameters(), max_tre=0.0041), named_in(rounded))  # 4.1000000000000005 mm
 
 
 def test_a_file_that_was_refused_is_refused_again(tmp_path):

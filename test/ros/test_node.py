@@ -222,7 +222,7 @@ def test_clouds_that_are_accumulated_are_merged_into_the_newest_and_counted(blob
     assert [len(source) for source in kept] == [150, 300, 100, 100, 100, 100, 100]
     np.testing.assert_allclose(kept[-2], GOOD[:100] * 4 * 1000.0, atol=1e-3)
     np.testing.assert_allclose(kept[-1], GOOD[:100] * 6 * 1000.0, atol=1e-3)
-    assert int(values["points_used"]) == 950
+    assert int(values["points_used"]) == 700, "distinct ones: the clouds share some"
 
 
 def test_clouds_from_before_a_reset_are_not_merged(blob_path, client):
@@ -657,6 +657,20 @@ def test_time_that_goes_back_clears_the_track(blob_path, client, method):
         assert "1 of 2" in client.ask(GOOD, stamp_s=990.1)["last_refusal"], "the track restarts"
 
 
+def test_another_clock_clears_the_track_and_the_log_says_so(blob_path, client, method, monkeypatch):
+    with node_in_thread(method, blob_path, require_consecutive=2) as node:
+        client.wait_for_state("active")
+        said = []
+        monkeypatch.setattr(node.session._admission._host.ros.get_logger(), "warning", said.append, raising=False)
+        assert "1 of 2" in client.ask(GOOD)["last_refusal"]
+        assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
+        set_clock(client, node, 1000)
+        assert "1 of 2" in client.ask(GOOD, stamp_s=1000.0)["last_refusal"], "the track restarts"
+        set_clock(client, node, 990)
+        assert "1 of 2" in client.ask(GOOD, stamp_s=990.1)["last_refusal"]
+    assert [text.partition(":")[0] for text in said] == ["the node's clock is another one now", "the clock jumped back"]
+
+
 def set_clock(client, node, seconds):
     wait_until(client.clock.get_subscription_count)
 
@@ -681,6 +695,22 @@ def test_a_cloud_without_a_stamp_gets_the_time_of_its_arrival(live):
     client.ask(xyz_to_cloud(GOOD, Header(frame_id="probe")))
     wait_until(lambda: client.poses)
     assert before - 1.0 <= client.poses[0].header.stamp.sec <= time.time()
+
+
+def test_a_failed_configuration_leaves_nothing_running(blob_path, client):
+    """Its method prepares something that is no bone; three tries left three workers, and parameters that held fast."""
+
+    class Strange(Collecting):
+        def prepare(self, target, units="mm"):
+            return SimpleNamespace(name="no points")
+
+    workers = sum(thread.name == "registration" for thread in threading.enumerate())
+    with node_in_thread(Strange(), blob_path) as node:
+        for _ in range(3):
+            assert not client.change_state(Transition.TRANSITION_CONFIGURE)
+        assert node.session is None
+        assert node.set_parameters([Parameter("sensor", value="pointer")])[0].successful
+        assert sum(thread.name == "registration" for thread in threading.enumerate()) == workers
 
 
 @pytest.mark.parametrize("path", ["", "/absent/bone.stl", "text.ply", "empty.stl", "metres.npy", "bone.docx"])

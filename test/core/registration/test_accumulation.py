@@ -1,5 +1,7 @@
 """What a probe collects, registered together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -322,3 +324,37 @@ def test_what_lies_within_the_least_noise_of_a_perfect_collection_is_on_the_bone
     some = slice(0, 50)
     source = prepared.points[some] + limit_mm * prepared.normals[some]
     assert collected._lies_off(source, prepared.points, np.eye(4), prepared) is lies_off
+
+
+def creeping(registrar, target, femur, step_mm, creeps, count=9):
+    """So many sources of 150 points all over the upper half, each so much farther along y; the last answer."""
+    accumulation = replace(registrar.config.accumulation, most_off=100, off=100.0)
+    rigidity = replace(registrar.config.rigidity, creeps=creeps)
+    config = replace(registrar.config, accumulation=accumulation, rigidity=rigidity)
+    accumulator = Accumulator(Registrar(config, registrar.proposers, registrar.calibrations), count)
+    half, answer = np.median(femur.points[:, 2]), None
+    for number in range(count):
+        rng = np.random.default_rng(number)
+        points = femur.sample(450, rng)[0]
+        points = points[points[:, 2] > half][:150]
+        source = points + rng.normal(0.0, 0.3, points.shape) + [0.0, step_mm * number, 0.0]
+        if number < count - 1:
+            accumulator.collect(source)
+        else:
+            answer = accumulator.register(source, target)
+    return accumulator, answer
+
+
+@pytest.mark.parametrize(
+    ("step_mm", "creeps", "count", "is_refused"),
+    [(0.3, 6.0, 9, True), (0.0, 6.0, 9, False), (0.3, np.inf, 9, False), (0.5, 6.0, 5, False)],
+)
+def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
+    registrar, target, femur, step_mm, creeps, count, is_refused
+):
+    """Only this rule refuses: without it, and of five sources, the same answer is accepted."""
+    accumulator, result = creeping(registrar, target, femur, step_mm, creeps, count)
+    assert ("the bone moves against the frame of the sources" in result.reason) is is_refused
+    assert result.ok is not is_refused and (result.T_target_source is None) is is_refused
+    kept = accumulator.collected
+    assert len(kept) == (150 * 3 if is_refused else 150 * count)

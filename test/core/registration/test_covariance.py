@@ -212,6 +212,24 @@ def test_what_the_bias_has_in_common_also_strains_the_source():
     assert covariance.strains(nothing_seen).shape == (0, 6)
 
 
+def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by():
+    """As strains in proportion to the bias do, about the middle of the points that were compared."""
+    fit = curved_fit()
+    errors = replace(NOTHING, bias_mm=0.8)
+    fields = covariance.fields(fit, CONFIG.correlation_mm, CONFIG.centres)
+    strained, rigid = (
+        covariance.sandwich(fit, fields, errors, replace(CONFIG, long_share=0.0, linear_share=share))
+        for share in (0.7, 0.0)
+    )
+    found = covariance.covariance_of_strain(fit, 0.56, CONFIG)
+    np.testing.assert_allclose(found, strained - rigid, rtol=1e-6, atol=1e-9)
+    some = np.arange(300) < 200
+    of_some = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.elements, fit.moved))
+    drawn = refinement.Fit(fit.T, fit.sigma_mm, *of_some, whole=fit)
+    about = drawn.moved.mean(axis=0) - fit.moved.mean(axis=0)
+    np.testing.assert_allclose(covariance.covariance_of_strain(drawn, 0.56, CONFIG), covariance_about(about, found))
+
+
 def test_the_noise_of_few_points_is_larger_than_their_residuals_say():
     """Six unknowns take up six points' residuals, and the sensor's own noise speaks as four points."""
     assert covariance.expected_noise_mm(0.3, 12, 0.5, 4.0) == pytest.approx(np.sqrt((4 * 0.25 + 12 * 0.09) / 10))

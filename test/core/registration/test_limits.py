@@ -194,3 +194,27 @@ def test_a_registrar_and_a_tracker_limit_what_few_points_say(registrar, femur, t
     for found in (registrar.register(noisy, target), tracker.register(noisy, target)):
         assert found.ok and found.confidence == 0.89 and found.contributions["sparse"] < 0.0
     assert stated.register(noisy, target).confidence > 0.9
+
+
+def test_a_strained_source_is_of_another_bone_or_of_a_bone_that_moved(made):
+    answer = made()
+    assert answer.strain_mm == 0.0 and limits.limited(answer, RegistrarConfig()).probability == SURE
+    found = limits.limited(made(strain_mm=0.6), RegistrarConfig())
+    assert found.probability == 0.89 and list(found.contributions)[-1] == "strained"
+
+
+def test_a_registration_of_a_strained_source_says_so_and_widens_its_bound(registrar, target, femur):
+    """Slices that are 3 % too far apart: only this limit holds, and without it the bound is too narrow."""
+    points = femur.sample(6000, np.random.default_rng(5))[0]
+    points = points[points[:, 2] > np.quantile(points[:, 2], 0.6)] + np.random.default_rng(6).normal(0, 0.3, (2400, 3))
+    strained = points * [1.0, 1.0, 1.03]
+    never = replace(registrar.config, rigidity=replace(registrar.config.rigidity, strained=np.inf))
+    unasked = Registrar(never, registrar.proposers, registrar.calibrations)
+    good, found, blind = (
+        each.register(source, target)
+        for each, source in ((registrar, points), (registrar, strained), (unasked, strained))
+    )
+    assert good.ok and "strained" not in good.contributions
+    assert found.ok and found.confidence <= 0.89 and "strained" in found.contributions
+    assert "strained" not in blind.contributions
+    assert found.tre95_mm > 1.5 * blind.tre95_mm

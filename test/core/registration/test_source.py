@@ -54,6 +54,18 @@ def test_of_many_points_some_are_fitted_and_all_give_their_normals():
     assert np.array_equal(prepared.order[np.argsort(prepared.order)], np.arange(len(rows)))
 
 
+@pytest.mark.parametrize("count", [700, 900])
+def test_one_point_far_from_all_others_is_no_part_of_the_whole(count):
+    """Whatever proposes poses takes the extent of the whole: of 600 fitted points, and of all where they are more."""
+    points = np.vstack([cloud(count=count), [[900.0, 0.0, 0.0]]])
+    for fitted in (600, 2000):
+        prepared = sources.prepare(points, replace(CONFIG, fitted_points=fitted))
+        assert len(prepared.whole) == count and np.ptp(prepared.whole, axis=0).max() < 100.0
+    crowd = points[-1] + np.random.default_rng(2).normal(0.0, 0.5, (20, 3))
+    with_crowd = sources.prepare(np.vstack([points, crowd]), replace(CONFIG, fitted_points=600))
+    assert len(with_crowd.whole) == count + 21, "a point among others is kept: it is for the registration to say"
+
+
 def test_what_is_fitted_is_drawn_at_random_and_always_the_same():
     config = replace(CONFIG, fitted_points=300)
     one, again = (sources.prepare(cloud(), config) for _ in range(2))

@@ -1,5 +1,6 @@
 """A stream of sources: near the last pose first, in full if that is not sure."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -83,6 +84,17 @@ def test_it_does_not_stand_after_a_source_that_was_refused(registrar, frames, pr
     tracker = unsure(registrar)
     first = tracker.register(frames[0].source, prepared)
     tracker._remember(replace(first, status=RegistrationStatus.AMBIGUOUS, T_target_source=None), frames[0].source)
+    assert tracker.register(frames[1].source, prepared).proposer != "track"
+
+
+@pytest.mark.parametrize("what", ["nothing", "a line", "metres"])
+def test_nor_after_a_source_that_was_refused_before_any_pose_of_it_was_looked_at(registrar, frames, prepared, what):
+    line = np.linspace(0.0, 60.0, 300)[:, None] * [[1.0, 0.0, 0.0]]
+    refused = {"nothing": np.zeros((2, 3)), "a line": line, "metres": line * 1000.0}[what]
+    tracker = unsure(registrar)
+    tracker.register(frames[0].source, prepared)
+    with suppress(InvalidPointCloudError):
+        assert not tracker.register(refused, prepared).ok
     assert tracker.register(frames[1].source, prepared).proposer != "track"
 
 

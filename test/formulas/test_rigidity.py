@@ -1,0 +1,192 @@
+"""The evidence of a motion or a strain: against dense restricted likelihoods, and what it is found for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from gapr_core.config import RegistrarConfig, RigidityConfig, SensorConfig
+from gapr_core.data.parametric import make_bone
+from gapr_core.geometry import se3
+from gapr_core.registration import rigidity
+from gapr_core.registration.refinement import Fit
+from gapr_core.registration.rigidity import (
+    BIASES_MM,
+    SHARED_MM,
+    SIZES_MM,
+    Blocks,
+    blocks,
+    evidence,
+    of_creep,
+    of_strain,
+)
+
+CONFIG = RegistrarConfig()
+SMALL = RigidityConfig(cells=12, groups=2)
+NOISE_MM = 0.4
+
+
+def fit_of(points, normals, errors, weights=None):
+    """A fit whose foot points are `points`; `errors` (N, 3), mm, show in the residuals along the normals."""
+    signed = np.einsum("ni,ni->n", normals, errors)
+    weights = np.ones(len(points)) if weights is None else weights
+    moved = points + signed[:, None] * normals
+    return Fit(np.eye(4), NOISE_MM, signed, weights, normals, np.zeros(len(points), dtype=np.int64), moved)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Points of one end of a femur, and their normals: an ellipsoid would be strained into another one, or turned."""
+    bone = make_bone("femur", 3)
+    high = np.quantile(bone.points[:, 2], 0.6)
+
+    def of(count):
+        points, normals = bone.sample(6 * count, np.random.default_rng(0))
+        end = np.flatnonzero(points[:, 2] > high)[:count]
+        return points[end] - points[end].mean(axis=0), normals[end]
+
+    return of
+
+
+def noise(count, seed=1):
+    return np.random.default_rng(seed).normal(0.0, NOISE_MM, (count, 3))
+
+
+@pytest.fixture(scope="module")
+def some():
+    """Blocks of random numbers."""
+    rng = np.random.default_rng(4)
+    n = 16
+    return Blocks(rng.normal(size=n), rng.normal(size=(n, 6)), rng.normal(size=(n, 3)), rng.uniform(0.1, 0.5, n),
+                  rng.uniform(0.0, 40.0, (n, 3)))  # fmt: skip
+
+
+def restricted(found, bias_mm, shared_mm, size_mm, correlation_mm):
+    """log likelihood of all contrasts that no `free` changes: what restricted likelihood is by definition."""
+    apart = np.linalg.norm(found.feet[:, None] - found.feet, axis=2)
+    V = np.diag(found.variances) + shared_mm**2 * np.eye(len(apart)) + size_mm**2 * found.more @ found.more.T
+    V += bias_mm**2 * np.exp(-0.5 * (apart / correlation_mm) ** 2)
+    contrasts = np.linalg.svd(found.free)[0][:, found.free.shape[1] :]
+    return multivariate_normal(None, contrasts.T @ V @ contrasts).logpdf(contrasts.T @ found.residuals)
+
+
+def test_the_evidence_is_a_ratio_of_restricted_likelihoods_and_the_size_their_mean(some):
+    config = RigidityConfig(correlation_mm=15.0)
+    dense = np.array([[[restricted(some, b, c, h, 15.0) for h in SIZES_MM] for c in SHARED_MM] for b in BIASES_MM])
+    found = evidence(some, config)
+    best = dense.max(axis=(0, 1))
+    assert found.log_ratio == pytest.approx(best.max() - best[0], abs=1e-9)
+    posterior = np.exp(dense - dense.max()).sum(axis=(0, 1))
+    assert found.size_mm == pytest.approx(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()), rel=1e-9)
+    assert found.log_ratio >= 0.0
+
+
+def test_blocks_are_weighted_means_of_neighbours_of_one_group(seen):
+    points, normals = seen(400)
+    weights = np.random.default_rng(3).uniform(0.0, 1.0, 400)
+    weights[:40] = 0.0
+    fit, inlier = fit_of(points, normals, noise(400), weights), weights > 0.0
+    more, group = np.random.default_rng(5).normal(size=(360, 2)), np.arange(360) % 2
+    found = blocks(fit, fit.jacobian[inlier], more, group, SMALL)
+    count = len(found.residuals)
+    assert SMALL.cells < count <= 2 * SMALL.cells
+    total = fit.sigma_mm**2 / found.variances
+    assert total.sum() == pytest.approx(weights.sum())
+    for of_all, of_blocks in (
+        (fit.signed_mm[inlier, None], found.residuals[:, None]),
+        (fit.jacobian[inlier], found.free),
+        (more, found.more),
+        (fit.feet[inlier], found.feet),
+    ):
+        assert total @ of_blocks == pytest.approx(weights[inlier] @ of_all)
+    alone = blocks(fit, fit.jacobian[inlier], group[:, None] * np.ones((360, 1)), group, SMALL)
+    assert set(alone.more.ravel()) == {0.0, 1.0}, "no block holds points of two groups"
+
+
+@pytest.mark.parametrize("motion", [[0, 0, 3.0, 0, 0, 0], [2.0, -1.0, 0, 0, 0, 0], [0, 0, 0, 0.0, 0.05, 0.0]])
+def test_a_bone_that_moves_while_it_is_measured_is_found_and_one_at_rest_is_not(seen, motion):
+    points, normals = seen(2400)
+    order = np.random.default_rng(6).permutation(np.repeat(np.arange(12), 200))
+    time = order / 11.0 - 0.5
+    moved = np.stack(
+        [se3.apply(se3.exp(np.array(motion) * t, np.zeros(3)), p[None])[0] for t, p in zip(time, points, strict=True)]
+    )
+    creeping, resting = (fit_of(points, normals, noise(2400) + off) for off in (moved - points, 0.0))
+    found, nothing = (of_creep(fit, order, CONFIG.rigidity) for fit in (creeping, resting))
+    assert found.log_ratio > CONFIG.rigidity.creeps > nothing.log_ratio
+    assert found.size_mm > 3.0 * nothing.size_mm and 0.5 < found.size_mm < 5.0
+
+
+def test_what_does_not_go_with_time_is_no_creep(seen):
+    """The same errors, but of sources in any order: the bone is deformed, and rests."""
+    points, normals = seen(2400)
+    order = np.random.default_rng(6).permutation(np.repeat(np.arange(12), 200))
+    off = np.random.default_rng(7).choice([-1.5, 1.5], 2400)[:, None] * [0.0, 0.0, 1.0]
+    assert of_creep(fit_of(points, normals, noise(2400) + off), order, CONFIG.rigidity).log_ratio < 4.0
+    off = 3.0 * np.sign(order - 5.5)[:, None] * [0.0, 0.0, 1.0]
+    assert of_creep(fit_of(points, normals, noise(2400) + off), order, CONFIG.rigidity).log_ratio > 40.0
+
+
+@pytest.mark.parametrize("strain", [np.diag([0, 0, 0.03]), np.diag([0.05, 0, 0]),
+                                    [[0, 0, 0.04], [0, 0, 0], [0.04, 0, 0]]])  # fmt: skip
+def test_a_strained_source_is_found_by_its_size_and_a_rigid_one_is_not(seen, strain):
+    points, normals = seen(3000)
+    fit, rigid = (fit_of(points, normals, noise(3000) + off) for off in (points @ np.array(strain), 0.0))
+    found, nothing = of_strain(fit, CONFIG), of_strain(rigid, CONFIG)
+    assert found.log_ratio > CONFIG.rigidity.strained > nothing.log_ratio
+    size_mm = np.linalg.norm(strain) * np.sqrt((points**2).sum(axis=1).mean())
+    assert found.size_mm == pytest.approx(size_mm / np.sqrt(6.0), rel=0.8)  # one of six components has all of it
+    assert nothing.size_mm < 0.5 * found.size_mm
+
+
+def test_smooth_bumps_are_no_strain(seen):
+    points, normals = seen(3000)
+    bumps = 0.7 * np.sin(points @ [0.13, 0.05, 0.1])[:, None] * normals
+    assert of_strain(fit_of(points, normals, noise(3000) + bumps), CONFIG).log_ratio < CONFIG.rigidity.strained
+
+
+def test_a_stand_off_is_no_strain(seen):
+    points, normals = seen(3000)
+    assert of_strain(fit_of(points, normals, noise(3000) + 1.5 * normals), CONFIG).log_ratio < 1.0
+
+
+def test_another_size_is_none_where_the_sensor_may_have_it(seen):
+    points, normals = seen(3000)
+    fit = fit_of(points, normals, noise(3000) + 0.03 * points)
+    named = replace(CONFIG, sensor=SensorConfig(scale=0.02))
+    assert of_strain(fit, CONFIG).log_ratio > CONFIG.rigidity.strained
+    assert of_strain(fit, named).log_ratio < 1.0
+
+
+def test_few_points_or_one_source_say_nothing(seen):
+    points, normals = seen(199)
+    fit = fit_of(points, normals, noise(199) + 0.2 * points)
+    assert of_strain(fit, CONFIG) == rigidity.NOTHING == of_creep(fit, np.arange(199), CONFIG.rigidity)
+    points, normals = seen(200)
+    fit = fit_of(points, normals, noise(200) + 0.2 * points * [0, 0, 1])
+    assert of_strain(fit, CONFIG).log_ratio > 3.0
+    assert of_creep(fit, np.zeros(200, dtype=np.int64), CONFIG.rigidity) == rigidity.NOTHING
+
+
+def test_points_without_weight_say_nothing(seen):
+    points, normals = seen(3000)
+    off, weights, strained = noise(3000), np.ones(3000), np.arange(3000) % 2 == 0
+    off[strained] += 0.08 * points[strained] * [0, 0, 1]
+    weights[strained] = 0.0
+    assert of_strain(fit_of(points, normals, off), CONFIG).log_ratio > 3.0
+    assert of_strain(fit_of(points, normals, off, weights), CONFIG).log_ratio < 1.0
+
+
+def test_of_a_motion_its_rotation_counts_by_the_radius_of_the_points(seen):
+    """So that all six unknowns are mm."""
+    points, normals = seen(2400)
+    order = np.arange(2400) // 200
+    radius_mm = np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())
+    time = (order / 11.0 - 0.5)[:, None]
+    fit = fit_of(points, normals, noise(2400))
+    motions = fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
+    group = np.minimum(order / 11.0 * CONFIG.rigidity.groups, CONFIG.rigidity.groups - 1).astype(int)
+    same = evidence(blocks(fit, fit.jacobian, time * motions, group, CONFIG.rigidity), CONFIG.rigidity)
+    found = of_creep(fit, order, CONFIG.rigidity)
+    assert found == pytest.approx(same, rel=1e-2, abs=1e-3)

@@ -24,6 +24,18 @@ def distinct(points: Array) -> Array:
     return np.asarray(ordered[np.concatenate([np.ones(min(len(points), 1), dtype=bool), is_new])])
 
 
+def without_crowds(points: Array, voxel_mm: float, fewest: int, times: float) -> Array:
+    """Points (N, 3) of which no voxel holds more than `fewest`, nor than so many times the typical voxel: the first."""
+    voxel = _voxels(points, *bounds(points), voxel_mm)
+    counts = np.bincount(voxel)
+    most = max(fewest, int(times * np.median(counts)))
+    if counts.max() <= most:
+        return points
+    order = np.argsort(voxel, kind="stable")
+    place = np.arange(len(points)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.asarray(points[np.sort(order[place < most])])
+
+
 def bounds(points: Array) -> tuple[Array, Array]:
     """Lowest and highest coordinates (3,) of (N, 3) points; along the first axis NumPy takes forty times as long."""
     columns = np.ascontiguousarray(points.T)
@@ -64,8 +76,8 @@ def _occupied(points, low, high, voxel, most):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
-    """Of the points in each voxel, the index of the one nearest to their mean; the first of equally near ones."""
+def _voxels(points, low, high, voxel):  # type: ignore[no-untyped-def]
+    """(N,) which voxel each point is in, numbered from 0 as they come."""
     table, voxel_of, found = _table(len(points)), np.empty(len(points), dtype=np.int64), 0
     for p in range(len(points)):
         key = _voxel(points, p, low, high, voxel)
@@ -74,6 +86,14 @@ def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
             found += 1
             table[slot, 0], table[slot, 1] = key, found
         voxel_of[p] = table[slot, 1] - 1
+    return voxel_of
+
+
+@numba.njit(cache=True, nogil=True)
+def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
+    """Of the points in each voxel, the index of the one nearest to their mean; the first of equally near ones."""
+    voxel_of = _voxels(points, low, high, voxel)
+    found = voxel_of.max() + 1
     means, counts = np.zeros((found, 3)), np.zeros(found)
     for p in range(len(points)):
         counts[voxel_of[p]] += 1.0

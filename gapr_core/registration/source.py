@@ -20,6 +20,8 @@ Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neigh
 SPREAD_OUT = 512  # points that are spread evenly, before the others in any order
 TRUSTED_SHARE = 0.8  # of the points, those most in the middle of their neighbours: of them the spread-out ones are
 STRAY = 4.0  # a point so many times farther from the middle than most is looked at; at the end of a bar it is 2
+CONTACT_MM = 1.0  # a pointer that is held still measures one contact again and again
+CROWD = 5, 5.0  # points that are kept of it: so many, or so many times those of a typical mm
 SMALLEST_MM = 1.0  # across: less is a cloud in metres, and not too short a piece
 SPARE_NEIGHBOURS = 6  # of a point, for means over those that lie on the bone
 
@@ -108,6 +110,8 @@ def prepare(
     if len(points) > config.most_raw_points:
         points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
     points = sampling.distinct(points)
+    if len(points):
+        points = sampling.without_crowds(points, CONTACT_MM, *CROWD)
     if len(points) > config.fitted_points and not in_scene:
         return _some_of(points, config, num_threads)
     points, found = _looked_up(points, config, num_threads)

@@ -40,6 +40,19 @@ def test_every_voxel_keeps_the_point_nearest_to_the_mean_even_where_rounding_dec
     np.testing.assert_array_equal(sampling.voxel_indices(points, voxel_mm), central_points(points, voxel_mm))
 
 
+def test_no_voxel_keeps_more_than_so_many_points_or_times_the_typical_ones():
+    rng = np.random.default_rng(1)
+    apart = np.column_stack([2.0 * np.arange(30), np.zeros(30), np.zeros(30)])
+    crowd = apart[4] + rng.uniform(0.0, 0.9, (20, 3))
+    points = np.vstack([apart, crowd])
+    kept = sampling.without_crowds(points, 1.0, 4, 2.0)
+    np.testing.assert_array_equal(kept, np.vstack([apart, crowd[:3]]))  # the first four of the voxel, in their order
+    assert len(sampling.without_crowds(points, 1.0, 4, 9.0)) == 30 + 8
+    assert sampling.without_crowds(points, 1.0, 21, 2.0) is points
+    dense = np.repeat(apart, 10, axis=0)
+    assert sampling.without_crowds(dense, 1.0, 4, 2.0) is dense, "all are as many"
+
+
 def test_thinning_takes_the_finest_grid_that_its_bisection_finds():
     points = np.random.default_rng(0).normal(size=(5000, 3)) * [10, 20, 100]
     low, high = 0.0, np.ptp(points, axis=0).max() + 1e-9

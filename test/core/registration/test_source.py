@@ -105,3 +105,14 @@ def test_a_straight_line_is_refused_however_its_sums_are_rounded(seed):
     direction = rng.normal(size=3)
     refused = sources.prepare(rng.uniform(0.0, 200.0, (500, 1)) * direction / np.linalg.norm(direction), CONFIG)
     assert "the source is a line" in refused.reason
+
+
+@pytest.mark.parametrize(("count", "held"), [(60, 600), (200, 5000), (200, 10_000)])
+def test_a_pointer_that_is_held_still_measures_one_contact(femur, registrar, target, count, held):
+    """Its hundreds of samples of one place made all others isolated, and the source a line."""
+    points = femur.sample(count, np.random.default_rng(3))[0]
+    rests = points[0] + np.random.default_rng(4).normal(0.0, 0.15, (held, 3))
+    prepared = sources.prepare(np.vstack([points, rests]))
+    near = np.linalg.norm(prepared.whole - points[0], axis=1) < 1.5
+    assert np.count_nonzero(~near) >= count - 5 and np.count_nonzero(near) < 200
+    assert registrar.register(np.vstack([points, rests]), target).ok

@@ -468,12 +468,21 @@ class RegistrarConfig(Settings):
         0, "seed of proposers that draw (ransac); other draws are always the same", low=0, high=2**31 - 1
     )
 
+    # What a probability has to reach, from low to high; what caps it stands in `limits` and `rules`.
+
     @property
-    def least_inferred(self) -> float:
-        """The least confidence of a pose that rests on an inferred viewpoint, whatever was seen before."""
+    def worth_checking(self) -> float:
+        """What the costly checks are asked of: a stream raises a source's probability p to sqrt(p) at most."""
+        return self.min_confidence**2
+
+    # Accepted is what reaches `min_confidence`.
+
+    @property
+    def accepted_if_inferred(self) -> float:
+        """What a pose has to reach that rests on an inferred viewpoint, whatever was seen before."""
         return max(self.min_confidence, self.clutter.inferred_least)
 
     @property
-    def may_pass(self) -> float:
-        """The least probability p of one source that may yet be accepted: a stream raises it to sqrt(p) at most."""
-        return self.min_confidence**2
+    def ends_search(self) -> float:
+        """From here on no further proposer is asked, and a stream counts as sure."""
+        return max(self.sure, self.min_confidence)

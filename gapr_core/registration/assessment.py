@@ -114,18 +114,18 @@ class Assessment:
         covariance = variance_scale * self.uncertainty.covariance
         return replace(self, uncertainty=replace(self.uncertainty, covariance=covariance), factor95=learned.factor95)
 
-    def refused(self, refusal: Refusal | None, config: RulesConfig) -> Assessment:
+    def with_refusal(self, refusal: Refusal | None, config: RulesConfig) -> Assessment:
         """The same with what a rule says against it, if it says anything, and the probability that is left then."""
         if refusal is None:
             return self
         return replace(self, refusal=refusal, probability=min(self.probability, config.ruled_out))
 
-    def limited(self, most: float) -> Assessment:
+    def capped(self, most: float) -> Assessment:
         """The same with a probability of at most `most`."""
         return replace(self, probability=min(self.probability, most))
 
 
-def assess(
+def assess_fit(
     fit: Fit,
     candidates: Candidates,
     source: PreparedSource,
@@ -165,7 +165,7 @@ def judge(
         contributions=calibration.contributions(features),
         independent_points=config.rules.independent_points,
     )
-    return assessment.refused(refusal, config.rules)
+    return assessment.with_refusal(refusal, config.rules)
 
 
 def shared_probability(best: float, scores: Array, independent_points: float) -> tuple[float, ...]:

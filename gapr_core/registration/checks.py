@@ -36,7 +36,7 @@ def unless_grown(assessment: Assessment, config: RegistrarConfig) -> Assessment:
         return a
     settings = config.verification, config.num_threads
     found = other_size.margin(a.fit.T, a.source, a.target, *settings, other_size.HALFWAY)
-    return a.refused(rules.by_growth(found, config.rules), config.rules)
+    return a.with_refusal(rules.by_growth(found, config.rules), config.rules)
 
 
 def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: bool, register: Register) -> Assessment:
@@ -56,7 +56,7 @@ def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: b
     by_chance = len(a.source.points) <= config.rules.mirrored_points or not believed
     if not _is_known_scene(a) and by_chance and rules.by_mirror(found, config.rules) is None:
         found = min(found, full_image_margin(a, config, register))
-    return a.refused(rules.by_mirror(found, config.rules), config.rules)
+    return a.with_refusal(rules.by_mirror(found, config.rules), config.rules)
 
 
 def _is_known_scene(assessment: Assessment) -> bool:

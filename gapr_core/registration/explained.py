@@ -78,7 +78,7 @@ def _described(scene: Scene, members: NDArray[np.bool_], config: RegistrarConfig
     return sources.describe(scene.source.points[members], config.source).facing(scene.viewpoint)
 
 
-def assess(
+def assess_part(
     explained: Explained,
     candidates: Candidates,
     scene: Scene,
@@ -86,7 +86,7 @@ def assess(
     calibration: Calibration,
     config: RegistrarConfig,
 ) -> Assessment:
-    """As `assessment.assess`, for a pose that explains a part of a scene."""
+    """As `assess_fit`, for a pose that explains a part of a scene."""
     fit, part = explained.fit, explained.source
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around)
     features = measure(explained, candidates, uncertainty, scene, target, config)

@@ -41,7 +41,7 @@ class Limit(NamedTuple):
     why: str
 
 
-def limited(assessment: Assessment, config: RegistrarConfig) -> Assessment:
+def applied(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same, no surer than the first limit that holds allows; refused where more is asked for than that."""
     a, most = assessment, config.limits.most
     if not a.probability > most:

@@ -19,7 +19,7 @@ from gapr_core.geometry import se3
 from gapr_core.registration import checks, clutter, cortices, explained, limits, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
-from gapr_core.registration.assessment import Assessment, answer, assess
+from gapr_core.registration.assessment import Assessment, answer, assess_fit
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.guidance import guide
 from gapr_core.registration.precision_model import Precision
@@ -79,7 +79,7 @@ class Registrar:
         scene_calibration: Calibration | None = None,
         precision: Precision | None = None,
     ) -> None:
-        self.config = RegistrarConfig() if config is None else _checked(config)
+        self.config = RegistrarConfig() if config is None else _as_config(config)
         self.proposers: tuple[Proposer, ...] = (_search(self.config),) if proposers is None else tuple(proposers)
         if not self.proposers:
             raise ConfigError("at least one proposer", "an empty list", "leave `proposers` out for the search")
@@ -108,7 +108,7 @@ class Registrar:
             MethodUnavailableError: torch is not installed; `Registrar()` works without.
             ConfigError: no such device, or something else than a `RegistrarConfig`.
         """
-        config = RegistrarConfig() if config is None else _checked(config)
+        config = RegistrarConfig() if config is None else _as_config(config)
         return cls(config, (shipped_network(device), _search(config)))
 
     @cached_property
@@ -161,9 +161,9 @@ class Registrar:
             reason = assessment.reason
             return RegistrationResult(assessment.status, reason=reason, method=self.name, stage_ms=clock.stages)
         guidance = guide(assessment, self.config.guidance) if self.config.guide else None
-        named = explained.named_clutter(limits.limited(assessment, self.config), self.config)
+        named = explained.named_clutter(limits.applied(assessment, self.config), self.config)
         inferred = assessment.inferred_viewpoint is not None
-        asked = replace(self.config, min_confidence=self.config.least_inferred) if inferred else self.config
+        asked = replace(self.config, min_confidence=self.config.accepted_if_inferred) if inferred else self.config
         result = asking_the_standoff(answer(named, asked), named, self.config)
         clock.lap("assess")
         return replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages)
@@ -209,17 +209,17 @@ class Registrar:
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
         config = self.config
-        if assessment.is_sure(config.may_pass):
+        if assessment.is_sure(config.worth_checking):
             assessment = checks.unless_grown(assessment, config)
-        if assessment.is_sure(config.may_pass):
+        if assessment.is_sure(config.worth_checking):
             believed = assessment.is_sure(config.rules.mirrored_below) or enough(assessment)
             assessment = checks.unless_mirrored(assessment, config, believed, partial(self._of_image, clock=clock))
         clock.lap("assess")
-        if assessment.is_sure(config.may_pass):
+        if assessment.is_sure(config.worth_checking):
             assessment = bias_corrected(assessment, config)
             clock.lap("refine")
         corrected = assessment.corrected(self.precision)
-        return allowing_for_strain(corrected, config) if corrected.is_sure(config.may_pass) else corrected
+        return allowing_for_strain(corrected, config) if corrected.is_sure(config.worth_checking) else corrected
 
     def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough
@@ -235,7 +235,7 @@ class Registrar:
         a, most = assessment, self.config.cortices.largest_confidence
         both = a.target.both_cortices
         again = None if both is None else self._in_rounds(a.source, both, a.fit.T[None], clock)
-        return replace((again or a).limited(most), most=most)
+        return replace((again or a).capped(most), most=most)
 
     def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:
         """A source that is refused as bone, taken for what a camera saw; None where that is not sure either.
@@ -249,7 +249,7 @@ class Registrar:
         clock.lap("prepare")
         for viewpoint, rounds in places:
             found = self._in_scene(scene, target, poses, viewpoint, clock, rounds)
-            if found is None or not found.is_sure(config.least_inferred):
+            if found is None or not found.is_sure(config.accepted_if_inferred):
                 continue
             found = self._checked_and_corrected(replace(found, inferred_viewpoint=viewpoint), clock, never)
             if found.refusal is None:
@@ -259,7 +259,7 @@ class Registrar:
     def _scene_of_unknown(self, source: ArrayLike) -> PreparedSource | None:
         """A source prepared as a scene; None where it is none, or where no pose of it would be sure enough."""
         config = self.config
-        if config.least_inferred > config.limits.most or not clutter.sees_from_afar(config):
+        if config.accepted_if_inferred > config.limits.most or not clutter.sees_from_afar(config):
             return None
         try:
             scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
@@ -288,10 +288,10 @@ class Registrar:
             fit = refine_fully(candidates.poses[0], source.points, target, config.refinement, source.neighbours)
             fit = rest_on_whole(fit, source, target, config.refinement)
             clock.lap("refine")
-            assessment = assess(fit, candidates, source, target, calibration, config)
+            assessment = assess_fit(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            if assessment.is_sure(max(config.sure, config.min_confidence)) or enough(assessment):
+            if assessment.is_sure(config.ends_search) or enough(assessment):
                 break
         return assessment
 
@@ -318,15 +318,15 @@ class Registrar:
             clock.lap("verify")
             part = explained.refine(poses[0], scene, target, config)
             clock.lap("refine")
-            assessment = explained.assess(part, candidates, scene, target, self.scene_calibration, config)
+            assessment = explained.assess_part(part, candidates, scene, target, self.scene_calibration, config)
             assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
             clock.lap("assess")
-            if assessment.is_sure(max(config.sure, config.min_confidence)):
+            if assessment.is_sure(config.ends_search):
                 break
         return assessment
 
 
-def _checked(config: object) -> RegistrarConfig:
+def _as_config(config: object) -> RegistrarConfig:
     """The settings, if they are some."""
     if not isinstance(config, RegistrarConfig):
         how = "pass RegistrarConfig(...); weights of your own go into NetworkProposer.from_weights"

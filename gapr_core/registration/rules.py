@@ -51,8 +51,8 @@ def by_geometry(
         return Refusal(RegistrationStatus.DEGENERATE, _what_is_loose(uncertainty))
     if is_matched(candidates, config.rules):
         return Refusal(RegistrationStatus.AMBIGUOUS, _which_rival(candidates, source))
-    may_pass = probability >= config.may_pass
-    if may_pass and can_be_pushed(fit, source, target, config.verification, config.num_threads, config.rules):
+    is_worth_it = probability >= config.worth_checking
+    if is_worth_it and can_be_pushed(fit, source, target, config.verification, config.num_threads, config.rules):
         return Refusal(
             RegistrationStatus.DEGENERATE,
             "a pose a few mm away fits as well: the observed surface is flat or straight",

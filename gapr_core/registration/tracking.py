@@ -5,22 +5,22 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
+from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.evidence import Evidence
-from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.features import STREAM
 from gapr_core.registration.following import FollowedPose, Follower
 from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.registrar import Registrar, check_call
-from gapr_core.registration.shared_misfit import SharedMisfit
+from gapr_core.registration.stream_misfit import NoMisfit, StreamMisfit
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
 from gapr_core.runtime.clock import Clock
@@ -30,6 +30,22 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 
 
+class Last(NamedTuple):
+    """The last source that no rule refused.
+
+    Attributes:
+        T_target_source: (4, 4) its pose, mm.
+        points: (N, 3) its points, mm, source frame.
+        agreed: it continued the one before it.
+        said: the probability that its answer had.
+    """
+
+    T_target_source: Array
+    points: Array
+    agreed: bool
+    said: float
+
+
 class Tracker:
     """Registers a stream of sources in one frame, such as the clouds of a tracked probe.
 
@@ -37,7 +53,7 @@ class Tracker:
     it stands. In a stream that is sure, so does one near the last pose that reaches `evidence.stands`. Else the
     registrar's proposers are asked as for a single source. So a jump, another frame or a wrong track costs time, not
     truth. The confidence of a source also rests on those before it: sources that agree raise it, those that fit badly
-    lower it (`Evidence`), and so does a misfit that they share (`SharedMisfit`). Used by one thread at a time.
+    lower it (`Evidence`), and so does a misfit that they share (`StreamMisfit`). Used by one thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
@@ -72,7 +88,7 @@ class Tracker:
         self._evidence = Evidence(self.registrar.config.evidence)
         self._stream = stream or Calibration.shipped(STREAM)
         self._stream.check_is_for(STREAM)
-        self._shared: SharedMisfit | None = SharedMisfit(self.registrar.config.evidence.memory)
+        self._misfit = StreamMisfit(self.registrar.config.evidence.memory, self._stream)
         self.reset()
 
     @classmethod
@@ -85,7 +101,7 @@ class Tracker:
         self._forget_track()
         self._bone: PreparedTarget | None = None
         self._evidence.reset()
-        self._forget_shared()
+        self._misfit.forget()
 
     def of_bone_alone(self) -> Tracker:
         """As `Registrar.of_bone_alone`: another tracker, which begins a stream of its own."""
@@ -93,7 +109,8 @@ class Tracker:
         twin.registrar, twin._memory = self.registrar.of_bone_alone(), Memory()
         twin._tracking = MemoryFirst(twin._memory, self._tracking.calibrations[0], twin.registrar)
         twin._evidence = Evidence(self._evidence.config)
-        twin._shared = None if self._shared is None else SharedMisfit(self._evidence.config.memory)
+        if not isinstance(self._misfit, NoMisfit):
+            twin._misfit = StreamMisfit(self._evidence.config.memory, self._stream)
         twin.reset()
         return twin
 
@@ -104,22 +121,14 @@ class Tracker:
         """
         twin = self.of_bone_alone()
         twin._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
-        twin._shared = None  # the same points have the same noise
+        twin._misfit = NoMisfit()
         return twin
 
-    def _forget_shared(self) -> None:
-        self._shared_for_bone = False  # what the frames share speaks for the bone
-        self._shared_mm: tuple[float, float] | None = None  # what they share, as `SharedMisfit.add` said last
-        self._seen: Array = np.empty((0, 3))  # points of the last source that was added
-        if self._shared is not None:
-            self._shared.forget()
-
     def _forget_track(self) -> None:
-        self._has_track = self._is_sure = self._was_sure = False  # there are poses to follow; the last source was sure
-        self._last: Array | None = None  # pose of the last source that no rule refused, (4, 4) T_target_source
-        self._heard: Array = np.empty((0, 3))  # its points
-        self._agreed, self._said = False, 1.0  # it continued the one before it; what was said of it
-        self._tracked = 0  # sources since the last full registration
+        self._has_track = False  # there are poses to follow
+        self._since_full = 0  # sources since the last full registration
+        self._is_sure = self._was_sure = False  # this source is; the one before it was
+        self._last: Last | None = None  # the last source that no rule refused
         self._follower: Follower | None = None  # of the last source, where that was sure
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
@@ -177,7 +186,8 @@ class Tracker:
         follower, self._follower = self._follower, None
         found = follower.follow(source) if follower is not None and target is self._bone else None
         if follower is not None and found is not None:
-            self._follower, self._memory.motion, self._last = follower, follower.motion(), found.T_target_source
+            self._follower, self._memory.motion = follower, follower.motion()
+            self._last = self._last and self._last._replace(T_target_source=found.T_target_source)
         return found
 
     def _assess(
@@ -191,7 +201,7 @@ class Tracker:
         """Where the last pose was, or in full; a camera's cloud in full, with the last pose among the hypotheses."""
         if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
-        if viewpoint is None and self._tracked + 1 < self.recheck:
+        if viewpoint is None and self._since_full + 1 < self.recheck:
             return self._tracking.assess(source, target, clock=clock, enough=self._stands)
         return self.registrar.assess(source, target, self._memory.now[0], viewpoint, clock)
 
@@ -204,7 +214,7 @@ class Tracker:
         """True when the pose continues that of the last source."""
         if self._last is None:
             return False
-        moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last, assessment.source.points)
+        moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last.T_target_source, assessment.source.points)
         return moved_mm <= self.registrar.config.evidence.agree_mm
 
     def _with_evidence(self, assessment: Assessment) -> Assessment:
@@ -216,54 +226,28 @@ class Tracker:
         if assessment.refusal is not None:
             return assessment
         if assessment.inferred_viewpoint is not None:
-            assessment = assessment.limited(self.registrar.config.limits.most)
-        again = np.array_equal(assessment.source.points, self._heard)
-        agrees, alone = self._agrees(assessment) and (self._agreed or not again), assessment.probability
-        self._last, self._heard, self._agreed = assessment.fit.T, assessment.source.points, agrees
-        one_by_one = replace(assessment, probability=self._evidence.add(alone, agrees, again))
-        together = self._with_shared_misfit(one_by_one, agrees)
-        found = together.limited(min(float(np.sqrt(alone)) if agrees else alone, assessment.most))
-        found = found.limited(self._said) if again else found
-        self._said = found.probability
+            assessment = assessment.capped(self.registrar.config.limits.most)
+        a, last = assessment, self._last
+        again = last is not None and np.array_equal(a.source.points, last.points)
+        agrees = self._agrees(a) and (last is None or last.agreed or not again)
+        one_by_one = replace(a, probability=self._evidence.add(a.probability, agrees, again))
+        most = min(float(np.sqrt(a.probability)) if agrees else a.probability, a.most)
+        found = self._misfit.weigh(one_by_one, agrees).capped(most)
+        if last is not None and again:
+            found = found.capped(last.said)
+        self._last = Last(a.fit.T, a.source.points, agrees, found.probability)
         return found
-
-    def _with_shared_misfit(self, assessment: Assessment, agrees: bool) -> Assessment:
-        """The probability in the light of what the residuals of the frames have in common.
-
-        After a jump it may be another bone: what spoke for the last one is forgotten, what spoke against it is not. A
-        source that is sent again has the same noise, and adds nothing.
-        """
-        if self._shared is None or not np.isfinite(assessment.probability):
-            return assessment
-        if not agrees and self._shared_for_bone:
-            self._forget_shared()
-        if not np.array_equal(assessment.source.points, self._seen):
-            self._seen = assessment.source.points
-            self._shared_mm = self._shared.add(assessment.fit)
-        if self._shared_mm is None:
-            self._shared_for_bone = False
-            return assessment
-        log_odds = float(np.clip(logit(assessment.probability), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS))
-        features = dict(zip(STREAM_FEATURES, (log_odds, *self._shared_mm), strict=True))
-        adds = {name: self._stream.contributions(features)[name] for name in STREAM_FEATURES[1:]}
-        self._shared_for_bone = sum(adds.values()) > 0.0
-        return replace(
-            assessment,
-            probability=self._stream.probability(features),
-            features={**assessment.features, **features},
-            contributions={**assessment.contributions, **adds},
-        )
 
     def _remember(self, result: RegistrationResult, source: Array) -> None:
         """Follow an accepted pose; a refusal changes nothing, since the bone may be where it was.
 
         As it does not count either, a refused full registration is followed by another one.
         """
-        self._is_sure = result.ok and result.confidence >= self.registrar.config.sure
+        self._is_sure = result.ok and result.confidence >= self.registrar.config.ends_search
         if result.T_target_source is None:
             return
         followed = result.proposer == Memory.name
-        self._tracked = self._tracked + 1 if followed else 0
+        self._since_full = self._since_full + 1 if followed else 0
         if followed:
             self._memory.follow(result.T_target_source, source)
         elif len(result.hypotheses) > 1:

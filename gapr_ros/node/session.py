@@ -1,4 +1,15 @@
-"""Everything that lives from configure to cleanup: one bone, one method, one worker, one track."""
+"""Everything that lives from configure to cleanup: one bone, one method, one worker, one track.
+
+What an interruption forgets; all but the last two refuse the clouds that are on their way:
+
+| event | collection | row of good poses | limits on jumps | seed | last cloud, for `~/register` | latched pose |
+|---|---|---|---|---|---|---|
+| reset, another clock or bone | forgotten | ends | off until a pose | none | outdated | withdrawn |
+| `initialpose` | forgotten | ends | stay until a good pose | the new one | stays | stays |
+| pause | stays | ends | stay | stays | outdated | stays |
+| clouds are read in another way | forgotten | stays | stay | stays | stays | stays |
+| other limits | forgotten: another method | stays | stay | stays | stays | stays |
+"""
 
 from __future__ import annotations
 

@@ -134,8 +134,8 @@ def test_an_answer_is_sure_from_its_limit_on_unless_a_rule_speaks_against_it(pla
 
 
 def test_a_limit_lowers_a_probability_and_never_raises_it(plane):
-    assert made(plane, 0.9).limited(0.85).probability == 0.85
-    assert made(plane, 0.3).limited(0.85).probability == 0.3
+    assert made(plane, 0.9).capped(0.85).probability == 0.85
+    assert made(plane, 0.3).capped(0.85).probability == 0.3
 
 
 def test_what_was_learned_scales_standard_deviations_and_the_bound(plane):

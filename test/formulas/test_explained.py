@@ -137,7 +137,7 @@ def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed
 ):
     judged.probability, judged.refusal = probability, refusal
     scene, part = SimpleNamespace(source=object()), part_of(share)
-    assessed_part = explained.assess(part, None, scene, None, None, CONFIG)
+    assessed_part = explained.assess_part(part, None, scene, None, None, CONFIG)
     assert assessed_part.refusal is refusal  # a stream may still raise the probability
     found = explained.named_clutter(assessed_part, CONFIG)
     assert (found.refusal and found.refusal.status.value) == status

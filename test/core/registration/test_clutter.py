@@ -135,7 +135,7 @@ def test_no_camera_is_looked_for_where_none_would_be_sure_enough(target, scene, 
 def test_a_pose_that_a_later_check_refuses_is_none_and_the_first_refusal_stands(target, scene, monkeypatch):
     def refuse(assessment, config):
         why = Refusal(RegistrationStatus.LOW_CONFIDENCE, "grown")
-        return assessment.refused(why, config.rules) if assessment.inferred_viewpoint is not None else assessment
+        return assessment.with_refusal(why, config.rules) if assessment.inferred_viewpoint is not None else assessment
 
     monkeypatch.setattr(checks, "unless_grown", refuse)
     result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0], target)

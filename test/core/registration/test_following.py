@@ -317,8 +317,9 @@ def test_another_bone_in_the_same_place_is_not_followed(sure, frames, prepared, 
 
 def test_following_changes_nothing_that_the_tracker_knows(sure, frames, prepared):
     def known():
-        arrays = {"poses": sure._memory.poses, "seen": sure._seen}
-        flags = sure._tracked, sure._is_sure, sure._has_track, sure._shared_for_bone, sure._shared_mm
+        misfit = sure._misfit
+        arrays = {"poses": sure._memory.poses, "seen": misfit._seen}
+        flags = sure._since_full, sure._is_sure, sure._has_track, misfit._speaks_for, misfit._shared_mm
         return {name: array.tolist() for name, array in arrays.items()} | vars(sure._evidence) | {"flags": flags}
 
     before = known()
@@ -332,7 +333,7 @@ def test_a_bone_that_was_followed_far_continues_its_track(sure, frames, prepared
     at = [frames[0].source + [5.0 * number, 0.0, 0.0] for number in range(6)]
     for source in at[1:5]:
         assert sure.follow(source, prepared) is not None
-    assert sure.register(at[5], prepared).ok and sure._agreed
+    assert sure.register(at[5], prepared).ok and sure._last.agreed
 
 
 def test_the_next_assessment_begins_where_the_bone_was_followed_to_with_its_rivals(sure, frames, prepared):

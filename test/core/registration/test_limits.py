@@ -46,17 +46,17 @@ def named(**sensor):
 def test_a_dense_source_of_a_pose_that_is_well_known_may_be_sure(made):
     for config in (RegistrarConfig(), named(kind="laser"), named(kind="pointer")):
         answer = made()
-        assert limits.limited(answer, config) is answer
+        assert limits.applied(answer, config) is answer
 
 
 def test_few_points_do_not_say_whose_bone_it_is(made):
     few = made(249)
-    found = limits.limited(few, RegistrarConfig())
+    found = limits.applied(few, RegistrarConfig())
     assert found.probability == 0.89 and found.refusal is None and list(found.contributions)[-1] == "sparse"
     assert sum(found.contributions.values()) - sum(few.contributions.values()) == pytest.approx(
         logit(0.89) - logit(SURE)
     )
-    assert limits.limited(made(250), RegistrarConfig()).probability == SURE
+    assert limits.applied(made(250), RegistrarConfig()).probability == SURE
 
 
 def test_nor_do_points_without_neighbours(made):
@@ -64,8 +64,8 @@ def test_nor_do_points_without_neighbours(made):
     assert limits.with_neighbours(made(16, spacing_mm=5.9)) == 16
     assert limits.with_neighbours(made(16, spacing_mm=5.9, gross=8)) == 8  # points that count
     assert limits.with_neighbours(made(5000, spacing_mm=5.9)) == 5000
-    assert limits.limited(made(1000, spacing_mm=6.1), RegistrarConfig()).probability == 0.89
-    assert limits.limited(made(1000, spacing_mm=5.9), RegistrarConfig()).probability == SURE
+    assert limits.applied(made(1000, spacing_mm=6.1), RegistrarConfig()).probability == 0.89
+    assert limits.applied(made(1000, spacing_mm=5.9), RegistrarConfig()).probability == SURE
 
 
 def test_a_contact_that_a_pointer_sends_again_and_again_is_one_point(made):
@@ -78,33 +78,33 @@ def test_a_contact_that_a_pointer_sends_again_and_again_is_one_point(made):
                    moved=fit.moved[again] + jitter)  # fmt: skip
     held_still = replace(answer, fit=many, source=SimpleNamespace(points=many.feet))
     assert 40 <= limits.with_neighbours(held_still) < 250
-    assert limits.limited(held_still, RegistrarConfig()).probability == 0.89
+    assert limits.applied(held_still, RegistrarConfig()).probability == 0.89
 
 
 def test_a_camera_that_nobody_named_may_have_been_elsewhere(made):
-    found = limits.limited(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig())
+    found = limits.applied(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig())
     assert found.probability == 0.89 and found.refusal is None and list(found.contributions)[-1] == "inferred"
-    asked = limits.limited(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig(min_confidence=0.9))
+    asked = limits.applied(made(inferred_viewpoint=np.zeros(3)), RegistrarConfig(min_confidence=0.9))
     assert asked.refusal.status is RegistrationStatus.LOW_CONFIDENCE and "(viewpoint)" in asked.refusal.reason
 
 
 def test_what_is_no_surer_than_that_stays(made):
     unsure = made(60, probability=0.89)
-    assert limits.limited(unsure, RegistrarConfig()) is unsure
-    assert np.isnan(limits.limited(made(60, probability=np.nan), RegistrarConfig()).probability)
-    assert limits.limited(made(60), RegistrarConfig(limits=LimitsConfig(most=1.0))).probability == SURE
+    assert limits.applied(unsure, RegistrarConfig()) is unsure
+    assert np.isnan(limits.applied(made(60, probability=np.nan), RegistrarConfig()).probability)
+    assert limits.applied(made(60), RegistrarConfig(limits=LimitsConfig(most=1.0))).probability == SURE
 
 
 def test_few_points_whose_noise_is_known_and_left_may_be_sure(made):
     """0.4 mm, the pose's six unknowns counted, may be at most 1.3 times what is stated."""
-    assert limits.limited(made(40), named(noise_mm=0.4 / 1.29)).probability == SURE
-    assert limits.limited(made(40), named(noise_mm=0.4 / 1.31)).probability == 0.89
-    assert limits.limited(made(7, gross=1), named(noise_mm=1.0)).probability == 0.89  # none left to be measured
+    assert limits.applied(made(40), named(noise_mm=0.4 / 1.29)).probability == SURE
+    assert limits.applied(made(40), named(noise_mm=0.4 / 1.31)).probability == 0.89
+    assert limits.applied(made(7, gross=1), named(noise_mm=1.0)).probability == 0.89  # none left to be measured
 
 
 def test_a_gross_point_in_ten_does_not_count_and_more_are_no_noise(made):
-    assert limits.limited(made(40, gross=4), named(noise_mm=0.4 / 1.29)).probability == SURE
-    assert limits.limited(made(40, gross=5), named(noise_mm=0.4 / 1.29)).probability == 0.89
+    assert limits.applied(made(40, gross=4), named(noise_mm=0.4 / 1.29)).probability == SURE
+    assert limits.applied(made(40, gross=5), named(noise_mm=0.4 / 1.29)).probability == 0.89
 
 
 @pytest.mark.parametrize("sensor", [{"kind": "laser"}, {"noise_mm": 0.15}])
@@ -114,9 +114,9 @@ def test_residuals_far_beyond_the_noise_of_a_sensor_may_be_of_another_bone(made,
     for times, probability in ((0.99 * most, SURE), (1.01 * most, 0.89)):
         answer = made()
         larger = replace(answer, fit=replace(answer.fit, signed_mm=times * answer.fit.signed_mm))
-        found = limits.limited(larger, named(**sensor))
+        found = limits.applied(larger, named(**sensor))
         assert found.probability == probability
-        assert limits.limited(larger, RegistrarConfig()).probability == SURE  # of a sensor that nobody named
+        assert limits.applied(larger, RegistrarConfig()).probability == SURE  # of a sensor that nobody named
     assert list(found.contributions)[-1] == "beyond_noise"
 
 
@@ -138,9 +138,9 @@ def test_what_near_points_share_beyond_a_sensor_may_be_of_another_bone(made, sen
         return replace(answer, uncertainty=replace(answer.uncertainty, smooth_mm=smooth_mm))
 
     for times, probability in ((0.99, SURE), (1.01, 0.89)):
-        found = limits.limited(sharing(times * most), named(**sensor))
+        found = limits.applied(sharing(times * most), named(**sensor))
         assert found.probability == probability
-        assert limits.limited(sharing(times * most), RegistrarConfig()).probability == SURE  # nobody named a sensor
+        assert limits.applied(sharing(times * most), RegistrarConfig()).probability == SURE  # nobody named a sensor
     assert list(found.contributions)[-1] == "beyond_bias"
     for count, holds in ((30, False), (31, True)):  # no more than one average is of
         assert limits.is_beyond_bias(sharing(1.01 * most, count), named(**sensor)) is holds
@@ -153,16 +153,16 @@ def test_near_points_of_a_scene_that_err_alike_may_be_of_another_bone(made, roug
     answer = made()
     features = dict(answer.features) | {"rough_misfit": rough_mm, "log_sigma": np.log(0.5)}
     answer = replace(answer, features=features, seen=answer.source if in_scene else None)
-    found = limits.limited(answer, RegistrarConfig())
+    found = limits.applied(answer, RegistrarConfig())
     assert found.probability == probability
     assert (list(found.contributions)[-1] == "rough") is (probability < SURE)
 
 
 def test_no_pose_is_surer_than_its_covariance(made):
     loose = made(covariance=np.diag([2.0**2] * 3 + [1e-6] * 3))
-    assert list(limits.limited(loose, RegistrarConfig()).contributions)[-1] == "uncertain"
-    assert limits.limited(loose, RegistrarConfig()).probability == 0.89
-    assert limits.limited(made(covariance=np.diag([1.5**2] * 3 + [1e-6] * 3)), RegistrarConfig()).probability == SURE
+    assert list(limits.applied(loose, RegistrarConfig()).contributions)[-1] == "uncertain"
+    assert limits.applied(loose, RegistrarConfig()).probability == 0.89
+    assert limits.applied(made(covariance=np.diag([1.5**2] * 3 + [1e-6] * 3)), RegistrarConfig()).probability == SURE
 
 
 def test_the_share_of_a_covariance_that_is_right_is_that_of_its_normal_distribution():
@@ -177,12 +177,12 @@ def test_the_share_of_a_covariance_that_is_right_is_that_of_its_normal_distribut
 
 def test_who_asks_for_more_than_a_limit_allows_reads_what_helps(made):
     asked = RegistrarConfig(min_confidence=0.9)
-    found = limits.limited(made(40), asked)
+    found = limits.applied(made(40), asked)
     assert found.refusal.status is RegistrationStatus.LOW_CONFIDENCE
     for word in ("0.89", "0.9", "another subject", "denser", "noise_mm"):
         assert word in found.refusal.reason
     refused = Refusal(RegistrationStatus.DEGENERATE, "flat")
-    assert limits.limited(made(40, refusal=refused), asked).refusal is refused
+    assert limits.applied(made(40, refusal=refused), asked).refusal is refused
 
 
 def test_a_registrar_and_a_tracker_limit_what_few_points_say(registrar, femur, target):
@@ -198,8 +198,8 @@ def test_a_registrar_and_a_tracker_limit_what_few_points_say(registrar, femur, t
 
 def test_a_strained_source_is_of_another_bone_or_of_a_bone_that_moved(made):
     answer = made()
-    assert answer.strain_mm == 0.0 and limits.limited(answer, RegistrarConfig()).probability == SURE
-    found = limits.limited(made(strain_mm=0.6), RegistrarConfig())
+    assert answer.strain_mm == 0.0 and limits.applied(answer, RegistrarConfig()).probability == SURE
+    found = limits.applied(made(strain_mm=0.6), RegistrarConfig())
     assert found.probability == 0.89 and list(found.contributions)[-1] == "strained"
 
 

@@ -283,7 +283,7 @@ def scripted(registrar):
 
     def of(*shared_mm):
         tracker = Tracker(registrar, stream=stream_model())
-        tracker._shared = Scripted(*shared_mm)
+        tracker._misfit._frames = Scripted(*shared_mm)
         return tracker
 
     return of
@@ -339,9 +339,9 @@ def test_after_a_jump_what_the_frames_shared_counts_only_against_the_bone(script
         tracker = scripted(None, shared_mm, 0.0)
         tracker.register(frames[0].source, prepared)
         tracker.register(frames[1].source, prepared)
-        before = tracker._shared.forgotten
+        before = tracker._misfit._frames.forgotten
         after = tracker.register(jumped, prepared)
-        assert tracker._shared.forgotten - before == forgotten
+        assert tracker._misfit._frames.forgotten - before == forgotten
         assert after.confidence <= alone + 1e-9
 
 
@@ -349,7 +349,7 @@ def test_a_source_that_is_sent_again_adds_nothing_to_what_is_shared(scripted, fr
     tracker = scripted(None, 1.0, 0.0)
     tracker.register(frames[0].source, prepared)
     results = [tracker.register(frames[i].source, prepared) for i in (1, 1, 2)]
-    assert [r.features["shared_misfit"] for r in results] == [1.0, 1.0, 0.0] and not tracker._shared.left
+    assert [r.features["shared_misfit"] for r in results] == [1.0, 1.0, 0.0] and not tracker._misfit._frames.left
 
 
 def test_sources_that_share_their_points_share_their_noise_as_well(scripted, frames, prepared):
@@ -361,11 +361,11 @@ def test_sources_that_share_their_points_share_their_noise_as_well(scripted, fra
 def test_another_target_and_a_reset_forget_what_the_frames_shared(scripted, frames, prepared, registrar):
     tracker = scripted(None, None)
     tracker.register(frames[0].source, prepared)
-    before = tracker._shared.forgotten
+    before = tracker._misfit._frames.forgotten
     tracker.register(frames[0].source, registrar.prepare(frames[0].target))
-    assert tracker._shared.forgotten == before + 1
+    assert tracker._misfit._frames.forgotten == before + 1
     tracker.reset()
-    assert tracker._shared.forgotten == before + 2
+    assert tracker._misfit._frames.forgotten == before + 2
 
 
 def test_bumps_that_no_frame_shows_alone_show_in_the_stream(registrar, specimen):

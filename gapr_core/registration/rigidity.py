@@ -19,10 +19,9 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.geometry import sampling
-from gapr_core.registration import sensor
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import ROUNDED, smooth_correlation
-from gapr_core.registration.covariance import covariance_of_strain, directions, strains
+from gapr_core.registration.covariance import covariance_of_strain, strains
 from gapr_core.registration.refinement import Fit
 
 Array = NDArray[np.float64]
@@ -65,25 +64,24 @@ def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evid
     return evidence(blocks(fit, fit.jacobian[inlier], (time[:, None] - 0.5) * motions, group, config), config)
 
 
-def of_strain(fit: Fit, config: RegistrarConfig) -> Evidence:
+def of_strain(fit: Fit, config: RigidityConfig) -> Evidence:
     """Evidence that the source is longer, wider or slanted against the bone (see `covariance.strains`).
 
-    A stand-off, and another size where the sensor's is uncertain, are no strain: they are taken out with the pose.
+    A stand-off is no strain: it is taken out with the pose. Another size is one, whatever the sensor: what its scale
+    may excuse may as well be another subject's bone.
     """
-    count = int(np.count_nonzero(fit.weights))
-    if count < config.rigidity.fewest_points:
+    inlier = fit.weights > 0.0
+    count = np.count_nonzero(inlier)
+    if count < config.fewest_points:
         return NOTHING
-    known = sensor.errors(config.sensor, count)
-    shift, growth = directions(fit, known.along_beam, config.covariance.one_sided)
-    free = [fit.jacobian[fit.weights > 0.0], shift, *([growth] if known.scale > config.scale.sure else [])]
-    at_once = np.zeros(count, dtype=np.int64)
-    return evidence(blocks(fit, np.column_stack(free), strains(fit), at_once, config.rigidity), config.rigidity)
+    free, at_once = np.column_stack([fit.jacobian[inlier], np.ones(count)]), np.zeros(count, dtype=np.int64)
+    return evidence(blocks(fit, free, strains(fit), at_once, config), config)
 
 
 def allowing_for_strain(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same where the residuals show no strain; else with what it adds to the covariance, and its size."""
     a = assessment
-    found = of_strain(a.fit.rests_on, config)
+    found = of_strain(a.fit.rests_on, config.rigidity)
     if found.log_ratio < config.rigidity.strained:
         return a
     covariance = a.uncertainty.covariance + covariance_of_strain(a.fit, found.size_mm, config.covariance)
@@ -134,17 +132,12 @@ def blocks(fit: Fit, free: Array, more: Array, group: NDArray[np.int64], config:
 def evidence(found: Blocks, config: RigidityConfig) -> Evidence:
     """What the blocks say of the further unknowns, whatever the bias and what the points of a block share."""
     correlation = smooth_correlation(found.feet, found.feet, config.correlation_mm)
-    log_likelihood = np.array(
-        [
-            [
-                _log_likelihoods(found, np.diag(found.variances + shared**2) + bias**2 * correlation)
-                for shared in SHARED_MM
-            ]
-            for bias in BIASES_MM
-        ]
+    covariances = (
+        np.diag(found.variances + shared**2) + bias**2 * correlation for bias in BIASES_MM for shared in SHARED_MM
     )
-    best = log_likelihood.max(axis=(0, 1))
-    posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=(0, 1))
+    log_likelihood = np.array([_log_likelihoods(found, V) for V in covariances])
+    best = log_likelihood.max(axis=0)
+    posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
     size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
     return Evidence(float(best.max() - best[0]), size_mm)
 

@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
+from gapr_core import __version__
 from gapr_core.errors import GaprError
 
 OK, BAD_INPUT, INTERRUPTED = 0, 1, 130
@@ -36,9 +37,12 @@ COMMANDS = {
 EXTRAS = {  # top-level module -> the extra of setup.py that installs it
     "torch": "network", "safetensors": "network", "open3d": "data", "matplotlib": "reports", "plotly": "reports",
     "PIL": "reports", "rich": "reports", "rclpy": "ros", "rosbags": "bags",
-    "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros",
+    "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros", "diagnostic_msgs": "ros", "std_srvs": "ros",
+    "builtin_interfaces": "ros", "lifecycle_msgs": "ros", "rcl_interfaces": "ros", "rosgraph_msgs": "ros",
     "SimpleITK": "medical", "skimage": "medical", "highdicom": "medical",
 }  # fmt: skip
+WHOLE = {"demo": "ros", "train": "training", "ablate": "training"}  # a command -> the extra that has all it needs
+RESUMED = ("evaluate", "benchmark", "make-pairs", "train", "ablate", "paper")
 NEGATIVE = re.compile(r"-[.\d].*[,:].*")  # X,Y,Z and FIRST:LAST; a single number argparse knows itself
 
 
@@ -49,19 +53,21 @@ def main(arguments: list[str] | None = None) -> int:
         0 for success, 2 for a refusal by the data, 1 for bad input (one line, no traceback), 130 when interrupted.
     """
     logging.basicConfig(format="gapr: %(message)s", level=logging.WARNING)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    command = next(iter(arguments), "")
     try:
-        args = _parser(sys.argv[1:] if arguments is None else arguments)
+        args = _parser(arguments)
         return int(args.run(args))
     except GaprError as error:
         return _complain(str(error))
     except ModuleNotFoundError as error:
-        return _complain(_which_extra(error))
+        return _complain(_which_extra(error, command))
     except BrokenPipeError:
         return OK
     except OSError as error:
         return _complain(f"{error.filename or 'a file'}: {error.strerror or error}")
     except KeyboardInterrupt:
-        _complain("stopped; what was finished is kept")
+        _complain("stopped" + ("; the same command goes on where it was" if command in RESUMED else ""))
         return INTERRUPTED
 
 
@@ -74,6 +80,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser(arguments: list[str]) -> argparse.Namespace:
     parser = _Parser(prog="gapr", description="Partial-to-full registration of bones.")
+    parser.add_argument("--version", action="version", version=f"gapr {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, module in modules().items():
         command = commands.add_parser(name, help=_first_line(module))
@@ -117,9 +124,9 @@ def _first_line(module: str) -> str:
     return (text or "not installed").splitlines()[0].partition(": ")[2] or "not installed"
 
 
-def _which_extra(error: ModuleNotFoundError) -> str:
+def _which_extra(error: ModuleNotFoundError, command: str) -> str:
     library = (error.name or str(error)).partition(".")[0]
-    extra = EXTRAS.get(library)
+    extra = EXTRAS.get(library) and WHOLE.get(command, EXTRAS[library])
     return f"this needs {library}, which is not installed; run: pip install " + (
         f"'gapr_ros[{extra}]'" if extra else library
     )

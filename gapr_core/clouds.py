@@ -21,7 +21,7 @@ MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
 CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header"
 OF_ARRAY = "pass units={unit!r}, or convert it to {read_as}"
-OPTIONS = "--source-units {unit}, of the source; --units {unit}, of both files; model_unit"
+OPTIONS = "--units {unit}; --source-units {unit}, of the source alone; model_unit of the node"
 OF_FILE = f"pass units={{unit!r}} ({OPTIONS}), or convert it to {{read_as}}"
 WHOLE_BONE_MM = (60.0, 700.0)  # smaller are a patella, bones of hand and foot, the neck's vertebrae; larger is no bone
 
@@ -39,7 +39,7 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
             here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
 
-    A mesh file of several separate long bones is read as one body, with a warning.
+    A mesh file or a label of several separate long bones is read as one body, with a warning.
 
     Raises:
         InvalidPointCloudError: unreadable file, unknown format, wrong shape, nothing finite, an extent that cannot be a
@@ -57,13 +57,14 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         _check_faces(surface, name)
     if is_in_mm:
         _check_size(surface, "mm", name, OF_HEADER)
+        _warn_of_several_bones(surface, name)
         return surface
     if isinstance(source, str | Path):
         units = _agreed(units, columns.unit(Path(source)), name)
     scale = _mm_per_unit(surface, units, name, how)
     camera = None if surface.camera is None else surface.camera * scale
     surface = replace(surface, points=surface.points * scale, camera=camera)
-    if isinstance(source, str | Path) and surface.faces is not None and len(surface.faces):
+    if isinstance(source, str | Path):
         _warn_of_several_bones(surface, name)
     return surface
 
@@ -178,6 +179,8 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
 
 def _warn_of_several_bones(surface: Surface, name: str) -> None:
     """A rigid pose of two bones that move against each other is that of neither."""
+    if surface.faces is None or not len(surface.faces):
+        return
     from gapr_core.geometry.long_bones import separate_long_bones
 
     lengths = separate_long_bones(surface.points, surface.triangles, surface.face_areas_mm2)
@@ -185,7 +188,8 @@ def _warn_of_several_bones(surface: Surface, name: str) -> None:
         sizes = " and ".join(f"{length:.0f} mm" for length in sorted(lengths, reverse=True))
         log.warning(
             "%s holds %d separate long parts, of %s: they are registered as one rigid body; "
-            "for one bone, save it to a file of its own, or take it from the label map with --label (model_label)",
+            "for one bone, save it to a file of its own, or give it a label of its own in the label map "
+            "(--label, model_label)",
             name, len(lengths), sizes,
         )  # fmt: skip
 

@@ -30,7 +30,7 @@ from gapr_core.config import SensorConfig
 from gapr_core.formats.options import ReadOptions
 
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
-OK, NOT_FOUND = 1, 5  # codes of STATUS in the specification of OpenIGTLink
+OK, NOT_FOUND = 1, 4  # codes of STATUS in the specification of OpenIGTLink
 STEP_MM = 1.0  # a pointer that rests sends the same point again and again
 GROUPS = 40  # of points, that are registered together
 

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from gapr_core.config import RegistrarConfig
 from gapr_core.results import Patch, RegistrationResult
+from gapr_core.runtime import origin
 
 
 def as_json(result: RegistrationResult) -> dict[str, Any]:
@@ -27,6 +29,13 @@ def as_json(result: RegistrationResult) -> dict[str, Any]:
         "contributions": {name: round(log_odds, 3) for name, log_odds in result.contributions.items()},
         "reason": result.reason,
     }
+
+
+def made_by(method: str, config: RegistrarConfig) -> dict[str, Any]:
+    """What made an answer: the method, whether its confidence is calibrated, the version, settings and weights."""
+    from gapr_core.benchmark import methods
+
+    return {"method": method, "calibrated": method in methods.OWN} | origin.of_answers(config)
 
 
 def guidance_json(result: RegistrationResult, spots: Sequence[Patch]) -> dict[str, Any] | None:

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 Named = tuple[str, Path]  # an option, and what it names
 
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
+FAR_TARGETS = 0.5  # of the diagonal of the bone's box: a planned target is nearer to that box
+MM_PER_M = 1000.0
 MUCH_NEARER = 0.3  # share of that distance that is left with the axes turned, or to the other cloud, and it was wrong
 
 
@@ -147,12 +149,27 @@ def warn_of_axes(args: Namespace) -> None:
     is_known = args.target.is_dir() or reading.says_axes(args.target)
     if names and (args.axes == "as_is" or (args.axes == "auto" and not is_known)):
         log.warning("in LPS: %s. If %s is RAS, give --axes ras", names, args.target.name)
-    if args.landmarks and not reading.says_axes(args.source):
-        name = args.landmarks[0].name
-        how = "save it from 3D Slicer, as PLY or markups, which say their axes"
-        log.warning("in LPS: %s. If %s is RAS, %s", name, args.source.name, how)
-    if not isinstance(args.viewpoint, str) and args.source.is_file() and axes.stated(args.source) == "ras":
+    if args.landmarks and args.source_axes == "auto" and not reading.says_axes(args.source):
+        log.warning("in LPS: %s. If %s is RAS, give --source-axes ras", args.landmarks[0].name, args.source.name)
+    said = axes.stated(args.source) if args.source_axes == "auto" and args.source.is_file() else args.source_axes
+    if not isinstance(args.viewpoint, str) and said == "ras":
         log.warning("%s is turned from RAS to LPS: --viewpoint is taken to be in LPS", args.source.name)
+
+
+def warn_of_tracker(args: Namespace) -> None:
+    """Warn of a transform for ITK and 3D Slicer of a tracker's numbers, whose axes nobody has named."""
+    from gapr_core.formats import reading
+    from gapr_core.formats.options import ReadOptions
+
+    kind = reading.format_of(args.source)
+    is_tracked = kind.is_in_mm(ReadOptions(tip_mm=args.tip)) and not kind.in_lps
+    is_of_itk = args.slicer or (args.out and args.out.suffix != ".txt")
+    if is_tracked and is_of_itk and args.source_axes == "auto":
+        log.warning(
+            "%s is taken as LPS. 3D Slicer shows a live tracker (OpenIGTLink, PLUS) as RAS, where this transform would "
+            "be wrong: for such a scene give --source-axes ras, else --source-axes lps (docs/how-to/slicer.md)",
+            args.source.name,
+        )
 
 
 def warn_of_units(args: Namespace) -> None:
@@ -195,9 +212,35 @@ def warn_of_frames(args: Namespace, source: Array, target: Array) -> None:
         first, second = (path.name for path in args.landmarks)
         near = f"{first} is near {args.target.name}, and {second} near {args.source.name}"
         log.warning("%s: are the files of --landmarks exchanged? That of the source comes first", near)
-    if args.targets and _is_elsewhere(args.targets, target, source):
+    if args.targets:
+        _warn_of_targets(args, source, target)
+
+
+def _warn_of_targets(args: Namespace, source: Array, target: Array) -> None:
+    """Warn of planned targets that are far from the box of the bone (N, 3), mm, or near the source, with the cause."""
+    from gapr_core.formats import axes, markups
+
+    points = markups.load(args.targets).points
+    is_far = _is_far(points, target)
+    cause = ""
+    if is_far.any() and not _is_far(points * axes.LPS_RAS, target).any():
+        cause = "with x and y negated they are near: is one of the files RAS, and read as LPS?"
+    elif is_far.any() and not _is_far(points * MM_PER_M, target).any():
+        cause = "times 1000 they are near: are they in m, and said to be in mm?"
+    if not cause and _is_elsewhere(args.targets, target, source):
         near = f"{args.targets.name} is near {args.source.name}, and far from {args.target.name}"
         log.warning("%s: --targets are in the frame of the target", near)
+    elif is_far.any():
+        log.warning("%d of %d points of %s are far from %s (half its size and more), and their errors mean little: %s",
+                    is_far.sum(), len(points), args.targets.name, args.target.name,
+                    cause or "check coordinateSystem and coordinateUnits")  # fmt: skip
+
+
+def _is_far(points: Array, target: Array) -> NDArray[np.bool_]:
+    """(K,) whether points (K, 3) are farther from the box of a bone (N, 3) than a share of its diagonal."""
+    low, high = target.min(axis=0), target.max(axis=0)
+    apart_mm = np.linalg.norm(points - np.clip(points, low, high), axis=1)
+    return np.asarray(apart_mm > FAR_TARGETS * np.linalg.norm(high - low))
 
 
 def warn_of_start(args: Namespace, start: Array | None, source: Array, target: Array) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from argparse import ArgumentParser, Namespace
 from collections import Counter
@@ -16,11 +17,11 @@ from gapr_core.baselines import RegistrationMethod
 from gapr_core.benchmark import methods
 from gapr_core.benchmark.record import ERROR
 from gapr_core.commands import options
-from gapr_core.commands.answer import as_json
+from gapr_core.commands.answer import as_json, made_by
 from gapr_core.data.pair_files import load_clouds, pair_paths
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_core.runtime import files, origin
+from gapr_core.runtime import files
 from gapr_core.runtime.arguments import a_path, at_least_one
 from gapr_core.runtime.console import say
 
@@ -28,6 +29,8 @@ log = logging.getLogger(__name__)
 Answer = dict[str, Any]
 WRITE_SECONDS = 5.0  # the file holds all answers, and grows: it is written again after so long
 INVALID_INPUT = "INVALID_INPUT"  # status of a pair that cannot be read
+OF_PYTHON = re.compile(r"pass units='\w+', or ")  # the pairs are in mm, and no option says otherwise
+OK, BAD_INPUT = 0, 1
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -46,8 +49,8 @@ def run(args: Namespace) -> int:
     answers = _answers_so_far(args.out)
     config = options.registrar_config(args)
     method = methods.make(args.method, config)
-    made_by = {"method": args.method} | origin.of_answers(config)
-    made_of = {path: made_by | {"sha256": _digest(path)} for path in paths}
+    by = made_by(args.method, config)
+    made_of = {path: by | {"sha256": _digest(path)} for path in paths}
     waiting = [path for path, made in made_of.items() if not made.items() <= answers.get(path.stem, {}).items()]
     for path in waiting[:1]:
         _answer(path, method)  # compiled code loads with the first call, whose time is not the method's
@@ -61,8 +64,8 @@ def run(args: Namespace) -> int:
                 new, written = {}, time.monotonic()
     finally:  # of an interrupted run, too
         answers |= _written(args.out, new) if new else {}
-    _say_counts(args.out, [answers[path.stem] for path in paths])
-    return 0
+    options.say_uncalibrated(args.method)
+    return _say_counts(args.out, {path.name: answers[path.stem] for path in paths})
 
 
 def _written(path: Path, new: dict[str, Answer]) -> dict[str, Answer]:
@@ -73,12 +76,15 @@ def _written(path: Path, new: dict[str, Answer]) -> dict[str, Answer]:
     return answers
 
 
-def _say_counts(path: Path, answers: list[Answer]) -> None:
-    """How many pairs had which status; the first pair that cannot be read says why."""
-    counts = Counter(str(answer["status"]) for answer in answers)
+def _say_counts(path: Path, answers: dict[str, Answer]) -> int:
+    """How many pairs had which status; the first that cannot be read says why; exit code 1 where none can be."""
+    counts = Counter(str(answer["status"]) for answer in answers.values())
     say(f"{path}: {len(answers)} pairs" + "".join(f", {count} {status}" for status, count in counts.most_common()))
-    if reason := next((answer["reason"] for answer in answers if answer["status"] == INVALID_INPUT), None):
-        log.warning("the first of %d pairs that cannot be read: %s", counts[INVALID_INPUT], reason)
+    invalid = [(name, answer["reason"]) for name, answer in answers.items() if answer["status"] == INVALID_INPUT]
+    for name, reason in invalid[:1]:
+        said = reason if name in reason else f"{name}: {reason}"
+        log.warning("the first of %d pairs that cannot be read: %s", len(invalid), said)
+    return BAD_INPUT if len(invalid) == len(answers) else OK
 
 
 def _digest(path: Path) -> str:
@@ -111,7 +117,8 @@ def _answer(path: Path, method: RegistrationMethod) -> Answer:
         result = methods.register(method, source, prepared, viewpoint)
         seconds = time.perf_counter() - start
     except InvalidPointCloudError as error:
-        refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=str(error))
+        reason = OF_PYTHON.sub("", str(error))
+        refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=reason)
         return as_json(refusal) | {"status": INVALID_INPUT, "prepare_seconds": None}
     except (ConfigError, MethodUnavailableError, WeightsError):
         raise

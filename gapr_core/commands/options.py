@@ -7,6 +7,7 @@ from argparse import ArgumentParser, Namespace
 from gapr_core.config import RegistrarConfig
 from gapr_core.runtime import settings
 from gapr_core.runtime.arguments import a_path
+from gapr_core.runtime.console import say
 
 
 def add_method(parser: ArgumentParser) -> None:
@@ -14,9 +15,18 @@ def add_method(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         default="gapr",
-        help="gapr (default), gapr_search (needs no torch), gapr_network, gapr_tracker, a baseline or module:factory",
+        help="gapr (default), gapr_search (needs no torch), gapr_network, gapr_tracker, module:factory, or a baseline, "
+        "which refuses almost nothing: its confidence is its share of inliers, not calibrated",
     )
     add_settings(parser)
+
+
+def say_uncalibrated(method: str) -> None:
+    """Say of a baseline that what it calls a confidence is no probability."""
+    from gapr_core.benchmark import methods
+
+    if method not in methods.OWN and ":" not in method:
+        say(f"{method} is a baseline: its confidence is its share of inliers, not calibrated; a wrong pose may be OK")
 
 
 def add_settings(parser: ArgumentParser) -> None:

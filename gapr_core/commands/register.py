@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gapr_core.commands import checks, options
-from gapr_core.commands.answer import as_json, guidance_json
+from gapr_core.commands.answer import as_json, guidance_json, made_by
 from gapr_core.errors import ConfigError
 from gapr_core.pages.registration import Registration
 from gapr_core.results import Patch, RegistrationResult
@@ -21,7 +21,7 @@ from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
-    from gapr_core.config import SensorConfig
+    from gapr_core.config import RegistrarConfig, SensorConfig
     from gapr_core.formats.planning import TargetError
     from gapr_core.surface import Surface
 
@@ -52,6 +52,9 @@ def add_arguments(parser: ArgumentParser) -> None:
                         help="the same in a label map that is the source")  # fmt: skip
     parser.add_argument("--axes", type=str.lower, default="auto",
                         help="of a target mesh: lps, ras, as_is, lps_to_ras, or auto (what it says)")  # fmt: skip
+    parser.add_argument("--source-axes", type=str.lower, default="auto", choices=("auto", "lps", "ras"),
+                        help="of a source that does not say them, such as a tracker's: ras for what 3D Slicer shows "
+                        "live over OpenIGTLink (auto: LPS)")  # fmt: skip
     parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
     parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
     parser.add_argument("--reference", type=int, metavar="TOOL",
@@ -121,11 +124,12 @@ def run(args: Namespace) -> int:
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     code = _show(args, result, errors)
+    options.say_uncalibrated(args.method)
     if result.tre95_mm is not None:
         _say_what_the_bound_leaves_out(config.sensor)
     if config.guide:
         _say_where_next(result, spots)
-    _write(args, Registration(target, source.points, result, errors, spots))
+    _write(args, Registration(target, source.points, result, errors, spots), config)
     checks.check_answer(args, result)
     return code
 
@@ -146,7 +150,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
 
     target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
-    how = {"tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
+    how = {"axes": args.source_axes, "tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
     how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
     source = _load(args.source, args.source_units or args.units, **how)
     if source.faces is not None and target.faces is None:
@@ -155,6 +159,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
         )
     checks.warn_of_units(args)
     checks.warn_of_axes(args)
+    checks.warn_of_tracker(args)
     checks.warn_of_landmarks(args, source.points, target.points)
     checks.warn_of_frames(args, source.points, target.points)
     return target, source
@@ -249,12 +254,12 @@ def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
             f"gain {spot.gain_mm:.2f} mm, {100 * spot.rivals_excluded:.0f} % of the rivals excluded")  # fmt: skip
 
 
-def _write(args: Namespace, done: Registration) -> None:
+def _write(args: Namespace, done: Registration, config: RegistrarConfig) -> None:
     """The files that were asked for; those of a pose only where there is one."""
     if args.json:
         errors = [asdict(error) for error in done.errors]
         more = {"targets": errors, "guidance": guidance_json(done.result, done.spots)}
-        files.write_json(args.json, as_json(done.result) | more)
+        files.write_json(args.json, as_json(done.result) | made_by(args.method, config) | more)
     if args.report:
         from gapr_core.pages import registration_report
 

@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 LPS_RAS = np.array([-1.0, -1.0, 1.0])  # the same both ways
 FACTORS = {"lps": np.ones(3), "as_is": np.ones(3), "ras": LPS_RAS, "lps_to_ras": LPS_RAS}
 CHOICES = ("auto", *FACTORS)
-COMMENT = re.compile(rb"SPACE[ \t]*=[ \t]*(LPS|RAS)\b")
+COMMENT = re.compile(rb"SPACE(?:[ \t]*=[ \t]*| 1 1 string\r?\n\xc3?)(LPS|RAS)\b")  # the second is a VTK field
 COMMENT_BYTES = 8192
+OPTIONS = "--axes, --source-axes or model_axes"
 
 
 def turned(surface: Surface, path: Path, axes: str) -> Surface:
@@ -53,22 +54,22 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
     if axes == "auto" and said == "ras":
         log.warning("%s %s: x and y are negated, to LPS", path.name, how)
     elif said == "ras" and axes != "ras":
-        log.warning("%s %s and is read as %s: --axes or model_axes says so", path.name, how, axes.upper())
+        log.warning("%s %s and is read as %s: %s says so", path.name, how, axes.upper(), OPTIONS)
     elif said == "lps" and axes == "ras":
-        log.warning("%s %s and is read as RAS: --axes or model_axes says so", path.name, how)
+        log.warning("%s %s and is read as RAS: %s says so", path.name, how, OPTIONS)
     return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])
 
 
-def unturned(surface: Surface, path: Path, axes: str) -> Surface:
-    """The surface of a file with axes of its own, LPS by its header or those of a tracker: "lps_to_ras" alone turns it.
+def turned_as_named(surface: Surface, path: Path, axes: str, in_lps: bool) -> Surface:
+    """The surface of a file that is LPS by its kind (`in_lps`), or in the axes of a tracker, which the caller may name.
 
     Raises:
-        ConfigError: unknown axes, or "ras": nobody names the axes of such a file.
+        ConfigError: unknown axes, or "ras" of a file that says its axes.
     """
     check(axes)
-    if axes == "ras":
+    if axes == "ras" and in_lps:
         raise ConfigError("axes of a mesh or a cloud", f"ras for {path.name}, which has its own", "leave them out")
-    return scaled(surface, FACTORS["lps_to_ras"]) if axes == "lps_to_ras" else surface
+    return surface if axes == "auto" else scaled(surface, FACTORS[axes])
 
 
 def check(axes: str) -> None:

@@ -55,11 +55,16 @@ def header_of(lines: Iterable[str]) -> Header:
         elif line.strip():
             first = line
             break
-    delimiter = next((d for d in DELIMITERS if d in first), None)
+    delimiter = delimiter_of(first)
     cells, commented = _cells(first, delimiter), words(comment.lstrip(" #/"), delimiter)
     if not first or _are_numbers(cells) or _is_point(cells, found_in_comment(commented, len(cells))):
         return Header(delimiter, commented, False, len(cells), comment)
     return Header(delimiter, words(first, delimiter), True, len(cells), first)
+
+
+def delimiter_of(line: str) -> str | None:
+    """What separates the cells of a line; None for white space."""
+    return next((d for d in DELIMITERS if d in line), None)
 
 
 def words(line: str, delimiter: str | None) -> list[str]:

@@ -18,6 +18,7 @@ from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.formats.reading import reason_of, unreadable
 from gapr_core.formats.text import check_encoding, check_end
+from gapr_core.geometry.extent import BEYOND
 from gapr_core.runtime.files import write_json
 from gapr_core.surface import Surface
 
@@ -56,7 +57,8 @@ def load(path: Path) -> Markups:
     if not path.exists():
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
     if not path.is_file() or not path.name.lower().endswith((".mrk.json", ".fcsv")):
-        raise InvalidPointCloudError("markups: a .mrk.json or .fcsv file", str(path), "save the points from 3D Slicer")
+        how = signatures.hint_of_markups(path) or "save the points from 3D Slicer"
+        raise InvalidPointCloudError("markups: a .mrk.json or .fcsv file", str(path), how)
     signatures.check_packed(path, path.suffix.lower())
     try:
         found = _load(path, FileLimits.from_environment())
@@ -73,8 +75,9 @@ def _load(path: Path, limits: FileLimits) -> Markups:
     data = limits.read(path)
     check_encoding(data)
     markups = _of_fcsv(data) if path.suffix.lower() == ".fcsv" else _of_json(json.loads(data.decode("utf-8-sig")))
-    if not np.isfinite(markups.points).all():
-        raise InvalidPointCloudError("finite coordinates", f"{path.name} with others", "place the points again")
+    if not (np.abs(markups.points) < BEYOND).all():
+        given = f"{path.name} with others"
+        raise InvalidPointCloudError(f"coordinates of finite numbers below {BEYOND:g}", given, "place the points again")
     return markups
 
 

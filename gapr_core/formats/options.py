@@ -14,6 +14,7 @@ class ReadOptions:
     Attributes:
         axes: axes of a mesh or cloud file: "lps", "ras" (turned to LPS), "as_is", "lps_to_ras" (a file in LPS, turned
             to RAS), or "auto": what a `SPACE=` comment or columns l p s or r a s in the file say, as_is without them.
+            Those of a tracker's points as well.
         labels: names or numbers of the segments of a label map that make up one rigid target; none where it has one.
         tip_mm: (3,) the tip of a pointer in the frame of its marker, for recordings of tracked tools.
         tool: which of the tools of a recording, from 0; None where it has one.

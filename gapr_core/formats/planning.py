@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from gapr_core.geometry.twists import motion_jacobians
 from gapr_core.results import RegistrationResult
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 DRAWS = 4096
 
@@ -41,6 +43,8 @@ class TargetError:
 def start_of(source: Path, target: Path) -> LandmarkPose:
     """The pose that lays the landmarks of one file on those of the other: by name if both have the same, else in order.
 
+    Small and capital letters are not distinguished. Names that are the same only in part are warned of.
+
     Raises:
         InvalidPointCloudError: files that cannot be read, or landmarks that determine no pose.
     """
@@ -48,9 +52,17 @@ def start_of(source: Path, target: Path) -> LandmarkPose:
     if len(moving.labels) != len(fixed.labels):
         given = f"{len(moving.labels)} in {source.name} and {len(fixed.labels)} in {target.name}"
         raise InvalidPointCloudError("as many source as target landmarks", given, "place the same points in both")
-    named = sorted(moving.labels) == sorted(fixed.labels) and len(set(fixed.labels)) == len(fixed.labels)
-    order = [fixed.labels.index(label) for label in moving.labels] if named else list(range(len(fixed.labels)))
-    return paired_pose(moving.points, fixed.points[order])
+    first, second = ([label.strip().casefold() for label in found.labels] for found in (moving, fixed))
+    shared = set(first) & set(second) - {""}
+    if len(shared) == len(first):
+        return paired_pose(moving.points, fixed.points[[second.index(name) for name in first]])
+    if shared:
+        log.warning(
+            "%s and %s have %d of %d names in common: the landmarks are paired in their order. "
+            "Give both the same names, each once, to pair them by name",
+            source.name, target.name, len(shared), len(first),
+        )  # fmt: skip
+    return paired_pose(moving.points, fixed.points)
 
 
 def errors_at(plan: Markups, result: RegistrationResult) -> list[TargetError]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gapr_core.errors import MethodUnavailableError
+from gapr_core.formats import axes
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
 
@@ -43,14 +44,17 @@ class Plugin:
             InvalidPointCloudError: what the reader cannot read.
             MethodUnavailableError: a library that the reader needs is not installed.
         """
-        return self._module().read(_folder_of(path, self.entry), options)  # type: ignore[no-any-return]
+        surface = self._module().read(_folder_of(path, self.entry), options)
+        return axes.turned_as_named(surface, path, options.axes, in_lps=False)
 
     def _module(self) -> Any:
         try:
             return self.entry.load()
         except ModuleNotFoundError as error:
-            how = f"pip install {OURS if self.entry.value.startswith('gapr_ros.') else error.name}"
-            raise MethodUnavailableError(f"files of the kind {self.entry.name}", f"no {error.name}", how) from error
+            is_ours = self.entry.value.startswith("gapr_ros.")
+            what = "reading bags" if is_ours else f"files of the kind {self.entry.name}"
+            how = f"pip install {OURS if is_ours else error.name}"
+            raise MethodUnavailableError(what, f"no {error.name}", how) from error
 
 
 def of(path: Path) -> Plugin | None:

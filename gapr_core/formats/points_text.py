@@ -45,7 +45,7 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
     """
     data = options.limits.read(path)
     header = next(text.lines(data), "")
-    names = [name.strip().lower() for name in columns.words(header, ",")]
+    names = [name.strip().lower() for name in columns.words(header, columns.delimiter_of(header) or ",")]
     if tracker.is_recording(names) and options.tip_mm is not None:
         poses = tracker.read_poses(path, options.limits, options.tool, options.reference)
         return Surface(tracker.tips(poses, options.tip_mm), joined=True)
@@ -63,7 +63,7 @@ def _surface(data: bytes) -> Surface:
     header = columns.header_of(lines)
     rows = [line for line in lines if not line.lstrip().startswith(COMMENTS)][header.is_line :]
     if rows and DECIMAL_COMMAS.fullmatch(rows[0].strip()):
-        raise _decimal_commas(rows[0])
+        raise _decimal_commas(rows[0], bool(columns.kinds_in([columns.axis(name) for name in header.names])))
     if _defined(header) is not None:
         return Surface(_by_cells(data, header))
     try:
@@ -174,15 +174,15 @@ def _number(cells: list[str], place: int, line: int, may_be_empty: bool) -> floa
         return float(cell if "_" not in cell else "")  # Python takes 1_0 for 10
     except ValueError as error:
         if DECIMAL_COMMA.fullmatch(cell):
-            raise _decimal_commas(cell) from error
+            raise _decimal_commas(cell, may_be_empty) from error
         given = f"{'text' if cell else 'nothing'} in column {place + 1} of line {line}"
         how = "correct it" + ("" if may_be_empty else ", or begin with a line of names, x y z and others for the rest")
         raise InvalidPointCloudError("a number", given, how) from error
 
 
-def _decimal_commas(row: str) -> InvalidPointCloudError:
+def _decimal_commas(row: str, is_named: bool = False) -> InvalidPointCloudError:
     given = f"decimal commas ({row.strip()[:LONGEST_NAMES]})"
-    how = "write them with a point; columns of whole numbers need a line of names"
+    how = "write them with a point" + ("" if is_named else "; columns of whole numbers need a line of names")
     return InvalidPointCloudError("decimals with a point, such as 1.5", given, how)
 
 

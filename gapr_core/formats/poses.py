@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.errors import GaprError
+from gapr_core.errors import GaprError, InvalidPointCloudError
 from gapr_core.formats import sweeps, tracker
 from gapr_core.formats.reading import format_of, reason_of, unreadable
 
@@ -23,7 +23,10 @@ def poses_in(path: Path, tool: int | None = None, reference: int | None = None) 
         InvalidPointCloudError: neither of them, no pose of that tool, several tools and none chosen, or no such
             reference.
     """
-    format_of(path)
+    if not format_of(path).is_tracked or path.is_dir():
+        given = path.name or path.resolve().name
+        how = "record the tool while it is turned on its tip"
+        raise InvalidPointCloudError("a recording by NDI Track (.csv) or PLUS (.igs.mha)", given, how)
     try:
         if not path.name.lower().endswith(".igs.mha"):
             return tracker.read_poses(path, tool=tool, reference=reference)

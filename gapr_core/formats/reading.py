@@ -47,8 +47,10 @@ class Format:
         self._check(path, options)
         module, function = self.reader.split(":")
         reader: Reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
-        turn = axes.unturned if self.in_mm else axes.turned
-        return turn(reader(path, options), path, options.axes)
+        surface = reader(path, options)
+        if self.in_mm:
+            return axes.turned_as_named(surface, path, options.axes, self.in_lps)
+        return axes.turned(surface, path, options.axes)
 
     def _check(self, path: Path, options: ReadOptions) -> None:
         """A choice that this kind of file cannot follow means that it is the wrong file, or the wrong choice."""
@@ -105,11 +107,13 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
         MethodUnavailableError: a library that the format needs is not installed.
     """
     options = options or ReadOptions()
+    path = path if path.name else path.resolve()  # a dot has no name
     kind = format_of(path)
     try:
         surface = kind.read(path, options)
     except InvalidPointCloudError as error:
-        raise InvalidPointCloudError(error.expected, f"{path.name}: {error.given}", error.how_to_fix) from error
+        given = error.given if path.is_file() and path.name in error.given else f"{path.name}: {error.given}"
+        raise InvalidPointCloudError(error.expected, given, error.how_to_fix) from error
     except GaprError:
         raise
     except PermissionError as error:
@@ -146,6 +150,8 @@ def format_of(path: Path) -> Format | plugins.Plugin:
         expected = "a header and its voxels in one file"
         raise InvalidPointCloudError(expected, path.name, "save it as one file: .mha or .nrrd")
     if ending not in FORMATS:
+        if hint := signatures.hint_of_markups(path):
+            raise InvalidPointCloudError("markups as .mrk.json", path.name, hint)
         endings = " ".join([*FORMATS, *plugins.kinds()])
         raise InvalidPointCloudError(f"one of {endings} or a folder", path.name, "convert the file to one of these")
     return FORMATS[ending]

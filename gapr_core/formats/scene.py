@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -17,6 +18,7 @@ from gapr_core.runtime import files
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 TARGETS = "targets.mrk.json"
 FILES = ("target.vtk", "source.vtk", "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `write_slicer`
@@ -73,6 +75,8 @@ def write_slicer(folder: Path, target: Surface, result: RegistrationResult, erro
     transforms.write(folder / "pose.tfm", result.T_target_source)
     if errors:
         planning.save_targets(folder / TARGETS, errors)
+    elif (folder / TARGETS).exists():
+        log.warning("%s in %s is of an earlier run, and not in this scene: it has no --targets", TARGETS, folder.name)
     files.write_text(folder / "scene.mrml", _mrml(bool(errors)))
 
 

@@ -62,6 +62,12 @@ def check_sequence(path: Path, ending: str) -> None:
         raise InvalidPointCloudError(f"a label map as {ending}", given, how)
 
 
+def hint_of_markups(path: Path) -> str:
+    """How to rename control points of 3D Slicer that lie in a plain .json; empty for other files."""
+    is_markups = path.suffix.lower() == ".json" and b'"markups"' in _head(path, SEQUENCE_BYTES)
+    return f"it looks like markups of 3D Slicer: rename it to {path.stem}.mrk.json" if is_markups else ""
+
+
 def _unpacks_to_nifti(path: Path) -> bool:
     try:
         with gzip.open(path) as file:

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats import columns
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.text import check_end
 
@@ -73,18 +74,19 @@ def read_poses(
     """
     data = (limits or FileLimits.from_environment()).read(path)
     check_end(data)
-    rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"))))
+    text = data.decode("utf-8-sig", "replace")
+    rows = list(csv.reader(io.StringIO(text), delimiter=columns.delimiter_of(text.partition("\n")[0]) or ","))
     names = [name.strip().lower() for name in rows[0]] if rows else []
     starts = [i for i, name in enumerate(names) if name in (QUATERNION[0], ANGLES[0])]
     if not starts:
         raise InvalidPointCloudError(COLUMNS, f"{path.name} without them", "export it from NDI Track")
     called = [_tool_name(rows[0][:start], i) for i, start in enumerate(starts)]
     used = chosen_with(tool, reference, called, path)
-    columns = [_columns(names, starts[i], i, path) for i in used]
-    seen = {i: row for i, row in enumerate(rows[1:], start=2) if row and all(_is_seen_in(row, s) for s, _ in columns)}
+    places = [_columns(names, starts[i], i, path) for i in used]
+    seen = {i: row for i, row in enumerate(rows[1:], start=2) if row and all(_is_seen_in(row, s) for s, _ in places)}
     if not seen:
         raise never_seen(used, called, path)
-    return relative([_poses_in(seen, wanted, path) for _, wanted in columns])
+    return relative([_poses_in(seen, wanted, path) for _, wanted in places])
 
 
 def _columns(names: Sequence[str], start: int, tool: int, path: Path) -> tuple[int | None, slice]:
@@ -98,16 +100,19 @@ def _columns(names: Sequence[str], start: int, tool: int, path: Path) -> tuple[i
     return state, slice(start, start + len(wanted))
 
 
-def _poses_in(rows: Mapping[int, Sequence[str]], columns: slice, path: Path) -> Array:
+def _poses_in(rows: Mapping[int, Sequence[str]], wanted: slice, path: Path) -> Array:
     """(N, 4, 4) of the rows by their numbers in the file, the line of names being row 1."""
     for number, row in rows.items():
-        if len(row) < columns.stop:
+        if len(row) < wanted.stop:
             raise ValueError(f"row {number} ends before its pose")
-        if wrong := [value.strip() for value in row[columns] if not abs(float(value)) <= FARTHEST_MM]:
+        if commas := [value for value in row[wanted] if "," in value]:
+            how = "save it with a point; the cells may be separated by ;"
+            raise InvalidPointCloudError("decimals with a point, such as 1.5", f"{path.name} with {commas[0]}", how)
+        if wrong := [value.strip() for value in row[wanted] if not abs(float(value)) <= FARTHEST_MM]:
             given = f"{path.name} with {wrong[0][:LONGEST_NAME]} in row {number}"
             how = "take that row out, or record it again"
             raise InvalidPointCloudError(f"poses of finite numbers up to {FARTHEST_MM:g} mm", given, how)
-    values = np.array([[float(value) for value in row[columns]] for row in rows.values()])
+    values = np.array([[float(value) for value in row[wanted]] for row in rows.values()])
     return poses_of(values[:, :-3], values[:, -3:])
 
 

@@ -120,7 +120,7 @@ def test_centimetres_become_millimetres_and_are_asked_for(tmp_path):
     with pytest.raises(InvalidPointCloudError, match="it looks like cm: pass units='cm', or convert it to mm$"):
         clouds.load(VERTICES / 10.0, units="mm")
     np.save(tmp_path / "a.npy", VERTICES / 10.0)
-    options = r"\(--source-units cm, of the source; --units cm, of both files; model_unit\)"
+    options = r"\(--units cm; --source-units cm, of the source alone; model_unit of the node\)"
     with pytest.raises(InvalidPointCloudError, match=rf"it looks like cm: pass units='cm' {options}, or convert it"):
         clouds.load(tmp_path / "a.npy", units="mm")
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gapr_core import cli
+from gapr_core import __version__, cli
 from gapr_core.benchmark import methods
 from gapr_core.commands import options
 
@@ -201,6 +201,55 @@ def test_a_missing_library_names_the_extra_that_installs_it(capsys, monkeypatch)
     monkeypatch.setattr("gapr_core.commands.settings.run", absent)
     assert run("settings") == 1
     assert "pip install 'gapr_ros[reports]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("library", "command", "install"), [
+    ("diagnostic_msgs.msg", "register", "'gapr_ros[ros]'"), ("rich", "demo", "'gapr_ros[ros]'"),
+    ("torch", "train", "'gapr_ros[training]'"), ("torch", "register", "'gapr_ros[network]'"),
+    ("distributed", "train", "distributed"),
+])  # fmt: skip
+def test_the_extra_of_a_command_has_all_that_it_needs(library, command, install):
+    """`gapr demo` named one extra after the other, and at last a package that no index has."""
+    assert cli._which_extra(ModuleNotFoundError(name=library), command).endswith(f"pip install {install}")
+
+
+@pytest.mark.parametrize(
+    ("command", "said"), [("settings", "stopped"), ("evaluate", "stopped; the same command goes on")]
+)
+def test_a_command_that_is_stopped_says_only_what_it_has_kept(capsys, monkeypatch, command, said):
+    def stopped(args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"gapr_core.commands.{command}.run", stopped)
+    assert cli.main([command, *(["--pairs", "a", "--out", "b"] if command == "evaluate" else [])]) == 130
+    assert capsys.readouterr().err.startswith(f"gapr: {said}" + "\n" * (command == "settings"))
+
+
+def test_the_version_is_said(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"gapr {__version__}\n"
+
+
+def test_a_baseline_is_said_to_have_no_calibrated_confidence(folder, capsys):
+    said = "icp is a baseline: its confidence is its share of inliers, not calibrated"
+    assert run(f"{REGISTER} --method icp --json x.json") == 0 and said in capsys.readouterr().out
+    assert json.loads((folder / "x.json").read_text())["calibrated"] is False
+    assert run("evaluate --pairs pairs --out poses.json --method icp") == 0 and said in capsys.readouterr().out
+    assert run("register --help") == 0 and "share of inliers, not calibrated" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    run(f"{REGISTER} --method gapr_search --json x.json")
+    assert "is a baseline" not in capsys.readouterr().out
+    assert json.loads((folder / "x.json").read_text())["calibrated"] is True
+
+
+def test_a_pair_in_another_unit_is_named_and_no_argument_of_python(folder, caplog):
+    """And where none of the pairs can be read, nothing was evaluated."""
+    np.savez("pairs/b.npz", source=CLOUD[:100] / 1000.0, target=CLOUD / 1000.0)
+    assert run("evaluate --pairs pairs --out poses.json --method icp") == 0
+    assert "the first of 1 pairs that cannot be read: b.npz: expected a bone" in caplog.text
+    assert "it looks like m: convert it to mm" in caplog.text and "units=" not in caplog.text
+    assert run("evaluate --pairs bad --out poses.json --method icp") == 1
 
 
 def test_json_of_a_refusal_holds_no_error_of_a_pose(folder):

@@ -105,7 +105,7 @@ def test_landmarks_of_a_source_without_axes_are_warned_of(folder, caplog, source
     save(folder / "q.mrk.json", Markups(POINTS[:4], ("a", "b", "c", "d")))
     line = "--landmarks q.mrk.json p.mrk.json"
     assert register(line, "lps.ply", source) == 0
-    assert (f"in LPS: q.mrk.json. If {source} is RAS, save it from 3D Slicer" in caplog.text) == (not is_known)
+    assert (f"in LPS: q.mrk.json. If {source} is RAS, give --source-axes ras" in caplog.text) == (not is_known)
     caplog.clear()
     assert register("", "lps.ply", source) == 0 and "in LPS: " not in caplog.text
 
@@ -145,7 +145,7 @@ def hints(monkeypatch):
     given = {}
 
     def look(self, source, target, initial=None, viewpoint=None):
-        given.update(initial=initial, viewpoint=viewpoint)
+        given.update(source=source, initial=initial, viewpoint=viewpoint)
         return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
 
     monkeypatch.setattr(Known, "register", look)
@@ -173,7 +173,7 @@ def test_a_start_in_a_file_goes_to_the_method_and_one_the_other_way_round_is_war
     ("--landmarks t t", 300.0, ""),
     ("--targets s", 300.0, "s.mrk.json is near s.npy, and far from t.npy: --targets are in the frame of the target"),
     ("--targets t", 300.0, ""),
-    ("--targets far", 300.0, ""),
+    ("--targets far", 300.0, "1 of 1 points of far.mrk.json are far from t.npy"),
 ])  # fmt: skip
 def test_markups_in_the_frame_of_the_other_cloud_are_warned_of(folder, caplog, line, at_mm, said):
     """No residual shows it: landmarks fit in either order. One file alone may be of a part that was not seen."""
@@ -188,11 +188,63 @@ def test_markups_in_the_frame_of_the_other_cloud_are_warned_of(folder, caplog, l
     assert [said in message for message in caplog.messages] == [True] * bool(said)
 
 
+@pytest.mark.parametrize(("factors", "said"), [
+    ([1.0, 1.0, 1.0], ""), ([-1.0, -1.0, 1.0], "with x and y negated they are near"),
+    ([1e-3, 1e-3, 1e-3], "times 1000 they are near"), ([1.0, 1.0, 9.0], "check coordinateSystem and coordinateUnits"),
+])  # fmt: skip
+def test_planned_targets_far_from_the_bone_are_warned_of_with_the_likely_cause(folder, caplog, factors, said):
+    """An entry in the skin is near the bone; its error was small, and said without a word, at 3 m."""
+    bone = POINTS + [900.0, -700.0, 500.0]
+    plan = np.array([[900.0, -700.0, 500.0], [900.0, -450.0, 500.0]]) * factors
+    save(folder / "plan.mrk.json", Markups(plan, ("a", "b")))
+    args = Namespace(source=Path("s.npy"), target=Path("t.npy"), landmarks=None, targets=Path("plan.mrk.json"))
+    checks.warn_of_frames(args, POINTS, bone)
+    assert [said in message for message in caplog.messages] == [True] * bool(said)
+    assert not said or "2 of 2 points of plan.mrk.json are far from t.npy" in caplog.text
+
+
+def test_a_target_too_far_for_any_number_is_refused_before_the_work(folder, capsys):
+    save(folder / "p.mrk.json", Markups(np.array([[1.0, 2.0, 1e308]]), ("a",)))
+    assert register("--targets p.mrk.json --out p.tfm") == 1 and Known.asked == 0
+    assert "got p.mrk.json with others" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("line", "is_warned"), [
+    ("--out p.tfm", True), ("--out p.h5", True), ("--slicer scene", True), ("--out p.txt", False), ("", False),
+    ("--out p.tfm --source-axes RAS", False), ("--out p.tfm --source-axes lps", False),
+])  # fmt: skip
+def test_a_transform_for_slicer_of_a_trackers_numbers_is_warned_of(folder, caplog, hints, line, is_warned):
+    """3D Slicer shows them live as RAS: the transform of the numbers as they are was two metres off there."""
+    pytest.importorskip("SimpleITK", reason=".h5 is optional: pip install '.[medical]'")
+    rows = "".join(f"OK,1,0,0,0,{x},{y},{z}\n" for x, y, z in POINTS)
+    Path("probe.csv").write_text(f"State,Q0,Qx,Qy,Qz,Tx,Ty,Tz\n{rows}")
+    assert register(f"--tip 0,0,0 {line}", "lps.ply", "probe.csv") == 0
+    assert ("probe.csv is taken as LPS. 3D Slicer shows a live tracker" in caplog.text) is is_warned
+    np.testing.assert_allclose(hints["source"], POINTS * ([-1, -1, 1] if "RAS" in line else [1, 1, 1]), atol=1e-9)
+    caplog.clear()
+    assert register(line, "lps.ply", "lps.ply") == 0 and "taken as LPS" not in caplog.text
+
+
+def test_the_axes_of_a_source_that_are_named_are_asked_for_no_more(folder, caplog, capsys):
+    line = "--landmarks p.mrk.json p.mrk.json --source-axes"
+    assert register(f"{line} lps", "lps.ply") == 0 and "in LPS: " not in caplog.text
+    assert register("--source-axes ras", "lps.ply", "p.mrk.json") == 1
+    assert "ras for p.mrk.json, which has its own" in capsys.readouterr().err
+
+
+def test_json_says_what_made_the_answer(folder):
+    assert register("--json x.json") == 0
+    answer = json.loads(Path("x.json").read_text())
+    assert answer["method"] == "known_method:make" and answer["calibrated"] is False
+    assert answer["version"].startswith("0.") and answer["settings"] and answer["weights"]
+
+
 def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, hints):
     assert register("--viewpoint 1,2,3", source="ras.ply") == 0 and list(hints["viewpoint"]) == [1.0, 2.0, 3.0]
     assert "--viewpoint is taken to be in LPS" in caplog.text
     caplog.clear()
     assert register("--viewpoint 1,2,3", source="lps.ply") == 0 and "--viewpoint" not in caplog.text
+    assert register("--viewpoint 1,2,3 --source-axes ras") == 0 and "--viewpoint is taken to be in LPS" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,11 @@ def test_a_pose_reaches_slicer_in_ras_and_a_refusal_as_a_status_alone(bridge, li
     assert status.text.startswith("OK")
 
 
+def test_the_codes_of_a_status_are_those_of_openigtlink(bridge):
+    """A client took a refusal for `Access denied`."""
+    assert (bridge.OK, bridge.NOT_FOUND) == (1, 4)  # igtlStatusMessage.h: STATUS_OK, STATUS_NOT_FOUND
+
+
 def test_a_pointer_that_sends_no_numbers_or_nothing_is_waited_for(bridge, linked):
     tracker, client, server, _ = linked
     made = bridge.Bridge(Fixed(), None, client, server, DEVICE, every=1)

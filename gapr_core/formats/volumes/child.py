@@ -78,6 +78,7 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
     voxels = SimpleITK.GetArrayFromImage(image)
     layers = list(np.moveaxis(voxels, 3, 0)) if voxels.ndim == 4 else [voxels]
     metadata = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}
+    _check_binary(metadata)
     named = names.of_seg_nrrd(metadata, len(layers))
     if is_nifti:
         named = [Segment(name, value) for value, name in nifti.label_names(path).items()]
@@ -95,6 +96,14 @@ def _check_axes(path: Path, metadata: dict[str, str]) -> None:
         known, given = codes != ["0", "0"], "qform_code and sform_code of 0"
     if not known:
         raise InvalidPointCloudError("patient axes in the header", given, "export it with its affine, LPS or RAS")
+
+
+def _check_binary(metadata: dict[str, str]) -> None:
+    """Raise for shares of voxels, which 3D Slicer writes under either of two keys: what they are shares of varies."""
+    for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
+        if (kind := metadata.get(key, "")).lower().startswith("fractional"):
+            how = "make Binary labelmap the source representation (module Segmentations), and save it again"
+            raise InvalidPointCloudError("a binary label map", f"a {kind.lower()}, says {key}", how)
 
 
 def _read_dicom(

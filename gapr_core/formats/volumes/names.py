@@ -71,14 +71,14 @@ def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tup
         return [_only(named, present)], []
     chosen, notes = [], []
     for label in wanted:
-        segment = _by_number(int(label), named, present) if label.isdigit() else _by_name(label, named, present)
+        segment = _by_number(int(label), named, present) if label.isdecimal() else _by_name(label, named, present)
         if segment.value not in present.get(segment.layer, ()):
             there = _present(named, present)
             how = "choose one of these" if there else "check the segmentation"
             raise InvalidPointCloudError(f"voxels of {label}", f"none, but {there or 'zeros only'}", how)
         chosen.append(segment)
-        if label.isdigit():
-            notes.append(f"label {label} {_meaning(segment)}")
+        if label.isdecimal():
+            notes.append(f"label {label} {_meaning(segment, present)}")
     return chosen, notes
 
 
@@ -147,9 +147,12 @@ def _nameless(label: str, present: Present) -> InvalidPointCloudError:
     return InvalidPointCloudError(f"a segment {label}", given, f"give its number{known}")
 
 
-def _meaning(segment: Segment) -> str:
+def _meaning(segment: Segment, present: Present) -> str:
     if segment.name:
         return f"is {segment.name}, says the file"
+    numbers = set().union(*present.values())
+    if len(numbers) == 1 or numbers == {1, 2}:  # any mask, and not TotalSegmentator's
+        return "has no name in the file"
     tables = [(version, table) for version, table in TOTALSEGMENTATOR.items() if segment.value in table]
     names = [f"{table[segment.value]} in {version}" for version, table in tables]
     return "has no name in the file" + (f"; it would be {', '.join(names)}" if names else "")

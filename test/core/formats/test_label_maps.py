@@ -161,6 +161,41 @@ def test_versions_of_totalsegmentator_are_named_where_the_file_has_no_names(tmp_
         clouds.load(path, options=options("88"))
 
 
+@pytest.mark.parametrize("numbers", [(1,), (1, 2), (5,)])
+def test_a_mask_without_names_is_not_taken_for_one_of_totalsegmentators(tmp_path, caplog, numbers):
+    """Every binary mask was called a patella."""
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    voxels = numbers[0] * voxels_of(affine, size).astype(np.uint8)
+    voxels[0, 0, 0] = numbers[-1]
+    clouds.load(write(tmp_path / "a.nii.gz", voxels, affine), options=options(str(numbers[0])))
+    assert f"label {numbers[0]} has no name in the file" in caplog.text and "TotalSegmentator" not in caplog.text
+
+
+def test_a_superscript_is_a_name_and_no_number(tmp_path):
+    with pytest.raises(InvalidPointCloudError, match="a segment ²; got two.nrrd: a file without names, with 75, 76"):
+        clouds.load(two_bones(tmp_path, "nrrd"), options=options("²"))
+
+
+@pytest.mark.parametrize("key", ["Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"])
+def test_a_fractional_segmentation_is_refused_with_the_way_out_in_slicer(tmp_path, key):
+    """It was read as hundreds of labels."""
+    path = two_bones(tmp_path, "seg.nrrd", **{key: "Binary labelmap"})
+    assert len(clouds.load(path, options=options("75")).points) > 100
+    path = two_bones(tmp_path, "seg.nrrd", **{key: "Fractional labelmap"})
+    with pytest.raises(InvalidPointCloudError, match=f"a fractional labelmap, says {key}; make Binary labelmap the"):
+        clouds.load(path, options=options("75"))
+
+
+def test_two_long_bones_in_one_label_are_warned_of(tmp_path, caplog):
+    """As both femora of a segmentation by thresholds."""
+    affine, size = np.diag([3.0, 3.0, 3.0, 1.0]), np.array([60, 20, 120])
+    at = [voxels_of(affine, size, np.array([x, 30.0, 180.0]), [15.0, 12.0, 160.0]) for x in (40.0, 140.0)]
+    clouds.load(write(tmp_path / "one.nrrd", at[0], affine))
+    assert "separate long parts" not in caplog.text
+    clouds.load(write(tmp_path / "both.nrrd", at[0] | at[1], affine))
+    assert "both.nrrd holds 2 separate long parts" in caplog.text and "a label of its own" in caplog.text
+
+
 def test_the_tables_of_totalsegmentator_are_its_own():
     v1, v2, mr, limbs = names.TOTALSEGMENTATOR.values()
     assert [v1[n] for n in (18, 41, 58, 81, 82, 88, 89, 91)] == [

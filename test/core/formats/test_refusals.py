@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import InvalidPointCloudError, MethodUnavailableError
 from gapr_core.formats import markups, plugins, poses, reading
+from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
 
 TEXT = b"x,y,z\n1,2,3\n"
@@ -93,6 +94,48 @@ def test_the_file_that_makes_a_folder_a_bag_stands_for_it(tmp_path, bags, monkey
 def test_the_list_of_what_can_be_read_has_folders_and_the_names_of_files(tmp_path, bags):
     said = refusal(tmp_path / "a.docx", b"")
     assert " .igs.mha .mcap metadata.yaml or a folder; got a.docx" in said
+
+
+def test_a_bag_that_cannot_be_read_here_is_called_a_bag(tmp_path, monkeypatch):
+    entry = EntryPoint("metadata.yaml", "gapr_ros.not_installed", plugins.GROUP)
+    monkeypatch.setattr(plugins, "_entries", lambda: (entry,))
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    with pytest.raises(MethodUnavailableError, match="^expected reading bags; got no gapr_ros.not_installed; pip ins"):
+        reading.read(tmp_path)
+
+
+def test_a_bag_is_turned_by_the_axes_that_are_named(tmp_path, bags):
+    (tmp_path / "a.mcap").write_bytes(b"")
+    for axes, factors in (("auto", [1, 1, 1]), ("ras", [-1, -1, 1])):
+        points = reading.read(tmp_path / "a.mcap", ReadOptions(axes=axes)).points
+        np.testing.assert_array_equal(points, np.eye(3) * factors)
+
+
+@pytest.mark.parametrize("name", ["bone.stl", "seg.nii", "a.xyz", "p.mrk.json", "folder"])
+def test_a_file_of_another_kind_is_no_recording_for_a_pivot(tmp_path, name):
+    """A mesh was said to be cut."""
+    (tmp_path / "folder").mkdir()
+    if name != "folder":
+        (tmp_path / name).write_bytes(b"solid a\n")
+    with pytest.raises(InvalidPointCloudError, match=rf"a recording by NDI Track .* or PLUS .*; got {name}; record"):
+        poses.poses_in(tmp_path / name)
+
+
+def test_a_name_is_said_once_and_a_dot_has_one(tmp_path, monkeypatch):
+    said = refusal(tmp_path / "a.csv", b"State,Q0,Qx,Qy,Qz,Tx,Ty,Tz\nOK,1,0,0,0,1,2,3\n")
+    assert said.count("a.csv") == 1
+    (tmp_path / "folder" / "poses.txt").parent.mkdir()
+    (tmp_path / "folder" / "poses.txt").write_text("1 2 3\n")
+    monkeypatch.chdir(tmp_path / "folder")
+    with pytest.raises(InvalidPointCloudError, match="got folder: poses.txt"):
+        reading.read(type(tmp_path)())
+
+
+@pytest.mark.parametrize("read", [reading.read, markups.load])
+def test_markups_under_a_plain_json_name_are_to_be_renamed(tmp_path, read):
+    said = refusal(tmp_path / "few.json", b'{"@schema": "x", "markups": []}', read)
+    assert said.endswith("it looks like markups of 3D Slicer: rename it to few.mrk.json")
+    assert "few.mrk.json" not in refusal(tmp_path / "few.json", b'{"points": []}', read)
 
 
 POINT = {"position": [1.0, 2.0, 3.0]}

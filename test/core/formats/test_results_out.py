@@ -64,6 +64,19 @@ def test_transforms_about_a_centre_and_composed_ones_are_read_as_a_start(tmp_pat
         np.testing.assert_allclose(se3.apply(transforms.read(tmp_path / name), moved), POINTS, atol=1e-6)
 
 
+def test_a_start_that_is_cut_is_refused(tmp_path):
+    """ITK takes the parameters that are there, and accepted an Euler transform of three."""
+    euler = sitk.Euler3DTransform((30.0, -40.0, 50.0), 0.3, -0.2, 0.9, (5.0, 6.0, -7.0))
+    both = sitk.CompositeTransform([euler, sitk.TranslationTransform(3, (1.0, 2.0, 3.0))])
+    for transform, cuts in ((euler, ("6 -7", " 5 6", "FixedP", "-40 50")), (both, ("#Transform 1", "2 3\n", "FixedP"))):
+        sitk.WriteTransform(transform, str(tmp_path / "whole.tfm"))
+        text = (tmp_path / "whole.tfm").read_text()
+        for cut in cuts:
+            (tmp_path / "cut.tfm").write_text(text[: text.rindex(cut)])
+            with pytest.raises(ConfigError, match="an ITK transform; got cut.tfm, which ITK cannot read"):
+                transforms.read(tmp_path / "cut.tfm")
+
+
 def test_a_start_that_is_no_rigid_motion_is_refused_by_its_name(tmp_path):
     sitk.WriteTransform(sitk.ScaleTransform(3, (1.1, 1.0, 1.0)), str(tmp_path / "scaled.tfm"))
     sitk.WriteTransform(sitk.BSplineTransform(3), str(tmp_path / "bent.tfm"))
@@ -213,6 +226,22 @@ def test_landmarks_are_paired_by_name_and_else_in_their_order(tmp_path):
         planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
 
 
+@pytest.mark.parametrize(("names", "is_by_name", "said"), [
+    (("D", "b", "A ", "c"), True, ""), (("d", "b", "apex", "c"), False, "have 3 of 4 names in common"),
+    (("d", "b", "b", "c"), False, "have 3 of 4 names in common"), (("1", "2", "", ""), False, ""),
+])  # fmt: skip
+def test_landmarks_whose_names_agree_in_part_are_warned_of(tmp_path, caplog, names, is_by_name, said):
+    """Names were compared letter by letter, and one that differs had all paired in their order without a word."""
+    points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 30, 0], [0, 0, 20]])
+    moved = se3.apply(T, points)
+    markups.save(tmp_path / "s.mrk.json", markups.Markups(points, ("a", "b", "c", "d")))
+    fixed = moved[[3, 1, 0, 2]] if is_by_name else moved
+    markups.save(tmp_path / "t.mrk.json", markups.Markups(fixed, names))
+    start = planning.start_of(tmp_path / "s.mrk.json", tmp_path / "t.mrk.json")
+    np.testing.assert_allclose(start.T_target_source, T, atol=1e-9)
+    assert [said in message for message in caplog.messages] == [True] * bool(said)
+
+
 def residuals():
     return Residuals(
         POINTS, np.r_[[-3.0, 0.0, 3.0, np.nan], np.zeros(16)], np.r_[[True, True, False, False], [True] * 16]
@@ -246,6 +275,15 @@ def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_
     np.testing.assert_allclose(clouds.load(tmp_path / "target.vtk").points, femur.points, atol=1e-3)
     np.testing.assert_allclose(clouds.load(tmp_path / "source.vtk").points, POINTS, atol=1e-3)
     assert "0.50 mm" in (tmp_path / "targets.mrk.json").read_text() and (tmp_path / "mine.txt").read_text() == "stays"
+
+
+def test_targets_of_an_earlier_run_in_the_folder_of_a_scene_are_warned_of(tmp_path, femur, caplog):
+    result = result_with(np.eye(6), residuals())
+    scene.write_slicer(tmp_path, femur, result, [planning.TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)])
+    assert not caplog.messages
+    scene.write_slicer(tmp_path, femur, result, [])
+    assert "targets.mrk.json in" in caplog.text and "is of an earlier run" in caplog.text
+    assert "targets" not in (tmp_path / "scene.mrml").read_text()
 
 
 def test_a_refused_registration_writes_no_pose_and_says_that_the_old_one_is_old(tmp_path, femur, capsys):

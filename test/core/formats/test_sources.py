@@ -52,6 +52,15 @@ def test_axes_of_markups_are_never_guessed(tmp_path, said):
         reading.read(fcsv(tmp_path / "a.fcsv", said))
 
 
+@pytest.mark.parametrize("value", [1e308, np.inf, np.nan, -1e12])
+def test_markups_with_a_number_beyond_any_coordinate_are_refused_by_their_name(tmp_path, value):
+    """A planned target at 1e308 ended a registration with a traceback, and the pose was lost."""
+    path = fcsv(tmp_path / "a.fcsv", "# CoordinateSystem = LPS\n", np.vstack([POINTS, [0.0, value, 0.0]]))
+    for read in (markups.load, reading.read):
+        with pytest.raises(InvalidPointCloudError, match="finite numbers below 1e.12; got a.fcsv with others; place"):
+            read(path)
+
+
 @pytest.mark.parametrize(("space", "factors"), [("LPS", [1, 1, 1]), ("RAS", LPS_RAS)])
 def test_mrk_json_points_come_in_lps_and_undefined_ones_stay_behind(tmp_path, space, factors):
     points = [{"label": f"L{i}", "position": p.tolist()} for i, p in enumerate(POINTS)]
@@ -148,6 +157,19 @@ def test_a_pivot_calibration_finds_the_tip_and_says_how_well(tmp_path):
     noisy = tracker.pivot(turned_poses(400, noise=0.3))
     assert noisy.residual_mm == pytest.approx(0.3 * np.sqrt(3.0), rel=0.1)
     np.testing.assert_allclose(noisy.tip_mm, TIP, atol=0.3)
+
+
+def test_a_recording_may_have_semicolons_and_no_decimal_commas(tmp_path):
+    """It was said to lack columns that it has."""
+    commas = ndi_csv(tmp_path / "a.csv", turned_poses())
+    text = commas.read_text().replace(",", ";")
+    (tmp_path / "b.csv").write_text(text)
+    np.testing.assert_array_equal(tracker.read_poses(tmp_path / "b.csv"), tracker.read_poses(commas))
+    tips = reading.read(tmp_path / "b.csv", ReadOptions(tip_mm=tuple(TIP))).points
+    np.testing.assert_allclose(tips, np.tile(PIVOT, (40, 1)), atol=1e-6)
+    (tmp_path / "c.csv").write_text(text.replace(".", ","))
+    with pytest.raises(InvalidPointCloudError, match="a point, such as 1.5; got c.csv with -?[0-9]+,[0-9]+; save it"):
+        tracker.read_poses(tmp_path / "c.csv")
 
 
 def test_a_tool_turned_about_one_axis_has_no_tip():
@@ -397,6 +419,22 @@ def test_texts_in_a_legacy_vtk_file_are_passed_over(tmp_path, version, is_binary
     assert surface.faces.tolist() == [[0, 1, 2]]
 
 
+@pytest.mark.parametrize("version", [42, 51])
+@pytest.mark.parametrize("is_binary", [False, True])
+@pytest.mark.parametrize(("said", "factors"), [("LPS", [1, 1, 1]), ("RAS", LPS_RAS), ("SCANNER", [1, 1, 1])])
+def test_axes_of_a_legacy_vtk_file_come_from_its_field_space_as_well(tmp_path, version, is_binary, said, factors):
+    """That of a .vtp file was obeyed, and this one not."""
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    writer = vtkPolyDataWriter()
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    writer.SetFileType(2 if is_binary else 1)
+    writer.SetFileVersion(version)
+    writer.SetInputData(triangle_with(said))
+    assert writer.Write()
+    np.testing.assert_allclose(reading.read(tmp_path / "a.vtk").points, POINTS * factors)
+
+
 def triangle_with(*texts):
     """Polygonal data with a field array SPACE, if there are texts for it."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
@@ -581,8 +619,8 @@ UNCLEAR = {
     "c.txt": ("Doe Jane\n0 1 2 3\n1 4 5 6\n", "a name for each of 4 columns; got c.txt: 2 names; give"),
     "d.csv": ("x,y,z\n25,828,-183,606,289,912\n", "each of 6 columns; got d.csv: 3 .*; .* decimals with a point"),
     "e.csv": ("25,828,-183,606,289,912\n", "decimals with a point, .* got e.csv: decimal commas"),
-    "f.csv": ("x;y;z\n25,828;-183,606;289,912\n", "decimals with a point, .* got f.csv: decimal commas"),
-    "g.txt": ("25,828 -183,606 289,912\n5,8 -3,6 2,2\n", "decimals with a point, .* got g.txt: decimal commas"),
+    "f.csv": ("x;y;z\n25,828;-183,606;289,912\n", "got f.csv: decimal commas .*; write them with a point$"),
+    "g.txt": ("25,828 -183,606 289,912\n5,8 -3,6 2,2\n", "got g.txt: decimal commas .*; columns of whole numbers need"),
     "h.csv": (
         "x_ref,y_ref,z_ref,x_tip,y_tip,z_tip\n1,2,3,4,5,6\n",
         "one column each for x y z; got h.csv: .* x_ref .* z_tip",
@@ -629,6 +667,17 @@ def test_files_that_say_their_own_axes_are_not_turned_by_those_of_a_mesh(tmp_pat
         reading.read(path, ReadOptions(axes="ras"))
     with pytest.raises(ConfigError, match="axes that are one of auto, lps"):
         reading.read(path, ReadOptions(axes="up"))
+
+
+def test_a_source_of_a_tracker_is_turned_by_the_axes_that_are_named(tmp_path):
+    """What 3D Slicer shows live is RAS: a .tfm of the numbers as they are lies on the other side of the patient."""
+    poses = turned_poses()
+    csv, plus = ndi_csv(tmp_path / "a.csv", poses), tmp_path / "a.igs.mha"
+    igs(plus, poses, ["OK"] * len(poses))
+    for path in (csv, plus):
+        for axes, factors in (("auto", [1, 1, 1]), ("lps", [1, 1, 1]), ("ras", LPS_RAS)):
+            points = reading.read(path, ReadOptions(axes=axes, tip_mm=tuple(TIP))).points
+            np.testing.assert_allclose(points, np.tile(PIVOT * factors, (len(poses), 1)), atol=1e-6)
 
 
 def test_which_packages_bring_readers_is_looked_up_once(tmp_path, monkeypatch):

@@ -287,10 +287,10 @@ class RigidityConfig(Settings):
     """Whether what was measured is one rigid piece (`gapr_core.registration.rigidity`)."""
 
     creeps: float = setting(
-        6.0, "log likelihood ratio from which collected sources show that the bone moves; infinity: never", low=0
+        6.0, "log likelihood ratio above which collected sources show that the bone moves; infinity: never", low=0
     )
     strained: float = setting(
-        3.0, "log likelihood ratio from which a source shows that it is strained; infinity: never", low=0
+        3.0, "log likelihood ratio above which a source shows that it is strained; infinity: never", low=0
     )
     fewest_points: int = setting(200, "inliers without which neither is looked for", low=12, high=1_000_000)
     cells: int = setting(40, "cells over which residuals are averaged", low=12, high=1000)

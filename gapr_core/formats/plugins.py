@@ -6,7 +6,7 @@ Its value is a module with `read(path, options) -> Surface`, in the unit of the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -44,7 +44,7 @@ class Plugin:
             InvalidPointCloudError: what the reader cannot read.
             MethodUnavailableError: a library that the reader needs is not installed.
         """
-        surface = self._module().read(_folder_of(path, self.entry), options)
+        surface = self._module().read(_folder_of(path, self.entry), replace(options, axes="auto"))
         return axes.turned_as_named(surface, path, options.axes, in_lps=False)
 
     def _module(self) -> Any:

@@ -21,7 +21,7 @@ class Format:
 
     Attributes:
         reader: `module:function` under `gapr_core.formats`; takes (path, options) and gives a `Surface`.
-        in_mm: its numbers are mm, whatever unit is named; its axes are its own, and none are named for it.
+        in_mm: its numbers are mm, whatever unit is named; its axes are its own; only a tracker's may be named.
         in_lps: it says its axes by its kind, and comes out in LPS.
         uses: the choices (`CHOICES`) that its reader takes; another one is an error and not ignored.
         unit: of its numbers, where the user names none.

@@ -25,13 +25,17 @@ def distinct(points: Array) -> Array:
 
 
 def without_crowds(points: Array, voxel_mm: float, fewest: int, times: float) -> Array:
-    """Points (N, 3) of which no voxel holds more than `fewest`, nor than so many times the typical voxel: the first."""
+    """Points (N, 3) of which no voxel holds more than `fewest`, nor than so many times the typical voxel.
+
+    Which of a voxel's points stay is drawn from a fixed seed, so that their mean is theirs whatever order they came in.
+    """
     voxel = _voxels(points, *bounds(points), voxel_mm)
     counts = np.bincount(voxel)
     most = max(fewest, int(times * np.median(counts)))
     if counts.max() <= most:
         return points
-    order = np.argsort(voxel, kind="stable")
+    shuffled = np.random.default_rng(0).permutation(len(points))
+    order = shuffled[np.argsort(voxel[shuffled], kind="stable")]
     place = np.arange(len(points)) - np.repeat(np.cumsum(counts) - counts, counts)
     return np.asarray(points[np.sort(order[place < most])])
 

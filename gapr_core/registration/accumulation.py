@@ -176,14 +176,14 @@ class Accumulator:
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
         found = rigidity.of_creep(refine_fully(T, points, seen, self.config.refinement), order[some], limits)
-        if found.log_ratio < limits.creeps:
+        if found.log_ratio <= limits.creeps:
             return result
         self.reset()
         self._kept = kept[-(len(kept) // 3) :]
         return _refused(
             result,
-            f"the bone moves against the frame of the sources, by some {found.size_mm:.1f} mm from the first to the "
-            "last: only the last are kept; look at what is fixed to the bone",
+            "the bone moves against the frame of the sources while they are collected: only the last are kept; "
+            "look at what is fixed to the bone",
         )
 
     def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:

@@ -44,7 +44,7 @@ class Assessment:
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
         most: no surer than this, in a stream neither: no such source was calibrated.
-        strain_mm: size of the strain that the residuals show (see `rigidity`); 0 where they show none.
+        strain_mm: size of each part of the strain that the residuals show (see `rigidity`); 0 where they show none.
     """
 
     fit: Fit

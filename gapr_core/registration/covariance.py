@@ -184,12 +184,13 @@ def strains(fit: Fit) -> Array:
     """(n, 6) how the residuals of the inliers change by independent strains of the source about their centroid.
 
     A symmetric matrix E moves a point p by E (p - c), and its residual by n . E (p - c). The six are orthogonal, and
-    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid.
+    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. Of p the foot is taken: on
+    a flat piece, what p is off it by would go with the residual, and look like a strain across the piece.
     """
     inlier = fit.weights > 0.0
     if not inlier.any():
         return np.zeros((0, 6))
-    away, normals = fit.moved[inlier] - fit.moved[inlier].mean(axis=0), fit.gradients[inlier]
+    away, normals = fit.feet[inlier] - fit.feet[inlier].mean(axis=0), fit.gradients[inlier]
     size_mm = max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
     products = np.einsum("ni,nj->nij", normals, away / size_mm)
     i, j = np.triu_indices(3)

@@ -36,7 +36,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         log_ratio: log likelihood of their best size over that of none; 0 where none is best.
-        size_mm: root mean square of their size under the residuals, all `SIZES_MM` alike before.
+        size_mm: of each of the six, root mean square under the residuals, all `SIZES_MM` alike before.
     """
 
     log_ratio: float
@@ -47,7 +47,7 @@ NOTHING = Evidence(0.0, 0.0)
 
 
 def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evidence:
-    """Evidence that the bone moved steadily while the points were collected, and how far from first to last.
+    """Evidence that the bone moved steadily while the points were collected; of the motion from the first to the last.
 
     Args:
         fit: the pose that all points have in common.
@@ -82,7 +82,7 @@ def allowing_for_strain(assessment: Assessment, config: RegistrarConfig) -> Asse
     """The same where the residuals show no strain; else with what it adds to the covariance, and its size."""
     a = assessment
     found = of_strain(a.fit.rests_on, config.rigidity)
-    if found.log_ratio < config.rigidity.strained:
+    if found.log_ratio <= config.rigidity.strained:
         return a
     covariance = a.uncertainty.covariance + covariance_of_strain(a.fit, found.size_mm, config.covariance)
     return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), strain_mm=found.size_mm)
@@ -152,12 +152,14 @@ def _log_likelihoods(found: Blocks, V: Array) -> Array:
     columns = np.column_stack([found.free, found.more, found.residuals])
     white = solve_triangular(root, columns, lower=True, check_finite=False)
     count = found.free.shape[1]
-    Q, R = np.linalg.qr(white[:, :count])
+    Q, singular, _ = np.linalg.svd(white[:, :count], full_matrices=False)
+    shows = singular > 1e-9 * singular[0]  # on a plane, a motion along it does not
+    Q, singular = Q[:, shows], singular[shows]
     left = white[:, count:] - Q @ (Q.T @ white[:, count:])
     more, residuals = left[:, :-1], left[:, -1]
     information, axes = np.linalg.eigh(more.T @ more)
     score = axes.T @ (more.T @ residuals)
     variances = SIZES_MM[:, None] ** 2
     gain = 1.0 + variances * np.maximum(information, 0.0)
-    alone = -0.5 * residuals @ residuals - np.log(np.diag(root)).sum() - np.log(np.abs(np.diag(R))).sum()
+    alone = -0.5 * residuals @ residuals - np.log(np.diag(root)).sum() - np.log(singular).sum()
     return np.asarray(alone + 0.5 * (variances * score**2 / gain - np.log(gain)).sum(axis=1))

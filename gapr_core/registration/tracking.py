@@ -37,7 +37,7 @@ class Last(NamedTuple):
         T_target_source: (4, 4) its pose, mm.
         points: (N, 3) its points, mm, source frame.
         agreed: it continued the one before it.
-        said: the probability that its answer had.
+        said: the probability that it had, before the limits.
     """
 
     T_target_source: Array
@@ -127,7 +127,7 @@ class Tracker:
     def _forget_track(self) -> None:
         self._has_track = False  # there are poses to follow
         self._since_full = 0  # sources since the last full registration
-        self._is_sure = self._was_sure = False  # this source is; the one before it was
+        self._is_sure = self._was_sure = False  # this source is, as answered; the one before was
         self._last: Last | None = None  # the last source that no rule refused
         self._follower: Follower | None = None  # of the last source, where that was sure
 

@@ -38,6 +38,7 @@ WORDS = {
     "beyond_bias": "limit: near points err alike by more than the smooth error of the sensor",
     "rough": "limit: near points of a camera's cloud err alike",
     "uncertain": "limit: the covariance leaves the pose loose",
+    "strained": "limit: the source is longer, wider or slanted against the bone",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits
 

@@ -105,6 +105,8 @@ def _decided(config: RegistrarConfig, parameters: NodeParameters) -> dict[tuple[
     }
     if parameters.standoff:
         decided["sensor.standoff_mm", "standoff"] = config.sensor.standoff_mm
+    if parameters.viewpoint == "none":
+        decided["clutter.infer_viewpoint", "viewpoint"] = config.clutter.infer_viewpoint
     if parameters.model_error >= 0.0:
         decided["covariance.model_mm", "model_error"] = config.covariance.model_mm
     return decided

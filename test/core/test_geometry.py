@@ -46,11 +46,25 @@ def test_no_voxel_keeps_more_than_so_many_points_or_times_the_typical_ones():
     crowd = apart[4] + rng.uniform(0.0, 0.9, (20, 3))
     points = np.vstack([apart, crowd])
     kept = sampling.without_crowds(points, 1.0, 4, 2.0)
-    np.testing.assert_array_equal(kept, np.vstack([apart, crowd[:3]]))  # the first four of the voxel, in their order
+    np.testing.assert_array_equal(np.setdiff1d(apart[:, 0], apart[4, 0]), np.setdiff1d(kept[:, 0], [*crowd[:, 0], 8.0]))
+    places = [np.flatnonzero((points == point).all(axis=1))[0] for point in kept]
+    assert np.all(np.diff(places) > 0), "in their order"
+    assert sum(place == 4 or place >= 30 for place in places) == 4 and len(kept) == 29 + 4
     assert len(sampling.without_crowds(points, 1.0, 4, 9.0)) == 30 + 8
     assert sampling.without_crowds(points, 1.0, 21, 2.0) is points
     dense = np.repeat(apart, 10, axis=0)
     assert sampling.without_crowds(dense, 1.0, 4, 2.0) is dense, "all are as many"
+
+
+def test_what_stays_of_crowds_lies_where_they_do_though_points_come_sorted():
+    """The first of sorted points would be those of low x, and a bone that is held by them lies aside."""
+    apart = 3.0 * np.stack(np.meshgrid(*[np.arange(10.0)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    crowds = (apart[:30, None] + np.random.default_rng(0).uniform(0.05, 0.95, (30, 40, 3))).reshape(-1, 3)
+    points = sampling.distinct(np.vstack([apart, crowds]))
+    kept = sampling.without_crowds(points, 1.0, 5, 5.0)
+    assert len(kept) == 100 - 30 + 30 * 5
+    aside = (kept[(kept % 3.0 > 0.0).any(axis=1)] % 3.0).mean(axis=0) - 0.5
+    assert np.abs(aside).max() < 4 * 0.26 / np.sqrt(140)
 
 
 def test_thinning_takes_the_finest_grid_that_its_bisection_finds():

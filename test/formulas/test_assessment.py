@@ -192,7 +192,7 @@ def test_a_fit_is_assessed_by_its_covariance_and_features(plane, rule, monkeypat
     monkeypatch.setattr(assessments.covariance, "estimate", lambda *words: seen.append(words) or a.uncertainty)
     monkeypatch.setattr(assessments, "measure", lambda *words: seen.append(words) or a.features)
     config = RegistrarConfig()
-    found = assessments.assess(a.fit, a.candidates, a.source, plane, calibrated(0.8), config)
+    found = assessments.assess_fit(a.fit, a.candidates, a.source, plane, calibrated(0.8), config)
     assert seen == [
         (a.fit, config.covariance, config.sensor, a.source.around),
         (a.fit, a.candidates, a.uncertainty, a.source, plane, config),

@@ -1,13 +1,17 @@
 """The evidence of a motion or a strain: against dense restricted likelihoods, and what it is found for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from gapr_core.config import RigidityConfig
+from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
 from gapr_core.registration import rigidity
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.rigidity import (
     BIASES_MM,
@@ -163,6 +167,30 @@ def test_few_points_or_one_source_say_nothing(seen):
     fit = fit_of(points, normals, noise(200) + 0.2 * points * [0, 0, 1])
     assert of_strain(fit, CONFIG).log_ratio > 3.0
     assert of_creep(fit, np.zeros(200, dtype=np.int64), CONFIG) == rigidity.NOTHING
+
+
+@pytest.mark.parametrize("lifts", [[0.0, 0.0, 1.0], [0.0, 0.03, 1.0]])
+def test_a_plane_of_which_some_motions_change_nothing_is_judged_by_the_others(lifts):
+    points = np.random.default_rng(0).uniform(-20.0, 20.0, (400, 3)) * [1, 1, 0]
+    fit = fit_of(points, np.tile([0.0, 0.0, 1.0], (400, 1)), noise(400) + (points @ lifts)[:, None] * [0, 0, 1])
+    found = of_strain(fit, CONFIG)
+    assert found.log_ratio == pytest.approx(0.0, abs=1e-6) and np.isfinite(found.size_mm)
+    order = np.arange(400) // 40
+    falling = replace(fit, signed_mm=fit.signed_mm + 0.4 * order)
+    assert of_creep(falling, order, CONFIG).log_ratio > CONFIG.creeps > of_creep(fit, order, CONFIG).log_ratio
+
+
+def test_infinity_finds_no_strain_and_zero_each_that_is_likelier_than_none(seen):
+    points, normals = seen(3000)
+    strained, rigid = (fit_of(points, normals, noise(3000) + off) for off in (0.04 * points * [0, 0, 1], 0.0))
+    for fit, limit, is_found in ((strained, np.inf, False), (strained, 0.0, True), (rigid, 0.0, False)):
+        uncertainty = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0, np.zeros(3), np.zeros(3))
+        a = Assessment(fit, None, uncertainty, {}, 0.9, None, None, None)
+        config = RegistrarConfig(rigidity=RigidityConfig(strained=limit))
+        found = rigidity.allowing_for_strain(a, config)
+        assert (found is not a) is is_found, limit
+        if is_found:
+            assert found.strain_mm > 0.0 and np.linalg.eigvalsh(found.uncertainty.covariance - np.eye(6))[-1] > 0.0
 
 
 def test_points_without_weight_say_nothing(seen):

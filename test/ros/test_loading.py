@@ -112,6 +112,7 @@ def named_in(config):
         ("min_confidence: 0.5", {"min_confidence": 0.1}, "min_confidence"),
         ("guide: false", {"guide": True}, "guide"),
         ("sensor: {kind: unknown}", {"sensor": "pointer"}, "sensor"),
+        ("clutter: {infer_viewpoint: true}", {"viewpoint": "none"}, "viewpoint"),
     ],
 )
 def test_what_a_file_says_counts_where_it_is_the_default_too(tmp_path, text, given, parameter):

@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gapr_core import clouds
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import markups, plugins, reading, tracker
 from gapr_core.formats.options import ReadOptions
+from gapr_core.surface import Surface
 
 POINTS = np.array([[10.0, 20.0, 30.0], [-40.0, 5.0, 60.0], [7.0, -8.0, 90.0]])
 LPS_RAS = [-1.0, -1.0, 1.0]
@@ -686,6 +688,16 @@ def test_which_packages_bring_readers_is_looked_up_once(tmp_path, monkeypatch):
     clouds.load(tmp_path / "a.xyz", units="mm")
     monkeypatch.setattr(plugins, "entry_points", pytest.fail)
     clouds.load(tmp_path / "a.xyz", units="mm")
+
+
+def test_a_reader_of_another_package_is_not_asked_for_axes_since_they_are_turned_once(tmp_path, monkeypatch):
+    (tmp_path / "a.made").touch()
+    asked = []
+    reader = SimpleNamespace(read=lambda _, options: asked.append(options.axes) or Surface(POINTS), UNIT="mm")
+    monkeypatch.setattr(plugins, "_entries", lambda: (SimpleNamespace(name="made", value="made", load=lambda: reader),))
+    points = reading.read(tmp_path / "a.made", ReadOptions(axes="ras")).points
+    np.testing.assert_allclose(points, POINTS * LPS_RAS)
+    assert asked == ["auto"]
 
 
 @pytest.mark.parametrize("gap", [0.033, 2.0])

@@ -326,17 +326,18 @@ def test_what_lies_within_the_least_noise_of_a_perfect_collection_is_on_the_bone
     assert collected._lies_off(source, prepared.points, np.eye(4), prepared) is lies_off
 
 
-def creeping(registrar, target, femur, step_mm, creeps, count=9):
+def creeping(registrar, target, femur, step_mm, creeps, count=9, size=150, tracked=False):
     """So many sources of 150 points all over the upper half, each so much farther along y; the last answer."""
     accumulation = replace(registrar.config.accumulation, most_off=100, off=100.0)
     rigidity = replace(registrar.config.rigidity, creeps=creeps)
     config = replace(registrar.config, accumulation=accumulation, rigidity=rigidity)
-    accumulator = Accumulator(Registrar(config, registrar.proposers, registrar.calibrations), count)
+    method = Registrar(config, registrar.proposers, registrar.calibrations)
+    accumulator = Accumulator(Tracker(method) if tracked else method, count)
     half, answer = np.median(femur.points[:, 2]), None
     for number in range(count):
         rng = np.random.default_rng(number)
-        points = femur.sample(450, rng)[0]
-        points = points[points[:, 2] > half][:150]
+        points = femur.sample(3 * max(size, 10), rng)[0]
+        points = points[points[:, 2] > half][:size]
         source = points + rng.normal(0.0, 0.3, points.shape) + [0.0, step_mm * number, 0.0]
         if number < count - 1:
             accumulator.collect(source)
@@ -358,3 +359,13 @@ def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
     assert result.ok is not is_refused and (result.T_target_source is None) is is_refused
     kept = accumulator.collected
     assert len(kept) == (150 * 3 if is_refused else 150 * count)
+
+
+@pytest.mark.parametrize(("step_mm", "is_refused"), [(0.005, True), (0.0, False)])
+def test_a_bone_that_creeps_under_a_pointer_of_single_points_is_refused_by_a_tracker_too(
+    registrar, target, femur, step_mm, is_refused
+):
+    accumulator, result = creeping(registrar, target, femur, step_mm, 6.0, 600, 1, tracked=True)
+    assert ("the bone moves against the frame of the sources" in result.reason) is is_refused
+    assert result.ok is not is_refused
+    assert len(accumulator.collected) == (200 if is_refused else 600)

@@ -292,7 +292,13 @@ class RigidityConfig(Settings):
     strained: float = setting(
         3.0, "log likelihood ratio above which a source shows that it is strained; infinity: never", low=0
     )
-    fewest_points: int = setting(200, "inliers without which neither is looked for", low=12, high=1_000_000)
+    apart: float = setting(
+        6.0, "log likelihood ratio above which a source shows two halves in two poses; infinity: never", low=0
+    )
+    layered: float = setting(
+        4.0, "log likelihood ratio above which a layer on the bone grows along a source; infinity: never", low=0
+    )
+    fewest_points: int = setting(200, "inliers without which none of these is looked for", low=12, high=1_000_000)
     cells: int = setting(40, "cells over which residuals are averaged", low=12, high=1000)
     groups: int = setting(6, "groups of sources in time, whose residuals are averaged apart", low=2, high=100)
     correlation_mm: float = setting(

@@ -44,7 +44,7 @@ class Assessment:
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
         most: no surer than this, in a stream neither: no such source was calibrated.
-        strain_mm: size of each part of the strain that the residuals show (see `rigidity`); 0 where they show none.
+        deformed: sizes, mm, of what the residuals show besides one rigid piece of bone (see `rigidity`), by name.
     """
 
     fit: Fit
@@ -64,7 +64,7 @@ class Assessment:
     factor95: float = 1.0
     independent_points: float = RulesConfig.independent_points
     most: float = 1.0
-    strain_mm: float = 0.0
+    deformed: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def centre_mm(self) -> Array:

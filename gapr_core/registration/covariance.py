@@ -102,11 +102,11 @@ def estimate(
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm, turn, shift)
 
 
-def covariance_of_strain(fit: Fit, size_mm: float, config: CovarianceConfig) -> Array:
-    """(6, 6) what `strains` of this size add to the covariance of a fit."""
+def covariance_of(fit: Fit, errors: Array, config: CovarianceConfig) -> Array:
+    """(6, 6) what independent `errors` (n, k) of the inliers of what the fit rests on add to its covariance, mm."""
     rests = fit.rests_on
     spanned = fields(rests, config.correlation_mm, config.centres)
-    moved = size_mm * gain_of(rests, spanned, rests.sigma_mm)[0] @ strains(rests)
+    moved = gain_of(rests, spanned, rests.sigma_mm)[0] @ errors
     return _about_middle(fit, moved @ moved.T)
 
 

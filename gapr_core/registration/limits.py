@@ -128,7 +128,17 @@ def is_rough(assessment: Assessment, config: RegistrarConfig) -> bool:
 
 def is_strained(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True where the residuals show that the source is strained (see `rigidity`)."""
-    return assessment.strain_mm > 0.0
+    return "strained" in assessment.deformed
+
+
+def is_apart(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the residuals show two halves of the source in two poses (see `rigidity`)."""
+    return "apart" in assessment.deformed
+
+
+def is_layered(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the residuals show a layer on the bone that grows along it (see `rigidity`)."""
+    return "layered" in assessment.deformed
 
 
 def residual_mm(assessment: Assessment) -> float:
@@ -192,6 +202,17 @@ LIMITS = (
         is_strained,
         "the source is longer, wider or slanted against the bone; check that nothing moved while it was measured, and "
         "the spacing of the slices of both",
+    ),
+    Limit(
+        "apart",
+        is_apart,
+        "two halves of the source lie in two poses; check that nothing moved while it was measured, that parts of it "
+        "were put together rightly, and that the bone is whole",
+    ),
+    Limit(
+        "layered",
+        is_layered,
+        "the distance from the bone changes along the source, as under tissue; bare the bone, or correct the sensor",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),

@@ -26,7 +26,7 @@ from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.refinement import refine_fully, rest_on_whole
-from gapr_core.registration.rigidity import allowing_for_strain
+from gapr_core.registration.rigidity import allowing_for_deformation
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
@@ -219,7 +219,7 @@ class Registrar:
             assessment = bias_corrected(assessment, config)
             clock.lap("refine")
         corrected = assessment.corrected(self.precision)
-        return allowing_for_strain(corrected, config) if corrected.is_sure(config.worth_checking) else corrected
+        return allowing_for_deformation(corrected, config) if corrected.is_sure(config.worth_checking) else corrected
 
     def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough

@@ -1,10 +1,12 @@
-"""Is what was measured one rigid piece? How much the residuals speak for a steady motion, or for a strain.
+"""Is what was measured one rigid piece of bone? How much the residuals speak for a motion, a strain, halves or a layer.
 
-A bone that creeps while its points are collected, slices that lie too far apart and a scan that drifts leave a pattern:
-the pose itself changes with time, or the source is strained. Six further unknowns describe either. Are they there? The
-restricted likelihood of the best size of them, over that of none, in which the pose is integrated out (Patterson and
-Thompson 1971). A smooth bias of any size and an error that neighbours share are allowed for in both, as they look
-similar. What is compared are averages over blocks of neighbours: a single point's normal errs with its residual.
+A bone that creeps while its points are collected, slices that lie too far apart, a scan that drifts or is stitched from
+two, a bone that is bent or broken, and tissue that grows thicker leave a pattern: the pose itself changes with time or
+from one half to the other, the source is strained, or its distance from the bone changes along it. A few further
+unknowns describe each. Are they there? The restricted likelihood of the best
+size of them, over that of none, in which the pose is integrated out (Patterson and Thompson 1971). A smooth bias of any
+size and an error that neighbours share are allowed for in both, as they look similar. What is compared are averages
+over blocks of neighbours: a single point's normal errs with its residual.
 """
 
 from __future__ import annotations
@@ -18,10 +20,10 @@ from scipy.linalg import solve_triangular
 from scipy.spatial import cKDTree
 
 from gapr_core.config import RegistrarConfig, RigidityConfig
-from gapr_core.geometry import sampling
+from gapr_core.geometry import extent, sampling
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import ROUNDED, smooth_correlation
-from gapr_core.registration.covariance import covariance_of_strain, strains
+from gapr_core.registration.covariance import covariance_of, strains
 from gapr_core.registration.refinement import Fit
 
 Array = NDArray[np.float64]
@@ -36,7 +38,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         log_ratio: log likelihood of their best size over that of none; 0 where none is best.
-        size_mm: of each of the six, root mean square under the residuals, all `SIZES_MM` alike before.
+        size_mm: of each of them, root mean square under the residuals, all `SIZES_MM` alike before.
     """
 
     log_ratio: float
@@ -44,6 +46,18 @@ class Evidence(NamedTuple):
 
 
 NOTHING = Evidence(0.0, 0.0)
+
+
+class Deformation(NamedTuple):
+    """What a source may have suffered against the bone.
+
+    Attributes:
+        evidence: what the residuals say of it.
+        changes: (n, k) how the residuals of the inliers change by each of its unknowns, by 1 mm.
+    """
+
+    evidence: Evidence
+    changes: Array
 
 
 def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evidence:
@@ -59,33 +73,78 @@ def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evid
         return NOTHING
     time = ((order - order.min()) / (order.max() - order.min()))[inlier]
     group = np.minimum(time * config.groups, config.groups - 1).astype(np.int64)
-    motions, away = fit.jacobian[inlier].copy(), fit.moved[inlier] - fit.moved[inlier].mean(axis=0)
-    motions[:, 3:] /= max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
-    return evidence(blocks(fit, fit.jacobian[inlier], (time[:, None] - 0.5) * motions, group, config), config)
+    moved = (time[:, None] - 0.5) * motions(fit)
+    return evidence(blocks(fit, fit.jacobian[inlier], [moved], group, config), config)[0]
 
 
-def of_strain(fit: Fit, config: RigidityConfig) -> Evidence:
-    """Evidence that the source is longer, wider or slanted against the bone (see `covariance.strains`).
+def of_deformations(fit: Fit, config: RigidityConfig) -> list[Deformation]:
+    """What the residuals say of a strain (see `covariance.strains`), of three pairs of `halves`, and of `a_layer`.
 
-    A stand-off is no strain: it is taken out with the pose. Another size is one, whatever the sensor: what its scale
-    may excuse may as well be another subject's bone.
+    Of few points nothing is said. A stand-off is no deformation: it is taken out with the pose. Another size is a
+    strain, whatever the sensor: what its scale may excuse may as well be another subject's bone.
     """
     inlier = fit.weights > 0.0
     count = np.count_nonzero(inlier)
     if count < config.fewest_points:
-        return NOTHING
+        return []
+    changes = [strains(fit), *halves(fit), a_layer(fit)]
     free, at_once = np.column_stack([fit.jacobian[inlier], np.ones(count)]), np.zeros(count, dtype=np.int64)
-    return evidence(blocks(fit, free, strains(fit), at_once, config), config)
+    found = evidence(blocks(fit, free, changes, at_once, config), config)
+    return list(map(Deformation, found, changes))
 
 
-def allowing_for_strain(assessment: Assessment, config: RegistrarConfig) -> Assessment:
-    """The same where the residuals show no strain; else with what it adds to the covariance, and its size."""
-    a = assessment
-    found = of_strain(a.fit.rests_on, config.rigidity)
-    if found.log_ratio <= config.rigidity.strained:
+def motions(fit: Fit) -> Array:
+    """(n, 6) how the residuals of the inliers change by a motion of 1 mm, a rotation about their middle included."""
+    inlier = fit.weights > 0.0
+    found, away = fit.jacobian[inlier].copy(), fit.moved[inlier] - fit.moved[inlier].mean(axis=0)
+    found[:, 3:] /= max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
+    return found
+
+
+def halves(fit: Fit) -> list[Array]:
+    """(n, 6) for each principal axis of the inliers: the same by a motion of one half against the other."""
+    feet = fit.feet[fit.weights > 0.0]
+    along = feet @ extent.principal(feet).axes.T
+    above = np.where(along > np.median(along, axis=0), 0.5, -0.5)
+    return [side[:, None] * motions(fit) for side in above.T]
+
+
+def a_layer(fit: Fit) -> Array:
+    """(n, 4) how the residuals of the inliers change by a layer on the bone: one column per axis that it grows along.
+
+    The last is its mean, which no residual shows: of a layer that grows from nothing, evenly, root 3 times its standard
+    deviation.
+    """
+    feet = fit.feet[fit.weights > 0.0]
+    away = feet - feet.mean(axis=0)
+    size_mm = max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
+    return np.column_stack([away / size_mm, np.full(len(feet), np.sqrt(3.0))])
+
+
+def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) -> Assessment:
+    """The same where the residuals show one rigid piece of bone; else with what the deformations add to the covariance.
+
+    More than one may: a bent source is strained, too.
+    """
+    a, limits = assessment, config.rigidity
+    found = of_deformations(a.fit.rests_on, limits)
+    if not found:
         return a
-    covariance = a.uncertainty.covariance + covariance_of_strain(a.fit, found.size_mm, config.covariance)
-    return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), strain_mm=found.size_mm)
+    strain, *halves_apart, layer = found
+    apart = max(halves_apart, key=lambda each: each.evidence.log_ratio)
+    named = (
+        ("strained", strain, limits.strained),
+        ("apart", apart, limits.apart),
+        ("layered", layer, limits.layered),
+    )
+    deformed, covariance = {}, a.uncertainty.covariance
+    for name, each, limit in named:
+        if each.evidence.log_ratio > limit:
+            deformed[name] = each.evidence.size_mm
+            covariance = covariance + covariance_of(a.fit, each.evidence.size_mm * each.changes, config.covariance)
+    if not deformed:
+        return a
+    return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +154,7 @@ class Blocks:
     Attributes:
         residuals: (n,) mm.
         free: (n, j) how they change by what is not in question: a motion of the source, at least.
-        more: (n, k) how they change by the further unknowns, of 1 mm each.
+        more: (n, m, k) how they change by the further unknowns, of 1 mm each: m alternatives of k at most, others 0.
         variances: (n,) what the noise of a point leaves in them, mm^2.
         feet: (n, 3) their places, mm.
     """
@@ -107,13 +166,13 @@ class Blocks:
     feet: Array
 
 
-def blocks(fit: Fit, free: Array, more: Array, group: NDArray[np.int64], config: RigidityConfig) -> Blocks:
+def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], config: RigidityConfig) -> Blocks:
     """Averages of the inliers (n) of a fit, weighted as they count: over cells around points that are spread evenly.
 
     Args:
         fit: the residuals.
         free: (n, j) derivatives of the inliers' residuals by what is not in question.
-        more: (n, k) the same by the further unknowns.
+        more: m times (n, k), the same by the further unknowns; k may differ.
         group: (n,) number of a group; a block holds points of one.
         config: how many cells.
     """
@@ -122,20 +181,28 @@ def blocks(fit: Fit, free: Array, more: Array, group: NDArray[np.int64], config:
     centres = feet[sampling.thin(feet.round(ROUNDED), min(config.cells, len(feet)))]
     cell = cKDTree(centres).query(feet)[1]
     block = np.unique(group * len(centres) + cell, return_inverse=True)[1].reshape(-1)
-    columns = np.column_stack([fit.signed_mm[inlier], feet, free, more])
+    most = max(each.shape[1] for each in more)
+    alternatives = [np.pad(each, ((0, 0), (0, most - each.shape[1]))) for each in more]
+    columns = np.column_stack([fit.signed_mm[inlier], feet, free, *alternatives])
     total = np.bincount(block, weights)
     means = np.stack([np.bincount(block, weights * column) for column in columns.T], axis=1) / total[:, None]
-    residuals, places, free, more = np.split(means, np.cumsum([1, 3, free.shape[1]]), axis=1)
-    return Blocks(residuals[:, 0], free, more, fit.sigma_mm**2 / total, places)
+    residuals, places, free, changes = np.split(means, np.cumsum([1, 3, free.shape[1]]), axis=1)
+    changes = changes.reshape(len(means), len(more), -1)
+    return Blocks(residuals[:, 0], free, changes, fit.sigma_mm**2 / total, places)
 
 
-def evidence(found: Blocks, config: RigidityConfig) -> Evidence:
-    """What the blocks say of the further unknowns, whatever the bias and what the points of a block share."""
+def evidence(found: Blocks, config: RigidityConfig) -> list[Evidence]:
+    """What the blocks say of each of the m alternatives, whatever the bias and what the points of a block share."""
     correlation = smooth_correlation(found.feet, found.feet, config.correlation_mm)
     covariances = (
         np.diag(found.variances + shared**2) + bias**2 * correlation for bias in BIASES_MM for shared in SHARED_MM
     )
-    log_likelihood = np.array([_log_likelihoods(found, V) for V in covariances])
+    of_all = np.array([_log_likelihoods(found, V) for V in covariances])
+    return [_of_sizes(of_all[:, i]) for i in range(of_all.shape[1])]
+
+
+def _of_sizes(log_likelihood: Array) -> Evidence:
+    """The evidence by (errors, K) log likelihoods of each of `SIZES_MM`."""
     best = log_likelihood.max(axis=0)
     posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
     size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
@@ -143,23 +210,23 @@ def evidence(found: Blocks, config: RigidityConfig) -> Evidence:
 
 
 def _log_likelihoods(found: Blocks, V: Array) -> Array:
-    """(K,) restricted log likelihood of each of `SIZES_MM`, of residuals whose other errors have the covariance V.
+    """(m, K) restricted log likelihood of each of `SIZES_MM`, of residuals whose other errors have the covariance V.
 
     With what is not in question projected out, the further unknowns have the information M and the score s: in the
     axes of M, y^T V^-1 y falls by sum h^2 s_i^2 / (1 + h^2 m_i), and log det grows by sum log(1 + h^2 m_i).
     """
     root = np.linalg.cholesky(V)
-    columns = np.column_stack([found.free, found.more, found.residuals])
+    columns = np.column_stack([found.free, found.more.reshape(len(V), -1), found.residuals])
     white = solve_triangular(root, columns, lower=True, check_finite=False)
     count = found.free.shape[1]
     Q, singular, _ = np.linalg.svd(white[:, :count], full_matrices=False)
     shows = singular > 1e-9 * singular[0]  # on a plane, a motion along it does not
     Q, singular = Q[:, shows], singular[shows]
     left = white[:, count:] - Q @ (Q.T @ white[:, count:])
-    more, residuals = left[:, :-1], left[:, -1]
-    information, axes = np.linalg.eigh(more.T @ more)
-    score = axes.T @ (more.T @ residuals)
+    more, residuals = left[:, :-1].reshape(found.more.shape).transpose(1, 0, 2), left[:, -1]
+    information, axes = np.linalg.eigh(more.transpose(0, 2, 1) @ more)
+    score = np.einsum("mki,mnk,n->mi", axes, more, residuals)
     variances = SIZES_MM[:, None] ** 2
-    gain = 1.0 + variances * np.maximum(information, 0.0)
+    gain = 1.0 + variances * np.maximum(information, 0.0)[:, None]
     alone = -0.5 * residuals @ residuals - np.log(np.diag(root)).sum() - np.log(singular).sum()
-    return np.asarray(alone + 0.5 * (variances * score**2 / gain - np.log(gain)).sum(axis=1))
+    return np.asarray(alone + 0.5 * (variances * score[:, None] ** 2 / gain - np.log(gain)).sum(axis=2))

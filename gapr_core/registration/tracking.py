@@ -20,6 +20,7 @@ from gapr_core.registration.features import STREAM
 from gapr_core.registration.following import FollowedPose, Follower
 from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.registrar import Registrar, check_call
+from gapr_core.registration.repeats import is_sent_again
 from gapr_core.registration.stream_misfit import NoMisfit, StreamMisfit
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
@@ -228,7 +229,7 @@ class Tracker:
         if assessment.inferred_viewpoint is not None:
             assessment = assessment.capped(self.registrar.config.limits.most)
         a, last = assessment, self._last
-        again = last is not None and np.array_equal(a.source.points, last.points)
+        again = last is not None and is_sent_again(a.source.points, last.points)
         agrees = self._agrees(a) and (last is None or last.agreed or not again)
         one_by_one = replace(a, probability=self._evidence.add(a.probability, agrees, again))
         most = min(float(np.sqrt(a.probability)) if agrees else a.probability, a.most)

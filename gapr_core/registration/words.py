@@ -39,6 +39,8 @@ WORDS = {
     "rough": "limit: near points of a camera's cloud err alike",
     "uncertain": "limit: the covariance leaves the pose loose",
     "strained": "limit: the source is longer, wider or slanted against the bone",
+    "layered": "limit: the distance from the bone changes along the source",
+    "apart": "limit: two halves of the source lie in two poses",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits
 

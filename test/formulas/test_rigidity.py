@@ -11,22 +11,31 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
 from gapr_core.registration import rigidity
 from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.covariance import PoseUncertainty
+from gapr_core.registration.covariance import PoseUncertainty, covariance_of
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.rigidity import (
     BIASES_MM,
     SHARED_MM,
     SIZES_MM,
     Blocks,
+    Deformation,
     blocks,
     evidence,
     of_creep,
-    of_strain,
+    of_deformations,
 )
 
 CONFIG = RigidityConfig()
 SMALL = RigidityConfig(cells=12, groups=2)
 NOISE_MM = 0.4
+
+
+def of_strain(fit, config):
+    return (of_deformations(fit, config) or [Deformation(rigidity.NOTHING, None)])[0].evidence
+
+
+def of_halves(fit, config):
+    return [each.evidence for each in of_deformations(fit, config)[1:4]]
 
 
 def fit_of(points, normals, errors, weights=None):
@@ -60,14 +69,14 @@ def some():
     """Blocks of random numbers."""
     rng = np.random.default_rng(4)
     n = 16
-    return Blocks(rng.normal(size=n), rng.normal(size=(n, 6)), rng.normal(size=(n, 3)), rng.uniform(0.1, 0.5, n),
+    return Blocks(rng.normal(size=n), rng.normal(size=(n, 6)), rng.normal(size=(n, 2, 3)), rng.uniform(0.1, 0.5, n),
                   rng.uniform(0.0, 40.0, (n, 3)))  # fmt: skip
 
 
-def restricted(found, bias_mm, shared_mm, size_mm, correlation_mm):
+def restricted(found, more, bias_mm, shared_mm, size_mm, correlation_mm):
     """log likelihood of all contrasts that no `free` changes: what restricted likelihood is by definition."""
     apart = np.linalg.norm(found.feet[:, None] - found.feet, axis=2)
-    V = np.diag(found.variances) + shared_mm**2 * np.eye(len(apart)) + size_mm**2 * found.more @ found.more.T
+    V = np.diag(found.variances) + shared_mm**2 * np.eye(len(apart)) + size_mm**2 * more @ more.T
     V += bias_mm**2 * np.exp(-0.5 * (apart / correlation_mm) ** 2)
     contrasts = np.linalg.svd(found.free)[0][:, found.free.shape[1] :]
     return multivariate_normal(None, contrasts.T @ V @ contrasts).logpdf(contrasts.T @ found.residuals)
@@ -75,13 +84,14 @@ def restricted(found, bias_mm, shared_mm, size_mm, correlation_mm):
 
 def test_the_evidence_is_a_ratio_of_restricted_likelihoods_and_the_size_their_mean(some):
     config = RigidityConfig(correlation_mm=15.0)
-    dense = np.array([[[restricted(some, b, c, h, 15.0) for h in SIZES_MM] for c in SHARED_MM] for b in BIASES_MM])
-    found = evidence(some, config)
-    best = dense.max(axis=(0, 1))
-    assert found.log_ratio == pytest.approx(best.max() - best[0], abs=1e-9)
-    posterior = np.exp(dense - dense.max()).sum(axis=(0, 1))
-    assert found.size_mm == pytest.approx(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()), rel=1e-9)
-    assert found.log_ratio >= 0.0
+    for i, found in enumerate(evidence(some, config)):
+        dense = np.array([[[restricted(some, some.more[:, i], b, c, h, 15.0) for h in SIZES_MM] for c in SHARED_MM]
+                          for b in BIASES_MM])  # fmt: skip
+        best = dense.max(axis=(0, 1))
+        assert found.log_ratio == pytest.approx(best.max() - best[0], abs=1e-9)
+        posterior = np.exp(dense - dense.max()).sum(axis=(0, 1))
+        assert found.size_mm == pytest.approx(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()), rel=1e-9)
+        assert found.log_ratio >= 0.0
 
 
 def test_blocks_are_weighted_means_of_neighbours_of_one_group(seen):
@@ -89,8 +99,8 @@ def test_blocks_are_weighted_means_of_neighbours_of_one_group(seen):
     weights = np.random.default_rng(3).uniform(0.0, 1.0, 400)
     weights[:40] = 0.0
     fit, inlier = fit_of(points, normals, noise(400), weights), weights > 0.0
-    more, group = np.random.default_rng(5).normal(size=(360, 2)), np.arange(360) % 2
-    found = blocks(fit, fit.jacobian[inlier], more, group, SMALL)
+    more, group = np.random.default_rng(5).normal(size=(2, 360, 3)), np.arange(360) % 2
+    found = blocks(fit, fit.jacobian[inlier], list(more), group, SMALL)
     count = len(found.residuals)
     assert SMALL.cells < count <= 2 * SMALL.cells
     total = fit.sigma_mm**2 / found.variances
@@ -98,11 +108,12 @@ def test_blocks_are_weighted_means_of_neighbours_of_one_group(seen):
     for of_all, of_blocks in (
         (fit.signed_mm[inlier, None], found.residuals[:, None]),
         (fit.jacobian[inlier], found.free),
-        (more, found.more),
+        (more[0], found.more[:, 0]),
+        (more[1], found.more[:, 1]),
         (fit.feet[inlier], found.feet),
     ):
         assert total @ of_blocks == pytest.approx(weights[inlier] @ of_all)
-    alone = blocks(fit, fit.jacobian[inlier], group[:, None] * np.ones((360, 1)), group, SMALL)
+    alone = blocks(fit, fit.jacobian[inlier], [group[:, None] * np.ones((360, 1))], group, SMALL)
     assert set(alone.more.ravel()) == {0.0, 1.0}, "no block holds points of two groups"
 
 
@@ -169,6 +180,91 @@ def test_few_points_or_one_source_say_nothing(seen):
     assert of_creep(fit, np.zeros(200, dtype=np.int64), CONFIG) == rigidity.NOTHING
 
 
+def test_halves_move_against_each_other_along_each_principal_axis(seen):
+    points, normals = seen(1000)
+    weights = np.random.default_rng(3).uniform(0.0, 1.0, 1000)
+    weights[:100] = 0.0
+    fit = fit_of(points, normals, noise(1000), weights)
+    moved, (feet, rows) = fit.moved[100:], (fit.feet[100:], fit.jacobian[100:])
+    radius_mm = np.sqrt(((moved - moved.mean(axis=0)) ** 2).sum(axis=1).mean())
+    axes = np.linalg.svd(feet - feet.mean(axis=0), full_matrices=False)[2]
+    for axis, found in zip(axes, rigidity.halves(fit), strict=True):
+        side = np.sign(feet @ axis - np.median(feet @ axis)) / 2.0
+        expected = side[:, None] * rows / ([1.0] * 3 + [radius_mm] * 3)
+        assert np.allclose(found, expected) or np.allclose(found, -expected)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("motion", [[0, 0, 3.0, 0, 0, 0], [2.0, -1.0, 1.0, 0, 0, 0], [0, 0, 0, 0.06, 0.05, 0.0]])
+def test_two_halves_in_two_poses_are_found_and_one_piece_is_not(seen, motion, axis):
+    points, normals = seen(3000)
+    along = points @ np.linalg.svd(points, full_matrices=False)[2][axis]
+    above = along > np.median(along)
+    moved = np.where(above[:, None], se3.apply(se3.exp(np.array(motion), points.mean(axis=0)), points), points)
+    apart, whole = (of_halves(fit_of(points, normals, noise(3000) + off), CONFIG) for off in (moved - points, 0.0))
+    assert np.argmax([each.log_ratio for each in apart]) == axis
+    assert apart[axis].log_ratio > CONFIG.apart > max(each.log_ratio for each in whole) + 3.0
+    assert 0.3 < apart[axis].size_mm < 4.0
+
+
+@pytest.mark.parametrize("name", ["apart", "layered", "strained"])
+def test_each_deformation_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, name):
+    points, normals = seen(3000)
+    along = points @ np.linalg.svd(points, full_matrices=False)[2][0]
+    above = along > np.median(along)
+    off = {
+        "apart": 3.0 * above[:, None] * [0.0, 1.0, 0.0],
+        "layered": 0.1 * along[:, None] * normals,
+        "strained": 0.04 * points * [0, 0, 1],
+    }[name]
+    fit = fit_of(points, normals, noise(3000) + off)
+    a = Assessment(fit, None, PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0, *np.zeros((2, 3))), {}, 0.9, None, None, None)
+    never = RigidityConfig(strained=np.inf, apart=np.inf, layered=np.inf)
+    assert rigidity.allowing_for_deformation(a, RegistrarConfig(rigidity=never)) is a
+    config = RegistrarConfig(rigidity=replace(never, **{name: getattr(CONFIG, name)}))
+    found = rigidity.allowing_for_deformation(a, config)
+    strain, *halves, layer = of_deformations(fit, CONFIG)
+    apart = max(halves, key=lambda each: each.evidence.log_ratio)
+    expected = {"apart": apart, "layered": layer, "strained": strain}[name]
+    assert found.deformed == {name: expected.evidence.size_mm}
+    added = covariance_of(fit, expected.evidence.size_mm * expected.changes, config.covariance)
+    np.testing.assert_allclose(found.uncertainty.covariance, np.eye(6) + added)
+
+
+def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(seen):
+    points, normals = seen(3000)
+    axis = np.linalg.svd(points, full_matrices=False)[2][0]
+    along = points @ axis
+    thick = 4.0 * (along - along.min())[:, None] / np.ptp(along) * normals
+    growing, even = (
+        of_deformations(fit_of(points, normals, noise(3000) + off), CONFIG)[-1] for off in (thick, 2.0 * normals)
+    )
+    assert growing.evidence.log_ratio > CONFIG.layered > 2.0 > even.evidence.log_ratio
+    slope = 4.0 / np.ptp(along) * np.sqrt((points**2).sum(axis=1).mean())
+    assert slope / np.sqrt(3.0) < growing.evidence.size_mm < 1.5 * slope  # one of three has all of it
+
+
+def test_what_a_layer_has_everywhere_is_in_its_covariance_though_no_residual_shows_it(seen):
+    points, normals = seen(500)
+    weights = np.ones(500)
+    weights[:50] = 0.0
+    fit = fit_of(points, normals, noise(500), weights)
+    feet = fit.feet[50:] - fit.feet[50:].mean(axis=0)
+    expected = feet / np.sqrt((feet**2).sum(axis=1).mean())
+    np.testing.assert_allclose(rigidity.a_layer(fit), np.column_stack([expected, np.full(450, 3.0**0.5)]))
+    thickness = np.linspace(0.0, 1.0, 100_001)
+    assert thickness.mean() / thickness.std() == pytest.approx(3.0**0.5, rel=1e-3)
+
+
+def test_alternatives_may_have_fewer_unknowns_than_others(seen):
+    points, normals = seen(400)
+    fit = fit_of(points, normals, noise(400))
+    more, none = np.random.default_rng(5).normal(size=(400, 5)), np.zeros(400, dtype=np.int64)
+    both = evidence(blocks(fit, fit.jacobian, [more, more[:, :2]], none, SMALL), SMALL)
+    alone = evidence(blocks(fit, fit.jacobian, [more[:, :2]], none, SMALL), SMALL)
+    assert both[1] == pytest.approx(alone[0])
+
+
 @pytest.mark.parametrize("lifts", [[0.0, 0.0, 1.0], [0.0, 0.03, 1.0]])
 def test_a_plane_of_which_some_motions_change_nothing_is_judged_by_the_others(lifts):
     points = np.random.default_rng(0).uniform(-20.0, 20.0, (400, 3)) * [1, 1, 0]
@@ -186,11 +282,14 @@ def test_infinity_finds_no_strain_and_zero_each_that_is_likelier_than_none(seen)
     for fit, limit, is_found in ((strained, np.inf, False), (strained, 0.0, True), (rigid, 0.0, False)):
         uncertainty = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0, np.zeros(3), np.zeros(3))
         a = Assessment(fit, None, uncertainty, {}, 0.9, None, None, None)
-        config = RegistrarConfig(rigidity=RigidityConfig(strained=limit))
-        found = rigidity.allowing_for_strain(a, config)
+        config = RegistrarConfig(rigidity=RigidityConfig(strained=limit, apart=np.inf, layered=np.inf))
+        found = rigidity.allowing_for_deformation(a, config)
         assert (found is not a) is is_found, limit
         if is_found:
-            assert found.strain_mm > 0.0 and np.linalg.eigvalsh(found.uncertainty.covariance - np.eye(6))[-1] > 0.0
+            assert (
+                found.deformed["strained"] > 0.0
+                and np.linalg.eigvalsh(found.uncertainty.covariance - np.eye(6))[-1] > 0.0
+            )
 
 
 def test_points_without_weight_say_nothing(seen):
@@ -211,6 +310,6 @@ def test_of_a_motion_its_rotation_counts_by_the_radius_of_the_points(seen):
     fit = fit_of(points, normals, noise(2400))
     motions = fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
     group = np.minimum(order / 11.0 * CONFIG.groups, CONFIG.groups - 1).astype(int)
-    same = evidence(blocks(fit, fit.jacobian, time * motions, group, CONFIG), CONFIG)
+    (same,) = evidence(blocks(fit, fit.jacobian, [time * motions], group, CONFIG), CONFIG)
     found = of_creep(fit, order, CONFIG)
     assert found == pytest.approx(same, rel=1e-2, abs=1e-3)

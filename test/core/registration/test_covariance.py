@@ -221,13 +221,14 @@ def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by():
         covariance.sandwich(fit, fields, errors, replace(CONFIG, long_share=0.0, linear_share=share))
         for share in (0.7, 0.0)
     )
-    found = covariance.covariance_of_strain(fit, 0.56, CONFIG)
+    found = covariance.covariance_of(fit, 0.56 * covariance.strains(fit), CONFIG)
     np.testing.assert_allclose(found, strained - rigid, rtol=1e-6, atol=1e-9)
     some = np.arange(300) < 200
     of_some = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.elements, fit.moved))
     drawn = refinement.Fit(fit.T, fit.sigma_mm, *of_some, whole=fit)
     about = drawn.moved.mean(axis=0) - fit.moved.mean(axis=0)
-    np.testing.assert_allclose(covariance.covariance_of_strain(drawn, 0.56, CONFIG), covariance_about(about, found))
+    same = covariance.covariance_of(drawn, 0.56 * covariance.strains(fit), CONFIG)
+    np.testing.assert_allclose(same, covariance_about(about, found))
 
 
 def test_the_noise_of_few_points_is_larger_than_their_residuals_say():

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import LimitsConfig, SensorConfig
+from gapr_core.geometry import se3
 from gapr_core.registration import limits
 from gapr_core.results import Refusal
 
@@ -198,9 +199,39 @@ def test_a_registrar_and_a_tracker_limit_what_few_points_say(registrar, femur, t
 
 def test_a_strained_source_is_of_another_bone_or_of_a_bone_that_moved(made):
     answer = made()
-    assert answer.strain_mm == 0.0 and limits.applied(answer, RegistrarConfig()).probability == SURE
-    found = limits.applied(made(strain_mm=0.6), RegistrarConfig())
+    assert not answer.deformed and limits.applied(answer, RegistrarConfig()).probability == SURE
+    found = limits.applied(made(deformed={"strained": 0.6}), RegistrarConfig())
     assert found.probability == 0.89 and list(found.contributions)[-1] == "strained"
+
+
+def test_a_source_of_two_halves_in_two_poses_is_not_sure(made):
+    found = limits.applied(made(deformed={"apart": 0.6}), RegistrarConfig())
+    assert found.probability == 0.89 and list(found.contributions)[-1] == "apart"
+
+
+def test_a_source_under_a_layer_that_grows_is_not_sure(made):
+    found = limits.applied(made(deformed={"layered": 0.6}), RegistrarConfig())
+    assert found.probability == 0.89 and list(found.contributions)[-1] == "layered"
+
+
+def test_a_registration_of_a_bent_source_says_so_and_widens_its_bound(registrar, target, femur):
+    """Only this limit holds: with it off, the same answer is sure."""
+    points = femur.sample(6000, np.random.default_rng(8))[0]
+    points = points[points[:, 2] > np.quantile(points[:, 2], 0.7)]
+    middle = np.median(points, axis=0)
+    bent = points.copy()
+    above = points[:, 2] > middle[2]
+    bent[above] = se3.apply(se3.exp(np.radians([0, 0, 0, 4.0, 0.0, 0.0]), middle), points[above])
+    rigidity = replace(registrar.config.rigidity, strained=np.inf)
+    asked, unasked = (
+        Registrar(replace(registrar.config, rigidity=each), registrar.proposers, registrar.calibrations)
+        for each in (rigidity, replace(rigidity, apart=np.inf))
+    )
+    good, found, blind = (each.register(x, target) for each, x in ((asked, points), (asked, bent), (unasked, bent)))
+    assert good.ok and "apart" not in good.contributions
+    assert found.ok and found.confidence <= 0.89 and "apart" in found.contributions
+    assert "apart" not in blind.contributions
+    assert found.tre95_mm > 1.2 * blind.tre95_mm
 
 
 def test_a_registration_of_a_strained_source_says_so_and_widens_its_bound(registrar, target, femur):

@@ -17,6 +17,7 @@ from gapr_core.registration.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.memory import Memory
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.repeats import is_sent_again
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
 
@@ -385,15 +386,30 @@ def test_bumps_that_no_frame_shows_alone_show_in_the_stream(registrar, specimen)
 
 
 @pytest.mark.parametrize("jumped", [False, True])
-def test_a_source_that_is_sent_again_is_no_surer(registrar, frames, prepared, jumped):
-    """Or a refusal became a pose by asking again."""
+@pytest.mark.parametrize("jitter_mm", [0.0, 1e-5])
+def test_a_source_that_is_sent_again_is_no_surer(registrar, frames, prepared, jumped, jitter_mm):
+    """Or a refusal became a pose by asking again; also where its points are rounded otherwise, or in another order."""
+    rng = np.random.default_rng(0)
     tracker = Tracker(registrar)
     tracker.register(frames[0].source, prepared)
     source = se3.apply(se3.exp([60.0, 0.0, 0.0, 0.0, 0.0, 0.3]), frames[1].source) if jumped else frames[1].source
     first = tracker.register(source, prepared)
     assert first.ok
     for _ in range(6):
-        assert tracker.register(source, prepared).confidence <= first.confidence + 1e-9
+        again = rng.permutation(source) + rng.normal(0.0, 1.0, source.shape) * jitter_mm
+        assert tracker.register(again, prepared).confidence <= first.confidence + (1e-4 if jitter_mm else 1e-9)
+
+
+def test_a_source_is_sent_again_where_most_of_its_points_are():
+    points = np.random.default_rng(0).normal(0.0, 30.0, (2000, 3))
+    off = np.random.default_rng(1).normal(size=points.shape)
+    off /= np.linalg.norm(off, axis=1, keepdims=True)
+    assert is_sent_again(points[::-1], points) and is_sent_again(points[::3], points)
+    assert is_sent_again(points + 0.9e-3 * off, points) and not is_sent_again(points + 1.1e-3 * off, points)
+    for kept, is_again in ((0.4, False), (0.6, True)):
+        new = np.where(np.random.default_rng(2).uniform(size=(2000, 1)) < kept, points, points + off)
+        assert is_sent_again(new, points) is is_again
+    assert not is_sent_again(points[:0], points) and not is_sent_again(points, points[:0])
 
 
 def test_a_calibration_of_other_answers_is_no_model_of_streams(registrar):

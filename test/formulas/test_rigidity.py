@@ -286,10 +286,8 @@ def test_infinity_finds_no_strain_and_zero_each_that_is_likelier_than_none(seen)
         found = rigidity.allowing_for_deformation(a, config)
         assert (found is not a) is is_found, limit
         if is_found:
-            assert (
-                found.deformed["strained"] > 0.0
-                and np.linalg.eigvalsh(found.uncertainty.covariance - np.eye(6))[-1] > 0.0
-            )
+            added = found.uncertainty.covariance - np.eye(6)
+            assert found.deformed["strained"] > 0.0 and np.linalg.eigvalsh(added)[-1] > 0.0
 
 
 def test_points_without_weight_say_nothing(seen):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from gapr_core.config import RegistrarConfig, RigidityConfig
@@ -105,8 +105,8 @@ def halves(fit: Fit) -> list[Array]:
     """(n, 6) for each principal axis of the inliers: the same by a motion of one half against the other."""
     feet = fit.feet[fit.weights > 0.0]
     along = feet @ extent.principal(feet).axes.T
-    above = np.where(along > np.median(along, axis=0), 0.5, -0.5)
-    return [side[:, None] * motions(fit) for side in above.T]
+    above, moved = np.where(along > np.median(along, axis=0), 0.5, -0.5), motions(fit)
+    return [side[:, None] * moved for side in above.T]
 
 
 def a_layer(fit: Fit) -> Array:
@@ -185,7 +185,7 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], c
     alternatives = [np.pad(each, ((0, 0), (0, most - each.shape[1]))) for each in more]
     columns = np.column_stack([fit.signed_mm[inlier], feet, free, *alternatives])
     total = np.bincount(block, weights)
-    means = np.stack([np.bincount(block, weights * column) for column in columns.T], axis=1) / total[:, None]
+    means = csr_array((weights, (block, np.arange(len(block))))) @ columns / total[:, None]
     residuals, places, free, changes = np.split(means, np.cumsum([1, 3, free.shape[1]]), axis=1)
     changes = changes.reshape(len(means), len(more), -1)
     return Blocks(residuals[:, 0], free, changes, fit.sigma_mm**2 / total, places)
@@ -193,11 +193,10 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], c
 
 def evidence(found: Blocks, config: RigidityConfig) -> list[Evidence]:
     """What the blocks say of each of the m alternatives, whatever the bias and what the points of a block share."""
-    correlation = smooth_correlation(found.feet, found.feet, config.correlation_mm)
-    covariances = (
-        np.diag(found.variances + shared**2) + bias**2 * correlation for bias in BIASES_MM for shared in SHARED_MM
-    )
-    of_all = np.array([_log_likelihoods(found, V) for V in covariances])
+    noise, correlation = np.diag(found.variances), smooth_correlation(found.feet, found.feet, config.correlation_mm)
+    shared = SHARED_MM[:, None, None] ** 2 * np.eye(len(noise))
+    V = np.concatenate([noise + bias_mm**2 * correlation + shared for bias_mm in BIASES_MM])
+    of_all = _log_likelihoods(found, V)
     return [_of_sizes(of_all[:, i]) for i in range(of_all.shape[1])]
 
 
@@ -210,23 +209,31 @@ def _of_sizes(log_likelihood: Array) -> Evidence:
 
 
 def _log_likelihoods(found: Blocks, V: Array) -> Array:
-    """(m, K) restricted log likelihood of each of `SIZES_MM`, of residuals whose other errors have the covariance V.
+    """(e, m, K) restricted log likelihood of each of `SIZES_MM`, of residuals whose other errors have covariances V.
 
     With what is not in question projected out, the further unknowns have the information M and the score s: in the
     axes of M, y^T V^-1 y falls by sum h^2 s_i^2 / (1 + h^2 m_i), and log det grows by sum log(1 + h^2 m_i).
+
+    Args:
+        found: the n blocks, with m alternatives.
+        V: (e, n, n) covariances of the residuals without what is in question, mm^2.
     """
     root = np.linalg.cholesky(V)
-    columns = np.column_stack([found.free, found.more.reshape(len(V), -1), found.residuals])
-    white = solve_triangular(root, columns, lower=True, check_finite=False)
-    count = found.free.shape[1]
-    Q, singular, _ = np.linalg.svd(white[:, :count], full_matrices=False)
-    shows = singular > 1e-9 * singular[0]  # on a plane, a motion along it does not
-    Q, singular = Q[:, shows], singular[shows]
-    left = white[:, count:] - Q @ (Q.T @ white[:, count:])
-    more, residuals = left[:, :-1].reshape(found.more.shape).transpose(1, 0, 2), left[:, -1]
-    information, axes = np.linalg.eigh(more.transpose(0, 2, 1) @ more)
-    score = np.einsum("mki,mnk,n->mi", axes, more, residuals)
+    columns = np.column_stack([found.free, found.more.reshape(len(found.more), -1), found.residuals])
+    white = np.linalg.solve(root, columns)
+    free, rest = np.split(white, [found.free.shape[1]], axis=2)
+    Q, singular, _ = np.linalg.svd(free, full_matrices=False)
+    shows = singular > 1e-9 * singular[:, :1]  # on a plane, a motion along it does not
+    Q = Q * shows[:, None]
+    left = rest - Q @ (Q.swapaxes(1, 2) @ rest)
+    residuals = left[..., -1]
+    more = left[..., :-1].reshape(len(V), *found.more.shape).transpose(0, 2, 3, 1)
+    information, axes = np.linalg.eigh(more @ more.swapaxes(2, 3))
+    score = (axes.swapaxes(2, 3) @ (more @ residuals[:, None, :, None]))[..., 0]
     variances = SIZES_MM[:, None] ** 2
-    gain = 1.0 + variances * np.maximum(information, 0.0)[:, None]
-    alone = -0.5 * residuals @ residuals - np.log(np.diag(root)).sum() - np.log(singular).sum()
-    return np.asarray(alone + 0.5 * (variances * score[:, None] ** 2 / gain - np.log(gain)).sum(axis=2))
+    gain = 1.0 + variances * np.maximum(information, 0.0)[:, :, None]
+    log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)  # of V, and of what is projected out of it
+    log_det += 2.0 * np.log(np.where(shows, singular, 1.0)).sum(axis=1)
+    alone = -0.5 * ((residuals**2).sum(axis=1) + log_det)
+    more_alike = 0.5 * (variances * score[:, :, None] ** 2 / gain - np.log(gain)).sum(axis=3)
+    return np.asarray(alone[:, None, None] + more_alike)

@@ -16,6 +16,7 @@ from gapr_core.registration import rigidity
 from gapr_core.registration.kernels import residuals_at
 from gapr_core.registration.refinement import refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
+from gapr_core.registration.repeats import fingerprint
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
@@ -91,7 +92,7 @@ class Accumulator:
         if apart_mm > EXTENT_LIMITS_MM[1]:
             self._leave_out(f"one that makes them {apart_mm:.0f} mm across")
         self._far_in_a_row = 0
-        if not _is_among(points, self._kept + self._new):
+        if not _was_sent(points, self._kept + self._new):
             self._new = [*self._new, points][-self.most :]
 
     def _leave_out(self, given: str) -> None:
@@ -252,6 +253,12 @@ def _together(sources: list[Array]) -> Array:
 
 def _is_among(source: Array, others: list[Array]) -> bool:
     return any(np.array_equal(source, other) for other in others)
+
+
+def _was_sent(source: Array, before: list[Array]) -> bool:
+    """True where one of those before is the same, in any order of its points."""
+    new = fingerprint(source)
+    return any(len(each) == len(source) and new.is_of_same(fingerprint(each)) for each in before)
 
 
 def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:

@@ -44,7 +44,7 @@ class Assessment:
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
         most: no surer than this, in a stream neither: no such source was calibrated.
-        deformed: sizes, mm, of what the residuals show besides one rigid piece of bone (see `rigidity`), by name.
+        deformed: sizes, mm, of what the residuals show besides one rigid piece of bone (`rigidity`), the surest first.
     """
 
     fit: Fit

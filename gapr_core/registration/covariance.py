@@ -47,16 +47,22 @@ class PoseUncertainty:
         bias_mm: standard deviation of the smooth bias that the covariance allows for.
         smooth_mm: the smooth misfit that the residuals show (see `smooth_misfits_mm`).
         short_mm: the same at a shorter range, which also holds what is rougher: another bone's surface.
-        weakest_turn: (3,) unit axis, target frame, about which the rotation is least certain.
-        weakest_shift: (3,) unit direction, target frame, along which the position is least certain.
     """
 
     covariance: Array
     bias_mm: float
     smooth_mm: float
     short_mm: float
-    weakest_turn: Array
-    weakest_shift: Array
+
+    @property
+    def weakest_turn(self) -> Array:
+        """(3,) unit axis, target frame, about which the rotation is least certain."""
+        return _largest_axis(self.covariance[3:, 3:])
+
+    @property
+    def weakest_shift(self) -> Array:
+        """(3,) unit direction, target frame, along which the position is least certain."""
+        return _largest_axis(self.covariance[:3, :3])
 
     @property
     def largest_shift_mm(self) -> float:
@@ -98,11 +104,10 @@ def estimate(
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     counts = config.smooth_neighbours, config.short_neighbours
     smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)
-    turn, shift = _largest_axis(covariance[3:, 3:]), _largest_axis(covariance[:3, :3])
-    return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm, turn, shift)
+    return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm)
 
 
-def covariance_of(fit: Fit, errors: Array, config: CovarianceConfig) -> Array:
+def covariance_added_by(fit: Fit, errors: Array, config: CovarianceConfig) -> Array:
     """(6, 6) what independent `errors` (n, k) of the inliers of what the fit rests on add to its covariance, mm."""
     rests = fit.rests_on
     spanned = fields(rests, config.correlation_mm, config.centres)

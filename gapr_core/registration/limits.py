@@ -126,19 +126,9 @@ def is_rough(assessment: Assessment, config: RegistrarConfig) -> bool:
     return bool(rough_mm > config.limits.rough_exceeded * sigma_mm)
 
 
-def is_strained(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True where the residuals show that the source is strained (see `rigidity`)."""
-    return "strained" in assessment.deformed
-
-
-def is_apart(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True where the residuals show two halves of the source in two poses (see `rigidity`)."""
-    return "apart" in assessment.deformed
-
-
-def is_layered(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True where the residuals show a layer on the bone that grows along it (see `rigidity`)."""
-    return "layered" in assessment.deformed
+def shows_most(name: str) -> Callable[[Assessment, RegistrarConfig], bool]:
+    """Whether this is the deformation that the residuals show most (see `rigidity`)."""
+    return lambda assessment, _: next(iter(assessment.deformed), None) == name
 
 
 def residual_mm(assessment: Assessment) -> float:
@@ -199,19 +189,19 @@ LIMITS = (
     ),
     Limit(
         "strained",
-        is_strained,
+        shows_most("strained"),
         "the source is longer, wider or slanted against the bone; check that nothing moved while it was measured, and "
         "the spacing of the slices of both",
     ),
     Limit(
         "apart",
-        is_apart,
+        shows_most("apart"),
         "two halves of the source lie in two poses; check that nothing moved while it was measured, that parts of it "
         "were put together rightly, and that the bone is whole",
     ),
     Limit(
         "layered",
-        is_layered,
+        shows_most("layered"),
         "the distance from the bone changes along the source, as under tissue; bare the bone, or correct the sensor",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),

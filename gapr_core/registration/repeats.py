@@ -1,23 +1,40 @@
-"""Is a source one that was there before? A driver that sends the last cloud again measures nothing new."""
+"""Is a cloud one that was there before? A driver that sends the last one again measures nothing new."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
-SAME_MM = 1e-3  # what rounding to single precision, or another order of points, leaves; far below any sensor's noise
-MOST_COMPARED = 500
+SAME_MM = 1e-4  # what rounding to single precision leaves; of a new measurement the noise alone moves the mean farther
 
 
-def is_sent_again(points: Array, before: Array) -> bool:
-    """True where most of the points (N, 3) are among those before (M, 3), mm, to `SAME_MM`, in any order."""
-    if np.array_equal(points, before):
-        return True
-    if not len(points) or not len(before):
-        return False
-    some = points[:: 1 + len(points) // MOST_COMPARED]
-    apart_mm = cKDTree(before).query(some, distance_upper_bound=SAME_MM)[0]
-    return bool(np.mean(apart_mm <= SAME_MM) > 0.5)
+class Fingerprint(NamedTuple):
+    """What stays of a cloud in any order of its points, and where they are rounded otherwise.
+
+    Attributes:
+        number: of points.
+        mean: (3,) mm.
+        spread: (3,) standard deviation along x, y and z, mm.
+    """
+
+    number: int
+    mean: Array
+    spread: Array
+
+    def is_of_same(self, other: Fingerprint) -> bool:
+        """True where both are of the same points."""
+        if self.number != other.number:
+            return False
+        apart_mm = np.abs([self.mean - other.mean, self.spread - other.spread])
+        return bool(apart_mm.max() <= SAME_MM)
+
+
+def fingerprint(points: Array) -> Fingerprint:
+    """The fingerprint of points (N, 3), mm."""
+    if not len(points):
+        return Fingerprint(0, np.zeros(3), np.zeros(3))
+    return Fingerprint(len(points), points.mean(axis=0), points.std(axis=0))

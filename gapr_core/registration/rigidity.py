@@ -1,12 +1,11 @@
 """Is what was measured one rigid piece of bone? How much the residuals speak for a motion, a strain, halves or a layer.
 
-A bone that creeps while its points are collected, slices that lie too far apart, a scan that drifts or is stitched from
-two, a bone that is bent or broken, and tissue that grows thicker leave a pattern: the pose itself changes with time or
-from one half to the other, the source is strained, or its distance from the bone changes along it. A few further
-unknowns describe each. Are they there? The restricted likelihood of the best
-size of them, over that of none, in which the pose is integrated out (Patterson and Thompson 1971). A smooth bias of any
-size and an error that neighbours share are allowed for in both, as they look similar. What is compared are averages
-over blocks of neighbours: a single point's normal errs with its residual.
+A bone that creeps moves the pose with time. So does a scan that drifts, or slices that lie too far apart: they strain
+the source. In a scan of two that do not fit, or of a bone that is bent or broken, one half lies in another pose. Under
+tissue that grows thicker the distance from the bone changes. Each has a few unknowns besides the pose. Are they there?
+The restricted likelihood of their best size is compared with that of none, and the pose is integrated out (Patterson
+and Thompson 1971). A smooth bias of any size and an error that neighbours share are allowed for in both, as they look
+similar. Averages over blocks of neighbours are compared: a single point's normal errs with its residual.
 """
 
 from __future__ import annotations
@@ -21,9 +20,10 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.geometry import extent, sampling
+from gapr_core.geometry.twists import covariance_about
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import ROUNDED, smooth_correlation
-from gapr_core.registration.covariance import covariance_of, strains
+from gapr_core.registration.covariance import covariance_added_by, strains
 from gapr_core.registration.refinement import Fit
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         log_ratio: log likelihood of their best size over that of none; 0 where none is best.
-        size_mm: of each of them, root mean square under the residuals, all `SIZES_MM` alike before.
+        size_mm: root mean square of the size of each, given the residuals; before them all `SIZES_MM` are as likely.
     """
 
     log_ratio: float
@@ -61,7 +61,9 @@ class Deformation(NamedTuple):
 
 
 def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evidence:
-    """Evidence that the bone moved steadily while the points were collected; of the motion from the first to the last.
+    """Evidence that the bone moved steadily while the points were collected.
+
+    Its size is that of the motion from the first source to the last.
 
     Args:
         fit: the pose that all points have in common.
@@ -77,28 +79,36 @@ def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evid
     return evidence(blocks(fit, fit.jacobian[inlier], [moved], group, config), config)[0]
 
 
-def of_deformations(fit: Fit, config: RigidityConfig) -> list[Deformation]:
-    """What the residuals say of a strain (see `covariance.strains`), of three pairs of `halves`, and of `a_layer`.
+def of_deformations(fit: Fit, config: RigidityConfig) -> dict[str, Deformation]:
+    """What the residuals say of each deformation, by the name of its limit in `RigidityConfig`; {} of few points.
 
-    Of few points nothing is said. A stand-off is no deformation: it is taken out with the pose. Another size is a
-    strain, whatever the sensor: what its scale may excuse may as well be another subject's bone.
+    `strained`: see `covariance.strains`. `apart`: of the three pairs of `halves` the one that they speak most for.
+    `layered`: see `a_layer`. A stand-off is no deformation: it is taken out with the pose. Another size is a strain,
+    whatever the sensor: what its scale may excuse may as well be another subject's bone.
     """
     inlier = fit.weights > 0.0
     count = np.count_nonzero(inlier)
     if count < config.fewest_points:
-        return []
-    changes = [strains(fit), *halves(fit), a_layer(fit)]
+        return {}
+    changes = [strains(fit), a_layer(fit), *halves(fit)]
     free, at_once = np.column_stack([fit.jacobian[inlier], np.ones(count)]), np.zeros(count, dtype=np.int64)
-    found = evidence(blocks(fit, free, changes, at_once, config), config)
-    return list(map(Deformation, found, changes))
+    said = evidence(blocks(fit, free, changes, at_once, config), config)
+    strained, layered, *apart = map(Deformation, said, changes)
+    return {
+        "strained": strained,
+        "apart": max(apart, key=lambda each: each.evidence.log_ratio),
+        "layered": layered,
+    }
 
 
 def motions(fit: Fit) -> Array:
-    """(n, 6) how the residuals of the inliers change by a motion of 1 mm, a rotation about their middle included."""
+    """(n, 6) how the residuals of the inliers change by shifts and by turns about their middle, of 1 mm each.
+
+    A turn of 1 mm is one by 1 mm over their root mean square distance from the middle.
+    """
     inlier = fit.weights > 0.0
-    found, away = fit.jacobian[inlier].copy(), fit.moved[inlier] - fit.moved[inlier].mean(axis=0)
-    found[:, 3:] /= max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
-    return found
+    away, normals = _away(fit), fit.gradients[inlier]
+    return np.hstack([normals, np.cross(away, normals) / _radius_mm(away)])
 
 
 def halves(fit: Fit) -> list[Array]:
@@ -110,41 +120,56 @@ def halves(fit: Fit) -> list[Array]:
 
 
 def a_layer(fit: Fit) -> Array:
-    """(n, 4) how the residuals of the inliers change by a layer on the bone: one column per axis that it grows along.
+    """(n, 4) how the residuals of the inliers change by a layer on the bone: its growth along x, y and z, and its mean.
 
-    The last is its mean, which no residual shows: of a layer that grows from nothing, evenly, root 3 times its standard
+    No residual shows the mean. A layer that grows evenly from nothing has a mean of root 3 times its standard
     deviation.
     """
     feet = fit.feet[fit.weights > 0.0]
     away = feet - feet.mean(axis=0)
-    size_mm = max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
-    return np.column_stack([away / size_mm, np.full(len(feet), np.sqrt(3.0))])
+    return np.column_stack([away / _radius_mm(away), np.full(len(feet), np.sqrt(3.0))])
+
+
+def _away(fit: Fit) -> Array:
+    """(n, 3) the inliers from their mean."""
+    moved = fit.moved[fit.weights > 0.0]
+    return np.asarray(moved - moved.mean(axis=0))
+
+
+def _radius_mm(away: Array) -> float:
+    return max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
 
 
 def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same where the residuals show one rigid piece of bone; else with what the deformations add to the covariance.
 
-    More than one may: a bent source is strained, too.
+    Several may be found at once: a bent source is strained, too. The one that they speak most for is the first.
     """
     a, limits = assessment, config.rigidity
-    found = of_deformations(a.fit.rests_on, limits)
+    found = {
+        name: each
+        for name, each in of_deformations(a.fit.rests_on, limits).items()
+        if each.evidence.log_ratio > getattr(limits, name)
+    }
     if not found:
         return a
-    strain, *halves_apart, layer = found
-    apart = max(halves_apart, key=lambda each: each.evidence.log_ratio)
-    named = (
-        ("strained", strain, limits.strained),
-        ("apart", apart, limits.apart),
-        ("layered", layer, limits.layered),
-    )
-    deformed, covariance = {}, a.uncertainty.covariance
-    for name, each, limit in named:
-        if each.evidence.log_ratio > limit:
-            deformed[name] = each.evidence.size_mm
-            covariance = covariance + covariance_of(a.fit, each.evidence.size_mm * each.changes, config.covariance)
-    if not deformed:
-        return a
+    covariance = a.uncertainty.covariance
+    for name, each in found.items():
+        covariance = covariance + covariance_added_by(a.fit, each.evidence.size_mm * each.changes, config.covariance)
+        if name == "apart":
+            covariance = covariance + covariance_of_half(a.fit, each.evidence.size_mm)
+    surest = sorted(found.items(), key=lambda item: -item[1].evidence.log_ratio)
+    deformed = {name: each.evidence.size_mm for name, each in surest}
     return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
+
+
+def covariance_of_half(fit: Fit, size_mm: float) -> Array:
+    """(6, 6) of either half against the pose between both, where they move against each other by so much."""
+    rests = fit.rests_on
+    inlier = rests.weights > 0.0
+    deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / _radius_mm(_away(rests))] * 3)
+    to_middle = fit.moved.mean(axis=0) - rests.moved[inlier].mean(axis=0)
+    return covariance_about(to_middle, np.diag(deviations**2))
 
 
 @dataclass(frozen=True, eq=False)

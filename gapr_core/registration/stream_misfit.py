@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logit
 
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.features import STREAM_FEATURES
+from gapr_core.registration.repeats import Fingerprint
 from gapr_core.registration.shared_misfit import SharedMisfit
-
-Array = NDArray[np.float64]
 
 
 class StreamMisfit:
@@ -33,9 +31,9 @@ class StreamMisfit:
         self._frames.forget()
         self._shared_mm: tuple[float, float] | None = None  # as `SharedMisfit.add` said last
         self._speaks_for = False  # that speaks for the bone
-        self._seen: Array = np.empty((0, 3))  # points of the last source that was added
+        self._seen: Fingerprint | None = None  # of the last source that was added
 
-    def weigh(self, assessment: Assessment, agrees: bool) -> Assessment:
+    def weigh(self, assessment: Assessment, agrees: bool, cloud: Fingerprint) -> Assessment:
         """The probability in the light of what the residuals of the frames have in common.
 
         A source that is sent again has the same noise, and adds nothing.
@@ -44,13 +42,14 @@ class StreamMisfit:
             assessment: of the next frame.
             agrees: it continues the one before it. After a jump it may be another bone: what spoke for the last one is
                 forgotten, what spoke against it is not.
+            cloud: of all points of the frame.
         """
         if not np.isfinite(assessment.probability):
             return assessment
         if not agrees and self._speaks_for:
             self.forget()
-        if not np.array_equal(assessment.source.points, self._seen):
-            self._seen = assessment.source.points
+        if self._seen is None or not cloud.is_of_same(self._seen):
+            self._seen = cloud
             self._shared_mm = self._frames.add(assessment.fit)
         if self._shared_mm is None:
             self._speaks_for = False
@@ -76,6 +75,6 @@ class NoMisfit(StreamMisfit):
     def forget(self) -> None:
         """There is nothing to forget."""
 
-    def weigh(self, assessment: Assessment, agrees: bool) -> Assessment:
+    def weigh(self, assessment: Assessment, agrees: bool, cloud: Fingerprint) -> Assessment:
         """The same."""
         return assessment

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -20,7 +21,7 @@ from gapr_core.registration.features import STREAM
 from gapr_core.registration.following import FollowedPose, Follower
 from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.registrar import Registrar, check_call
-from gapr_core.registration.repeats import is_sent_again
+from gapr_core.registration.repeats import Fingerprint, fingerprint
 from gapr_core.registration.stream_misfit import NoMisfit, StreamMisfit
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
@@ -36,13 +37,13 @@ class Last(NamedTuple):
 
     Attributes:
         T_target_source: (4, 4) its pose, mm.
-        points: (N, 3) its points, mm, source frame.
+        cloud: of all its points, source frame.
         agreed: it continued the one before it.
         said: the probability that it had, before the limits.
     """
 
     T_target_source: Array
-    points: Array
+    cloud: Fingerprint
     agreed: bool
     said: float
 
@@ -158,7 +159,7 @@ class Tracker:
         self._follower, clock = None, Clock()
         assessment = self._assess(source, target, initial, viewpoint, clock)
         if isinstance(assessment, Assessment):
-            assessment = self._with_evidence(assessment)
+            assessment = self._with_evidence(assessment, fingerprint(finite_points(source)))
         result = replace(self.registrar.conclude(assessment, clock), method=self.name)
         if isinstance(assessment, Assessment):
             self._remember(result, assessment.source.points)
@@ -218,7 +219,7 @@ class Tracker:
         moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last.T_target_source, assessment.source.points)
         return moved_mm <= self.registrar.config.evidence.agree_mm
 
-    def _with_evidence(self, assessment: Assessment) -> Assessment:
+    def _with_evidence(self, assessment: Assessment, cloud: Fingerprint) -> Assessment:
         """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.
 
         What they say of the bone cannot make a pose right (see `evidence`). A frame that a safety rule refuses says
@@ -229,14 +230,14 @@ class Tracker:
         if assessment.inferred_viewpoint is not None:
             assessment = assessment.capped(self.registrar.config.limits.most)
         a, last = assessment, self._last
-        again = last is not None and is_sent_again(a.source.points, last.points)
+        again = last is not None and cloud.is_of_same(last.cloud)
         agrees = self._agrees(a) and (last is None or last.agreed or not again)
         one_by_one = replace(a, probability=self._evidence.add(a.probability, agrees, again))
         most = min(float(np.sqrt(a.probability)) if agrees else a.probability, a.most)
-        found = self._misfit.weigh(one_by_one, agrees).capped(most)
+        found = self._misfit.weigh(one_by_one, agrees, cloud).capped(most)
         if last is not None and again:
             found = found.capped(last.said)
-        self._last = Last(a.fit.T, a.source.points, agrees, found.probability)
+        self._last = Last(a.fit.T, cloud, agrees, found.probability)
         return found
 
     def _remember(self, result: RegistrationResult, source: Array) -> None:

@@ -33,7 +33,7 @@ def plane():
 
 def uncertainty(shift_mm=0.3, turn_rad=0.0):
     covariance = np.diag([shift_mm**2] * 3 + [turn_rad**2] * 3)
-    return PoseUncertainty(covariance, 0.1, 0.2, 0.3, AXIS, AXIS)
+    return PoseUncertainty(covariance, 0.1, 0.2, 0.3)
 
 
 def made(plane, probability=0.9, refusal=None, known=None, scores=(1.0, 1.2), **more):

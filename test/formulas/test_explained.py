@@ -197,7 +197,7 @@ def test_every_feature_of_a_scene_says_what_its_name_says(monkeypatch):
     fit = Fit(T, 0.5, np.zeros(12), weights, gradients, np.zeros(12, dtype=int), se3.apply(T, points))
     alone = np.arange(12)[:, None]  # neighbours without a curvature
     part, members = SimpleNamespace(points=points, normals=normals, patches=alone), np.arange(30) < 12
-    known = PoseUncertainty(np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6]), 0.1, 0.2, 0.3, np.eye(3)[2], np.eye(3)[2])
+    known = PoseUncertainty(np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6]), 0.1, 0.2, 0.3)
     candidates = Candidates(None, np.array([2.0, 3.0]), np.array([0.7, 0.1]))
     bone = SimpleNamespace(points=np.zeros((50, 3)), spacing_mm=3.0, half_extent_mm=50.0)
     scene, asked = SimpleNamespace(source=SimpleNamespace(flatness_mm=np.where(members, 0.3, 9.0))), []

@@ -52,7 +52,7 @@ def measured(fit, scores=(0.25, 0.5), normals=None, noise_mm=0.3, **more):
     points, flatness_mm = se3.apply(se3.inverse(T), fit.moved), np.full(count, noise_mm)
     source = SimpleNamespace(points=points, normals=normals, flatness_mm=flatness_mm, patches=alone)
     covariance = np.diag([4.0, 1.0, 0.25, 1e-4, 4e-4, 1e-6])
-    known = PoseUncertainty(covariance, 0.1, 0.2, 0.3, AXIS, AXIS)
+    known = PoseUncertainty(covariance, 0.1, 0.2, 0.3)
     candidates = Candidates(None, np.array(scores), np.array([0.7, 0.1]))
     target = SimpleNamespace(half_extent_mm=50.0)
     return features.measure(fit, candidates, known, source, target, RegistrarConfig())

@@ -11,14 +11,13 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
 from gapr_core.registration import rigidity
 from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.covariance import PoseUncertainty, covariance_of
+from gapr_core.registration.covariance import PoseUncertainty, covariance_added_by
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.rigidity import (
     BIASES_MM,
     SHARED_MM,
     SIZES_MM,
     Blocks,
-    Deformation,
     blocks,
     evidence,
     of_creep,
@@ -31,11 +30,8 @@ NOISE_MM = 0.4
 
 
 def of_strain(fit, config):
-    return (of_deformations(fit, config) or [Deformation(rigidity.NOTHING, None)])[0].evidence
-
-
-def of_halves(fit, config):
-    return [each.evidence for each in of_deformations(fit, config)[1:4]]
+    found = of_deformations(fit, config)
+    return found["strained"].evidence if found else rigidity.NOTHING
 
 
 def fit_of(points, normals, errors, weights=None):
@@ -183,15 +179,18 @@ def test_few_points_or_one_source_say_nothing(seen):
 def test_halves_move_against_each_other_along_each_principal_axis(seen):
     points, normals = seen(1000)
     weights = np.random.default_rng(3).uniform(0.0, 1.0, 1000)
-    weights[:100] = 0.0
+    points[:100], weights[:100] = points[:100] + 200.0, 0.0  # what does not count has no part in their middle
     fit = fit_of(points, normals, noise(1000), weights)
-    moved, (feet, rows) = fit.moved[100:], (fit.feet[100:], fit.jacobian[100:])
-    radius_mm = np.sqrt(((moved - moved.mean(axis=0)) ** 2).sum(axis=1).mean())
+    moved, feet = fit.moved[100:], fit.feet[100:]
+    away = moved - moved.mean(axis=0)
+    radius_mm = np.sqrt((away**2).sum(axis=1).mean())
     axes = np.linalg.svd(feet - feet.mean(axis=0), full_matrices=False)[2]
     for axis, found in zip(axes, rigidity.halves(fit), strict=True):
         side = np.sign(feet @ axis - np.median(feet @ axis)) / 2.0
-        expected = side[:, None] * rows / ([1.0] * 3 + [radius_mm] * 3)
-        assert np.allclose(found, expected) or np.allclose(found, -expected)
+        for i, unit in enumerate(np.eye(3)):
+            shift, turn = side * normals[100:, i], side * (normals[100:] * np.cross(unit, away)).sum(axis=1) / radius_mm
+            expected = np.stack([shift, turn])
+            assert np.allclose(found[:, [i, i + 3]].T, expected) or np.allclose(found[:, [i, i + 3]].T, -expected)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -201,34 +200,83 @@ def test_two_halves_in_two_poses_are_found_and_one_piece_is_not(seen, motion, ax
     along = points @ np.linalg.svd(points, full_matrices=False)[2][axis]
     above = along > np.median(along)
     moved = np.where(above[:, None], se3.apply(se3.exp(np.array(motion), points.mean(axis=0)), points), points)
-    apart, whole = (of_halves(fit_of(points, normals, noise(3000) + off), CONFIG) for off in (moved - points, 0.0))
-    assert np.argmax([each.log_ratio for each in apart]) == axis
-    assert apart[axis].log_ratio > CONFIG.apart > max(each.log_ratio for each in whole) + 3.0
-    assert 0.3 < apart[axis].size_mm < 4.0
+    fit, rigid = (fit_of(points, normals, noise(3000) + off) for off in (moved - points, 0.0))
+    apart, whole = (of_deformations(each, CONFIG)["apart"] for each in (fit, rigid))
+    np.testing.assert_array_equal(apart.changes, rigidity.halves(fit)[axis])
+    assert apart.evidence.log_ratio > CONFIG.apart > whole.evidence.log_ratio + 3.0
+    assert 0.3 < apart.evidence.size_mm < 4.0
 
 
-@pytest.mark.parametrize("name", ["apart", "layered", "strained"])
-def test_each_deformation_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, name):
+def deformed(seen, *names, whole=False):
+    """A fit of a source with these deformations; `whole`: of 1800 of its points, which rests on all."""
     points, normals = seen(3000)
     along = points @ np.linalg.svd(points, full_matrices=False)[2][0]
-    above = along > np.median(along)
     off = {
-        "apart": 3.0 * above[:, None] * [0.0, 1.0, 0.0],
+        "apart": 3.0 * (along > np.median(along))[:, None] * [0.0, 1.0, 0.0],
         "layered": 0.1 * along[:, None] * normals,
         "strained": 0.04 * points * [0, 0, 1],
-    }[name]
-    fit = fit_of(points, normals, noise(3000) + off)
-    a = Assessment(fit, None, PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0, *np.zeros((2, 3))), {}, 0.9, None, None, None)
-    never = RigidityConfig(strained=np.inf, apart=np.inf, layered=np.inf)
-    assert rigidity.allowing_for_deformation(a, RegistrarConfig(rigidity=never)) is a
-    config = RegistrarConfig(rigidity=replace(never, **{name: getattr(CONFIG, name)}))
-    found = rigidity.allowing_for_deformation(a, config)
-    strain, *halves, layer = of_deformations(fit, CONFIG)
-    apart = max(halves, key=lambda each: each.evidence.log_ratio)
-    expected = {"apart": apart, "layered": layer, "strained": strain}[name]
-    assert found.deformed == {name: expected.evidence.size_mm}
-    added = covariance_of(fit, expected.evidence.size_mm * expected.changes, config.covariance)
-    np.testing.assert_allclose(found.uncertainty.covariance, np.eye(6) + added)
+    }
+    fit = fit_of(points, normals, noise(3000) + sum(off[name] for name in names))
+    some = np.argsort(along)[:1800]
+    part = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.elements, fit.moved))
+    return Fit(fit.T, fit.sigma_mm, *part, whole=fit) if whole else fit
+
+
+def allowed(fit, **limits):
+    a = Assessment(fit, None, PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), {}, 0.9, None, None, None)
+    never = {"strained": np.inf, "apart": np.inf, "layered": np.inf}
+    found = rigidity.allowing_for_deformation(a, RegistrarConfig(rigidity=RigidityConfig(**never | limits)))
+    return found.deformed, found.uncertainty.covariance - np.eye(6)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("name", ["apart", "layered", "strained"])
+def test_each_deformation_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, name, whole):
+    fit = deformed(seen, name, whole=whole)
+    assert allowed(fit)[0] == {} and not allowed(fit)[1].any()
+    found, added = allowed(fit, **{name: getattr(CONFIG, name)})
+    expected = of_deformations(fit.rests_on, CONFIG)[name]
+    size_mm = expected.evidence.size_mm
+    moved = covariance_added_by(fit, size_mm * expected.changes, RegistrarConfig().covariance)
+    assert found == {name: size_mm}
+    np.testing.assert_allclose(added, moved + (name == "apart") * rigidity.covariance_of_half(fit, size_mm), atol=1e-12)
+
+
+def test_either_half_lies_half_of_their_motion_from_the_pose_between_them(seen):
+    """About the middle of the points that are compared, though all that count are in two halves."""
+    fit = deformed(seen, "apart", whole=True)
+    middles = [each.moved.mean(axis=0) for each in (fit, fit.whole)]
+    radius_mm = np.sqrt(((fit.whole.moved - middles[1]) ** 2).sum(axis=1).mean())
+    rng = np.random.default_rng(0)
+    twists = 0.5 * 1.7 * rng.normal(size=(200_000, 6)) / ([1.0] * 3 + [radius_mm] * 3)
+    about = np.hstack([twists[:, :3] + np.cross(twists[:, 3:], middles[0] - middles[1]), twists[:, 3:]])
+    found = rigidity.covariance_of_half(fit, 1.7)
+    scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    np.testing.assert_allclose(np.cov(about.T) / scale, found / scale, atol=0.015)
+
+
+def test_two_deformations_add_up_and_the_surer_is_named_first(seen):
+    fit = deformed(seen, "apart", "strained")
+    ratios = {name: each.evidence.log_ratio for name, each in of_deformations(fit, CONFIG).items()}
+    (both, added), (_, one), (_, other) = (
+        allowed(fit, **each) for each in ({"strained": 0.0, "apart": 0.0}, {"strained": 0.0}, {"apart": 0.0})
+    )
+    assert list(both) == sorted(["strained", "apart"], key=lambda name: -ratios[name])
+    np.testing.assert_allclose(added, one + other, atol=1e-12)
+
+
+def test_what_depends_on_what_is_not_in_question_or_is_scaled_changes_nothing(some):
+    more = replace(some, free=np.column_stack([some.free, some.free[:, 0] + some.free[:, 1], np.zeros(16)]))
+    scaled = replace(some, free=some.free * [1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
+    for found in (more, scaled):
+        np.testing.assert_allclose(evidence(found, CONFIG), evidence(some, CONFIG))
+
+
+def test_points_without_weight_say_nothing_of_a_creep(seen):
+    points, normals = seen(2400)
+    order, weights = np.arange(2400) // 200, np.where(np.arange(2400) % 2, 1.0, 0.0)
+    off = np.where(weights[:, None] > 0.0, 0.0, 3.0 * (order / 11.0)[:, None] * [0.0, 0.0, 1.0])
+    assert of_creep(fit_of(points, normals, noise(2400) + off, weights), order, CONFIG).log_ratio < 1.0
 
 
 def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(seen):
@@ -237,7 +285,7 @@ def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(s
     along = points @ axis
     thick = 4.0 * (along - along.min())[:, None] / np.ptp(along) * normals
     growing, even = (
-        of_deformations(fit_of(points, normals, noise(3000) + off), CONFIG)[-1] for off in (thick, 2.0 * normals)
+        of_deformations(fit_of(points, normals, noise(3000) + off), CONFIG)["layered"] for off in (thick, 2.0 * normals)
     )
     assert growing.evidence.log_ratio > CONFIG.layered > 2.0 > even.evidence.log_ratio
     slope = 4.0 / np.ptp(along) * np.sqrt((points**2).sum(axis=1).mean())
@@ -278,16 +326,9 @@ def test_a_plane_of_which_some_motions_change_nothing_is_judged_by_the_others(li
 
 def test_infinity_finds_no_strain_and_zero_each_that_is_likelier_than_none(seen):
     points, normals = seen(3000)
-    strained, rigid = (fit_of(points, normals, noise(3000) + off) for off in (0.04 * points * [0, 0, 1], 0.0))
-    for fit, limit, is_found in ((strained, np.inf, False), (strained, 0.0, True), (rigid, 0.0, False)):
-        uncertainty = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0, np.zeros(3), np.zeros(3))
-        a = Assessment(fit, None, uncertainty, {}, 0.9, None, None, None)
-        config = RegistrarConfig(rigidity=RigidityConfig(strained=limit, apart=np.inf, layered=np.inf))
-        found = rigidity.allowing_for_deformation(a, config)
-        assert (found is not a) is is_found, limit
-        if is_found:
-            added = found.uncertainty.covariance - np.eye(6)
-            assert found.deformed["strained"] > 0.0 and np.linalg.eigvalsh(added)[-1] > 0.0
+    rigid = fit_of(points, normals, noise(3000))
+    assert list(allowed(deformed(seen, "strained"), strained=0.0)[0]) == ["strained"]
+    assert allowed(rigid, strained=0.0)[0] == {}
 
 
 def test_points_without_weight_say_nothing(seen):

@@ -23,8 +23,8 @@ PUSHED = VerificationConfig(middle_points=60, final_limits_mm=(5.0, 4.0, 5), sam
 
 
 def uncertainty(shift_mm=0.1, turn_deg=0.1):
-    covariance = np.diag([shift_mm**2, 0.01, 0.01, np.radians(turn_deg) ** 2, 1e-6, 1e-6])
-    return PoseUncertainty(covariance, 0.1, 0.1, 0.1, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+    covariance = np.diag([shift_mm**2, 1e-4, 1e-4, 1e-8, 1e-8, np.radians(turn_deg) ** 2])
+    return PoseUncertainty(covariance, 0.1, 0.1, 0.1)
 
 
 def candidates(*scores, shift=30.0):

@@ -84,7 +84,8 @@ def test_a_source_that_is_empty_or_there_already_changes_nothing(registrar, fram
     for pair in frames[:2]:
         accumulator.register(pair.source, prepared)
     kept = accumulator.collected
-    for again in (frames[1].source, frames[0].source, np.empty((0, 3)), np.full((4, 3), np.nan)):
+    rounded = frames[0].source[::-1].astype(np.float32)
+    for again in (frames[1].source, frames[0].source, rounded, np.empty((0, 3)), np.full((4, 3), np.nan)):
         accumulator.register(again, prepared)
         np.testing.assert_array_equal(accumulator.collected, kept)
 
@@ -369,3 +370,10 @@ def test_a_bone_that_creeps_under_a_pointer_of_single_points_is_refused_by_a_tra
     assert ("the bone moves against the frame of the sources" in result.reason) is is_refused
     assert result.ok is not is_refused
     assert len(accumulator.collected) == (200 if is_refused else 600)
+
+
+def test_a_tracker_grows_surer_of_a_collection_that_grows(registrar, frames, prepared):
+    """Most of it was there before: that is no source that is sent again."""
+    accumulator = Accumulator(Tracker(registrar), most=20)
+    said = [accumulator.register(pair.source, prepared).confidence for pair in frames]
+    assert said[-1] > said[2] + 0.05

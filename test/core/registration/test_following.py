@@ -318,7 +318,7 @@ def test_another_bone_in_the_same_place_is_not_followed(sure, frames, prepared, 
 def test_following_changes_nothing_that_the_tracker_knows(sure, frames, prepared):
     def known():
         misfit = sure._misfit
-        arrays = {"poses": sure._memory.poses, "seen": misfit._seen}
+        arrays = {"poses": sure._memory.poses, "seen": misfit._seen.mean}
         flags = sure._since_full, sure._is_sure, sure._has_track, misfit._speaks_for, misfit._shared_mm
         return {name: array.tolist() for name, array in arrays.items()} | vars(sure._evidence) | {"flags": flags}
 

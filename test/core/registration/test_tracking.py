@@ -17,7 +17,7 @@ from gapr_core.registration.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.memory import Memory
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.repeats import is_sent_again
+from gapr_core.registration.repeats import fingerprint
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
 
@@ -400,16 +400,21 @@ def test_a_source_that_is_sent_again_is_no_surer(registrar, frames, prepared, ju
         assert tracker.register(again, prepared).confidence <= first.confidence + (1e-4 if jitter_mm else 1e-9)
 
 
-def test_a_source_is_sent_again_where_most_of_its_points_are():
-    points = np.random.default_rng(0).normal(0.0, 30.0, (2000, 3))
-    off = np.random.default_rng(1).normal(size=points.shape)
-    off /= np.linalg.norm(off, axis=1, keepdims=True)
-    assert is_sent_again(points[::-1], points) and is_sent_again(points[::3], points)
-    assert is_sent_again(points + 0.9e-3 * off, points) and not is_sent_again(points + 1.1e-3 * off, points)
-    for kept, is_again in ((0.4, False), (0.6, True)):
-        new = np.where(np.random.default_rng(2).uniform(size=(2000, 1)) < kept, points, points + off)
-        assert is_sent_again(new, points) is is_again
-    assert not is_sent_again(points[:0], points) and not is_sent_again(points, points[:0])
+@pytest.mark.parametrize("count", [12, 2000, 120_000])
+def test_a_cloud_is_the_same_in_any_order_and_rounding_and_another_one_with_noise_of_its_own(count):
+    rng = np.random.default_rng(0)
+    points = rng.normal(0.0, 30.0, (count, 3)) + [900.0, -40.0, 300.0]
+    one = fingerprint(points)
+    assert fingerprint(rng.permutation(points)).is_of_same(one)
+    assert fingerprint(points.astype(np.float32).astype(float)).is_of_same(one)
+    assert not fingerprint(points + rng.normal(0.0, 0.1, points.shape)).is_of_same(one)
+    assert not fingerprint(points[1:]).is_of_same(one) and not fingerprint(points[:0]).is_of_same(one)
+    for axis in range(3):
+        there = np.eye(3)[axis]
+        assert not fingerprint(points + 1.1e-4 * there).is_of_same(one), "one mean is another"
+        wider = points + (points - points.mean(axis=0)) * there * 2e-5
+        assert not fingerprint(wider).is_of_same(one), "one spread is another"
+    assert fingerprint(points[:0]).is_of_same(fingerprint(points[:0]))
 
 
 def test_a_calibration_of_other_answers_is_no_model_of_streams(registrar):

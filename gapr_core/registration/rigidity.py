@@ -33,7 +33,7 @@ SHARED_MM = np.array([0.05, 0.2, 0.5, 1.0])  # of what the points of a block sha
 SIZES_MM = np.array([0.0, 0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0, 12.0])  # of the further unknowns
 
 
-class Evidence(NamedTuple):
+class Finding(NamedTuple):
     """What the residuals say of further unknowns.
 
     Attributes:
@@ -45,23 +45,23 @@ class Evidence(NamedTuple):
     size_mm: float
 
 
-NOTHING = Evidence(0.0, 0.0)
+NOTHING = Finding(0.0, 0.0)
 
 
 class Deformation(NamedTuple):
     """What a source may have suffered against the bone.
 
     Attributes:
-        evidence: what the residuals say of it.
+        finding: what the residuals say of it.
         changes: (n, k) how the residuals of the inliers change by each of its unknowns, by 1 mm.
     """
 
-    evidence: Evidence
+    finding: Finding
     changes: Array
 
 
-def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evidence:
-    """Evidence that the bone moved steadily while the points were collected.
+def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Finding:
+    """Whether the bone moved steadily while the points were collected.
 
     Its size is that of the motion from the first source to the last.
 
@@ -76,7 +76,7 @@ def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Evid
     time = ((order - order.min()) / (order.max() - order.min()))[inlier]
     group = np.minimum(time * config.groups, config.groups - 1).astype(np.int64)
     moved = (time[:, None] - 0.5) * motions(fit)
-    return evidence(blocks(fit, fit.jacobian[inlier], [moved], group, config), config)[0]
+    return findings(blocks(fit, fit.jacobian[inlier], [moved], group, config), config)[0]
 
 
 def of_deformations(fit: Fit, config: RigidityConfig) -> dict[str, Deformation]:
@@ -92,11 +92,11 @@ def of_deformations(fit: Fit, config: RigidityConfig) -> dict[str, Deformation]:
         return {}
     changes = [strains(fit), a_layer(fit), *halves(fit)]
     free, at_once = np.column_stack([fit.jacobian[inlier], np.ones(count)]), np.zeros(count, dtype=np.int64)
-    said = evidence(blocks(fit, free, changes, at_once, config), config)
+    said = findings(blocks(fit, free, changes, at_once, config), config)
     strained, layered, *apart = map(Deformation, said, changes)
     return {
         "strained": strained,
-        "apart": max(apart, key=lambda each: each.evidence.log_ratio),
+        "apart": max(apart, key=lambda each: each.finding.log_ratio),
         "layered": layered,
     }
 
@@ -149,17 +149,17 @@ def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) ->
     found = {
         name: each
         for name, each in of_deformations(a.fit.rests_on, limits).items()
-        if each.evidence.log_ratio > getattr(limits, name)
+        if each.finding.log_ratio > getattr(limits, name)
     }
     if not found:
         return a
     covariance = a.uncertainty.covariance
     for name, each in found.items():
-        covariance = covariance + covariance_added_by(a.fit, each.evidence.size_mm * each.changes, config.covariance)
+        covariance = covariance + covariance_added_by(a.fit, each.finding.size_mm * each.changes, config.covariance)
         if name == "apart":
-            covariance = covariance + covariance_of_half(a.fit, each.evidence.size_mm)
-    surest = sorted(found.items(), key=lambda item: -item[1].evidence.log_ratio)
-    deformed = {name: each.evidence.size_mm for name, each in surest}
+            covariance = covariance + covariance_of_half(a.fit, each.finding.size_mm)
+    surest = sorted(found.items(), key=lambda item: -item[1].finding.log_ratio)
+    deformed = {name: each.finding.size_mm for name, each in surest}
     return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
 
 
@@ -216,7 +216,7 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], c
     return Blocks(residuals[:, 0], free, changes, fit.sigma_mm**2 / total, places)
 
 
-def evidence(found: Blocks, config: RigidityConfig) -> list[Evidence]:
+def findings(found: Blocks, config: RigidityConfig) -> list[Finding]:
     """What the blocks say of each of the m alternatives, whatever the bias and what the points of a block share."""
     noise, correlation = np.diag(found.variances), smooth_correlation(found.feet, found.feet, config.correlation_mm)
     shared = SHARED_MM[:, None, None] ** 2 * np.eye(len(noise))
@@ -225,12 +225,12 @@ def evidence(found: Blocks, config: RigidityConfig) -> list[Evidence]:
     return [_of_sizes(of_all[:, i]) for i in range(of_all.shape[1])]
 
 
-def _of_sizes(log_likelihood: Array) -> Evidence:
-    """The evidence by (errors, K) log likelihoods of each of `SIZES_MM`."""
+def _of_sizes(log_likelihood: Array) -> Finding:
+    """The finding by (errors, K) log likelihoods of each of `SIZES_MM`."""
     best = log_likelihood.max(axis=0)
     posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
     size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
-    return Evidence(float(best.max() - best[0]), size_mm)
+    return Finding(float(best.max() - best[0]), size_mm)
 
 
 def _log_likelihoods(found: Blocks, V: Array) -> Array:

@@ -19,7 +19,7 @@ from gapr_core.registration.rigidity import (
     SIZES_MM,
     Blocks,
     blocks,
-    evidence,
+    findings,
     of_creep,
     of_deformations,
 )
@@ -31,7 +31,7 @@ NOISE_MM = 0.4
 
 def of_strain(fit, config):
     found = of_deformations(fit, config)
-    return found["strained"].evidence if found else rigidity.NOTHING
+    return found["strained"].finding if found else rigidity.NOTHING
 
 
 def fit_of(points, normals, errors, weights=None):
@@ -80,7 +80,7 @@ def restricted(found, more, bias_mm, shared_mm, size_mm, correlation_mm):
 
 def test_the_evidence_is_a_ratio_of_restricted_likelihoods_and_the_size_their_mean(some):
     config = RigidityConfig(correlation_mm=15.0)
-    for i, found in enumerate(evidence(some, config)):
+    for i, found in enumerate(findings(some, config)):
         dense = np.array([[[restricted(some, some.more[:, i], b, c, h, 15.0) for h in SIZES_MM] for c in SHARED_MM]
                           for b in BIASES_MM])  # fmt: skip
         best = dense.max(axis=(0, 1))
@@ -203,8 +203,8 @@ def test_two_halves_in_two_poses_are_found_and_one_piece_is_not(seen, motion, ax
     fit, rigid = (fit_of(points, normals, noise(3000) + off) for off in (moved - points, 0.0))
     apart, whole = (of_deformations(each, CONFIG)["apart"] for each in (fit, rigid))
     np.testing.assert_array_equal(apart.changes, rigidity.halves(fit)[axis])
-    assert apart.evidence.log_ratio > CONFIG.apart > whole.evidence.log_ratio + 3.0
-    assert 0.3 < apart.evidence.size_mm < 4.0
+    assert apart.finding.log_ratio > CONFIG.apart > whole.finding.log_ratio + 3.0
+    assert 0.3 < apart.finding.size_mm < 4.0
 
 
 def deformed(seen, *names, whole=False):
@@ -236,7 +236,7 @@ def test_each_deformation_widens_the_covariance_by_what_it_may_move_the_pose_by(
     assert allowed(fit)[0] == {} and not allowed(fit)[1].any()
     found, added = allowed(fit, **{name: getattr(CONFIG, name)})
     expected = of_deformations(fit.rests_on, CONFIG)[name]
-    size_mm = expected.evidence.size_mm
+    size_mm = expected.finding.size_mm
     moved = covariance_added_by(fit, size_mm * expected.changes, RegistrarConfig().covariance)
     assert found == {name: size_mm}
     np.testing.assert_allclose(added, moved + (name == "apart") * rigidity.covariance_of_half(fit, size_mm), atol=1e-12)
@@ -257,7 +257,7 @@ def test_either_half_lies_half_of_their_motion_from_the_pose_between_them(seen):
 
 def test_two_deformations_add_up_and_the_surer_is_named_first(seen):
     fit = deformed(seen, "apart", "strained")
-    ratios = {name: each.evidence.log_ratio for name, each in of_deformations(fit, CONFIG).items()}
+    ratios = {name: each.finding.log_ratio for name, each in of_deformations(fit, CONFIG).items()}
     (both, added), (_, one), (_, other) = (
         allowed(fit, **each) for each in ({"strained": 0.0, "apart": 0.0}, {"strained": 0.0}, {"apart": 0.0})
     )
@@ -269,7 +269,7 @@ def test_what_depends_on_what_is_not_in_question_or_is_scaled_changes_nothing(so
     more = replace(some, free=np.column_stack([some.free, some.free[:, 0] + some.free[:, 1], np.zeros(16)]))
     scaled = replace(some, free=some.free * [1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
     for found in (more, scaled):
-        np.testing.assert_allclose(evidence(found, CONFIG), evidence(some, CONFIG))
+        np.testing.assert_allclose(findings(found, CONFIG), findings(some, CONFIG))
 
 
 def test_points_without_weight_say_nothing_of_a_creep(seen):
@@ -287,9 +287,9 @@ def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(s
     growing, even = (
         of_deformations(fit_of(points, normals, noise(3000) + off), CONFIG)["layered"] for off in (thick, 2.0 * normals)
     )
-    assert growing.evidence.log_ratio > CONFIG.layered > 2.0 > even.evidence.log_ratio
+    assert growing.finding.log_ratio > CONFIG.layered > 2.0 > even.finding.log_ratio
     slope = 4.0 / np.ptp(along) * np.sqrt((points**2).sum(axis=1).mean())
-    assert slope / np.sqrt(3.0) < growing.evidence.size_mm < 1.5 * slope  # one of three has all of it
+    assert slope / np.sqrt(3.0) < growing.finding.size_mm < 1.5 * slope  # one of three has all of it
 
 
 def test_what_a_layer_has_everywhere_is_in_its_covariance_though_no_residual_shows_it(seen):
@@ -308,8 +308,8 @@ def test_alternatives_may_have_fewer_unknowns_than_others(seen):
     points, normals = seen(400)
     fit = fit_of(points, normals, noise(400))
     more, none = np.random.default_rng(5).normal(size=(400, 5)), np.zeros(400, dtype=np.int64)
-    both = evidence(blocks(fit, fit.jacobian, [more, more[:, :2]], none, SMALL), SMALL)
-    alone = evidence(blocks(fit, fit.jacobian, [more[:, :2]], none, SMALL), SMALL)
+    both = findings(blocks(fit, fit.jacobian, [more, more[:, :2]], none, SMALL), SMALL)
+    alone = findings(blocks(fit, fit.jacobian, [more[:, :2]], none, SMALL), SMALL)
     assert both[1] == pytest.approx(alone[0])
 
 
@@ -349,6 +349,6 @@ def test_of_a_motion_its_rotation_counts_by_the_radius_of_the_points(seen):
     fit = fit_of(points, normals, noise(2400))
     motions = fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
     group = np.minimum(order / 11.0 * CONFIG.groups, CONFIG.groups - 1).astype(int)
-    (same,) = evidence(blocks(fit, fit.jacobian, [time * motions], group, CONFIG), CONFIG)
+    (same,) = findings(blocks(fit, fit.jacobian, [time * motions], group, CONFIG), CONFIG)
     found = of_creep(fit, order, CONFIG)
     assert found == pytest.approx(same, rel=1e-2, abs=1e-3)

@@ -164,7 +164,7 @@ def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) ->
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:
-    """(6, 6) of either half against the pose between both, where they move against each other by so much."""
+    """(6, 6) of either half against the pose between both, where they move against each other by `size_mm`."""
     rests = fit.rests_on
     inlier = rests.weights > 0.0
     deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / _radius_mm(_away(rests))] * 3)

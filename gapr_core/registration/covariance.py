@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.geometry import extent
 from gapr_core.geometry.twists import covariance_about
 from gapr_core.registration import fit_kernels
 from gapr_core.registration import sensor as sensors
@@ -195,9 +196,8 @@ def strains(fit: Fit) -> Array:
     inlier = fit.weights > 0.0
     if not inlier.any():
         return np.zeros((0, 6))
-    away, normals = fit.feet[inlier] - fit.feet[inlier].mean(axis=0), fit.gradients[inlier]
-    size_mm = max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
-    products = np.einsum("ni,nj->nij", normals, away / size_mm)
+    feet, normals = fit.feet[inlier], fit.gradients[inlier]
+    products = np.einsum("ni,nj->nij", normals, (feet - feet.mean(axis=0)) / extent.radius_mm(feet))
     i, j = np.triu_indices(3)
     return np.asarray((products[:, i, j] + products[:, j, i]) / np.where(i == j, 2.0, np.sqrt(2.0)))
 

@@ -107,8 +107,8 @@ def motions(fit: Fit) -> Array:
     A turn of 1 mm is one by 1 mm over their root mean square distance from the middle.
     """
     inlier = fit.weights > 0.0
-    away, normals = _away(fit), fit.gradients[inlier]
-    return np.hstack([normals, np.cross(away, normals) / _radius_mm(away)])
+    moved, normals = fit.moved[inlier], fit.gradients[inlier]
+    return np.hstack([normals, np.cross(moved - moved.mean(axis=0), normals) / extent.radius_mm(moved)])
 
 
 def halves(fit: Fit) -> list[Array]:
@@ -126,18 +126,8 @@ def a_layer(fit: Fit) -> Array:
     deviation.
     """
     feet = fit.feet[fit.weights > 0.0]
-    away = feet - feet.mean(axis=0)
-    return np.column_stack([away / _radius_mm(away), np.full(len(feet), np.sqrt(3.0))])
-
-
-def _away(fit: Fit) -> Array:
-    """(n, 3) the inliers from their mean."""
-    moved = fit.moved[fit.weights > 0.0]
-    return np.asarray(moved - moved.mean(axis=0))
-
-
-def _radius_mm(away: Array) -> float:
-    return max(float(np.sqrt((away**2).sum(axis=1).mean())), 1.0)
+    away = (feet - feet.mean(axis=0)) / extent.radius_mm(feet)
+    return np.column_stack([away, np.full(len(feet), np.sqrt(3.0))])
 
 
 def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) -> Assessment:
@@ -166,10 +156,9 @@ def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) ->
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:
     """(6, 6) of either half against the pose between both, where they move against each other by `size_mm`."""
     rests = fit.rests_on
-    inlier = rests.weights > 0.0
-    deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / _radius_mm(_away(rests))] * 3)
-    to_middle = fit.moved.mean(axis=0) - rests.moved[inlier].mean(axis=0)
-    return covariance_about(to_middle, np.diag(deviations**2))
+    moved = rests.moved[rests.weights > 0.0]
+    deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / extent.radius_mm(moved)] * 3)
+    return covariance_about(fit.moved.mean(axis=0) - moved.mean(axis=0), np.diag(deviations**2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,14 +125,16 @@ class TrainingPairs(Dataset[TrainingPair]):
         raise RuntimeError(f"no usable pair under number {number}")
 
     def _bone_number(self, number: int) -> int:
-        """Neighbouring pairs share a bone, and so its features; every fourth micro-batch has the same fourth of them.
+        """Neighbouring pairs share a bone, and so its features; micro-batches take turns in lanes of bones of their own.
 
-        So each of two or four processes, which take micro-batches in turn, needs its own bones only.
+        Those of one turn take bones of the same kinds, which came in together. So each of two or four processes needs
+        its own bones only, and has as much to do as the others, which wait for it.
         """
-        rng = np.random.default_rng([self.train.seed, 3, number // self.train.share])
-        oldest = number // self.train.reuse
-        first = (number // self.train.micro_batch - oldest) % LANES
-        return oldest + first + LANES * int(rng.integers(max(1, -(-(self.train.pool - first) // LANES))))
+        micro_batch, place = divmod(number, self.train.micro_batch)
+        turn, lane = divmod(micro_batch, LANES)
+        rng = np.random.default_rng([self.train.seed, 3, turn, place // self.train.share])
+        row = _oldest_row(self.train, number) + int(rng.integers(max(1, self.train.pool // LANES)))
+        return LANES * row + lane
 
     def _seen_by(self, protocol: str, bone: PooledBone) -> Specimen:
         """What a protocol makes its pair of: the bone, or the target's own points where they are to be cropped."""
@@ -170,7 +172,7 @@ class TrainingPairs(Dataset[TrainingPair]):
         return bone
 
     def _new_bone(self, number: int) -> PooledBone:
-        people = self.people[number // LANES % len(self.people)]
+        people = self.people[number // LANES % len(self.people)]  # a row is of one kind
         specimen, subjects = people.draw_of(number, self.train.synthetic, self.train.seed)
         rng = np.random.default_rng([self.train.seed, 2, number])
         points, _ = specimen.sample(TARGET_POINTS, rng)
@@ -192,7 +194,12 @@ def check_mix(mix: Mapping[str, float]) -> None:
 
 def prune(folder: Path, train: TrainConfig, pairs: int) -> None:
     """Delete what the cache holds for pairs before number `pairs`."""
-    bone_cache.prune(folder, pairs // train.reuse)
+    bone_cache.prune(folder, LANES * _oldest_row(train, pairs))
+
+
+def _oldest_row(train: TrainConfig, number: int) -> int:
+    """The first row of `LANES` bones that pair `number` and those after it may ask for."""
+    return number // (train.reuse * LANES)
 
 
 def one_thread(worker: int) -> None:

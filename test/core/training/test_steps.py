@@ -110,7 +110,7 @@ def test_compiled_steps_learn_what_the_tensors_learn(with_tensors, model, batch)
 
     found, wanted = learn(), with_tensors(learn)
     torch.testing.assert_close(found[0], wanted[0], rtol=1e-5, atol=0.0)
-    assert float((found[1] - wanted[1]).norm() / wanted[1].norm()) < 1e-5
+    assert float((found[1] - wanted[1]).norm() / wanted[1].norm()) < 1e-4
 
 
 def test_registration_takes_the_compiled_steps_and_finds_what_the_tensors_find(with_tensors, batch, model, monkeypatch):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gapr_core.config import RegistrarConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
     from gapr_core.registration.accumulation import Accumulator
+    from gapr_core.registration.check_points import check_points
     from gapr_core.registration.crop import crop_box, crop_to_pose
     from gapr_core.registration.following import FollowedPose
     from gapr_core.registration.registrar import Registrar
@@ -36,6 +37,7 @@ _HOMES = {
     "RegistrationStatus": "results",
     "Surface": "surface",
     "load": "clouds",
+    "check_points": "registration.check_points",
     "crop_box": "registration.crop",
     "crop_to_pose": "registration.crop",
     "GaprError": "errors",

@@ -24,6 +24,7 @@ from gapr_core.errors import GaprError
 OK, BAD_INPUT, INTERRUPTED = 0, 1, 130
 COMMANDS = {
     "register": "gapr_core.commands.register",
+    "check-points": "gapr_core.commands.check_points",
     "evaluate": "gapr_core.commands.evaluate",
     "settings": "gapr_core.commands.settings",
     "pivot": "gapr_core.commands.pivot",

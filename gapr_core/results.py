@@ -1,4 +1,4 @@
-"""What a registration answers: a pose with its certainty, or a refusal with its reason."""
+"""What a registration answers: a pose with its certainty, or a refusal with its reason; what check points say of it."""
 
 from __future__ import annotations
 
@@ -220,3 +220,49 @@ class RegistrationResult:
             head += f" (95 %: {self.tre95_mm:.1f} mm)"
         head += f"  inliers {self.inlier_ratio:.2f}  {sum(self.stage_ms.values()):.0f} ms"
         return f"{head}  ({self.reason})" if self.reason else head
+
+
+class Verdict(str, Enum):
+    """What the check points say of a pose."""
+
+    HOLDS = "HOLDS"  # they lie where they should, and an error that matters would have shown
+    SAYS_LITTLE = "SAYS_LITTLE"  # they lie where they should, but such an error might not show in them
+    CONTRADICTED = "CONTRADICTED"  # they lie farther off the bone than the pose's covariance allows
+
+    def __str__(self) -> str:
+        return self.value
+
+
+@dataclass(frozen=True, eq=False)
+class PointCheck:
+    """The answer to one `check_points` call.
+
+    Attributes:
+        verdict: what the points say.
+        probability: that the points of a right pose lie as far off or farther, 0 to 1.
+        points: (N, 3) mm, source frame, the points that were checked.
+        distance_mm: (N,) signed distance to the surface, positive outside, the sensor's stand-off taken off; NaN where
+            no surface is near.
+        expected_mm: (N,) its standard deviation under a right pose; NaN with it.
+        unseen_mm: 95 % bound of the error over the bone that these points alone leave open.
+        tre95_mm: 95 % bound of the error over the bone by registration and check points together, if the pose is right.
+        next_point, next_normal: (3,) mm and unit, target frame: where another point lowers `unseen_mm` most.
+    """
+
+    verdict: Verdict
+    probability: float
+    points: Array
+    distance_mm: Array
+    expected_mm: Array
+    unseen_mm: float
+    tre95_mm: float
+    next_point: Array
+    next_normal: Array
+
+    def __str__(self) -> str:
+        sizes = np.abs(self.distance_mm)
+        largest = "no surface near" if np.isnan(sizes).any() else f"{sizes.max():.1f} mm off at most"
+        return (
+            f"{self.verdict}  {len(self.points)} points, {largest}  probability {self.probability:.3f}  "
+            f"unseen {self.unseen_mm:.1f} mm  TRE 95 %: {self.tre95_mm:.1f} mm"
+        )

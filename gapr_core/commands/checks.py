@@ -39,7 +39,7 @@ def check_outputs(args: Namespace) -> None:
         option = next(iter(in_lps))
         how = f"say what the mesh is in, or leave {option} out"
         raise ConfigError(f"--axes lps or ras with {option}, which is LPS", "lps_to_ras", how)
-    _check_collisions(_inputs(args), _outputs(args))
+    check_collisions(_inputs(args), _outputs(args))
     for _, path in _outputs(args):
         files.check_writable(path)
 
@@ -84,7 +84,7 @@ def _outputs(args: Namespace) -> list[Named]:
     return outputs + [("--slicer", args.slicer / name) for name in files_of_scene]
 
 
-def _check_collisions(inputs: list[Named], outputs: list[Named]) -> None:
+def check_collisions(inputs: list[Named], outputs: list[Named]) -> None:
     """Raise `ConfigError` where a file would be written over another one of the same run."""
     from gapr_core.formats.sweeps import SLICE_ENDINGS
 

@@ -1,13 +1,22 @@
-"""Options that several commands share: the method and its settings."""
+"""Options that several commands share: the method, its settings, what a tracker recorded, and how files are read."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.runtime import settings
 from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
+
+if TYPE_CHECKING:
+    from gapr_core.surface import Surface
+
+UNITS = ("mm", "cm", "m")
 
 
 def add_method(parser: ArgumentParser) -> None:
@@ -45,3 +54,39 @@ def registrar_config(args: Namespace) -> RegistrarConfig:
         ConfigError: an unknown setting, a value out of range, or a file that cannot be read.
     """
     return settings.load(RegistrarConfig, args.config, args.assignments)
+
+
+def add_tracker(parser: ArgumentParser) -> None:
+    """`--tip`, `--tool` and `--reference`: which points of a tracker's recording are meant, and in whose frame."""
+    parser.add_argument("--tip", type=place, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
+    parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
+    parser.add_argument(
+        "--reference",
+        type=int,
+        metavar="TOOL",
+        help="the tool on the bone, from 0: points are in its frame, not the tracker's",
+    )
+
+
+def place(text: str) -> tuple[float, float, float]:
+    """X,Y,Z of an argument.
+
+    Raises:
+        ArgumentTypeError: not three finite numbers.
+    """
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise ArgumentTypeError(f"three numbers X,Y,Z, not {text!r}") from error
+    if not np.isfinite([x, y, z]).all():
+        raise ArgumentTypeError(f"three finite numbers X,Y,Z, not {text!r}")
+    return x, y, z
+
+
+def load(path: Path, units: str | None, **how: Any) -> Surface:
+    """A file in the unit that is named, or that files of its kind usually have; `how` are fields of `ReadOptions`."""
+    from gapr_core import clouds
+    from gapr_core.formats import reading
+    from gapr_core.formats.options import ReadOptions
+
+    return clouds.load(path, units or reading.format_of(path).unit, ReadOptions(**how))

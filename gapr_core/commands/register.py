@@ -6,7 +6,6 @@ import logging
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,9 +40,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--source", required=True, type=a_path, help="partial cloud, markups, recording, folder of slices, bag"
     )
     parser.add_argument("--target", required=True, type=a_path, help="full bone: mesh, cloud or label map")
-    units = ("mm", "cm", "m")
-    parser.add_argument("--units", choices=units, help="of meshes and clouds (default: mm; clouds of a bag: m)")
-    parser.add_argument("--source-units", choices=units, help="of the source, where it is in another unit")
+    parser.add_argument("--units", choices=options.UNITS, help="of meshes and clouds (default: mm; clouds of a bag: m)")
+    parser.add_argument("--source-units", choices=options.UNITS, help="of the source, where it is in another unit")
     parser.add_argument("--topic", default="", help="of the clouds in a bag; may be left out where it has one")
     parser.add_argument("--clouds", type=_span, default=(None, None), metavar="FIRST:LAST",
                         help="clouds of the topic that are joined, as a slice: 0:1 is the first (all)")  # fmt: skip
@@ -55,10 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--source-axes", type=str.lower, default="auto", choices=("auto", "lps", "ras"),
                         help="of a source that does not say them, such as a tracker's: ras for what 3D Slicer shows "
                         "live over OpenIGTLink (auto: LPS)")  # fmt: skip
-    parser.add_argument("--tip", type=_point, help="X,Y,Z of the pointer's tip in its marker's frame, mm (gapr pivot)")
-    parser.add_argument("--tool", type=int, help="which of several tools in a recording, from 0")
-    parser.add_argument("--reference", type=int, metavar="TOOL",
-                        help="the tool on the bone, from 0: the source is in its frame, not the tracker's")  # fmt: skip
+    options.add_tracker(parser)
     parser.add_argument("--viewpoint", type=_place, default="auto", metavar="X,Y,Z|auto|none",
                         help="of the camera in the source's frame, mm; auto: its pixels or its surface may show it; "
                         "none: all is bone")  # fmt: skip
@@ -78,18 +73,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     options.add_method(parser)
 
 
-def _point(text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError as error:
-        raise ArgumentTypeError(f"three numbers X,Y,Z, not {text!r}") from error
-    if not np.isfinite([x, y, z]).all():
-        raise ArgumentTypeError(f"three finite numbers X,Y,Z, not {text!r}")
-    return x, y, z
-
-
 def _place(text: str) -> tuple[float, float, float] | str:
-    return text if text in ("auto", "none") else _point(text)
+    return text if text in ("auto", "none") else options.place(text)
 
 
 def _span(text: str) -> tuple[int | None, int | None]:
@@ -148,11 +133,11 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     """Target and source, with a warning of everything that may be wrong and can be read nevertheless."""
     from gapr_core import clouds
 
-    target = _load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
+    target = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     clouds.warn_of_size(args.target, target.extent_mm)
     how = {"axes": args.source_axes, "tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
     how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
-    source = _load(args.source, args.source_units or args.units, **how)
+    source = options.load(args.source, args.source_units or args.units, **how)
     if source.faces is not None and target.faces is None:
         log.warning(
             "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
@@ -163,15 +148,6 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     checks.warn_of_landmarks(args, source.points, target.points)
     checks.warn_of_frames(args, source.points, target.points)
     return target, source
-
-
-def _load(path: Path, units: str | None, **how: Any) -> Surface:
-    """A file in the unit that is named, or that files of its kind usually have."""
-    from gapr_core import clouds
-    from gapr_core.formats import reading
-    from gapr_core.formats.options import ReadOptions
-
-    return clouds.load(path, units or reading.format_of(path).unit, ReadOptions(**how))
 
 
 def _plan(args: Namespace) -> Any:

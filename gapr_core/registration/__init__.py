@@ -12,7 +12,8 @@ Where to read on, in the order in which a source passes:
   `checks` asks the costly ones), `limits` (what keeps it from being sure), `words` for all of these; `standoff` asks
   a refused source for the radius of a tip.
 - `smooth_bias`, `precision` and `precision_model` correct what is accepted: its pose, and the error that is expected.
-- `guidance`: where to look next. `cortices`: bones whose model has an inner surface.
+- `guidance`: where to look next. `check_points`: does the pose hold where the source was not? `cortices`: bones whose
+  model has an inner surface.
 
 A camera's cloud goes another way: `clutter` (with `proposals.regions`, `free_space`, `clutter_kernels`), `explained`.
 Streams: `tracking` (with `memory`, `evidence`, `repeats`, `stream_misfit` of `shared_misfit`), `following` between two

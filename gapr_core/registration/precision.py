@@ -19,7 +19,7 @@ QUANTILE = 0.95
 
 def expected_mm(covariance: Array, points: Array, centre: Array) -> float:
     """Root-mean-square error over points (M, 3), mm, under a pose covariance (6, 6) about `centre` (3,)."""
-    return float(np.sqrt(np.trace(_mean_square(points, centre) @ covariance)))
+    return float(np.sqrt(np.trace(mean_square(points, centre) @ covariance)))
 
 
 def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = QUANTILE) -> float:
@@ -31,13 +31,13 @@ def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = 
         centre: (3,) mm, target frame.
         quantile: 0 to 1.
     """
-    product = _mean_square(points, centre) @ covariance
+    product = mean_square(points, centre) @ covariance
     mean, variance = np.trace(product), 2.0 * np.trace(product @ product)
     scale, freedom = variance / (2.0 * mean), 2.0 * mean**2 / variance
     return float(np.sqrt(scale * chi2.ppf(quantile, freedom)))
 
 
-def _mean_square(points: Array, centre: Array) -> Array:
+def mean_square(points: Array, centre: Array) -> Array:
     """(6, 6) A with TRE^2 = e^T A e over points (M, 3): of their mean m and second moments S about the centre.
 
     With [m]x the matrix of a cross product, A = [I, -[m]x; [m]x, tr(S) I - S].

@@ -125,7 +125,7 @@ class TrainingPairs(Dataset[TrainingPair]):
         raise RuntimeError(f"no usable pair under number {number}")
 
     def _bone_number(self, number: int) -> int:
-        """Neighbouring pairs share a bone, and so its features; micro-batches take turns in lanes of bones of their own.
+        """Neighbouring pairs share a bone, and so its features; micro-batches take turns in lanes of their own bones.
 
         Those of one turn take bones of the same kinds, which came in together. So each of two or four processes needs
         its own bones only, and has as much to do as the others, which wait for it.

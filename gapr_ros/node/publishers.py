@@ -28,6 +28,7 @@ TOPICS = {
     "followed_pose": (PoseStamped, 10),
     "confidence": (Float64, 10),
     "status": (DiagnosticStatus, 10),
+    "check": (DiagnosticStatus, 10),
     "hypotheses": (PoseArray, 10),
     "residuals": (PointCloud2, 1),
     "guidance": (PointCloud2, 1),
@@ -68,6 +69,10 @@ class Publishers:
     def send_followed(self, T_frame_model: Array, header: Header) -> None:
         """Where the bone is, (4, 4), metres, by a cloud that was not assessed: to be shown."""
         self._topics["followed_pose"].publish(PoseStamped(header=header, pose=matrix_to_pose(T_frame_model)))
+
+    def send_check(self, found: DiagnosticStatus) -> None:
+        """What touched points say of the last accepted pose."""
+        self._topics["check"].publish(found)
 
     def withdraw(self, *names: str) -> None:
         """No late listener gets the last message of these any more: they are given up and advertised again."""

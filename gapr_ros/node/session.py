@@ -20,10 +20,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 
-from gapr_ros.node import intake, timeline
+from gapr_core.results import PointCheck
+from gapr_ros.node import intake, timeline, touches
 from gapr_ros.node.admission import CLOCK_CHANGED, CLOCK_WENT_BACK, STAMPS_WENT_BACK, Admission
 from gapr_ros.node.changes import Changes
 from gapr_ros.node.collection import forget
@@ -65,6 +66,7 @@ class Session:
         self._changes = Changes(ready.parameters, host.parameters)
         self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
+        self._standing: Outcome | None = None  # of the last accepted pose, until it is withdrawn
         self.conflicts = Conflicts(host.ros.get_logger().warning)
         self.course = Course()
         self._log_refusal = RefusalLog(host.ros.get_logger().warning)
@@ -140,6 +142,17 @@ class Session:
         if frame:
             self._frames.listen()
 
+    def take_touches(self, message: PoseArray) -> None:
+        """Touched points, which check the last accepted pose: what they say goes out, and the pose stays."""
+        found: PointCheck | str
+        try:
+            found = touches.check(message, self._standing, self.model, self._host.parameters)
+        except touches.NothingToCheckError as error:
+            found = str(error)
+            self._host.ros.get_logger().warning(f"nothing was checked: {found}")
+        name = self._host.ros.get_fully_qualified_name()
+        self._publishers.send_check(touches.status(message, found, name, self.model.file))
+
     def _is_future(self, stamp_ns: int) -> bool:
         """Of a transform."""
         return timeline.is_far_ahead(stamp_ns, self._host.now_ns(), self._host.parameters.max_future)
@@ -206,6 +219,7 @@ class Session:
     def _answer(self, outcome: Outcome) -> None:
         """Count an outcome, send it, and tell who waits for it."""
         self.last_outcome = outcome
+        self._standing = outcome if outcome.ok else self._standing
         self._host.counters.answered(outcome)
         if not outcome.ok:
             self._log_refusal(outcome)
@@ -213,7 +227,7 @@ class Session:
             if not self._closed:
                 self._publishers.send(outcome, self.model)
                 if self._host.counters.consecutive_refusals == OUTLIVED_AFTER:
-                    self._publishers.withdraw("pose")
+                    self._withdraw_pose()
                 self._admission.note_tf()
         finally:
             outcome.tell()
@@ -229,7 +243,7 @@ class Session:
     def _clear(self, why: str) -> None:
         self._begin_again(why)
         self.worker.outdate(self.course.epoch)
-        self._publishers.withdraw("pose")
+        self._withdraw_pose()
 
     def clock_jumped(self, is_another: bool) -> None:
         """The node's clock went back, or is another one: `use_sim_time` was set."""
@@ -257,7 +271,7 @@ class Session:
         self._changes = Changes(ready.parameters, self._host.parameters)
         self.worker.outdate(self.course.epoch)
         self.parameters_changed()
-        self._publishers.withdraw("pose")
+        self._withdraw_pose()
         self.send_model()
 
     def send_model(self) -> None:
@@ -266,7 +280,13 @@ class Session:
 
     def withdraw(self) -> None:
         """Late listeners get nothing from a node that is not active: it does not know where the bone is."""
-        self._publishers.withdraw("pose", "model")
+        self._withdraw_pose()
+        self._publishers.withdraw("model")
+
+    def _withdraw_pose(self) -> None:
+        """Nobody gets it any more, and nothing checks it."""
+        self._standing = None
+        self._publishers.withdraw("pose")
 
     def stop_waiting(self, why: str) -> None:
         """A pause: drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way.

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
@@ -19,7 +19,7 @@ from gapr_ros.node.host import Host
 from gapr_ros.node.session import Session
 from msg_adapters import INPUTS
 
-CLOUDS, SEEDS = "points", "initialpose"
+CLOUDS, SEEDS, TOUCHES = "points", "initialpose", "check_points"
 LOOK_S = 1.0  # between two looks at who publishes
 GRACE_S = 3.0  # the graph may know of a publisher later than the event of its QoS
 MOST_QUEUED = 100  # clouds in the middleware's queue
@@ -27,7 +27,7 @@ REMEMBERED = 256  # clouds, to know the same one from the other subscription
 
 
 class Subscriptions:
-    """Listens to `points` and `initialpose` while the node is active.
+    """Listens to `points`, `initialpose` and `check_points` while the node is active.
 
     Clouds stay serialised until the worker takes one: a dropped cloud costs nothing, and damaged bytes cannot end the
     executor. Reliable publishers are heard by a reliable subscription, always. While there are publishers that offer
@@ -43,6 +43,7 @@ class Subscriptions:
         first = ReliabilityPolicy.BEST_EFFORT if self._asked == "best_effort" else ReliabilityPolicy.RELIABLE
         self._clouds, self._second = self._subscribe(first), None
         self._seeds = host.ros.create_subscription(PoseWithCovarianceStamped, SEEDS, self._on_seed, 1)
+        self._touches = host.ros.create_subscription(PoseArray, TOUCHES, self._on_touches, 10)
         self._looking = host.ros.create_timer(LOOK_S, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def describe(self) -> Input:
@@ -58,7 +59,7 @@ class Subscriptions:
         for about in ("type", "publishers"):
             self._session.conflicts.note(about, "")
         self._host.ros.destroy_timer(self._looking)
-        for subscription in (self._clouds, self._second, self._seeds):
+        for subscription in (self._clouds, self._second, self._seeds, self._touches):
             if subscription is not None:
                 self._host.ros.destroy_subscription(subscription)
 
@@ -112,6 +113,10 @@ class Subscriptions:
     @guarded
     def _on_seed(self, message: PoseWithCovarianceStamped) -> None:
         self._session.take_seed(message)
+
+    @guarded
+    def _on_touches(self, message: PoseArray) -> None:
+        self._session.take_touches(message)
 
     @guarded
     def _on_mismatch(self, event: Any) -> None:

@@ -305,8 +305,8 @@ def test_a_camera_is_not_looked_for_where_all_is_bone_or_seen_from_several_place
             return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9, **FULL)
 
     monkeypatch.setattr(methods, "make", lambda name, config: Own(config))
-    load = commands.register._load
-    monkeypatch.setattr(commands.register, "_load", lambda *given, **how: replace(load(*given, **how), **made_of))
+    load = commands.options.load
+    monkeypatch.setattr(commands.options, "load", lambda *given, **how: replace(load(*given, **how), **made_of))
     assert register(f"{option} --method gapr_search") == 0
     assert asked == [is_inferred]
 

@@ -1,0 +1,105 @@
+"""`gapr check-points`: does an accepted pose hold at points of the bone that were touched after the registration?"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gapr_core.commands import answer, checks, options
+from gapr_core.geometry import se3
+from gapr_core.runtime import files
+from gapr_core.runtime.arguments import a_path
+from gapr_core.runtime.console import say
+
+if TYPE_CHECKING:
+    from gapr_core.results import PointCheck
+
+HOLDS, REFUSED = 0, 2
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """The options of `gapr check-points`; docs/how-to/check_points.md explains the answer."""
+    parser.add_argument(
+        "--points", required=True, type=a_path, help="touched points, source frame: markups, cloud or recording"
+    )
+    parser.add_argument("--target", required=True, type=a_path, help="full bone, as it was registered")
+    parser.add_argument("--pose", required=True, type=a_path, metavar="FILE.json",
+                        help="the answer of gapr register --json")  # fmt: skip
+    parser.add_argument("--units", choices=options.UNITS, help="of meshes and clouds (default: mm)")
+    parser.add_argument("--points-units", choices=options.UNITS, help="of the points, where they are in another unit")
+    parser.add_argument("--label", action="append", default=[], help="NAME or NUMBER in a label map; may be repeated")
+    parser.add_argument("--axes", type=str.lower, default="auto", help="of a target mesh, as in gapr register")
+    parser.add_argument("--points-axes", type=str.lower, default="auto", choices=("auto", "lps", "ras"),
+                        help="of points that do not say them (auto: LPS)")  # fmt: skip
+    options.add_tracker(parser)
+    parser.add_argument("--within", type=float, default=se3.RIGHT_MM, metavar="MM",
+                        help=f"error over the bone that matters ({se3.RIGHT_MM:g})")  # fmt: skip
+    parser.add_argument("--json", type=a_path, help="write the answer here as well; keys: docs/reference/json.md")
+    options.add_settings(parser)
+
+
+def run(args: Namespace) -> int:
+    """Print the answer; exit code 0 where the pose holds, 2 where it does not or the points say too little.
+
+    Raises:
+        GaprError: options or files that cannot be used.
+    """
+    from gapr_core.registration import target as targets
+    from gapr_core.registration.check_points import check_points
+    from gapr_core.results import Verdict
+
+    config = options.registrar_config(args)
+    result = answer.read_json(args.pose)
+    if args.json:
+        inputs = [("--points", args.points), ("--target", args.target), ("--pose", args.pose)]
+        checks.check_collisions(inputs, [("--json", args.json)])
+        files.check_writable(args.json)
+    bone = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
+    how: dict[str, Any] = {"axes": args.points_axes, "tip_mm": args.tip, "tool": args.tool}
+    touched = options.load(args.points, args.points_units or args.units, **how, reference=args.reference)
+    target = targets.prepare(bone, "mm", config.target, config.num_threads)
+    found = check_points(touched.points, target, result, config, args.within)
+    _show(found, args.within)
+    if args.json:
+        files.write_json(args.json, _as_json(found))
+    return HOLDS if found.verdict is Verdict.HOLDS else REFUSED
+
+
+def _show(found: PointCheck, within_mm: float) -> None:
+    """The answer in words, every point, and what to do."""
+    from gapr_core.results import Verdict
+
+    say(str(found))
+    for number, (distance, expected) in enumerate(zip(found.distance_mm, found.expected_mm, strict=True), 1):
+        if np.isnan(distance):
+            say(f"{number}. no surface is near")
+        else:
+            say(f"{number}. {distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)")
+    if found.verdict is Verdict.CONTRADICTED:
+        say("the pose does not hold there: touch the farthest point again; if it stays, register again")
+    elif found.verdict is Verdict.SAYS_LITTLE:
+        where = "({:.0f}, {:.0f}, {:.0f})".format(*found.next_point)
+        say(f"an error of {found.unseen_mm:.1f} mm over the bone might not show, {within_mm:g} mm matters: "
+            f"touch more points, the next one at {where} mm on the target")  # fmt: skip
+
+
+def _as_json(found: PointCheck) -> dict[str, Any]:
+    """The keys of docs/reference/json.md."""
+    return {
+        "verdict": str(found.verdict),
+        "probability": found.probability,
+        "points": found.points.tolist(),
+        "distance_mm": _numbers(found.distance_mm),
+        "expected_mm": _numbers(found.expected_mm),
+        "unseen_mm": found.unseen_mm,
+        "tre95_mm": found.tre95_mm,
+        "next_point_mm": found.next_point.tolist(),
+        "next_normal": found.next_normal.tolist(),
+    }
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """JSON has no NaN."""
+    return [None if np.isnan(value) else float(value) for value in values]

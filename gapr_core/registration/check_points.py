@@ -1,0 +1,159 @@
+"""Check points: does an accepted pose hold where the source was not? Points of the bone that took no part in it say so.
+
+Under a right pose, with covariance C, the signed distances d of n points from the bone's surface are normal with
+covariance S = J C J^T + R: J is their derivative by the pose's error, and R holds what the sensor and the model err by.
+Then d^T S^-1 d is chi-square with n degrees of freedom. That they are as small as expected says much only if an error
+of the pose would have shown: points on one side of a shaft never notice a slide along it. So the answer has the error
+over the bone that the points alone leave open, by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P, too, and where
+another point would lower it most (`precision` for errors over the bone).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2, norm
+
+from gapr_core.clouds import finite_points
+from gapr_core.config import RegistrarConfig
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import se3
+from gapr_core.geometry.twists import motion_jacobians
+from gapr_core.registration import kernels, precision, sensor
+from gapr_core.registration.bias_field import smooth_correlation
+from gapr_core.registration.registrar import check_call
+from gapr_core.registration.sensor import Errors, offset_surface
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.results import PointCheck, RegistrationResult, Verdict
+
+Array = NDArray[np.float64]
+
+SURPRISING = 0.01  # a right pose is contradicted so often
+LOOSE_MM, LOOSE_DEG = 20.0, 20.0  # standard deviations of a pose of which only the check points are known
+CANDIDATES = 500  # places of the bone that are compared for the next point
+
+
+def check_points(
+    points: ArrayLike,
+    target: PreparedTarget,
+    result: RegistrationResult,
+    config: RegistrarConfig | None = None,
+    within_mm: float = se3.RIGHT_MM,
+) -> PointCheck:
+    """Whether points of the bone that took no part in a registration lie on it under the accepted pose.
+
+    Args:
+        points: (N, 3) mm, in the frame of the source, one or more; rows that are not finite are dropped. A point that
+            the registration used says nothing here.
+        target: the bone, as it was registered.
+        result: the answer, `OK` and with a covariance.
+        config: the sensor that measured the points (`sensor`), and how far the bone's model may be off
+            (`covariance.model_mm`); the defaults when not given.
+        within_mm: an error over the bone that matters: a pose holds where the points alone would have shown it.
+
+    Raises:
+        InvalidPointCloudError: no points, a wrong shape or type, a target that is not prepared, or a result without a
+            pose or its covariance.
+    """
+    check_call(target, None)
+    config = config or RegistrarConfig()
+    points = finite_points(points)
+    if not len(points):
+        raise InvalidPointCloudError("check points", "none that is finite", "touch the bone and pass (N, 3), mm")
+    T, covariance, centre = _accepted(result)
+    surface = offset_surface(target, config.sensor)
+    distance_mm, normals = _distances(T, points, surface)
+    moved, near = se3.apply(T, points), ~np.isnan(distance_mm)
+    J = _jacobian(moved[near], normals[near], centre)
+    R = _errors_of(moved[near], normals[near], sensor.errors(config.sensor, len(points)), config)
+    S = J @ covariance @ J.T + R
+    expected_mm = np.full(len(points), np.nan)
+    expected_mm[near] = np.sqrt(np.diag(S))
+    probability = _probability(distance_mm[near], S) if near.all() else 0.0
+    information = J.T @ np.linalg.solve(R, J)
+    alone = np.linalg.inv(np.linalg.inv(_loose()) + information)
+    unseen_mm = precision.bound_mm(alone, target.points, centre)
+    together = np.linalg.inv(np.linalg.inv(covariance) + information)
+    best = _next(alone, target, centre, float(np.diag(R).mean()) if near.any() else 1.0)
+    return PointCheck(
+        _verdict(probability, unseen_mm, within_mm), probability, points, distance_mm, expected_mm, unseen_mm,
+        precision.bound_mm(together, target.points, centre), target.points[best], target.normals[best],
+    )  # fmt: skip
+
+
+def _accepted(result: RegistrationResult) -> tuple[Array, Array, Array]:
+    """Pose (4, 4), covariance (6, 6) and its centre (3,) of an answer.
+
+    The covariance is widened as its bound was: 95 % of errors of known size stay below that.
+    """
+    T, covariance, centre = result.T_target_source, result.covariance, result.centre_mm
+    if T is None or covariance is None or centre is None:
+        given = f"{result.status} by {result.method}"
+        raise InvalidPointCloudError(
+            "an accepted pose with its covariance", given, "register again, with more of the bone or method gapr"
+        )
+    return T, result.factor95**2 * covariance, centre
+
+
+def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
+    """Signed distances (N,), mm, of points (N, 3) to the surface under a pose, NaN where none is near; its normals.
+
+    Off the edge of a model that was cut off, what a point lies beyond the last surface element counts as well.
+    """
+    signed, normals, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
+    return np.where(signed < 0.0, -1.0, 1.0) * np.hypot(signed, aside), normals
+
+
+def _jacobian(moved: Array, normals: Array, centre: Array) -> Array:
+    """(n, 6) derivative of the signed distances by the pose's error about `centre`."""
+    return np.einsum("ni,nij->nj", normals, motion_jacobians(moved, centre))
+
+
+def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarConfig) -> Array:
+    """(n, n) covariance of what the distances of points err by under the true pose, mm^2.
+
+    Noise, a smooth bias that near points share, a stand-off and an error of the model that all share, and another size,
+    which moves a point along its normal by its place.
+    """
+    settings = config.covariance
+    alike = smooth_correlation(moved, moved, settings.correlation_mm)
+    grown = np.einsum("ni,ni->n", moved - moved.mean(axis=0), normals) if len(moved) else np.empty(0)
+    own_mm2 = errors.noise_mm**2 + errors.local_mm**2
+    shared_mm2 = errors.standoff_mm**2 + settings.model_mm**2
+    return np.asarray(
+        own_mm2 * np.eye(len(moved)) + errors.bias_mm**2 * alike + shared_mm2 + errors.scale**2 * np.outer(grown, grown)
+    )
+
+
+def _probability(distance_mm: Array, S: Array) -> float:
+    """That n normal distances with covariance S (n, n) lie as far off or farther: the smaller of two tests', times two.
+
+    All together (chi-square), and the farthest of all by itself, which many good ones would hide (Bonferroni).
+    """
+    together = chi2.sf(distance_mm @ np.linalg.solve(S, distance_mm), len(distance_mm))
+    farthest = 2.0 * norm.sf(np.abs(distance_mm / np.sqrt(np.diag(S))).max()) * len(distance_mm)
+    return float(min(2.0 * min(together, farthest), 1.0))
+
+
+def _verdict(probability: float, unseen_mm: float, within_mm: float) -> Verdict:
+    if probability < SURPRISING:
+        return Verdict.CONTRADICTED
+    return Verdict.HOLDS if unseen_mm <= within_mm else Verdict.SAYS_LITTLE
+
+
+def _loose() -> Array:
+    """(6, 6) covariance of a pose of which nothing is known but that it is near, mm and rad."""
+    return np.diag([LOOSE_MM**2] * 3 + [np.radians(LOOSE_DEG) ** 2] * 3)
+
+
+def _next(covariance: Array, target: PreparedTarget, centre: Array, variance_mm2: float) -> int:
+    """The target point where a point of this variance lowers the mean square error over the bone most.
+
+    A distance with derivative j takes C j j^T C / (s^2 + j^T C j) off the covariance C of the pose (Kalman 1960).
+    """
+    chosen = np.arange(0, len(target.points), max(1, len(target.points) // CANDIDATES))
+    J = _jacobian(target.points[chosen], target.normals[chosen], centre)
+    CJ = J @ covariance
+    moved = precision.mean_square(target.points, centre)
+    gain = np.einsum("ki,ij,kj->k", CJ, moved, CJ) / (variance_mm2 + np.einsum("ki,ki->k", CJ, J))
+    return int(chosen[gain.argmax()])

@@ -1,0 +1,89 @@
+"""Check points: positions that a tracked pointer touched on the bone, against the last accepted pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
+from numpy.typing import NDArray
+
+from gapr_core import RegistrarConfig, check_points
+from gapr_core.config import SensorConfig
+from gapr_core.errors import GaprError
+from gapr_core.results import PointCheck, Verdict
+from gapr_ros.node import wire
+from gapr_ros.node.diagnostics import status_message
+from gapr_ros.node.intake import plain_frame
+from gapr_ros.node.model import Model
+from gapr_ros.node.outcome import Outcome
+from gapr_ros.parameters import NodeParameters
+
+Array = NDArray[np.float64]
+LEVELS = {
+    Verdict.HOLDS: DiagnosticStatus.OK,
+    Verdict.SAYS_LITTLE: DiagnosticStatus.WARN,
+    Verdict.CONTRADICTED: DiagnosticStatus.ERROR,
+}
+
+
+class NothingToCheckError(Exception):
+    """There is no verdict; the text says why."""
+
+
+def check(message: PoseArray, accepted: Outcome | None, model: Model, parameters: NodeParameters) -> PointCheck:
+    """What touched points say of the last accepted pose.
+
+    Args:
+        message: positions of the pointer's tip, metres, in the frame of the pose; orientations do not count.
+        accepted: what became of the last cloud with a pose that still stands; None where there is none.
+        model: the bone.
+        parameters: of the node; where `sensor` is not a pointer, what is usual of one is assumed.
+
+    Raises:
+        NothingToCheckError: no pose, another frame, no points, or a method that says no covariance.
+    """
+    if accepted is None or accepted.result is None:
+        raise NothingToCheckError("no pose was accepted, or the last one was withdrawn: register first")
+    frame, wanted = plain_frame(message.header.frame_id), accepted.header.frame_id
+    if frame != wanted:
+        raise NothingToCheckError(f"check points in '{frame}', the pose is in '{wanted}': publish them there")
+    positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses]
+    points_mm = wire.to_mm(np.array(positions, dtype=np.float64).reshape(-1, 3), "m")
+    try:
+        return check_points(points_mm, model.target, accepted.result, _config(parameters))
+    except GaprError as error:
+        raise NothingToCheckError(str(error)) from error
+
+
+def status(message: PoseArray, found: PointCheck | str, name: str, hardware_id: str) -> DiagnosticStatus:
+    """The verdict with its numbers, lengths in metres; or why there is none."""
+    stamp = message.header.stamp
+    values: dict[str, object] = {
+        "stamp": f"{stamp.sec}.{stamp.nanosec:09d}",
+        "frame": plain_frame(message.header.frame_id),
+        "points": len(message.poses),
+    }
+    if isinstance(found, str):
+        return status_message(
+            DiagnosticStatus.WARN, f"{name}: check points", hardware_id, found, {"verdict": ""} | values
+        )
+    largest_mm = float(np.abs(found.distance_mm).max())  # NaN where no surface is near
+    values |= {
+        "probability": found.probability,
+        "largest_distance": wire.to_metres(largest_mm),
+        "unseen": wire.to_metres(found.unseen_mm),
+        "tre95": wire.to_metres(found.tre95_mm),
+        "next_point": " ".join(f"{value:.4f}" for value in wire.to_metres(found.next_point)),
+    }
+    values = {"verdict": str(found.verdict)} | values
+    return status_message(LEVELS[found.verdict], f"{name}: check points", hardware_id, str(found), values)
+
+
+def _config(parameters: NodeParameters) -> RegistrarConfig:
+    """The pointer, and how far the model may be off."""
+    sensor, covariance = SensorConfig(kind="pointer"), RegistrarConfig().covariance
+    if parameters.sensor == "pointer" and parameters.standoff:
+        sensor = SensorConfig(kind="pointer", standoff_mm=parameters.standoff * wire.MM_PER_M)
+    if parameters.model_error >= 0.0:
+        covariance = type(covariance)(model_mm=parameters.model_error * wire.MM_PER_M)
+    return RegistrarConfig(sensor=sensor, covariance=covariance)

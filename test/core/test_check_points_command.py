@@ -1,0 +1,91 @@
+"""`gapr check-points`: from the answer of `gapr register --json` and touched points to a verdict."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar, check_points, cli
+from gapr_core.commands.answer import as_json, read_json
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+T = se3.from_rotation_translation(se3.random_rotation(np.random.default_rng(3)), np.array([30.0, -20.0, 10.0]))
+OK = RegistrationResult(
+    RegistrationStatus.OK, T, np.diag([0.04] * 3 + [1e-5] * 3), 0.93, 0.5, 1.0, factor95=1.3, centre_mm=np.zeros(3)
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, femur_cloud):
+    """A bone, its accepted pose, and thirty touched points in the frame of the source."""
+    monkeypatch.chdir(tmp_path)
+    np.save("bone.npy", femur_cloud)
+    touched = femur_cloud[np.random.default_rng(0).choice(len(femur_cloud), 30, replace=False)]
+    np.savetxt("touched.txt", se3.apply(np.linalg.inv(T), touched))
+    (tmp_path / "pose.json").write_text(json.dumps(as_json(OK)))
+    return tmp_path
+
+
+def run(*more, points="touched.txt", pose="pose.json"):
+    return cli.main(["check-points", "--points", points, "--target", "bone.npy", "--pose", pose, *more])
+
+
+def test_what_register_wrote_is_read_as_it_was(folder):
+    again = read_json(folder / "pose.json")
+    assert again.ok and again.factor95 == 1.3 and again.confidence == 0.93
+    for name in ("T_target_source", "covariance", "centre_mm"):
+        assert np.array_equal(getattr(again, name), getattr(OK, name))
+
+
+def test_a_right_pose_holds_with_exit_code_0(folder, capsys):
+    assert run("--json", "found.json") == 0
+    shown, found = capsys.readouterr().out, json.loads((folder / "found.json").read_text())
+    assert shown.startswith("HOLDS  30 points") and "30. " in shown
+    assert found["verdict"] == "HOLDS" and len(found["distance_mm"]) == len(found["expected_mm"]) == 30
+    assert found["unseen_mm"] < 4.0 and found["tre95_mm"] < found["unseen_mm"]
+
+
+def test_points_that_say_little_name_the_next_place_and_exit_with_2(folder, capsys):
+    np.savetxt("three.txt", np.loadtxt("touched.txt")[:3])
+    assert run(points="three.txt") == 2
+    assert "touch more points, the next one at (" in capsys.readouterr().out
+
+
+def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, capsys):
+    moved = np.loadtxt("touched.txt") + [0.0, 0.0, 8.0]
+    np.savetxt("moved.txt", np.vstack([moved, [900.0, 0.0, 0.0]]))
+    assert run("--json", "found.json", points="moved.txt") == 2
+    shown = capsys.readouterr().out
+    assert shown.startswith("CONTRADICTED") and "31. no surface is near" in shown and "register again" in shown
+    assert json.loads((folder / "found.json").read_text())["distance_mm"][30] is None
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "expected the answer of a registration; got pose.json"),
+        ("[1]", "the answer of a registration in pose.json"),
+        ('{"status": "OK"}', "no 'transform' in it"),
+        (json.dumps(as_json(RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two fit"))), "AMBIGUOUS: two fit"),
+        (json.dumps(as_json(OK) | {"transform": np.diag([2.0, 2, 2, 1]).tolist()}), "a rigid transform in pose.json"),
+        (json.dumps(as_json(OK) | {"covariance": [[1.0]]}), "finite numbers (6, 6) in pose.json; got (1, 1)"),
+        (json.dumps(as_json(OK) | {"centre_mm": ["a", 0, 0]}), "numbers (3,) in pose.json"),
+    ],
+)
+def test_another_file_than_an_accepted_answer_is_one_line(folder, capsys, content, said):
+    (folder / "pose.json").write_text(content)
+    assert run() == 1
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+
+
+def test_the_answer_does_not_go_over_what_it_was_made_of(folder, capsys):
+    assert run("--json", "pose.json") == 1
+    assert "which belongs to --pose" in capsys.readouterr().err
+
+
+def test_the_library_has_it_under_one_name(femur_cloud):
+    target = Registrar().prepare(femur_cloud)
+    found = check_points(se3.apply(np.linalg.inv(T), femur_cloud[::200]), target, OK)
+    assert str(found).startswith("HOLDS")

@@ -1,0 +1,165 @@
+"""Check points: distances, their covariance, the probability and what stays unseen, against draws and by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+from tiny import ellipsoid, on_ellipsoid, plane
+
+from gapr_core.config import CovarianceConfig, RegistrarConfig, SensorConfig
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.geometry import se3
+from gapr_core.registration import check_points as module
+from gapr_core.registration import precision
+from gapr_core.registration.check_points import check_points as check
+from gapr_core.results import RegistrationResult, RegistrationStatus, Verdict
+
+EXACT = RegistrarConfig(
+    sensor=SensorConfig(noise_mm=0.3, bias_mm=1e-3, scale=0.0, standoff_mm=0.0, known_standoff_mm=1e-3),
+    covariance=CovarianceConfig(model_mm=0.0),
+)
+SMALL = np.diag([0.2**2] * 3 + [0.005**2] * 3)
+
+
+def answer(T=None, covariance=SMALL, **more):
+    pose, centre = np.eye(4) if T is None else T, np.array([3.0, 1.0, 2.0])
+    return RegistrationResult(RegistrationStatus.OK, pose, covariance, 0.95, centre_mm=centre, **more)
+
+
+def test_a_distance_is_positive_outside_less_the_stand_off_and_nan_where_no_surface_is_near():
+    points = np.array([[0.0, 0.0, 1.2], [4.0, 2.0, -0.7], [0.0, 0.0, 60.0]])
+    assert check(points, plane(), answer(), EXACT).distance_mm[:2] == pytest.approx([1.2, -0.7])
+    stated = replace(EXACT, sensor=replace(EXACT.sensor, standoff_mm=0.5))
+    found = check(points, plane(), answer(), stated)
+    assert found.distance_mm[:2] == pytest.approx([0.7, -1.2]) and np.isnan(found.distance_mm[2])
+    assert found.verdict is Verdict.CONTRADICTED and found.probability == 0.0
+    assert "no surface near" in str(found)
+
+
+def test_off_the_edge_of_a_model_what_a_point_lies_beyond_it_counts():
+    """An element of a plane of 2 mm spacing reaches 4 mm, the last one lies at 20 mm."""
+    found = check([[26.0, 0.0, 0.5], [0.0, 0.0, 0.0]], plane(40.0), answer(), EXACT)
+    assert found.distance_mm[0] == pytest.approx(np.hypot(2.0, 0.5))
+
+
+def test_expected_distances_are_those_of_drawn_poses_and_errors():
+    """Every source of error is there, with its square: poses, noise, what all share, another size and a smooth bias."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6)) * np.array([0.3] * 3 + [0.01] * 3)[:, None]
+    covariance, points = root @ root.T, on_ellipsoid(5, 3)
+    target = ellipsoid(count=4000)
+    sensor = SensorConfig(noise_mm=0.2, bias_mm=0.4, scale=0.02, standoff_mm=0.0, known_standoff_mm=0.3)
+    config = RegistrarConfig(sensor=sensor, covariance=CovarianceConfig(model_mm=0.25, correlation_mm=15.0))
+    result = answer(covariance=covariance, factor95=1.5)
+    found = check(points, target, result, config)
+    _, normals = module._distances(np.eye(4), points, target)
+    n, away = 40_000, points - points.mean(axis=0)
+    twists = 1.5 * rng.multivariate_normal(np.zeros(6), covariance, n)
+    moves = twists[:, None, :3] + np.cross(twists[:, None, 3:], (points - result.centre_mm)[None])
+    alike = np.exp(-0.5 * ((points[:, None] - points) ** 2).sum(axis=2) / 15.0**2)
+    drawn = np.einsum("sni,ni->sn", moves, normals)
+    drawn += rng.normal(size=(n, 5)) * 0.2 + rng.normal(size=(n, 1)) * 0.3 + rng.normal(size=(n, 1)) * 0.25
+    drawn += rng.normal(size=(n, 1)) * 0.02 * (away * normals).sum(axis=1)
+    drawn += 0.4 * rng.multivariate_normal(np.zeros(5), alike, n)
+    assert found.expected_mm == pytest.approx(drawn.std(axis=0), rel=0.02)
+    S = np.cov(drawn.T)
+    d = found.distance_mm
+    together = chi2.sf(d @ np.linalg.solve(S, d), 5)
+    assert found.probability == pytest.approx(min(1.0, 2.0 * together), abs=0.02)
+
+
+def test_the_probability_is_even_under_a_right_pose_and_one_far_point_among_many_shows():
+    rng = np.random.default_rng(1)
+    S = np.diag(rng.uniform(0.1, 2.0, 8))
+    values = [module._probability(rng.multivariate_normal(np.zeros(8), S), S) for _ in range(4000)]
+    assert np.mean(np.array(values) < 0.05) == pytest.approx(0.04, abs=0.012)
+    one = np.zeros(60)
+    one[7] = 4.5
+    assert chi2.sf(4.5**2, 60) > 0.9
+    assert module._probability(one, np.eye(60)) == pytest.approx(2.0 * 60 * 2.0 * norm.sf(4.5))
+
+
+def test_what_stays_unseen_is_the_bound_of_a_pose_of_which_only_these_points_are_known():
+    """Points on a plane never notice a shift along it or a turn about its normal."""
+    target = plane()
+    flat = check([[-15.0, -15.0, 0.0], [15.0, -15.0, 0.0], [0.0, 15.0, 0.0], [9.0, 9.0, 0.0]], target, answer(), EXACT)
+    assert flat.verdict is Verdict.SAYS_LITTLE and flat.probability > 0.9
+    free = np.zeros((6, 6))
+    free[[0, 1, 5], [0, 1, 5]] = [20.0**2, 20.0**2, np.radians(20.0) ** 2]
+    assert flat.unseen_mm == pytest.approx(precision.bound_mm(free, target.points, answer().centre_mm), rel=0.01)
+
+
+def test_spread_points_show_every_error_and_together_with_the_registration_they_bound_it_more_tightly():
+    target = ellipsoid(count=4000)
+    result = answer()
+    few, many = (check(on_ellipsoid(count, 5), target, result, EXACT) for count in (4, 40))
+    registration_mm = precision.bound_mm(SMALL, target.points, result.centre_mm)
+    assert few.unseen_mm > 4.0 > many.unseen_mm
+    assert registration_mm > few.tre95_mm > many.tre95_mm
+    assert few.verdict is Verdict.SAYS_LITTLE and many.verdict is Verdict.HOLDS
+    stricter = check(on_ellipsoid(40, 5), target, result, EXACT, within_mm=many.unseen_mm - 0.01)
+    assert stricter.verdict is Verdict.SAYS_LITTLE
+
+
+def test_information_adds_up():
+    """C_alone^-1 = P^-1 + J^T J / s^2, and the registration's C^-1 in place of P^-1 for both together."""
+    target, points, result = ellipsoid(count=4000), on_ellipsoid(6, 2), answer()
+    _, normals = module._distances(np.eye(4), points, target)
+    J = np.hstack([normals, np.cross(points - result.centre_mm, normals)])
+    information = J.T @ J / 0.3**2
+    loose = np.diag([1.0 / 400.0] * 3 + [1.0 / np.radians(20.0) ** 2] * 3)
+    found = check(points, target, result, EXACT)
+    for bound, prior in ((found.unseen_mm, loose), (found.tre95_mm, np.linalg.inv(SMALL))):
+        wanted = precision.bound_mm(np.linalg.inv(prior + information), target.points, result.centre_mm)
+        assert bound == pytest.approx(wanted, rel=1e-4)
+
+
+def test_the_next_point_is_where_another_one_lowers_what_is_unseen_most():
+    target, points, result = ellipsoid(count=300), on_ellipsoid(3, 8), answer()
+    found = check(points, target, result, EXACT)
+    _, normals = module._distances(np.eye(4), points, target)
+    before = np.hstack([normals, np.cross(points - result.centre_mm, normals)])
+    loose = np.diag([1.0 / 400.0] * 3 + [1.0 / np.radians(20.0) ** 2] * 3)
+
+    def left_mm(place, normal):
+        J = np.vstack([before, np.hstack([normal, np.cross(place - result.centre_mm, normal)])])
+        covariance = np.linalg.inv(loose + J.T @ J / 0.3**2)
+        return precision.expected_mm(covariance, target.points, result.centre_mm)
+
+    left = [left_mm(*each) for each in zip(target.points, target.normals, strict=True)]
+    best = int(np.argmin(left))
+    assert found.next_point == pytest.approx(target.points[best])
+    assert found.next_normal == pytest.approx(target.normals[best])
+
+
+def test_a_pose_that_is_off_by_more_than_it_says_is_contradicted_and_only_then():
+    target, points = ellipsoid(count=4000), on_ellipsoid(10, 4)
+    shifted = se3.exp(np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.zeros(3))
+    assert check(points, target, answer(shifted), EXACT).verdict is Verdict.CONTRADICTED
+    assert check(points, target, answer(shifted, 400.0 * SMALL), EXACT).verdict is not Verdict.CONTRADICTED
+    assert check(points, target, answer(), EXACT).verdict is not Verdict.CONTRADICTED
+
+
+def test_points_are_taken_from_the_frame_of_the_source():
+    T = se3.from_rotation_translation(se3.random_rotation(np.random.default_rng(2)), np.array([40.0, -10.0, 5.0]))
+    points = on_ellipsoid(12, 6)
+    found = check(se3.apply(np.linalg.inv(T), points), ellipsoid(count=4000), answer(T), EXACT)
+    assert np.abs(found.distance_mm).max() < 0.1
+    assert found.points == pytest.approx(se3.apply(np.linalg.inv(T), points))
+
+
+def test_rows_that_are_not_finite_are_dropped_and_nothing_to_check_is_an_error():
+    found = check([[0.0, 0.0, 0.1], [np.nan, 0.0, 0.0]], plane(), answer(), EXACT)
+    assert len(found.points) == 1
+    with pytest.raises(InvalidPointCloudError, match="check points; got none that is finite"):
+        check([[np.nan] * 3], plane(), answer(), EXACT)
+
+
+def test_a_refusal_and_a_pose_without_covariance_cannot_be_checked():
+    refused = RegistrationResult(RegistrationStatus.AMBIGUOUS)
+    for result in (refused, answer(covariance=None)):
+        with pytest.raises(InvalidPointCloudError, match="an accepted pose with its covariance; got"):
+            check([[0.0, 0.0, 0.0]], plane(), result, EXACT)

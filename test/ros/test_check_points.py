@@ -1,0 +1,101 @@
+"""Points that a pointer touched, on `check_points`: the verdict on ~/check is of the pose that stands alone."""
+
+from __future__ import annotations
+
+import bones
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point, Pose, PoseArray
+from harness import NODE, StandIn, accepted, node_in_thread, pose_mm, wait_until
+from std_msgs.msg import Header
+
+from gapr_core import Registrar
+from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
+T = pose_mm([0.3, -1.1, 0.7], [120.0, -40.0, 300.0])
+OK, WARN, ERROR = (ord(level) for level in (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR))
+
+
+class Prepares(StandIn):
+    """A stand-in whose bone is prepared as GAPR does it, and whose pose is known."""
+
+    def __init__(self):
+        super().__init__()
+        self.answer = accepted(T, centre_mm=np.zeros(3))
+
+    def prepare(self, target, units="mm"):
+        return Registrar().prepare(target, units)
+
+
+class Pointer:
+    """Publishes touched points, metres, and waits for what the node says of them."""
+
+    def __init__(self, client):
+        self._client, self.heard = client, []
+        listen = client.node.create_subscription
+        client.do(lambda: listen(DiagnosticStatus, f"{NODE}/check", self.heard.append, 10))
+        self._publisher = client.do(lambda: client.node.create_publisher(PoseArray, "check_points", 10))
+        wait_until(self._publisher.get_subscription_count, what="the subscription to check_points")
+        wait_until(lambda: client.node.count_publishers(f"{NODE}/check"), what="the publisher of ~/check")
+
+    def touch(self, points, frame="probe"):
+        """(level, message, values) of the answer."""
+        before = len(self.heard)
+        poses = [Pose(position=Point(x=float(x), y=float(y), z=float(z))) for x, y, z in points]
+        self._publisher.publish(PoseArray(header=Header(frame_id=frame), poses=poses))
+        wait_until(lambda: len(self.heard) > before, what="an answer on ~/check")
+        found = self.heard[-1]
+        return ord(found.level), found.message, {pair.key: pair.value for pair in found.values}
+
+
+@pytest.fixture
+def bone(tmp_path):
+    """Points of a bone, mm, and their file."""
+    points = bones.bone().sample(4000, np.random.default_rng(0))[0]
+    np.save(tmp_path / "bone.npy", points)
+    return points, tmp_path / "bone.npy"
+
+
+def test_touched_points_check_the_pose_that_stands(client, bone):
+    points, path = bone
+    method = Prepares()
+    touched = se3.apply(se3.inverse(T), points[::80]) * 1e-3
+
+    with node_in_thread(method, path):
+        client.wait_for_state("active")
+        pointer = Pointer(client)
+        level, text, values = pointer.touch(touched)
+        assert (level, values["verdict"]) == (WARN, "") and "register first" in text
+
+        client.ask(GOOD)
+        level, text, values = pointer.touch(touched)
+        assert (level, values["verdict"], values["points"]) == (OK, "HOLDS", "50")
+        assert text.startswith("HOLDS  50 points") and 0.0 < float(values["unseen"]) < 0.004
+        assert len(values["next_point"].split()) == 3
+
+        level, _, values = pointer.touch(touched[:3])
+        assert (level, values["verdict"]) == (WARN, "SAYS_LITTLE")
+        level, _, values = pointer.touch(touched + [0.0, 0.0, 0.02])
+        assert (level, values["verdict"]) == (ERROR, "CONTRADICTED")
+        level, text, values = pointer.touch(touched, frame="tracker")
+        assert (level, values["verdict"]) == (WARN, "") and "in 'tracker', the pose is in 'probe'" in text
+        level, text, _ = pointer.touch(np.empty((0, 3)))
+        assert level == WARN and "check points; got none" in text
+
+        method.answer = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="for the test")
+        client.ask(GOOD)
+        assert pointer.touch(touched)[2]["verdict"] == "HOLDS"  # a refusal takes no pose away
+        client.call("reset")
+        assert "register first" in pointer.touch(touched)[1]
+
+
+def test_a_method_that_says_no_covariance_or_prepares_nothing_is_named(client, blob_path, method):
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        pointer = Pointer(client)
+        client.ask(GOOD)
+        level, text, _ = pointer.touch(GOOD[:5])
+        assert level == WARN and "expected a prepared target; got" in text

@@ -79,7 +79,8 @@ def cases_of(
     if answered is None or not se3.pose_error(answered, truth, pair.source).is_right:
         return
     yield RIGHT, target, result
-    wrong = [(RIVAL, T) for T in result.alternatives] + [(MOVED, moved(answered, target, rng))]
+    wrong = [(RIVAL, rival.T_target_source) for rival in result.hypotheses[1:]]
+    wrong.append((MOVED, moved(answered, target, rng)))
     for what, T in wrong:
         if off_mm(T, truth, target) > se3.RIGHT_MM:
             yield what, target, replace(result, T_target_source=T)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -149,7 +149,7 @@ class RegistrationResult:
         centre_mm: (3,) mean of the source points that were used, in the target frame; None unless `OK`, and where a
             method does not say.
         proposer: name of the last proposer that was asked; empty where nothing was registered.
-        rounds: how many proposers were asked.
+        rounds: rounds of proposals: of how many proposers, of a camera's cloud of how many sets of regions.
         features: what the confidence is computed from, by name.
         contributions: log odds that each feature adds to the confidence, by name: above 0 it speaks for the pose.
         residuals: of every used point under the best hypothesis; None where a method does not say.
@@ -187,15 +187,24 @@ class RegistrationResult:
         """True when there is a pose."""
         return self.status is RegistrationStatus.OK
 
+    def refused(self, status: RegistrationStatus, reason: str) -> RegistrationResult:
+        """The same without its pose and all that goes with one; its confidence and hypotheses stay, to look at."""
+        return replace(
+            self,
+            status=status,
+            reason=reason,
+            T_target_source=None,
+            covariance=None,
+            centre_mm=None,
+            tre_mm=None,
+            tre95_mm=None,
+            factor95=1.0,
+        )
+
     @property
     def best(self) -> Array | None:
         """(4, 4) T_target_source of the best hypothesis, accepted or not; None where there is none."""
         return self.hypotheses[0].T_target_source if self.hypotheses else self.T_target_source
-
-    @property
-    def alternatives(self) -> tuple[Array, ...]:
-        """All hypotheses but the best, (4, 4) each; kept for one version, read `hypotheses` instead."""
-        return tuple(hypothesis.T_target_source for hypothesis in self.hypotheses[1:])
 
     @property
     def seconds(self) -> float:

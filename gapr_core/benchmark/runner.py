@@ -97,8 +97,9 @@ def run_task(task: Task) -> Record:
     try:
         made_of = task.method, task.config
         if made_of not in _methods:
-            _methods[made_of] = methods.make(task.method, methods.config_of(task.method, task.config))
-            _timed(_methods[made_of], pair)
+            method = methods.make(task.method, methods.config_of(task.method, task.config))
+            _timed(method, pair)
+            _methods[made_of] = method  # not before it has answered once
         result, times = _timed(_methods[made_of], pair)
         why = why_unusable(result)
     except (ConfigError, MethodUnavailableError, WeightsError):

@@ -69,8 +69,8 @@ def _parser() -> ArgumentParser:
         "--scenes", type=int, default=0, help="more pairs of each family of scenes (default: %(default)s)"
     )
     parser.add_argument("--look-alikes", type=int, default=0,
-                        help="more of subjects' femora and tibiae at L3, half of them against another subject's, and "
-                        "as many seen by all other families, half as many thinned (default: %(default)s)")  # fmt: skip
+                        help="three times as many more pairs of subjects' bones, half of them against another "
+                        "subject's: at L3, by all other families, thinned, a camera's (%(default)s)")  # fmt: skip
     parser.add_argument(
         "--streams", type=int, default=0, help="streams of frames, half of them of others (default: %(default)s)"
     )

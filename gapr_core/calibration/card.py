@@ -29,8 +29,9 @@ def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
         f"The families {' and '.join(made['held_out_families'])} are in no fit, only judged. "
         "New bones are drawn from shape models of all subjects, and the network learned from the same subjects: who is "
         "unseen here is unseen by the confidence.",
-        f"How a bone is seen: {_shares(views)}.",
-        f"Whose bone it is: {_shares(WHAT)}. {100 * SHAPE_SHARE:.0f} % are shapes without a knowable pose.",
+        f"How a bone is seen in the first list (`--count`): {_shares(views)}.",
+        f"Whose bone it is there: {_shares(WHAT)}; {100 * SHAPE_SHARE:.0f} % are shapes without a knowable pose. "
+        "Scenes, look-alikes and streams come on top; the tables count all.",
         "AUROC and ECE (10 equal-width bins) are of all pairs; wrong and right count what a confidence of .5 or .9 "
         "and the safety rules accept. One of these is left out: sources of many points were not registered mirrored "
         "(`mirrored_below`).",

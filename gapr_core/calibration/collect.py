@@ -25,7 +25,7 @@ from gapr_core.calibration.answers import round_of
 from gapr_core.calibration.pairs import Drawn, Task
 from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, RulesConfig, SensorConfig
 from gapr_core.data.pair import Pair
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.sampling import random_directions
 from gapr_core.registration import clutter
@@ -52,7 +52,7 @@ Record = dict[str, Any]
 Shared = tuple[str, str, pairs.Bones]  # folder, split and the bones of both
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FOLLOWED = 0.5  # share of the pairs that become a stream
-LOOKED_AT = 3  # of the clean clouds that one camera may have seen every third is registered as a scene as well
+LOOKED_AT = 3  # every third cloud of bone alone is registered as a scene as well, where one camera may have seen it
 ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
@@ -156,7 +156,10 @@ def _viewpoints(pair: Pair) -> Array:
     """
     if pair.viewpoint is not None:
         return np.asarray(pair.viewpoint)[None]
-    prepared = sources.prepare(pair.source, in_scene=True)
+    try:
+        prepared = sources.prepare(pair.source, in_scene=True)
+    except InvalidPointCloudError:  # of all points some are metres away
+        return np.empty((0, 3))
     if isinstance(prepared, Refusal):
         return np.empty((0, 3))
     return np.reshape([place for place, _ in clutter.inferred_places(prepared, RegistrarConfig())], (-1, 3))

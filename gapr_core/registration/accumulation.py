@@ -21,6 +21,7 @@ from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -109,6 +110,7 @@ class Accumulator:
         """Everything static about a target; see `Registrar.prepare`."""
         return self.method.prepare(target, units)
 
+    @single_threaded_libraries
     def register(
         self,
         source: ArrayLike,
@@ -165,7 +167,8 @@ class Accumulator:
             return self._restart(result)
         if new and self._off_in_a_row:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
-            return _refused(result, f"the {newest} off the bone where the others found it: left out")
+            why = f"the {newest} off the bone where the others found it: left out"
+            return _refused(result, why)
         return self._unless_it_creeps(result, target)
 
     def _unless_it_creeps(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
@@ -181,11 +184,8 @@ class Accumulator:
             return result
         self.reset()
         self._kept = kept[-(len(kept) // 3) :]
-        return _refused(
-            result,
-            "the bone moves against the frame of the sources while they are collected: only the last are kept; "
-            "look at what is fixed to the bone",
-        )
+        why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
+        return _refused(result, f"{why}; look at what is fixed to the bone")
 
     def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.
@@ -262,14 +262,5 @@ def _was_sent(source: Array, before: list[Array]) -> bool:
 
 
 def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
-    return replace(
-        result,
-        status=RegistrationStatus.LOW_CONFIDENCE,
-        T_target_source=None,
-        covariance=None,
-        centre_mm=None,
-        tre_mm=None,
-        tre95_mm=None,
-        confidence=0.0,
-        reason=reason,
-    )
+    """Of a bone that is no longer where all sources together have it: that their pose is right is not believed."""
+    return replace(result.refused(RegistrationStatus.LOW_CONFIDENCE, reason), confidence=0.0)

@@ -1,4 +1,17 @@
-"""The last step: how sure is the best pose? A typed answer on its way to the caller."""
+"""The last step: how sure is the best pose? A typed answer on its way to the caller.
+
+Who changes its probability, in this order:
+
+| step | how | where |
+|---|---|---|
+| calibrated model of the features | sets it | `assess_fit` |
+| safety rules | do not; they refuse | `rules`, `checks` |
+| a source on both cortices, an inferred camera in a stream | at most so much | `capped` |
+| sources before it in a stream | up to its root, or down | `tracking`, `evidence`, `stream_misfit` |
+| limits | at most `limits.most` | `limits.applied` |
+
+Thresholds compare it then: `min_confidence`, or `accepted_if_inferred`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,16 @@
-"""The algorithm on one screen: prepare, propose, verify, refine, assess."""
+"""The algorithm on one screen: prepare, propose, verify, refine, assess.
+
+The order in which an answer comes about, with the function of each step:
+
+1. `sources.prepare` cleans the source.
+2. `_in_rounds`: each proposer in turn proposes, `verify` keeps some poses, `refine_fully` makes the best exact,
+   `assess_fit` says how sure it is, until that is enough. `_on_both_cortices` once more where a bone is hollow.
+3. `_of_one_view`: what is not sure as bone alone may be what a camera saw. With a viewpoint `_in_scene` comes at once.
+4. `_checked_and_corrected`: sizes, then the mirror image, may refuse; `bias_corrected` moves the pose; the precision
+   model and `allowing_for_deformation` widen its covariance.
+5. In a stream `Tracker` weighs it with the sources before.
+6. `conclude`: `limits` keep it from being sure, thresholds refuse, and the reason gets its words.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +168,10 @@ class Registrar:
 
     @single_threaded_libraries
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
-        """The answer to an assessment: thresholds, guidance where asked for, times."""
+        """The answer to an assessment: limits, names for clutter, thresholds, the question of a stand-off, guidance.
+
+        What decides comes in this order. Of an inferred viewpoint more is asked (`accepted_if_inferred`).
+        """
         if isinstance(assessment, Refusal):
             reason = assessment.reason
             return RegistrationResult(assessment.status, reason=reason, method=self.name, stage_ms=clock.stages)
@@ -180,7 +195,8 @@ class Registrar:
     ) -> Assessment | Refusal:
         """What `register` knows before `min_confidence` and `max_tre_mm` decide: for streams, calibration and research.
 
-        An answer that is `enough` ends the rounds, and no mirror image of its source is registered in full.
+        An answer that is `enough` ends the rounds, and a mirror image of its source is registered in full only where it
+        has at most `rules.mirrored_points`.
         """
         clock = clock or Clock()
         check_call(target, initial)

@@ -54,10 +54,19 @@ class Deformation(NamedTuple):
     Attributes:
         finding: what the residuals say of it.
         changes: (n, k) how the residuals of the inliers change by each of its unknowns, by 1 mm.
+        limit: log ratio beyond which it is believed.
+        in_halves: two halves move against each other, and the pose lies between both.
     """
 
     finding: Finding
     changes: Array
+    limit: float
+    in_halves: bool = False
+
+    @property
+    def is_shown(self) -> bool:
+        """True where the residuals speak for it enough."""
+        return self.finding.log_ratio > self.limit
 
 
 def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Finding:
@@ -80,7 +89,7 @@ def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Find
 
 
 def of_deformations(fit: Fit, config: RigidityConfig) -> dict[str, Deformation]:
-    """What the residuals say of each deformation, by the name of its limit in `RigidityConfig`; {} of few points.
+    """What the residuals say of each deformation, by its name in `limits`; {} of few points.
 
     `strained`: see `covariance.strains`. `apart`: of the three pairs of `halves` the one that they speak most for.
     `layered`: see `a_layer`. A stand-off is no deformation: it is taken out with the pose. Another size is a strain,
@@ -93,11 +102,12 @@ def of_deformations(fit: Fit, config: RigidityConfig) -> dict[str, Deformation]:
     changes = [strains(fit), a_layer(fit), *halves(fit)]
     free, at_once = np.column_stack([fit.jacobian[inlier], np.ones(count)]), np.zeros(count, dtype=np.int64)
     said = findings(blocks(fit, free, changes, at_once, config), config)
-    strained, layered, *apart = map(Deformation, said, changes)
+    (strained, of_strain), (layered, of_layer), *apart = zip(said, changes, strict=True)
+    moved, of_halves = max(apart, key=lambda each: each[0].log_ratio)
     return {
-        "strained": strained,
-        "apart": max(apart, key=lambda each: each.finding.log_ratio),
-        "layered": layered,
+        "strained": Deformation(strained, of_strain, config.strained),
+        "apart": Deformation(moved, of_halves, config.apart, in_halves=True),
+        "layered": Deformation(layered, of_layer, config.layered),
     }
 
 
@@ -135,18 +145,14 @@ def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) ->
 
     Several may be found at once: a bent source is strained, too. The one that they speak most for is the first.
     """
-    a, limits = assessment, config.rigidity
-    found = {
-        name: each
-        for name, each in of_deformations(a.fit.rests_on, limits).items()
-        if each.finding.log_ratio > getattr(limits, name)
-    }
+    a = assessment
+    found = {name: each for name, each in of_deformations(a.fit.rests_on, config.rigidity).items() if each.is_shown}
     if not found:
         return a
     covariance = a.uncertainty.covariance
-    for name, each in found.items():
+    for each in found.values():
         covariance = covariance + covariance_added_by(a.fit, each.finding.size_mm * each.changes, config.covariance)
-        if name == "apart":
+        if each.in_halves:
             covariance = covariance + covariance_of_half(a.fit, each.finding.size_mm)
     surest = sorted(found.items(), key=lambda item: -item[1].finding.log_ratio)
     deformed = {name: each.finding.size_mm for name, each in surest}

@@ -98,15 +98,12 @@ class Replay:
     def _wait_for_listeners(self) -> None:
         """Volatile messages that go out before a listener was discovered are lost."""
         deadline = time.monotonic() + self._options.wait_s
-        while not self._has_listeners():
+        while self._unheard():
             if time.monotonic() > deadline:
                 self._say_who_is_not_heard()
                 return
             time.sleep(0.02)
         time.sleep(SETTLE_S)
-
-    def _has_listeners(self) -> bool:
-        return not self._unheard()
 
     def _unheard(self) -> list[str]:
         """Topics with fewer listeners than were asked for."""
@@ -130,7 +127,8 @@ class Replay:
                     self._tick(stamp_ns)
                     continue
                 self._publishers[connection.topic].publish(data)
-                sent += bar.update() is not False
+                sent += 1
+                bar.update()
                 if self._on_message:
                     self._on_message(connection.topic, stamp_ns)
         return sent

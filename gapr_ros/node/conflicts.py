@@ -24,9 +24,11 @@ class Conflicts:
 
         An empty text: there is none any more.
         """
-        if text and text != self._texts.get(kind):
+        now = time.monotonic()
+        lasts = now < self._until.get(kind, now)
+        if text and not (lasts and text == self._texts[kind]):
             self._write(text)
-        self._texts[kind], self._until[kind] = text, time.monotonic() + for_s
+        self._texts[kind], self._until[kind] = text, now + for_s
 
     @property
     def texts(self) -> tuple[str, ...]:

@@ -65,7 +65,8 @@ class Course:
     def decide(self, outcome: Outcome, model: Model, parameters: NodeParameters) -> None:
         """Let an outcome pass, or turn it into a refusal."""
         if outcome.job.epoch != self.epoch:
-            outcome.refuse(Reason.SUPERSEDED_BY_RESET, "a reset came while the cloud was on its way")
+            why = "the node was reset, paused or given another bone while the cloud was on its way"
+            outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             return
         if outcome.reason is Reason.STALE:  # it grew old in the mailbox, and changes nothing
             return

@@ -81,7 +81,7 @@ class Registration:
     def _collect(self, job: Job) -> None:
         now = self._situation()
         if job.epoch < now.oldest:
-            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset")
+            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset, pause or bone")
         outcome = Outcome(job)
         now = replace(now, epoch=job.epoch, parameters=replace(now.parameters, tf_timeout=0.0))
         points_mm = self._points_mm(outcome, now)
@@ -111,7 +111,7 @@ class Registration:
     def _points_mm(self, outcome: Outcome, now: Situation) -> Array:
         """(N, 3) points of a cloud, mm, in the frame of the answer."""
         if outcome.job.epoch != now.epoch:
-            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset")
+            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset, pause or bone")
         cloud = intake.read_message(outcome.job.cloud, now.parameters.cloud_type)
         _note_header(outcome, cloud, now)
         timeline.check_age(timeline.stamp_ns(cloud.header), now.now_ns, now.parameters.max_cloud_age)

@@ -19,7 +19,7 @@ MM_PER_UNIT = {"m": MM_PER_M, "cm": 10.0, "mm": 1.0}
 
 
 def to_mm(points: Array, unit: str) -> Array:
-    """Points in `unit` ("m" or "mm") as mm."""
+    """Points in `unit` (m, cm or mm) as mm."""
     return points * MM_PER_UNIT[unit]
 
 

@@ -237,9 +237,12 @@ def test_a_conflict_is_said_once_and_ends_with_its_time(monkeypatch):
     assert said == ["two of them"] and conflicts.texts == ("two of them",)
     now[0] = 6.0
     assert conflicts.texts == ()
-    conflicts.note("frame", "")
-    conflicts.note("frame", "two of them")
+    conflicts.note("frame", "two of them", 5.0)
     assert len(said) == 2 and conflicts.texts == ("two of them",)
+    conflicts.note("frame", "")
+    assert conflicts.texts == ()
+    conflicts.note("frame", "two of them")
+    assert len(said) == 3
 
 
 # --- quality of service ---

@@ -36,7 +36,8 @@ def read(path: Path, options: ReadOptions) -> Surface:
             ends.append(len(corners))
         elif found := ANNOUNCED.match(line):
             announced[found[1].lower()] = int(found[2])
-    options.limits.check_counts(len(vertices) // 3, len(corners))
+    triangles = len(corners) - 2 * (len(ends) - 1)  # of a face with n corners n - 2
+    options.limits.check_counts(len(vertices) // 3, max(triangles, 0))
     surface = Surface(np.array(vertices).reshape(-1, 3), fans(np.array(ends), np.array(corners)))
     _check_whole(surface, len(ends) - 1, announced)
     if not announced and (open_edges := _open_edges(surface.triangles)):

@@ -42,12 +42,10 @@ def test_points_that_all_but_coincide_are_no_trouble(apart_mm):
     assert np.isfinite(prepared.flatness_mm).all()
 
 
-def test_a_dozen_points_with_an_initial_pose_are_answered_or_refused_by_their_uncertainty(registrar, femur, target):
+def test_a_dozen_points_with_an_initial_pose_are_answered(registrar, femur, target):
     points, normals = femur.sample(4000, np.random.default_rng(4))
     touched = points[normals @ [0.0, 1.0, 0.0] > 0.3][:14]
     initial = se3.exp([2.0, 1.0, -2.0, 0.02, 0.0, 0.03], touched.mean(axis=0))
     result = registrar.register(touched, target, initial)
-    assert result.status is not RegistrationStatus.TOO_FEW_POINTS
-    best = result.hypotheses[0].T_target_source
-    assert best.shape == (4, 4)
-    assert result.ok or result.reason
+    assert result.ok and result.confidence <= registrar.config.limits.most
+    assert se3.pose_error(result.T_target_source, np.eye(4), touched).is_right

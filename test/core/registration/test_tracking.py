@@ -143,7 +143,8 @@ def test_a_jump_is_found_by_a_full_registration(tracker, frames, prepared):
 def test_a_wrong_track_is_left(tracker, frames, prepared):
     """Every remembered pose is wrong: none may be followed."""
     first = tracker.register(frames[0].source, prepared)
-    tracker._memory.keep([*first.alternatives[-1:], *first.alternatives[:-1]])
+    rivals = [hypothesis.T_target_source for hypothesis in first.hypotheses[1:]]
+    tracker._memory.keep([*rivals[-1:], *rivals[:-1]])
     result = tracker.register(frames[1].source, prepared)
     assert result.ok and is_right(result, frames[1])
 

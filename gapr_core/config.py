@@ -299,6 +299,13 @@ class RigidityConfig(Settings):
         4.0, "log likelihood ratio above which a layer on the bone grows along a source; infinity: never", low=0
     )
     fewest_points: int = setting(200, "inliers without which none of these is looked for", low=12, high=1_000_000)
+    doubled: float = setting(
+        0.5, "probability of a pose of the rejected points from which they are a copy of the bone; above 1: never",
+        low=0, high=2,
+    )  # fmt: skip
+    doubled_mm: float = setting(20.0, "a copy lies no farther from the answer than this", low=0, unit="mm")
+    doubled_deg: float = setting(15.0, "nor is it turned farther", low=0, high=180, unit="deg")
+    rejected_points: int = setting(60, "with fewer rejected points no copy is looked for", low=12, high=1_000_000)
     cells: int = setting(40, "cells over which residuals are averaged", low=12, high=1000)
     groups: int = setting(6, "groups of sources in time, whose residuals are averaged apart", low=2, high=100)
     correlation_mm: float = setting(

@@ -41,7 +41,11 @@ class NodeParameters(Settings):
     `live=False`: read when configuring.
     """
 
-    model_path: str = setting("", "file of the pre-operative bone: a mesh, a cloud or a label map (docs/formats.md)")
+    model_path: str = setting(
+        "",
+        "file of the pre-operative bone: a mesh, a cloud or a label map (docs/formats.md); "
+        "model_... are read when configuring and by ~/reload_model",
+    )
     model_label: str = setting("", "name or number of the bone in a label map; several, with commas, are one bone")
     model_unit: str = setting("auto", "unit of that file; auto guesses mm or m from the extent and warns",
                               choices=("auto", "mm", "cm", "m"))  # fmt: skip
@@ -165,6 +169,9 @@ def remarks(parameters: NodeParameters) -> list[str]:
     if 0.0 < parameters.range_max <= parameters.range_min:
         limits = f"range_min {parameters.range_min} is not below range_max {parameters.range_max}"
         sentences.append(f"{limits}: every cloud is refused until it is")
+    if 0 < parameters.max_points < parameters.min_points:
+        limits = f"max_points {parameters.max_points} is below min_points {parameters.min_points}"
+        sentences.append(f"{limits}: points are counted before a cloud is thinned, so fewer than min_points may decide")
     low, high = parameters.crop_min, parameters.crop_max
     if low != high and any(least >= most for least, most in zip(low, high, strict=True)):
         sentences.append(f"crop_min {low} is not below crop_max {high}: every cloud is refused until it is")
@@ -209,6 +216,8 @@ def check_change(node: Node, parameters: Iterable[Parameter], configured: bool) 
         if setting_field is None or plain(parameter.value) == plain(node.get_parameter(parameter.name).value):
             continue
         if configured and not setting_field.metadata.get("live", True):
+            if parameter.name == "autostart":
+                return "autostart is read when the node starts: give it there"
             return f"{parameter.name} is read when configuring: deactivate, clean up, set it, then configure again"
         why = problem(setting_field, parameter.value)
         if why:

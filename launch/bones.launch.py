@@ -7,29 +7,66 @@ The file names a node a bone, `/femur/register_node`, `/tibia/register_node`, ..
 """
 # ruff: noqa: I001  (this folder is not the package launch)
 
+import difflib
+import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.logging import get_logger
 from launch_ros.actions import Node
 
+FILE = Path(__file__).resolve()
 EXECUTABLE = "register_node"
 ENDING = f"/{EXECUTABLE}"
+PARAMETERS = "ros__parameters"
 PATIENCE_S = "20"  # after Ctrl-C: the node ends with a second of work, which takes longer on a busy machine
 EXAMPLE = "copy share/gapr_ros/config/two_bones.yaml and pass params_file:=FILE"
 ARGUMENTS = {
     "params_file": ("", "parameter file with one entry a bone; config/two_bones.yaml is one to copy"),
     "points": ("points", "topic of the clouds, the same for all bones"),
 }
+NOT_NEAR = "parameters of a node belong in params_file"
+READ_BY_LAUNCH = (  # needs no declaration
+    "launch-prefix",
+    "launch-prefix-filter",
+    "emulate_tty",
+    "sigterm_timeout",
+    "sigkill_timeout",
+    "ros_namespace",
+)
+
+
+# the same as in register.launch.py: a launch file cannot import another
+def check_names(context: LaunchContext, declared: Iterable[str]) -> None:
+    """Refuses an argument that is not declared, which launch would lose in silence.
+
+    A launch file that includes this one has names of its own among `launch_configurations`, such as points_left. So a
+    name is refused only if it was typed after `ros2 launch gapr_ros` and this file, where every argument is for this
+    file. Anywhere else a name that resembles a declared one is warned of, and the others are left alone.
+
+    Raises:
+        ValueError: the unknown name, with the nearest declared one.
+    """
+    alone = {"gapr_ros", FILE.name} <= set(sys.argv) or FILE in [Path(word).resolve() for word in sys.argv]
+    typed = [word.split(":=")[0] for word in context.argv] if alone else []
+    for name in sorted({*context.launch_configurations} - {*declared, *READ_BY_LAUNCH}):
+        near = difflib.get_close_matches(name, declared, n=1, cutoff=0.8)
+        sentence = f"unknown launch argument {name}: " + (f"did you mean {near[0]}?" if near else NOT_NEAR)
+        if name in typed:
+            raise ValueError(sentence)
+        if near:
+            get_logger(FILE.name).warning(sentence)
 
 
 def bones(path: str) -> list[str]:
     """The namespaces that the file names, in its order.
 
     Raises:
-        ValueError: there is no such file, it names none, or two bones publish one frame.
+        ValueError: there is no such file, it names none, it names what is no bone, or two bones publish one frame.
     """
     if not Path(path).is_file():
         raise ValueError(f"params_file: expected a parameter file with one entry a bone, got {path!r}; {EXAMPLE}")
@@ -41,24 +78,38 @@ def bones(path: str) -> list[str]:
         raise ValueError(
             f"{path}: expected entries such as /femur/{EXECUTABLE}, got {type(entries).__name__}; {EXAMPLE}"
         )
-    keys = [key for key in map(str, entries) if "*" not in key]  # what a pattern names is for all
-    names = [key.rsplit("/", 1)[0] for key in keys if key.endswith(ENDING) and key != ENDING]
+    found: dict[str, dict[str, Any]] = {}
+    for name, parameters in (node for key, entry in entries.items() for node in _nodes_of(key, entry)):
+        if "*" not in name:  # what a pattern names is for all
+            found.setdefault(name, {}).update(parameters)
+    names = [name for name in found if name.endswith(ENDING) and name != ENDING]
+    wrong = [name for name in found if name not in names]
     if not names:
         raise ValueError(f"{path}: no entry such as /femur/{EXECUTABLE}, got {', '.join(map(str, entries))}; {EXAMPLE}")
-    frames = [_parameters(entries[f"{name}/{EXECUTABLE}"]).get("model_frame") for name in names]
+    if wrong:
+        expected = f"expected entries such as /femur/{EXECUTABLE}, and patterns such as /** for all"
+        raise ValueError(f"{path}: {', '.join(wrong)} would start no node: {expected}")
+    frames = [found[name].get("model_frame") for name in names]
     if len(set(frames)) < len(frames):
         raise ValueError(f"{path}: every bone needs a model_frame of its own, got {frames}")
-    return names
+    return [name.removesuffix(ENDING) for name in names]
 
 
-def _parameters(entry: Any) -> dict[str, Any]:
-    """What stands under `ros__parameters`; empty without it."""
-    found = entry.get("ros__parameters") if isinstance(entry, dict) else None
-    return found if isinstance(found, dict) else {}
+def _nodes_of(key: Any, entry: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The nodes that an entry names, with their parameters: as rcl does, keys above `ros__parameters` are joined."""
+    name = "/" + str(key).strip("/")
+    inner = entry if isinstance(entry, dict) else {}
+    deeper = {part: value for part, value in inner.items() if part != PARAMETERS and isinstance(value, dict)}
+    if PARAMETERS in inner or not deeper:
+        given = inner.get(PARAMETERS)
+        yield name, given if isinstance(given, dict) else {}
+    for part, value in deeper.items():
+        yield from _nodes_of(f"{name}/{part}", value)
 
 
 def nodes(context: LaunchContext) -> list[Node]:
     """One node a bone."""
+    check_names(context, ARGUMENTS)
     chosen = context.launch_configurations
     return [
         Node(

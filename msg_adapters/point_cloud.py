@@ -27,6 +27,7 @@ DTYPES: dict[int, str] = {
 }
 LARGEST_STEP = 2**31 - 1  # bytes of a point; NumPy counts them in a C int
 CODES = {code: kind for kind, code in DTYPES.items()}
+NAMES = {getattr(PointField, name): name for name in ("INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32")}
 
 
 def cloud_to_xyz(
@@ -120,7 +121,7 @@ def _coordinate_dtype(cloud: PointCloud2) -> np.dtype[Any]:
     fields = [_single_field(cloud, name) for name in "xyz"]
     for field in fields:
         if field.datatype not in (PointField.FLOAT32, PointField.FLOAT64):
-            kind = DTYPES.get(field.datatype, f"unknown ({field.datatype})")
+            kind = NAMES.get(field.datatype, f"unknown ({field.datatype})")
             raise InvalidMessageError(f"field {field.name} must be FLOAT32 or FLOAT64, got {kind}")
     return _dtype_of(cloud, fields)
 

@@ -127,7 +127,7 @@ def is_rough(assessment: Assessment, config: RegistrarConfig) -> bool:
 
 
 def shows_most(name: str) -> Callable[[Assessment, RegistrarConfig], bool]:
-    """Whether this is the deformation that the residuals show most (see `rigidity`)."""
+    """Whether this is the deformation that the residuals show most (see `rigidity`, `doubles`)."""
     return lambda assessment, _: next(iter(assessment.deformed), None) == name
 
 
@@ -186,6 +186,12 @@ LIMITS = (
         is_rough,
         "near points err alike, by much of what each errs by; check that it is this subject's bone, or measure it from "
         "nearer",
+    ),
+    Limit(
+        "doubled",
+        shows_most("doubled"),
+        "the points that do not fit lie on the bone in another pose near by; check that bone, reference and sensor did "
+        "not move while it was measured, or measure it again",
     ),
     Limit(
         "strained",

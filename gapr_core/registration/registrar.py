@@ -7,7 +7,7 @@ The order in which an answer comes about, with the function of each step:
    `assess_fit` says how sure it is, until that is enough. `_on_both_cortices` once more where a bone is hollow.
 3. `_of_one_view`: what is not sure as bone alone may be what a camera saw. With a viewpoint `_in_scene` comes at once.
 4. `_checked_and_corrected`: sizes, then the mirror image, may refuse; `bias_corrected` moves the pose; the precision
-   model and `allowing_for_deformation` widen its covariance.
+   model, `allowing_for_deformation` and `allowing_for_a_copy` widen its covariance.
 5. In a stream `Tracker` weighs it with the sources before.
 6. `conclude`: `limits` keep it from being sure, thresholds refuse, and the reason gets its words.
 """
@@ -28,7 +28,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import checks, clutter, cortices, explained, limits, rules
+from gapr_core.registration import checks, clutter, cortices, doubles, explained, limits, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess_fit
@@ -235,7 +235,15 @@ class Registrar:
             assessment = bias_corrected(assessment, config)
             clock.lap("refine")
         corrected = assessment.corrected(self.precision)
-        return allowing_for_deformation(corrected, config) if corrected.is_sure(config.worth_checking) else corrected
+        if not corrected.is_sure(config.worth_checking):
+            return corrected
+
+        def register(source: PreparedSource, poses: Array) -> Assessment | None:
+            return self._in_rounds(source, assessment.target, poses, clock)
+
+        found = doubles.allowing_for_a_copy(allowing_for_deformation(corrected, config), config, register)
+        clock.lap("assess")
+        return found
 
     def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough

@@ -134,7 +134,8 @@ def by_threshold(
     """
     if not probability >= config.min_confidence:
         worst, asked = words.against(contributions or {}), f"{config.min_confidence:g} is asked for"
-        reason = f"the best pose is right with a probability of only {probability:.2f}, {asked}"
+        digits = 6 if round(probability, 2) >= config.min_confidence else 2  # enough to be less than what is asked for
+        reason = f"the best pose is right with a probability of only {probability:.{digits}f}, {asked}"
         return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}; against it: {worst}" if worst else reason)
     if config.max_tre_mm > 0.0 and not tre95_mm <= config.max_tre_mm:
         reason = f"the error over the bone is below {tre95_mm:.1f} mm (95 %), allowed are {config.max_tre_mm:g} mm"

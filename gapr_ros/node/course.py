@@ -29,12 +29,14 @@ class Course:
         epoch: the clouds of earlier ones are refused.
         oldest: first epoch of the clouds that may be registered together with new ones.
         seed: a pose from outside, where registrations start until one is accepted.
+        why: the last epoch ended.
     """
 
     def __init__(self) -> None:
         self.timeline = Timeline()
         self.epoch, self.oldest = 0, 0
         self.seed: Seed | None = None
+        self.why = ""
         self._track = Track()
 
     @property
@@ -42,20 +44,20 @@ class Course:
         """Where the bone was with the last cloud; None where that says nothing of the next one."""
         return self._track.place
 
-    def begin_again(self, seed: Seed | None = None) -> None:
+    def begin_again(self, why: str, seed: Seed | None = None) -> None:
         """Forget the track; clouds on their way will be refused, and none before is registered with new ones.
 
         With a seed, whose frame may never come, jumps are still measured against the poses before it until a good pose
         was found from there.
         """
-        self.refuse_all()
+        self.refuse_all(why)
         self.oldest, self.seed = self.epoch, seed
         if seed is None:
             self._track.clear()
 
-    def refuse_all(self) -> None:
+    def refuse_all(self, why: str) -> None:
         """Clouds on their way will be refused, and say nothing about those to come."""
-        self.epoch += 1
+        self.epoch, self.why = self.epoch + 1, why
         self._track.miss()
 
     def forget_place(self) -> None:
@@ -65,8 +67,7 @@ class Course:
     def decide(self, outcome: Outcome, model: Model, parameters: NodeParameters) -> None:
         """Let an outcome pass, or turn it into a refusal."""
         if outcome.job.epoch != self.epoch:
-            why = "the node was reset, paused or given another bone while the cloud was on its way"
-            outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
+            outcome.refuse(Reason.SUPERSEDED_BY_RESET, f"the cloud was on its way when this came: {self.why}")
             return
         if outcome.reason is Reason.STALE:  # it grew old in the mailbox, and changes nothing
             return

@@ -16,6 +16,7 @@ from gapr_ros.node.refusal import Reason
 
 SILENCE_S = 2.0
 THROTTLE_S = 5.0
+LOST_FOR_S = 5.0  # after a cloud was lost the input is not well
 
 
 @dataclass
@@ -37,6 +38,13 @@ class Counters:
     consecutive_refusals: int = 0
     last_refusal: str = ""
     last_cloud_at: float = field(default_factory=time.monotonic)
+    last_lost_at: float = float("-inf")
+
+    def lose(self, count: int) -> None:
+        """So many clouds more were sent and never came; fewer than none where some were missed by mistake."""
+        self.lost += count
+        if count > 0:
+            self.last_lost_at = time.monotonic()
 
     def receive(self) -> None:
         """A cloud came."""
@@ -199,6 +207,9 @@ def _level_of_input(now: Snapshot, silent_s: float) -> tuple[bytes, str]:
         return DiagnosticStatus.WARN, "; ".join(now.conflicts)
     if not now.source.publishers:
         return DiagnosticStatus.WARN, "nobody publishes clouds"
+    if time.monotonic() - now.counters.last_lost_at < LOST_FOR_S:
+        how = "crop or thin clouds before they are sent, or send fewer"
+        return DiagnosticStatus.WARN, f"{now.counters.lost} clouds were sent and never came: {how}"
     if silent_s > SILENCE_S:
         return DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s"
     return DiagnosticStatus.OK, f"{now.counters.received} clouds"

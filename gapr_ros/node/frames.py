@@ -89,7 +89,7 @@ class Frames:
         try:
             return transform_to_matrix(buffer.lookup_transform(parent, child, stamp))
         except (self._tf2.TransformException, InvalidMessageError) as error:
-            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {error}") from error
+            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {str(error).strip()}") from error
 
     def start_over(self) -> None:
         """What was heard so far is of another round of time: between that and what comes tf2 would interpolate."""
@@ -168,7 +168,7 @@ def _check_not_the_bones(parameters: NodeParameters) -> None:
         why["viewpoint"] = "the bone's frame is not known before its pose; name the frame of the camera"
     for name, text in why.items():
         if getattr(parameters, name).lstrip("/") == parameters.model_frame:
-            raise ConfigError(f"a {name} other than model_frame", f"'{parameters.model_frame}' for both", text)
+            raise ConfigError(f"another {name} than model_frame", f"'{parameters.model_frame}' for both", text)
 
 
 def _import_tf2() -> Any | None:

@@ -194,7 +194,8 @@ class RegisterNode(LifecycleNode):
         self._configured.send_model()
         self.subscriptions_in = Subscriptions(self, self._configured)
         kind, unit = self.parameters.cloud_type, self.parameters.cloud_unit
-        self.get_logger().info(f"active, waits for clouds on {self.resolve_topic_name(CLOUDS)} ({kind}, in {unit})")
+        does = "waits for clouds" if self._configured.enabled else "but disabled (~/set_enabled): drops clouds"
+        self.get_logger().info(f"active, {does} on {self.resolve_topic_name(CLOUDS)} ({kind}, in {unit})")
         return result
 
     @transition

@@ -48,6 +48,7 @@ class Outcome:
         result: its whole answer; None where it was not asked.
         seeded: the registration began at a pose from outside.
         found_by: how far the registration had to look: track, network, search, or scene with a viewpoint.
+        tf_wait_s: of it, how long transforms were waited for.
         exec_ms: wall time of the whole way.
     """
 
@@ -69,6 +70,7 @@ class Outcome:
     inlier_ratio: float = 0.0
     seeded: bool = False
     found_by: str = ""
+    tf_wait_s: float = 0.0
     exec_ms: float = 0.0
 
     @property

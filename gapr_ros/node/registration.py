@@ -81,7 +81,7 @@ class Registration:
     def _collect(self, job: Job) -> None:
         now = self._situation()
         if job.epoch < now.oldest:
-            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset, pause or bone")
+            raise RefusedError(Reason.SUPERSEDED_BY_RESET, f"the cloud is older than this: {now.why}")
         outcome = Outcome(job)
         now = replace(now, epoch=job.epoch, parameters=replace(now.parameters, tf_timeout=0.0))
         points_mm = self._points_mm(outcome, now)
@@ -102,16 +102,16 @@ class Registration:
         is_to_be_assessed = outcome.job.urgent or outcome.seen_from is not None
         outcome.followed = self._following.follow(points_mm, outcome.header.frame_id, is_to_be_assessed, now)
         if outcome.followed is not None:
-            _check_time(time.monotonic() - start, now.parameters)
+            _check_time(time.monotonic() - start - outcome.tf_wait_s, now.parameters)
             return
         result = self._register(points_mm, outcome, now)
-        _check(result, time.monotonic() - start, now.parameters)
+        _check(result, time.monotonic() - start - outcome.tf_wait_s, now.parameters)
         _note_pose(outcome, result, points_mm, now.parameters)
 
     def _points_mm(self, outcome: Outcome, now: Situation) -> Array:
         """(N, 3) points of a cloud, mm, in the frame of the answer."""
         if outcome.job.epoch != now.epoch:
-            raise RefusedError(Reason.SUPERSEDED_BY_RESET, "the cloud is older than the last reset, pause or bone")
+            raise RefusedError(Reason.SUPERSEDED_BY_RESET, f"the cloud is older than this: {now.why}")
         cloud = intake.read_message(outcome.job.cloud, now.parameters.cloud_type)
         _note_header(outcome, cloud, now)
         timeline.check_age(timeline.stamp_ns(cloud.header), now.now_ns, now.parameters.max_cloud_age)
@@ -169,11 +169,23 @@ class Registration:
         return T_frame_cloud[:3, 3] * wire.MM_PER_M
 
     def _lookup(self, frame: str, outcome: Outcome, now: Situation) -> Array:
-        """T_frame_cloud at the cloud's stamp; no frame is that of the cloud."""
+        """T_frame_cloud at the cloud's stamp; no frame is that of the cloud. All look-ups of a cloud share one wait."""
         if not frame:
             return np.eye(4)
-        stamp = Time.from_msg(outcome.header.stamp)
-        return self._frames.lookup(intake.plain_frame(frame), outcome.cloud_frame, stamp, now.parameters.tf_timeout)
+        stamp, start = Time.from_msg(outcome.header.stamp), time.monotonic()
+        left_s = max(now.parameters.tf_timeout - outcome.tf_wait_s, 0.0)
+        try:
+            return self._frames.lookup(intake.plain_frame(frame), outcome.cloud_frame, stamp, left_s)
+        except RefusedError as refusal:
+            raise RefusedError(refusal.reason, _who_asks(frame, now.parameters) + refusal.text) from refusal
+        finally:
+            outcome.tf_wait_s += time.monotonic() - start
+
+
+def _who_asks(frame: str, parameters: NodeParameters) -> str:
+    """The parameters that name a frame, for a refusal; empty for the frame of an initialpose."""
+    names = [name for name in ("output_frame", "crop_frame", "viewpoint") if getattr(parameters, name) == frame]
+    return f"{' and '.join(names)}: " if names else ""
 
 
 def needs_frames(parameters: NodeParameters) -> bool:
@@ -209,10 +221,10 @@ def _note_header(outcome: Outcome, cloud: Any, now: Situation) -> None:
 
 
 def _check(result: RegistrationResult, seconds: float, parameters: NodeParameters) -> None:
-    """Refuse what the method refused, what took too long and what is not sure enough."""
-    _check_time(seconds, parameters)
+    """Refuse what the method refused, whatever time that took, what took too long and what is not sure enough."""
     if not result.ok:
         raise RefusedError(OF_STATUS[result.status], result.reason)
+    _check_time(seconds, parameters)
     check_limits(result, parameters)
     for name, value in (("pose", result.T_target_source), ("covariance", result.covariance)):
         if value is None or not np.isfinite(value).all():

@@ -119,6 +119,7 @@ class Services:
     async def reset(self, _: Trigger.Request) -> tuple[bool, str]:
         """Forget the track, the seed, all clouds so far and the latched pose."""
         self._session().reset()
+        self._host.ros.get_logger().info("reset: the track is forgotten")
         return True, "the track is forgotten; clouds on their way will be refused"
 
     @answering
@@ -132,7 +133,7 @@ class Services:
             raise NotNowError("the node was cleaned up meanwhile")
         if isinstance(ready, BaseException):
             why = f"the old bone stays: {describe(ready)}"
-            self._host.ros.get_logger().error(f"reload_model failed, {why}")
+            session.reload_failed(why)
             return False, why
         session.replace(ready)
         return True, str(ready.model)
@@ -142,6 +143,7 @@ class Services:
         """Take clouds, or leave them."""
         session = self._session()
         session.enabled = request.data
+        self._host.ros.get_logger().info("enabled" if request.data else "disabled: clouds are dropped")
         if not request.data:
             session.stop_waiting("the node was disabled")
         return True, "enabled" if request.data else "disabled: clouds are counted as dropped"

@@ -46,6 +46,7 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
+OF_BONE = "model_path", "model_label", "model_unit", "model_scale", "model_axes"  # read with the bone
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
 
 
@@ -176,7 +177,9 @@ class Session:
     def _situation(self) -> Situation:
         host, ready, course = self._host, self._ready, self.course
         since = course.epoch, course.oldest
-        return Situation(ready.method, ready.model, host.parameters, *since, course.seed, course.place, host.now_ns())
+        return Situation(
+            ready.method, ready.model, host.parameters, *since, course.why, course.seed, course.place, host.now_ns()
+        )
 
     def _renew_method(self) -> None:
         """Before the next cloud, which may wait already: it is not registered by the limits of before."""
@@ -251,9 +254,15 @@ class Session:
         self._admission.start_over(why)
         self._clear(why)
 
+    def reload_failed(self, why: str) -> None:
+        """The old bone stays, and the diagnostics say so until another one is read."""
+        self.conflicts.note("reload", f"~/reload_model failed, {why}")
+
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
         now = self._host.parameters
+        waits = [name for name in OF_BONE if getattr(now, name) != getattr(self._ready.parameters, name)]
+        self.conflicts.note("bone", f"the bone is not that of {', '.join(waits)}: call ~/reload_model" if waits else "")
         if self._changes.in_reading(now):
             self._forget_clouds("clouds are read in another way")
         if self._changes.in_limits(now):
@@ -265,6 +274,8 @@ class Session:
 
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
+        self.conflicts.note("reload", "")
+        self._host.ros.get_logger().info(str(ready.model))
         self._begin_again("another bone")
         with self._swapping:
             self._ready = ready
@@ -293,7 +304,7 @@ class Session:
 
         What was collected stays, with that cloud, and so do the poses against which jumps are measured.
         """
-        self.course.refuse_all()
+        self.course.refuse_all(why)
         waiting = self.worker.clear()
         if waiting is not None:
             outcome = Outcome(waiting)
@@ -307,7 +318,7 @@ class Session:
         self._forget_clouds(why)
 
     def _begin_again(self, why: str, seed: Seed | None = None) -> None:
-        self.course.begin_again(seed)
+        self.course.begin_again(why, seed)
         self._forget_clouds(why)
 
     def _forget_clouds(self, why: str) -> None:

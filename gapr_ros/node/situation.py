@@ -25,13 +25,17 @@ class Seed:
 
 @dataclass(frozen=True)
 class Situation:
-    """What holds at the moment when a cloud is taken in hand: `oldest` is the first epoch of what may be collected."""
+    """What holds at the moment when a cloud is taken in hand.
+
+    `oldest` is the first epoch of what may be collected, `why` the last one ended.
+    """
 
     method: Any
     model: Model
     parameters: NodeParameters
     epoch: int
     oldest: int
+    why: str
     seed: Seed | None
     place: Place | None
     now_ns: int

@@ -75,6 +75,7 @@ class Subscriptions:
         others = {p.topic_type for p in publishers} - {_type_name(kind)}
         text = f"a publisher of {topic} sends {', '.join(sorted(others))}, cloud_type is {kind}: nothing of it comes"
         self._session.conflicts.note("type", text if others else "")
+        publishers = [each for each in publishers if each.topic_type == _type_name(kind)]
         text = f"{len(publishers)} publishers on {topic} ({names_of(publishers)}): a node follows one source of clouds"
         self._session.conflicts.note("publishers", text if len(publishers) > 1 else "")
         if any(p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for p in publishers):
@@ -98,7 +99,7 @@ class Subscriptions:
             return
         publishers = self._host.ros.count_publishers(self._clouds.topic_name)
         if number is not None:
-            self._host.counters.lost += self._gaps.note(number, publishers)
+            self._host.counters.lose(self._gaps.note(number, publishers))
         self._session.take_cloud(data, alone=publishers == 1)
 
     def _is_taken(self, key: tuple[int, int | None]) -> bool:
@@ -126,7 +127,8 @@ class Subscriptions:
             return
         kind = qos_policy_name_from_kind(event.last_policy_kind)
         topic = self._clouds.topic_name
-        self._mismatch = f"a publisher of {topic} offers an incompatible {kind}: none of its clouds come"
+        how = f"; cloud_reliability is {self._asked}: set it to auto" if self._asked != "auto" else ""
+        self._mismatch = f"a publisher of {topic} offers an incompatible {kind}: none of its clouds come{how}"
         self.get_logger().error(self._mismatch)
 
     def _hear_best_effort(self) -> None:

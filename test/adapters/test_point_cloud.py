@@ -157,7 +157,10 @@ ILLEGAL = {
     "no z": (lambda c: c.fields.pop(), "exactly one field z"),
     "two fields x": (lambda c: c.fields.append(c.fields[0]), "exactly one field x"),
     "no fields": (lambda c: c.fields.clear(), "exactly one field x, the cloud has: none"),
-    "integer x": (lambda c: setattr(c.fields[0], "datatype", PointField.INT32), "must be FLOAT32 or FLOAT64, got i4"),
+    "integer x": (
+        lambda c: setattr(c.fields[0], "datatype", PointField.INT32),
+        "must be FLOAT32 or FLOAT64, got INT32",
+    ),
     "unknown type": (lambda c: setattr(c.fields[0], "datatype", 77), "unknown"),
     "an array field": (lambda c: setattr(c.fields[0], "count", 3), "count 1"),
     "a field beyond the point": (lambda c: setattr(c.fields[2], "offset", 9), "beyond point_step"),

@@ -178,6 +178,7 @@ def test_a_publisher_of_another_type_is_named_until_it_goes(blob_path, client, m
             "a publisher of /points sends geometry_msgs/msg/PoseArray, cloud_type is PointCloud2: nothing of it comes"
         )
         wait_until(lambda: text in client.values("input")["message"])
+        assert "2 publishers on" not in client.values("input")["message"], "of clouds there is one source"
         apart.do(lambda: tracker.destroy_publisher(poses))
         wait_until(lambda: text not in client.values("input")["conflicts"])
         apart.close()

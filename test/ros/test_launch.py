@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import sys
 import types
 from pathlib import Path
 
 import pytest
 import yaml
+from harness import DOMAIN
+from rclpy.context import Context
+from rclpy.node import Node
 
 from gapr_ros.parameters import FIELDS, problem
 
@@ -29,6 +33,7 @@ def load(monkeypatch):
         "launch": ["LaunchContext", "LaunchDescription"],
         "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction"],
         "launch.conditions": ["IfCondition"],
+        "launch.logging": [],
         "launch.substitutions": ["PathJoinSubstitution"],
         "launch_ros": [],
         "launch_ros.actions": ["Node"],
@@ -39,6 +44,7 @@ def load(monkeypatch):
         for name in classes:
             setattr(made, name, type(name, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, module, made)
+    sys.modules["launch.logging"].get_logger = logging.getLogger
 
     def load(name):
         spec = importlib.util.spec_from_file_location(name.split(".")[0], ROOT / "launch" / name)
@@ -49,14 +55,18 @@ def load(monkeypatch):
     return load
 
 
-def started(module, **arguments):
-    """The nodes that a launch file starts when it is given these arguments."""
+def started(module, typed=(), others=None, **arguments):
+    """The nodes that a launch file starts when it is given these arguments.
+
+    `typed` is what stands on the command line, `others` are configurations of a launch file that includes this one.
+    """
     *declared, opaque = module.generate_launch_description().given[0]
     values = {argument.given[0]: argument.named["default_value"] for argument in declared}
     assert set(arguments) <= set(values), "an argument that is not declared"
     values = {name: value if isinstance(value, str) else DEFAULTS for name, value in values.items()}
-    context = types.SimpleNamespace(launch_configurations=values | arguments)
-    return opaque.named["function"](context, *opaque.named.get("args", []))
+    values |= arguments | dict(word.split(":=") for word in typed) | (others or {})
+    chosen = types.SimpleNamespace(launch_configurations=values, argv=list(typed))
+    return opaque.named["function"](chosen, *opaque.named.get("args", []))
 
 
 def test_every_parameter_of_the_node_is_an_argument_and_none_is_given_unasked(load):
@@ -143,3 +153,86 @@ def test_a_file_without_bones_and_one_frame_for_two_are_refused(load, tmp_path, 
 def test_bones_without_a_file_are_refused_with_what_to_pass(load):
     with pytest.raises(ValueError, match="got ''; copy .* pass params_file:=FILE"):
         started(load("bones.launch.py"))
+
+
+@pytest.mark.parametrize("command", [["gapr_ros", "{}"], [str(ROOT / "launch" / "{}")]])
+@pytest.mark.parametrize(
+    ("name", "word", "hint"),
+    [
+        ("register", "max_tree:=0.002", "unknown launch argument max_tree: did you mean max_tre?"),
+        ("register", "modelunit:=mm", "unknown launch argument modelunit: did you mean model_unit?"),
+        ("register", "voxel:=1", "unknown launch argument voxel: --show-args lists those that there are"),
+        ("bones", "point:=/x", "unknown launch argument point: did you mean points?"),
+        ("bones", "model_unit:=mm", "unknown launch argument model_unit: parameters of a node belong in params_file"),
+    ],
+)
+def test_an_argument_that_is_not_declared_is_refused_with_the_nearest(load, monkeypatch, name, word, hint, command):
+    file = f"{name}.launch.py"
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", *(part.format(file) for part in command), word])
+    with pytest.raises(ValueError) as caught:
+        started(load(file), [word], params_file=str(ROOT / "config" / "two_bones.yaml"))
+    assert str(caught.value) == hint
+
+
+@pytest.mark.parametrize("file", ["register.launch.py", "bones.launch.py"])
+def test_what_launch_itself_reads_may_be_given(load, monkeypatch, file):
+    typed = ["launch-prefix:=gdb", "emulate_tty:=true", "sigterm_timeout:=9", "sigkill_timeout:=9", "points:=/x"]
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "gapr_ros", file, *typed])
+    assert len(started(load(file), typed, params_file=str(ROOT / "config" / "two_bones.yaml"))) == 2
+
+
+@pytest.mark.parametrize("file", ["register.launch.py", "bones.launch.py"])
+@pytest.mark.parametrize("command", [["my_robot", "robot.launch.py"], ["my_robot", "{}"]])
+def test_the_names_of_a_launch_file_that_includes_this_one_are_at_most_warned_of(
+    load, monkeypatch, caplog, file, command
+):
+    typed = ["points_left:=/a", "robot:=arm", "point:=/x"]
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", *(part.format(file) for part in command), *typed])
+    others = {"ros_namespace": "left", "global_params": [("use_sim_time", True)], "rviz_config": "robot.rviz"}
+    assert len(started(load(file), typed, others, params_file=str(ROOT / "config" / "two_bones.yaml"))) == 2
+    assert caplog.messages == ["unknown launch argument point: did you mean points?"]
+
+
+NESTED = """
+/**: {ros__parameters: {model_unit: mm}}
+/femur/register_node: {ros__parameters: {model_frame: a}}
+tibia/register_node: {ros__parameters: {model_frame: b}}
+tibia2: {register_node: {ros__parameters: {model_frame: c}}}
+/left/: {knee: {patella: {register_node: {ros__parameters: {model_frame: d}}}}, "*": {ros__parameters: {timeout: 9.0}}}
+tibia2/register_node: {ros__parameters: {model_label: "2"}}
+"""
+
+
+def test_a_bone_in_every_form_that_rcl_reads_gets_a_node_and_its_parameters(load, tmp_path):
+    path = tmp_path / "bones.yaml"
+    path.write_text(NESTED)
+    namespaces = [node.named["namespace"] for node in started(load("bones.launch.py"), params_file=str(path))]
+    assert namespaces == ["/femur", "/tibia", "/tibia2", "/left/knee/patella"]
+    for namespace, frame in zip(namespaces, "abcd", strict=True):
+        ros = Context()
+        ros.init(args=["--ros-args", "--params-file", str(path), "-r", f"__ns:={namespace}"], domain_id=DOMAIN)
+        node = Node("register_node", context=ros)
+        found = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+        assert (found["model_frame"], found["model_unit"]) == (frame, "mm")
+        node.destroy_node()
+        ros.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    ("entry", "name"),
+    [
+        ("/femur/registernode: {ros__parameters: {model_frame: c}}", "/femur/registernode"),
+        ("femur: {registernode: {ros__parameters: {model_frame: c}}}", "/femur/registernode"),
+        ("tibia: {registernode: {ros__parameters: {}}, register_node: {ros__parameters: {}}}", "/tibia/registernode"),
+        ("/tibia: {ros__parameters: {model_frame: c}}", "/tibia"),
+        ("/femur/register_node: {ros_parameters: {model_frame: c}}", "/femur/register_node/ros_parameters"),
+        ("register_node: {ros__parameters: {model_frame: c}}", "/register_node"),
+        ("femur:", "/femur"),
+        ("1: 2", "/1"),
+    ],
+)
+def test_an_entry_that_would_start_no_node_is_refused_beside_good_ones(load, tmp_path, entry, name):
+    path = tmp_path / "bones.yaml"
+    path.write_text(f"/tibia/register_node: {{ros__parameters: {{model_frame: b}}}}\n{entry}\n")
+    with pytest.raises(ValueError, match=f"bones.yaml: {name} would start no node: expected entries such as /femur/re"):
+        started(load("bones.launch.py"), params_file=str(path))

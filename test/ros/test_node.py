@@ -316,7 +316,10 @@ def test_clouds_whose_transform_never_comes_are_dropped_counted_and_logged(blob_
         assert client.ask(GOOD * 1.1, stamp_s=100.3)["level"] == 0
         wait_until(lambda: node.counters.dropped == 2)
         assert (node.counters.merged, node.counters.accepted, len(method.kept)) == (0, 2, 2)
-    assert "a cloud is not registered with the newer ones: tf_missing: tracker <- probe" in capfd.readouterr().err
+    assert (
+        "a cloud is not registered with the newer ones: tf_missing: output_frame: tracker <- probe"
+        in capfd.readouterr().err
+    )
 
 
 def test_clouds_that_wait_for_their_transforms_are_counted_as_dropped_when_the_node_is_cleaned_up(
@@ -399,6 +402,9 @@ def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
     settled = ("frames_accepted", "frames_refused", "frames_dropped", "frames_lost")
     wait_until(lambda: sum(int(client.values()[name]) for name in settled) == 6)
     assert client.ask(GOOD)["frames_lost"] == str(node.counters.lost)
+    wait_until(lambda: "were sent and never came: crop or thin" in client.values("input")["message"])
+    node.counters.last_lost_at -= 10.0
+    wait_until(lambda: "never came" not in client.values("input")["message"])
 
 
 def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(blob_path, client, method):
@@ -539,8 +545,10 @@ def test_other_settings_of_how_clouds_are_read_forget_what_was_collected(blob_pa
 def test_reload_keeps_the_old_bone_until_the_new_one_is_ready(live, tmp_path, blob_path):
     node, client, method = live
     node.set_parameters([Parameter("model_path", value=str(tmp_path / "absent.stl"))])
+    wait_until(lambda: "the bone is not that of model_path: call ~/reload_model" in client.values("input")["conflicts"])
     answer = client.call("reload_model")
     assert not answer.success and answer.message.startswith("the old bone stays: expected a file that exists")
+    wait_until(lambda: "~/reload_model failed, the old bone stays" in client.values("input")["conflicts"])
     assert client.ask(GOOD)["model_path"] == str(blob_path)
     assert {entry.hardware_id for entry in client.diagnostics[-1].status} == {"blob.npy"}
 
@@ -551,6 +559,7 @@ def test_reload_keeps_the_old_bone_until_the_new_one_is_ready(live, tmp_path, bl
     values = client.ask(GOOD)
     assert values["level"] == 0 and values["model_points"] == "700"
     wait_until(lambda: client.models[-1].width == 700)
+    wait_until(lambda: client.values("input")["conflicts"] == "")
 
 
 def test_a_disabled_node_counts_clouds_and_answers_none(live):
@@ -774,7 +783,7 @@ def test_without_tf_another_output_frame_is_refused_and_never_taken_as_identity(
     with node_in_thread(method, blob_path, output_frame="tracker"):
         client.wait_for_state("active")
         values = client.ask(GOOD, frame="probe")
-        assert values["last_refusal"].startswith("tf_missing: tracker <- probe: tf2_ros is not installed")
+        assert values["last_refusal"].startswith("tf_missing: output_frame: tracker <- probe: tf2_ros is not installed")
         assert client.ask(GOOD, frame="tracker")["level"] == 0, "the cloud is in the output frame already"
 
 
@@ -867,7 +876,7 @@ def test_with_tf_poses_go_to_the_output_frame_and_to_tf_once_for_each_newer_stam
         assert [t.header.stamp.sec for t in tf2.sent] == [10, 11]
         assert tf2.sent[0].header.frame_id == "tracker" and tf2.sent[0].child_frame_id == "bone_preop"
         refused = client.ask(GOOD, frame="unknown", stamp_s=12.0)
-        assert refused["last_refusal"] == "tf_missing: tracker <- unknown: unknown does not exist"
+        assert refused["last_refusal"] == "tf_missing: output_frame: tracker <- unknown: unknown does not exist"
 
 
 def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands_still(monkeypatch):

@@ -189,6 +189,12 @@ def test_what_tre95_leaves_out_and_that_none_is_too_large_is_said(given, place, 
     assert ("max_tre is 0" in remarks) is bound
 
 
+@pytest.mark.parametrize(("most", "said"), [(50, True), (200, False), (0, False)])
+def test_a_cloud_that_is_thinned_below_what_is_asked_of_it_is_said(most, said):
+    remarks = parameters.remarks(parameters.NodeParameters(max_points=most))
+    assert any(f"max_points {most} is below min_points 200" in remark for remark in remarks) == said
+
+
 @pytest.mark.parametrize(("least", "most", "said"), [(5.0, 1.0, True), (1.0, 1.0, True), (0.5, 1.0, False),
                                                     (5.0, 0.0, False), (0.0, 1.0, False)])  # fmt: skip
 def test_a_range_that_no_point_can_be_in_is_said_when_it_is_configured(least, most, said):

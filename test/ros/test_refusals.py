@@ -9,16 +9,21 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import StandIn, accepted, node_in_thread, pose_mm, wait_until
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.surface import Surface
 from gapr_ros.node import diagnostics, seeding
+from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason, RefusedError
-from gapr_ros.node.situation import Seed
+from gapr_ros.node.registration import Registration
+from gapr_ros.node.situation import Seed, Situation
 from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
@@ -171,6 +176,58 @@ def test_a_slow_registration_times_out(live):
     method.gate.set()
     wait_until(lambda: client.values()["last_refusal"].startswith("timeout: took ") and client.confidences)
     assert client.confidences == [0.0] and not client.poses
+
+
+def test_what_the_method_refused_after_a_long_time_is_its_reason_and_not_the_time(live):
+    """With another bone every cloud took long, and was refused as `timeout`: the users raised the limit."""
+    node, client, method = live
+    node.set_parameters_atomically([Parameter("timeout", value=0.05)])
+    method.answer = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two poses fit")
+    before = len(method.calls)
+    method.gate.clear()
+    client.send(GOOD)
+    wait_until(lambda: len(method.calls) > before)
+    time.sleep(0.1)
+    method.gate.set()
+    wait_until(lambda: client.confidences)
+    assert client.values()["last_refusal"] == "ambiguous: two poses fit"
+
+
+class Slow:
+    """Frames of which each comes after a while, if the wait is long enough."""
+
+    def __init__(self, seconds):
+        self.seconds, self.waits = seconds, []
+
+    def lookup(self, parent, child, stamp, timeout_s):
+        self.waits.append(timeout_s)
+        time.sleep(min(self.seconds, timeout_s))
+        if timeout_s < self.seconds:
+            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: not there")
+        return np.eye(4)
+
+
+def processed(frames, **parameters):
+    """What became of a cloud whose frames come late."""
+    method, given = StandIn(), NodeParameters(cloud_type="PointCloud2", **parameters)
+    points = np.random.default_rng(0).normal(size=(500, 3)) * [60.0, 20.0, 15.0]
+    model = Model("blob.npy", Surface(points), points, Surface(points).extent_mm, cKDTree(points))
+    now = Situation(method, model, given, 0, 0, "", None, None, 0)
+    cloud = serialize_message(xyz_to_cloud(GOOD.astype(np.float32), Header(frame_id="probe")))
+    return Registration(frames, lambda: now, lambda *_: None).process(Job(cloud, 0, 0))
+
+
+def test_the_wait_for_a_transform_is_no_time_of_the_registration():
+    outcome = processed(Slow(0.3), output_frame="ref", tf_timeout=1.0, timeout=0.25)
+    assert outcome.ok and outcome.tf_wait_s == pytest.approx(0.3, abs=0.1)
+
+
+def test_all_transforms_of_a_cloud_share_one_wait_and_a_missing_one_names_who_asks_for_it():
+    frames = Slow(0.3)
+    corners = {"crop_min": (-1.0, -1.0, -1.0), "crop_max": (1.0, 1.0, 1.0)}
+    outcome = processed(frames, output_frame="ref", crop_frame="box", tf_timeout=0.5, **corners)
+    assert outcome.reason is Reason.TF_MISSING and outcome.text == "crop_frame: box <- probe: not there"
+    assert frames.waits == [0.5, pytest.approx(0.2, abs=0.1)]
 
 
 @pytest.mark.parametrize(
@@ -425,6 +482,7 @@ def test_a_reset_refuses_the_cloud_on_its_way(live):
     wait_until(lambda: client.confidences == [0.0, 0.0])
     # The next answer must not be the last one of these.
     wait_until(lambda: int(client.values()["frames_refused"]) == node.counters.refused)
+    assert client.values()["last_refusal"].endswith("a reset")
     assert client.values()["last_refusal"].startswith("superseded_by_reset")
     assert len(method.calls) == before + 1, "the waiting cloud is not even registered"
     expect_good(live)

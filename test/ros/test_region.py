@@ -124,7 +124,7 @@ def test_the_box_is_looked_up_in_its_frame_and_a_missing_frame_is_a_refusal(blob
         values = client.ask(np.vstack([GOOD, FAR]), frame="probe")
         assert values["level"] == 0 and values["points_used"] == "1000"
         refused = client.ask(GOOD, frame="elsewhere")
-        assert refused["last_refusal"] == "tf_missing: table <- elsewhere: table does not exist"
+        assert refused["last_refusal"] == "tf_missing: crop_frame: table <- elsewhere: table does not exist"
 
 
 def test_after_a_good_pose_only_the_neighbourhood_counts_and_after_a_refusal_everything(blob_path, client, method):

@@ -1,0 +1,82 @@
+"""A source with the bone in it twice: the robust fit is sure of one copy, what it rejects is the other one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gapr_core import Registrar
+from gapr_core.geometry import se3
+from gapr_core.registration import doubles
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.limits import applied
+
+STEP = np.array([5.0, -2.0, 4.0, 0.02, 0.03, -0.02])
+
+
+@pytest.fixture(scope="module")
+def seen(femur):
+    """(N, 3) one side of the femur's lower part with 0.3 mm of noise, mm."""
+    rng = np.random.default_rng(3)
+    points, normals = femur.sample(9000, rng)
+    low = points[(normals[:, 1] < -0.2) & (points[:, 2] < np.quantile(points[:, 2], 0.4))]
+    return low + rng.normal(0.0, 0.3, low.shape)
+
+
+@pytest.fixture(scope="module")
+def twice(seen):
+    """The same after a step of a third of its points."""
+    moved = np.random.default_rng(4).random(len(seen)) < 0.33
+    points = seen.copy()
+    points[moved] = se3.apply(se3.exp(STEP, seen.mean(axis=0)), seen[moved])
+    return points
+
+
+def assessed(registrar, points, target, **settings):
+    rigidity = replace(registrar.config.rigidity, **settings)
+    config = replace(registrar.config, rigidity=rigidity)
+    found = Registrar(config, registrar.proposers, registrar.calibrations).assess(points, target)
+    assert isinstance(found, Assessment) and found.refusal is None
+    return found, applied(found, config)
+
+
+def test_of_two_copies_none_is_sure_and_the_bound_reaches_from_one_to_the_other(registrar, seen, twice, target):
+    found, limited = assessed(registrar, twice, target)
+    step_mm = se3.rms_apart_mm(se3.exp(STEP, seen.mean(axis=0)), np.eye(4), seen)
+    assert found.deformed[doubles.NAME] == pytest.approx(step_mm, rel=0.15)
+    assert next(iter(found.deformed)) == doubles.NAME
+    assert found.probability > 0.9 and limited.probability == registrar.config.limits.most
+    assert doubles.NAME in limited.contributions
+    other = se3.exp(-STEP, seen.mean(axis=0))  # where the bone is by the fewer points
+    assert found.tre95_mm > se3.rms_apart_mm(other, np.eye(4), target.points)
+
+
+def test_only_this_limit_keeps_two_copies_from_being_sure(registrar, seen, twice, target):
+    found, limited = assessed(registrar, twice, target, doubled=2.0, strained=np.inf, apart=np.inf, layered=np.inf)
+    assert doubles.NAME not in found.deformed and limited.probability > 0.9
+    assert found.tre95_mm < 2.0
+    assert se3.pose_error(found.fit.T, np.eye(4), seen).is_right, "the copy of most points"
+
+
+def test_outliers_tissue_and_few_rejected_points_are_no_copy(registrar, seen, target):
+    rng = np.random.default_rng(5)
+    some = rng.random(len(seen)) < 0.25
+    outliers, tissue = seen.copy(), seen.copy()
+    outliers[some] += rng.uniform(-15.0, 15.0, (some.sum(), 3))
+    tissue[some] += [0.0, -1.0, 0.0] * rng.uniform(3.0, 12.0, (some.sum(), 1)) + rng.normal(0.0, 1.5, (some.sum(), 3))
+    for points in (seen, outliers, tissue):
+        assert doubles.NAME not in assessed(registrar, points, target)[0].deformed
+
+
+def test_fewer_points_than_are_asked_for_say_nothing(registrar, twice, target):
+    found, _ = assessed(registrar, twice, target)
+    rests = found.fit.rests_on
+    rejected = int((rests.weights == 0.0).sum())
+    assert rejected > 60
+    assert doubles.NAME in assessed(registrar, twice, target, rejected_points=rejected)[0].deformed
+    assert doubles.NAME not in assessed(registrar, twice, target, rejected_points=rejected + 1)[0].deformed
+
+
+@pytest.mark.parametrize("name", ["doubled_mm", "doubled_deg"])
+def test_what_lies_far_from_the_answer_is_something_else(registrar, twice, target, name):
+    assert doubles.NAME not in assessed(registrar, twice, target, **{name: 0.5})[0].deformed

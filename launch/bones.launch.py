@@ -7,9 +7,7 @@ The file names a node a bone, `/femur/register_node`, `/tibia/register_node`, ..
 """
 # ruff: noqa: I001  (this folder is not the package launch)
 
-import difflib
-import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,8 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.logging import get_logger
 from launch_ros.actions import Node
+
+from gapr_ros.launch_names import check_names
 
 FILE = Path(__file__).resolve()
 EXECUTABLE = "register_node"
@@ -30,36 +30,6 @@ ARGUMENTS = {
     "points": ("points", "topic of the clouds, the same for all bones"),
 }
 NOT_NEAR = "parameters of a node belong in params_file"
-READ_BY_LAUNCH = (  # needs no declaration
-    "launch-prefix",
-    "launch-prefix-filter",
-    "emulate_tty",
-    "sigterm_timeout",
-    "sigkill_timeout",
-    "ros_namespace",
-)
-
-
-# the same as in register.launch.py: a launch file cannot import another
-def check_names(context: LaunchContext, declared: Iterable[str]) -> None:
-    """Refuses an argument that is not declared, which launch would lose in silence.
-
-    A launch file that includes this one has names of its own among `launch_configurations`, such as points_left. So a
-    name is refused only if it was typed after `ros2 launch gapr_ros` and this file, where every argument is for this
-    file. Anywhere else a name that resembles a declared one is warned of, and the others are left alone.
-
-    Raises:
-        ValueError: the unknown name, with the nearest declared one.
-    """
-    alone = {"gapr_ros", FILE.name} <= set(sys.argv) or FILE in [Path(word).resolve() for word in sys.argv]
-    typed = [word.split(":=")[0] for word in context.argv] if alone else []
-    for name in sorted({*context.launch_configurations} - {*declared, *READ_BY_LAUNCH}):
-        near = difflib.get_close_matches(name, declared, n=1, cutoff=0.8)
-        sentence = f"unknown launch argument {name}: " + (f"did you mean {near[0]}?" if near else NOT_NEAR)
-        if name in typed:
-            raise ValueError(sentence)
-        if near:
-            get_logger(FILE.name).warning(sentence)
 
 
 def bones(path: str) -> list[str]:
@@ -109,7 +79,7 @@ def _nodes_of(key: Any, entry: Any) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """One node a bone."""
-    check_names(context, ARGUMENTS)
+    check_names(context, FILE, ARGUMENTS, NOT_NEAR, get_logger(FILE.name).warning)
     chosen = context.launch_configurations
     return [
         Node(

@@ -4,9 +4,6 @@ ros2 launch gapr_ros register.launch.py model_path:=/path/to/bone.stl points:=/c
 """
 # ruff: noqa: I001  (this folder is not the package launch)
 
-import difflib
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ from launch.substitutions import PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from gapr_ros.launch_names import check_names
 from gapr_ros.parameters import FIELDS
 
 FILE = Path(__file__).resolve()
@@ -32,36 +30,6 @@ ARGUMENTS = {
     "rviz": ("false", "show clouds and bone"),
 }
 NOT_NEAR = "--show-args lists those that there are"
-READ_BY_LAUNCH = (  # needs no declaration
-    "launch-prefix",
-    "launch-prefix-filter",
-    "emulate_tty",
-    "sigterm_timeout",
-    "sigkill_timeout",
-    "ros_namespace",
-)
-
-
-# the same as in bones.launch.py: a launch file cannot import another
-def check_names(context: LaunchContext, declared: Iterable[str]) -> None:
-    """Refuses an argument that is not declared, which launch would lose in silence.
-
-    A launch file that includes this one has names of its own among `launch_configurations`, such as points_left. So a
-    name is refused only if it was typed after `ros2 launch gapr_ros` and this file, where every argument is for this
-    file. Anywhere else a name that resembles a declared one is warned of, and the others are left alone.
-
-    Raises:
-        ValueError: the unknown name, with the nearest declared one.
-    """
-    alone = {"gapr_ros", FILE.name} <= set(sys.argv) or FILE in [Path(word).resolve() for word in sys.argv]
-    typed = [word.split(":=")[0] for word in context.argv] if alone else []
-    for name in sorted({*context.launch_configurations} - {*declared, *READ_BY_LAUNCH}):
-        near = difflib.get_close_matches(name, declared, n=1, cutoff=0.8)
-        sentence = f"unknown launch argument {name}: " + (f"did you mean {near[0]}?" if near else NOT_NEAR)
-        if name in typed:
-            raise ValueError(sentence)
-        if near:
-            get_logger(FILE.name).warning(sentence)
 
 
 def given(context: LaunchContext) -> dict[str, Any]:
@@ -97,7 +65,7 @@ def _shown(chosen: dict[str, str]) -> dict[str, str]:
 
 def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
     """The node and RViz, once the arguments are known."""
-    check_names(context, (*ARGUMENTS, *FIELDS))
+    check_names(context, FILE, (*ARGUMENTS, *FIELDS), NOT_NEAR, get_logger(FILE.name).warning)
     parameters = given(context)
     chosen = context.launch_configurations
     if not Path(chosen["params_file"]).is_file():  # launch only warns, and the node would run with other limits

@@ -299,10 +299,7 @@ class RigidityConfig(Settings):
         4.0, "log likelihood ratio above which a layer on the bone grows along a source; infinity: never", low=0
     )
     fewest_points: int = setting(200, "inliers without which none of these is looked for", low=12, high=1_000_000)
-    doubled: float = setting(
-        0.5, "probability of a pose of the rejected points from which they are a copy of the bone; above 1: never",
-        low=0, high=2,
-    )  # fmt: skip
+    doubled: float = setting(0.5, "as probable a pose makes rejected points a copy of the bone; above 1: never", low=0)
     doubled_mm: float = setting(20.0, "a copy lies no farther from the answer than this", low=0, unit="mm")
     doubled_deg: float = setting(15.0, "nor is it turned farther", low=0, high=180, unit="deg")
     rejected_points: int = setting(60, "with fewer rejected points no copy is looked for", low=12, high=1_000_000)

@@ -9,8 +9,9 @@ import difflib
 import math
 import sys
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gapr_core.config import SENSOR_KINDS
@@ -26,6 +27,14 @@ NOT_OURS = ("use_sim_time", "start_type_description_service")  # declared by rcl
 LARGE = 1e9  # end of a range that has none: rclpy wants one
 ROS_TYPES = {float: "double", int: "integer", str: "string", bool: "bool", tuple: "double_array"}
 NO_FRAME = ("auto", "none")  # what `viewpoint` can be besides a place
+READ_BY_LAUNCH = (  # needs no declaration
+    "launch-prefix",
+    "launch-prefix-filter",
+    "emulate_tty",
+    "sigterm_timeout",
+    "sigkill_timeout",
+    "ros_namespace",
+)
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
 Triple = tuple[float, float, float]
 
@@ -204,6 +213,37 @@ def unknown_names(node: Node) -> list[str]:
             hint = f"; did you mean '{near[0]}'?" if near else ""
             sentences.append(f"unknown parameter '{name}' is ignored{hint}")
     return sentences
+
+
+def check_launch_names(
+    context: Any, file: Path, declared: Iterable[str], hint: str, warn: Callable[[str], object]
+) -> None:
+    """Refuse an argument that a launch file does not declare, which launch would lose in silence.
+
+    A launch file that includes this one has names of its own among `launch_configurations`, such as points_left. So a
+    name is refused only if it was typed after `ros2 launch gapr_ros` and this file, where every argument is for this
+    file. Anywhere else a name that resembles a declared one is warned of, and the others are left alone.
+
+    Args:
+        context: the LaunchContext.
+        file: the launch file, resolved.
+        declared: the names that it has.
+        hint: what to do where no name is near.
+        warn: logs a sentence.
+
+    Raises:
+        ValueError: the unknown name, with the nearest declared one.
+    """
+    names = tuple(declared)
+    alone = {"gapr_ros", file.name} <= set(sys.argv) or file in [Path(word).resolve() for word in sys.argv]
+    typed = [word.split(":=")[0] for word in context.argv] if alone else []
+    for name in sorted({*context.launch_configurations} - {*names, *READ_BY_LAUNCH}):
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.8)
+        sentence = f"unknown launch argument {name}: " + (f"did you mean {near[0]}?" if near else hint)
+        if name in typed:
+            raise ValueError(sentence)
+        if near:
+            warn(sentence)
 
 
 def check_change(node: Node, parameters: Iterable[Parameter], configured: bool) -> str:

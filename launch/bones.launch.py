@@ -17,7 +17,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.logging import get_logger
 from launch_ros.actions import Node
 
-from gapr_ros.launch_names import check_names
+from gapr_ros.parameters import check_launch_names
 
 FILE = Path(__file__).resolve()
 EXECUTABLE = "register_node"
@@ -79,7 +79,7 @@ def _nodes_of(key: Any, entry: Any) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def nodes(context: LaunchContext) -> list[Node]:
     """One node a bone."""
-    check_names(context, FILE, ARGUMENTS, NOT_NEAR, get_logger(FILE.name).warning)
+    check_launch_names(context, FILE, ARGUMENTS, NOT_NEAR, get_logger(FILE.name).warning)
     chosen = context.launch_configurations
     return [
         Node(

@@ -16,8 +16,7 @@ from launch.substitutions import PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from gapr_ros.launch_names import check_names
-from gapr_ros.parameters import FIELDS
+from gapr_ros.parameters import FIELDS, check_launch_names
 
 FILE = Path(__file__).resolve()
 PATIENCE_S = "20"  # after Ctrl-C: the node ends with a second of work, which takes longer on a busy machine
@@ -65,7 +64,7 @@ def _shown(chosen: dict[str, str]) -> dict[str, str]:
 
 def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
     """The node and RViz, once the arguments are known."""
-    check_names(context, FILE, (*ARGUMENTS, *FIELDS), NOT_NEAR, get_logger(FILE.name).warning)
+    check_launch_names(context, FILE, (*ARGUMENTS, *FIELDS), NOT_NEAR, get_logger(FILE.name).warning)
     parameters = given(context)
     chosen = context.launch_configurations
     if not Path(chosen["params_file"]).is_file():  # launch only warns, and the node would run with other limits

@@ -283,7 +283,8 @@ def test_two_processes_under_torchrun_learn_what_one_learns(settings, anatomy, t
                "-m", "gapr_core.cli", "train", "--config", str(tmp_path / "run.yaml"), "--anatomy", str(anatomy),
                "--out", str(tmp_path / "two")]  # fmt: skip
     environment = os.environ | {"OMP_NUM_THREADS": "1", "TMPDIR": str(tmp_path)}
-    subprocess.run(command, check=True, env=environment, capture_output=True, timeout=300)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-5000:]
     first, second = weights.load(one)[0], weights.load(tmp_path / "two" / "weights.safetensors")[0]
     for a, b in zip(first.parameters(), second.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-4)

@@ -10,7 +10,7 @@ import numpy as np
 from gapr_core.commands import answer, checks, options
 from gapr_core.geometry import se3
 from gapr_core.runtime import files
-from gapr_core.runtime.arguments import a_path
+from gapr_core.runtime.arguments import a_path, above_zero
 from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--points-axes", type=str.lower, default="auto", choices=("auto", "lps", "ras"),
                         help="of points that do not say them (auto: LPS)")  # fmt: skip
     options.add_tracker(parser)
-    parser.add_argument("--within", type=float, default=se3.RIGHT_MM, metavar="MM",
+    parser.add_argument("--within", type=above_zero, default=se3.RIGHT_MM, metavar="MM",
                         help=f"error over the bone that matters ({se3.RIGHT_MM:g})")  # fmt: skip
     parser.add_argument("--json", type=a_path, help="write the answer here as well; keys: docs/reference/json.md")
     options.add_settings(parser)

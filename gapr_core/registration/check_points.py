@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 SURPRISING = 0.01  # a right pose is contradicted so often
 LOOSE_MM, LOOSE_DEG = 20.0, 20.0  # standard deviations of a pose of which only the check points are known
+MOST_POINTS = 1000  # all pairs of them are looked at
 CANDIDATES = 500  # places of the bone that are compared for the next point
 
 
@@ -52,14 +53,17 @@ def check_points(
         within_mm: an error over the bone that matters: a pose holds where the points alone would have shown it.
 
     Raises:
-        InvalidPointCloudError: no points, a wrong shape or type, a target that is not prepared, or a result without a
-            pose or its covariance.
+        InvalidPointCloudError: no points, too many, a wrong shape or type, a target that is not prepared, or a result
+            without a pose or its covariance.
     """
     check_call(target, None)
     config = config or RegistrarConfig()
     points = finite_points(points)
     if not len(points):
         raise InvalidPointCloudError("check points", "none that is finite", "touch the bone and pass (N, 3), mm")
+    if len(points) > MOST_POINTS:
+        how = "register a cloud of these; check with points that were touched"
+        raise InvalidPointCloudError(f"at most {MOST_POINTS} check points", str(len(points)), how)
     T, covariance, centre = _accepted(result)
     surface = offset_surface(target, config.sensor)
     distance_mm, normals = _distances(T, points, surface)
@@ -92,6 +96,8 @@ def _accepted(result: RegistrationResult) -> tuple[Array, Array, Array]:
         raise InvalidPointCloudError(
             "an accepted pose with its covariance", given, "register again, with more of the bone or method gapr"
         )
+    if not np.linalg.eigvalsh(covariance).min() > 0.0:
+        raise InvalidPointCloudError("a positive definite covariance", "one that is not", "pass it as it was answered")
     return T, result.factor95**2 * covariance, centre
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist
 from gapr_core.registration import source as sources
@@ -45,15 +46,12 @@ def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, registe
     a, limits = assessment, config.rigidity
     if a.seen is not None:
         return a
-    rests = a.fit.rests_on
-    rejected = (a.source.points if rests is a.fit else a.source.whole)[rests.weights == 0.0]
+    residuals = a.residuals
+    rejected = residuals.points[~residuals.inlier]
     if len(rejected) < limits.rejected_points:
         return a
     T = _elsewhere(a, rejected, config)
-    prepared = None if T is None else sources.prepare(rejected, config.source, config.num_threads)
-    if T is None or prepared is None or isinstance(prepared, Refusal):
-        return a
-    found = register(prepared, np.stack([T, a.fit.T]))
+    found = None if T is None else _registered(rejected, np.stack([T, a.fit.T]), config, register)
     if found is None or not _is_copy(found, a, config):
         return a
     twist = error_twist(found.fit.T, a.fit.T, a.source.points)
@@ -70,6 +68,15 @@ def _elsewhere(assessment: Assessment, rejected: Array, config: RegistrarConfig)
     T = refine_many(a.fit.T[None], some, a.target, LIMITS_MM, config.num_threads)[0][0]
     sigma_mm = evaluate(T, some, a.target, config.refinement).sigma_mm
     return T if sigma_mm <= AS_PRECISE * a.fit.sigma_mm else None
+
+
+def _registered(points: Array, poses: Array, config: RegistrarConfig, register: Register) -> Assessment | None:
+    """The points as a source of their own, from these poses on; None of a line, or of a heap too small for a piece."""
+    try:
+        prepared = sources.prepare(points, config.source, config.num_threads)
+    except InvalidPointCloudError:
+        return None
+    return None if isinstance(prepared, Refusal) else register(prepared, poses)
 
 
 def _is_copy(found: Assessment, assessment: Assessment, config: RegistrarConfig) -> bool:

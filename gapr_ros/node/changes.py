@@ -6,6 +6,8 @@ from typing import Any
 
 from gapr_ros.parameters import NodeParameters
 
+OF_BONE = "model_path", "model_label", "model_unit", "model_scale", "model_axes"  # read with the bone
+
 
 class Changes:
     """Tells what has changed since it was asked last.
@@ -16,7 +18,11 @@ class Changes:
     """
 
     def __init__(self, made_from: NodeParameters, now: NodeParameters) -> None:
-        self._limits, self._reading = _limits(made_from), _reading(now)
+        self._made_from, self._limits, self._reading = made_from, _limits(made_from), _reading(now)
+
+    def of_bone(self, now: NodeParameters) -> list[str]:
+        """Names of what says which bone it is and is not as the bone was read with."""
+        return [name for name in OF_BONE if getattr(now, name) != getattr(self._made_from, name)]
 
     def in_reading(self, now: NodeParameters) -> bool:
         """Clouds are read in another way: what was collected cannot be registered with what comes."""

@@ -46,7 +46,6 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
-OF_BONE = "model_path", "model_label", "model_unit", "model_scale", "model_axes"  # read with the bone
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
 
 
@@ -261,7 +260,7 @@ class Session:
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
         now = self._host.parameters
-        waits = [name for name in OF_BONE if getattr(now, name) != getattr(self._ready.parameters, name)]
+        waits = self._changes.of_bone(now)
         self.conflicts.note("bone", f"the bone is not that of {', '.join(waits)}: call ~/reload_model" if waits else "")
         if self._changes.in_reading(now):
             self._forget_clouds("clouds are read in another way")

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
 
-from gapr_core import RegistrarConfig, check_points
-from gapr_core.config import SensorConfig
 from gapr_core.errors import GaprError
 from gapr_core.results import PointCheck, Verdict
 from gapr_ros.node import wire
 from gapr_ros.node.diagnostics import status_message
 from gapr_ros.node.intake import plain_frame
+from gapr_ros.node.method import configured
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.parameters import NodeParameters
+
+if TYPE_CHECKING:
+    from gapr_core import RegistrarConfig
 
 Array = NDArray[np.float64]
 LEVELS = {
@@ -42,6 +47,8 @@ def check(message: PoseArray, accepted: Outcome | None, model: Model, parameters
     Raises:
         NothingToCheckError: no pose, another frame, no points, or a method that says no covariance.
     """
+    from gapr_core import check_points
+
     if accepted is None or accepted.result is None:
         raise NothingToCheckError("no pose was accepted, or the last one was withdrawn: register first")
     frame, wanted = plain_frame(message.header.frame_id), accepted.header.frame_id
@@ -80,10 +87,8 @@ def status(message: PoseArray, found: PointCheck | str, name: str, hardware_id: 
 
 
 def _config(parameters: NodeParameters) -> RegistrarConfig:
-    """The pointer, and how far the model may be off."""
-    sensor, covariance = SensorConfig(kind="pointer"), RegistrarConfig().covariance
-    if parameters.sensor == "pointer" and parameters.standoff:
-        sensor = SensorConfig(kind="pointer", standoff_mm=parameters.standoff * wire.MM_PER_M)
-    if parameters.model_error >= 0.0:
-        covariance = type(covariance)(model_mm=parameters.model_error * wire.MM_PER_M)
-    return RegistrarConfig(sensor=sensor, covariance=covariance)
+    """The library's settings for a pointer: the node's own where its clouds are a pointer's, else what is usual."""
+    from gapr_core import RegistrarConfig
+
+    standoff = parameters.standoff if parameters.sensor == "pointer" else 0.0
+    return configured(RegistrarConfig(), replace(parameters, sensor="pointer", standoff=standoff))

@@ -85,6 +85,13 @@ def test_the_answer_does_not_go_over_what_it_was_made_of(folder, capsys):
     assert "which belongs to --pose" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("within", ["nan", "-1", "0", "x"])
+def test_an_error_that_matters_is_a_number_above_0(folder, capsys, within):
+    with pytest.raises(SystemExit, match="1"):
+        run(f"--within={within}")
+    assert "expected a number above 0" in capsys.readouterr().err
+
+
 def test_the_library_has_it_under_one_name(femur_cloud):
     target = Registrar().prepare(femur_cloud)
     found = check_points(se3.apply(np.linalg.inv(T), femur_cloud[::200]), target, OK)

@@ -158,6 +158,19 @@ def test_rows_that_are_not_finite_are_dropped_and_nothing_to_check_is_an_error()
         check([[np.nan] * 3], plane(), answer(), EXACT)
 
 
+def test_more_points_than_are_touched_are_refused_before_the_work():
+    """Of 100 000 poses the node would have made a matrix of 80 GB."""
+    points = np.zeros((module.MOST_POINTS + 1, 3))
+    with pytest.raises(InvalidPointCloudError, match="at most 1000 check points; got 1001"):
+        check(points, plane(), answer(), EXACT)
+    assert len(check(points[:-1], plane(), answer(), EXACT).points) == module.MOST_POINTS
+
+
+def test_a_covariance_that_is_none_is_an_error():
+    with pytest.raises(InvalidPointCloudError, match="a positive definite covariance"):
+        check([[0.0, 0.0, 0.0]], plane(), answer(covariance=np.zeros((6, 6))), EXACT)
+
+
 def test_a_refusal_and_a_pose_without_covariance_cannot_be_checked():
     refused = RegistrationResult(RegistrationStatus.AMBIGUOUS)
     for result in (refused, answer(covariance=None)):

@@ -165,7 +165,8 @@ def test_an_old_cloud_is_stale(live):
     expect_good(live)
 
 
-def test_a_slow_registration_times_out(live):
+def send_slowly(live):
+    """A cloud whose registration takes longer than `timeout`."""
     node, client, method = live
     node.set_parameters_atomically([Parameter("timeout", value=0.05)])
     before = len(method.calls)
@@ -174,21 +175,20 @@ def test_a_slow_registration_times_out(live):
     wait_until(lambda: len(method.calls) > before)
     time.sleep(0.1)
     method.gate.set()
+
+
+def test_a_slow_registration_times_out(live):
+    client = live[1]
+    send_slowly(live)
     wait_until(lambda: client.values()["last_refusal"].startswith("timeout: took ") and client.confidences)
     assert client.confidences == [0.0] and not client.poses
 
 
 def test_what_the_method_refused_after_a_long_time_is_its_reason_and_not_the_time(live):
     """With another bone every cloud took long, and was refused as `timeout`: the users raised the limit."""
-    node, client, method = live
-    node.set_parameters_atomically([Parameter("timeout", value=0.05)])
+    _, client, method = live
     method.answer = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two poses fit")
-    before = len(method.calls)
-    method.gate.clear()
-    client.send(GOOD)
-    wait_until(lambda: len(method.calls) > before)
-    time.sleep(0.1)
-    method.gate.set()
+    send_slowly(live)
     wait_until(lambda: client.confidences)
     assert client.values()["last_refusal"] == "ambiguous: two poses fit"
 

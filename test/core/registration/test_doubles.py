@@ -77,6 +77,12 @@ def test_fewer_points_than_are_asked_for_say_nothing(registrar, twice, target):
     assert doubles.NAME not in assessed(registrar, twice, target, rejected_points=rejected + 1)[0].deformed
 
 
+def test_a_heap_of_points_and_a_line_are_no_source_and_no_error(registrar):
+    heap, line = np.random.default_rng(0).normal(0.0, 0.05, (70, 3)), np.arange(70.0)[:, None] * [1.0, 0.0, 0.0]
+    for points in (heap, line):
+        assert doubles._registered(points, np.eye(4)[None], registrar.config, pytest.fail) is None
+
+
 @pytest.mark.parametrize("name", ["doubled_mm", "doubled_deg"])
 def test_what_lies_far_from_the_answer_is_something_else(registrar, twice, target, name):
     assert doubles.NAME not in assessed(registrar, twice, target, **{name: 0.5})[0].deformed

@@ -61,7 +61,7 @@ MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2lik
 TRACED     := traced traced-named
 FEW        := $(addprefix few-,pointer ultrasound femora)
 SCRIPTS    := strangers similar mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described \
-              guidance hollow unknowable check_points proposals proposals_clean viewpoint viewpoint_wrong
+              guidance hollow unknowable check_points flat_ends proposals proposals_clean viewpoint viewpoint_wrong
 made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --count 500 --mirrored 60 --sides 12 --out $(OUT)/strangers
 made_by_mirrored          = strangers.py --anatomy $(ANATOMY) --split test --count 4 --mirrored 300 --out $(OUT)/mirrored
 made_by_similar           = strangers.py --anatomy $(ANATOMY) --split test --bones femur,tibia,pelvis --count 0 --mirrored 0 --sides 0 --similar 270 --out $(OUT)/similar
@@ -75,6 +75,7 @@ made_by_guidance          = guidance.py --anatomy $(ANATOMY) --count 4 --most 40
 made_by_hollow            = hollow.py --anatomy $(ANATOMY) --split test --count 4
 made_by_unknowable        = unknowable.py --count 8
 made_by_check_points      = check_points.py --anatomy $(ANATOMY) --split test --count 12
+made_by_flat_ends         = flat_ends.py --anatomy $(ANATOMY) --split test --count 24
 made_by_proposals         = proposals.py --pairs $(OUT)/pairs/one_sided --limit 16
 made_by_proposals_clean   = proposals.py --pairs $(OUT)/pairs/clean --limit 16
 SEEN                      := scenes scene_stereo scene_joint scene_table

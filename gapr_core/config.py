@@ -26,6 +26,7 @@ class TargetConfig(Settings):
     misfit_neighbours: int = setting(10, "neighbours whose distance to an element is its misfit", low=1, high=200)
     misfit_gain: float = setting(0.5, "variance of an element over its mean square misfit", low=0.0, high=100.0)
     view_directions: int = setting(96, "directions from which the target is looked at to find its outside", low=6)
+    flat_end_mm2: float = setting(200.0, "larger flat ends are left out; 0 keeps them", low=0, high=1e6, unit="mm^2")
     anchors: int = setting(1200, "points where the search places the source", low=10)
     field_reach_mm: float = setting(12.0, "reach of the distance field around the target", low=3, high=100, unit="mm")
 

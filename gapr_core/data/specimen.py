@@ -80,6 +80,22 @@ class Specimen:
         points, faces = _closed(self.surface.points[used], faces.reshape(-1, 3))
         return replace(self, surface=Surface(points, faces))
 
+    def cut(self, normal: Array, offset_mm: float) -> Specimen:
+        """What a saw or the border of a scan leaves of it: the side of a plane against its normal, closed by the plane.
+
+        Corners of cut faces that are beyond the plane move onto it.
+
+        Args:
+            normal: (3,) unit.
+            offset_mm: along the normal, from the origin of the scan.
+        """
+        beyond = self.surface.points @ normal - offset_mm
+        faces = self.surface.triangles[(beyond < 0.0)[self.surface.triangles].any(axis=1)]
+        used, faces = np.unique(faces, return_inverse=True)
+        flattened = self.surface.points[used] - np.outer(np.maximum(beyond[used], 0.0), normal)
+        points, faces = _closed(flattened, faces.reshape(-1, 3))
+        return replace(self, surface=Surface(points, faces))
+
     @cached_property
     def _centre(self) -> Array:
         return self.surface.points.mean(axis=0)

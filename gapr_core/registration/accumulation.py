@@ -37,8 +37,8 @@ class Accumulator:
     together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
     what lies off the bone is left out, and refused if it is the newest. After three of them in a row the bone or its
-    reference has moved, and only these three are kept. Where all show that the bone creeps (see `rigidity`), the answer
-    is refused and only the last third kept.
+    reference has moved, and only these three are kept. Where all show that the bone moves (see `rigidity`), the answer
+    is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -169,21 +169,24 @@ class Accumulator:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
             why = f"the {newest} off the bone where the others found it: left out"
             return _refused(result, why)
-        return self._unless_it_creeps(result, target)
+        return self._unless_it_moves(result, target)
 
-    def _unless_it_creeps(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
-        """The answer; a refusal, and only the last third of the sources left, where they show that the bone moves."""
+    def _unless_it_moves(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
+        """The answer; a refusal where the sources show that the bone moves.
+
+        Those since a step are left; of a steady motion the last third.
+        """
         T, kept, limits = result.T_target_source, self._kept, self.config.rigidity
         if T is None or len(kept) < FEWEST_IN_TIME:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
-        found = rigidity.of_creep(refine_fully(T, points, seen, self.config.refinement), order[some], limits)
-        if found.log_ratio <= limits.creeps:
+        found = rigidity.of_motion(refine_fully(T, points, seen, self.config.refinement), order[some], limits)
+        if found.finding.log_ratio <= limits.creeps:
             return result
         self.reset()
-        self._kept = kept[-(len(kept) // 3) :]
+        self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
 

@@ -48,6 +48,18 @@ class Finding(NamedTuple):
 NOTHING = Finding(0.0, 0.0)
 
 
+class Motion(NamedTuple):
+    """What collected sources say of a bone that moves.
+
+    Attributes:
+        finding: of a steady motion or of a step, what they speak most for.
+        rests_from: number of the first source since a step; None for a steady motion.
+    """
+
+    finding: Finding
+    rests_from: int | None = None
+
+
 class Deformation(NamedTuple):
     """What a source may have suffered against the bone.
 
@@ -69,23 +81,38 @@ class Deformation(NamedTuple):
         return self.finding.log_ratio > self.limit
 
 
-def of_creep(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Finding:
-    """Whether the bone moved steadily while the points were collected.
+def of_motion(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Motion:
+    """Whether the bone moved while the points were collected: steadily, or once between two groups of sources.
 
-    Its size is that of the motion from the first source to the last.
+    The size of a steady motion is that from the first source to the last.
 
     Args:
         fit: the pose that all points have in common.
         order: (N,) when each point was measured, as the number of its source: 0, 1, 2 and on.
-        config: of the blocks.
+        config: of the blocks, and how many groups.
     """
     inlier = fit.weights > 0.0
     if np.count_nonzero(inlier) < config.fewest_points or not order.max() > order.min():
-        return NOTHING
+        return Motion(NOTHING)
     time = ((order - order.min()) / (order.max() - order.min()))[inlier]
-    group = np.minimum(time * config.groups, config.groups - 1).astype(np.int64)
-    moved = (time[:, None] - 0.5) * motions(fit)
-    return findings(blocks(fit, fit.jacobian[inlier], [moved], group, config), config)[0]
+    steps = step_times(config.groups)
+    group = np.searchsorted(steps, time, side="right")
+    changes = [when[:, None] * motions(fit) for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in steps)]]
+    found = findings(blocks(fit, fit.jacobian[inlier], changes, group, config), config)
+    any_of_steps = np.log(len(steps))  # each of them is as likely as the others, before the residuals
+    ratios = [found[0].log_ratio, *(each.log_ratio - any_of_steps for each in found[1:])]
+    best = int(np.argmax(ratios))
+    if best == 0:
+        return Motion(found[0])
+    at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()  # the step may lie anywhere in the group
+    return Motion(
+        Finding(ratios[best], found[best].size_mm), int(np.ceil(order.min() + at * (order.max() - order.min())))
+    )
+
+
+def step_times(groups: int) -> Array:
+    """(groups,) shares of the time between groups: equal ones, the last of them halved, as the newest matter most."""
+    return np.append(np.arange(1, groups), groups - 0.5) / groups
 
 
 def of_deformations(fit: Fit, config: RigidityConfig) -> dict[str, Deformation]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,9 +18,11 @@ from gapr_core.config import TargetConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import distance_field, extent, quadrics, sampling, visibility
 from gapr_core.geometry.distance_field import DistanceField
+from gapr_core.geometry.flat_ends import OF_POINT, flat_ends
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 DENSER = 4  # times as many points are drawn on a mesh as are kept, so that they can be kept evenly
 FLAT = 1e-3  # spread along an axis over that along the longest, below which there is no extent
@@ -111,9 +114,12 @@ def prepare(
     _check_is_a_body(points, config)
     spacing_mm = quadrics.spacing(points, num_threads=num_threads)
     shell = _outer_shell(points, normals, spacing_mm, config, num_threads)
-    whole = _described(*shell, surface, config, num_threads)
+    whole = _described(*_without_flat_ends(*shell, spacing_mm, config), surface, config, num_threads)
     outer = _outer_cortex(points, normals, spacing_mm, config, num_threads)
-    return whole if outer is None else replace(_described(*outer, surface, config, num_threads), both_cortices=whole)
+    if outer is None:
+        return whole
+    outer = _without_flat_ends(*outer, spacing_mm, config, warns=False)
+    return replace(_described(*outer, surface, config, num_threads), both_cortices=whole)
 
 
 def _described(
@@ -161,10 +167,16 @@ def _check_is_a_body(points: Array, config: TargetConfig) -> None:
     if len(points) < config.fewest_points:
         given = f"{len(points)} distinct points"
         raise InvalidPointCloudError(f"a target of at least {config.fewest_points} points", given, "export it denser")
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
-    if spread[0] < FLAT * spread[2]:
-        shape = "line" if spread[1] < FLAT * spread[2] else "plane"
+    if shape := _flat_shape(points):
         raise InvalidPointCloudError("a bone with extent in three directions", f"a {shape}", "check the file")
+
+
+def _flat_shape(points: Array) -> str:
+    """What points (N, 3) are that have no extent in some direction: a line, a plane; "" for others."""
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
+    if spread[0] >= FLAT * spread[2]:
+        return ""
+    return "line" if spread[1] < FLAT * spread[2] else "plane"
 
 
 def _outer_shell(
@@ -177,6 +189,25 @@ def _outer_shell(
     normals = quadrics.orient(normals, votes)
     shell = counts > 0
     return (points[shell], normals[shell]) if shell.mean() > LEAST_SHELL else (points, normals)
+
+
+def _without_flat_ends(
+    points: Array, normals: Array, spacing_mm: float, config: TargetConfig, warns: bool = True
+) -> tuple[Array, Array]:
+    """Points and normals that are not on a flat end of the model; everything, should no body be left."""
+    if not config.flat_end_mm2:
+        return points, normals
+    on_end = flat_ends(points, normals, spacing_mm, config.flat_end_mm2)
+    left = points[~on_end]
+    if not on_end.any() or len(left) < config.fewest_points or _flat_shape(left):
+        return points, normals
+    if warns:
+        log.warning(
+            "the model has flat ends (%.0f mm^2), as where a scan or a cut ends, or a table: no point is laid on them. "
+            "Delete what is not bone; target.flat_end_mm2=0 keeps them",
+            OF_POINT * spacing_mm**2 * np.count_nonzero(on_end),
+        )
+    return left, normals[~on_end]
 
 
 def _outer_cortex(

@@ -20,8 +20,8 @@ from gapr_core.registration.rigidity import (
     Blocks,
     blocks,
     findings,
-    of_creep,
     of_deformations,
+    of_motion,
 )
 
 CONFIG = RigidityConfig()
@@ -122,7 +122,7 @@ def test_a_bone_that_moves_while_it_is_measured_is_found_and_one_at_rest_is_not(
         [se3.apply(se3.exp(np.array(motion) * t, np.zeros(3)), p[None])[0] for t, p in zip(time, points, strict=True)]
     )
     creeping, resting = (fit_of(points, normals, noise(2400) + off) for off in (moved - points, 0.0))
-    found, nothing = (of_creep(fit, order, CONFIG) for fit in (creeping, resting))
+    found, nothing = (of_motion(fit, order, CONFIG).finding for fit in (creeping, resting))
     assert found.log_ratio > CONFIG.creeps > nothing.log_ratio
     assert found.size_mm > 3.0 * nothing.size_mm and 0.5 < found.size_mm < 5.0
 
@@ -132,9 +132,9 @@ def test_what_does_not_go_with_time_is_no_creep(seen):
     points, normals = seen(2400)
     order = np.random.default_rng(6).permutation(np.repeat(np.arange(12), 200))
     off = np.random.default_rng(7).choice([-1.5, 1.5], 2400)[:, None] * [0.0, 0.0, 1.0]
-    assert of_creep(fit_of(points, normals, noise(2400) + off), order, CONFIG).log_ratio < 4.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off), order, CONFIG).finding.log_ratio < 4.0
     off = 3.0 * np.sign(order - 5.5)[:, None] * [0.0, 0.0, 1.0]
-    assert of_creep(fit_of(points, normals, noise(2400) + off), order, CONFIG).log_ratio > 40.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off), order, CONFIG).finding.log_ratio > 40.0
 
 
 @pytest.mark.parametrize("strain", [np.diag([0, 0, 0.03]), np.diag([0.05, 0, 0]),
@@ -169,11 +169,11 @@ def test_another_size_is_a_strain(seen):
 def test_few_points_or_one_source_say_nothing(seen):
     points, normals = seen(199)
     fit = fit_of(points, normals, noise(199) + 0.2 * points)
-    assert of_strain(fit, CONFIG) == rigidity.NOTHING == of_creep(fit, np.arange(199), CONFIG)
+    assert of_strain(fit, CONFIG) == rigidity.NOTHING == of_motion(fit, np.arange(199), CONFIG).finding
     points, normals = seen(200)
     fit = fit_of(points, normals, noise(200) + 0.2 * points * [0, 0, 1])
     assert of_strain(fit, CONFIG).log_ratio > 3.0
-    assert of_creep(fit, np.zeros(200, dtype=np.int64), CONFIG) == rigidity.NOTHING
+    assert of_motion(fit, np.zeros(200, dtype=np.int64), CONFIG).finding == rigidity.NOTHING
 
 
 def test_halves_move_against_each_other_along_each_principal_axis(seen):
@@ -276,7 +276,7 @@ def test_points_without_weight_say_nothing_of_a_creep(seen):
     points, normals = seen(2400)
     order, weights = np.arange(2400) // 200, np.where(np.arange(2400) % 2, 1.0, 0.0)
     off = np.where(weights[:, None] > 0.0, 0.0, 3.0 * (order / 11.0)[:, None] * [0.0, 0.0, 1.0])
-    assert of_creep(fit_of(points, normals, noise(2400) + off, weights), order, CONFIG).log_ratio < 1.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off, weights), order, CONFIG).finding.log_ratio < 1.0
 
 
 def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(seen):
@@ -321,7 +321,8 @@ def test_a_plane_of_which_some_motions_change_nothing_is_judged_by_the_others(li
     assert found.log_ratio == pytest.approx(0.0, abs=1e-6) and np.isfinite(found.size_mm)
     order = np.arange(400) // 40
     falling = replace(fit, signed_mm=fit.signed_mm + 0.4 * order)
-    assert of_creep(falling, order, CONFIG).log_ratio > CONFIG.creeps > of_creep(fit, order, CONFIG).log_ratio
+    moves, rests = (of_motion(each, order, CONFIG).finding for each in (falling, fit))
+    assert moves.log_ratio > CONFIG.creeps > rests.log_ratio
 
 
 def test_infinity_finds_no_strain_and_zero_each_that_is_likelier_than_none(seen):
@@ -340,15 +341,35 @@ def test_points_without_weight_say_nothing(seen):
     assert of_strain(fit_of(points, normals, off, weights), CONFIG).log_ratio < 1.0
 
 
-def test_of_a_motion_its_rotation_counts_by_the_radius_of_the_points(seen):
-    """So that all six unknowns are mm."""
+def drawn_along(seen):
+    """Points of a sweep along the bone and back in 12 sources, their normals, and when each was measured."""
     points, normals = seen(2400)
-    order = np.arange(2400) // 200
+    along = np.argsort(np.argsort(points @ np.linalg.svd(points, full_matrices=False)[2][0]))
+    order = np.where(np.random.default_rng(8).random(2400) < 0.5, along // 400, 11 - along // 400)
+    return points, normals, order
+
+
+def test_of_a_steady_motion_its_rotation_counts_by_the_radius_of_the_points(seen):
+    """So that all six unknowns are mm."""
+    points, normals, order = drawn_along(seen)
     radius_mm = np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())
     time = (order / 11.0 - 0.5)[:, None]
-    fit = fit_of(points, normals, noise(2400))
-    motions = fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
-    group = np.minimum(order / 11.0 * CONFIG.groups, CONFIG.groups - 1).astype(int)
-    (same,) = findings(blocks(fit, fit.jacobian, [time * motions], group, CONFIG), CONFIG)
-    found = of_creep(fit, order, CONFIG)
-    assert found == pytest.approx(same, rel=1e-2, abs=1e-3)
+    fit = fit_of(points, normals, noise(2400) + 4.0 * time * [0.0, 0.0, 1.0])
+    changes = time * fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
+    group = np.searchsorted([2 / 12, 4 / 12, 6 / 12, 8 / 12, 10 / 12, 11 / 12], order / 11.0, side="right")
+    (same,) = findings(blocks(fit, fit.jacobian, [changes], group, CONFIG), CONFIG)
+    found = of_motion(fit, order, CONFIG)
+    assert found.rests_from is None and same.log_ratio > CONFIG.creeps
+    assert found.finding == pytest.approx(same, rel=1e-2, abs=1e-3)
+
+
+@pytest.mark.parametrize("first", [2, 4, 6, 8, 10, 11])
+def test_a_step_is_found_and_what_was_measured_since_is_named(seen, first):
+    points, normals, order = drawn_along(seen)
+    off = np.where(order < first, 0.0, 4.0)[:, None] * [0.0, 0.0, 1.0]
+    stepped, at_rest = (fit_of(points, normals, noise(2400) + each) for each in (off, 0.0 * off))
+    found, resting = (of_motion(fit, order, CONFIG) for fit in (stepped, at_rest))
+    assert found.finding.log_ratio > CONFIG.creeps > resting.finding.log_ratio
+    assert found.rests_from is not None and first <= found.rests_from <= first + 1
+    later = of_motion(fit_of(points, normals, noise(2400) + off), order + 7, CONFIG)
+    assert later.rests_from == found.rests_from + 7

@@ -13,6 +13,8 @@ THICK_MM = 0.25  # another; a sphere has five times as many points in it, a cyli
 LEAST_SHARE = 0.67  # of the points of the thick layer that the thin one of a plane holds
 RIM_MM = 2.0  # depth to which the rounded edge of an end goes with it
 LEAST_COS = 0.8  # of the angle between the normals of this edge and that of the plane
+STAIRS_MM = 4.0  # depth in which a step of voxels is followed by others that face the same way
+MOST_STAIRS = 1.5  # times the points of an end may face the same way in this depth
 OF_POINT = 2.0  # area of an evenly thinned point over the square of the median distance to the nearest
 FEWEST = 10  # points of an end
 HIGHEST = 0.95  # share of an end's points that its plane is above
@@ -60,8 +62,10 @@ def _end_of(points: Array, normals: Array, spacing_mm: float, least_mm2: float) 
         height = points @ (normal if normal @ outward > 0.0 else -normal)
         depth = np.quantile(height[near], HIGHEST) - height
         thin, thick = (np.count_nonzero(depth < limit) for limit in (THIN_MM, THICK_MM))
-        if thin >= max(fewest, LEAST_SHARE * thick):
-            return (depth < THIN_MM) | ((depth < RIM_MM) & (normals @ outward > LEAST_COS))
+        faces_it = normals @ outward > LEAST_COS
+        stairs = np.count_nonzero(faces_it & (depth < STAIRS_MM))
+        if thin >= max(fewest, LEAST_SHARE * thick, stairs / MOST_STAIRS):
+            return (depth < THIN_MM) | (faces_it & (depth < RIM_MM))
     return None
 
 

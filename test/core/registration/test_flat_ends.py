@@ -94,6 +94,18 @@ def test_neither_a_sphere_nor_a_cylinder_is_flat_at_its_end():
     assert not flat_ends(wall, round_wall, 1.3, 100.0).any()
 
 
+def test_the_highest_step_of_voxels_is_no_end(monkeypatch):
+    """1 mm voxels make a plane of 250 mm^2 on top of a ball of 40 mm; the next ones face the same way."""
+    ball = np.random.default_rng(0).normal(size=(20_000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    steps = 40.0 * ball
+    steps[:, 2] = np.floor(steps[:, 2] + 0.001)
+    spacing_mm = np.sqrt(4.0 * np.pi * 40.0**2 / 20_000 / OF_POINT)
+    assert not flat_ends(steps, ball, spacing_mm, 150.0).any()
+    monkeypatch.setattr("gapr_core.geometry.flat_ends.MOST_STAIRS", np.inf)
+    assert flat_ends(steps, ball, spacing_mm, 150.0).any(), "nothing else knows it"
+
+
 def test_a_plane_with_the_noise_of_a_scanner_is_no_border_of_a_scan(cut_femur):
     points, normals, spacing_mm = spread(cut_femur)
     noisy = points + np.random.default_rng(1).normal(0.0, 0.1, points.shape)

@@ -118,7 +118,7 @@ class Assessment:
         counts[self.members] = self.fit.weights > 0.0
         return Residuals(self.seen.points, distance_mm, counts)
 
-    def is_sure(self, limit: float) -> bool:
+    def reaches(self, limit: float) -> bool:
         """True when no rule speaks against the pose and its probability reaches `limit`."""
         return self.refusal is None and self.probability >= limit
 

@@ -1,8 +1,8 @@
 """Is the bone in a source twice? It or its reference moved between two passes, or a sweep lags behind its tracker.
 
 The robust fit then takes one copy for the bone and the other one for outliers, and is sure of the first. So the points
-that it rejects are registered by themselves, from where it lies: outliers, tissue and instruments have no pose there, a
-second copy of the bone has. Which of the two is right nobody knows.
+that it rejects are registered by themselves: outliers, tissue and instruments have no pose on the bone, a second copy
+has. Which of the two is right nobody knows: where they differ, the answer is as probable as its share of their points.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import InvalidPointCloudError
@@ -34,9 +35,10 @@ ON_BONE = 0.6  # share of the rejected points that count for their pose
 
 
 def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, register: Register) -> Assessment:
-    """The same; where its rejected points are another copy of the bone, with the way there in its covariance.
+    """The same; where its rejected points are another copy of the bone, less probable, and with the way there.
 
-    What else than bone is in a camera's cloud is rejected anyway: it is not asked.
+    Near the answer a copy is looked for first, which costs little. Only where much is rejected it may lie anywhere.
+    The way goes into the covariance. What else than bone is in a camera's cloud is rejected anyway: it is not asked.
 
     Args:
         assessment: an answer that may be accepted.
@@ -51,14 +53,32 @@ def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, registe
     if len(rejected) < limits.rejected_points:
         return a
     T = _elsewhere(a, rejected, config)
-    found = None if T is None else _registered(rejected, np.stack([T, a.fit.T]), config, register)
-    if found is None or not _is_copy(found, a, config):
+    if T is None and len(rejected) < limits.doubled_share * len(residuals.points):
         return a
-    twist = error_twist(found.fit.T, a.fit.T, a.source.points)
+    found = _registered(rejected, a.fit.T[None] if T is None else np.stack([T, a.fit.T]), config, register)
+    if found is None:
+        return a
+    on_bone = float((found.fit.rests_on.weights > 0.0).mean())
+    is_same = se3.pose_error(found.fit.T, a.fit.T, found.source.points).is_right
+    if found.probability < limits.doubled or on_bone < ON_BONE:
+        return a
+    if T is None and (is_same or found.fit.sigma_mm > AS_PRECISE * a.fit.sigma_mm):
+        return a
+    own, others = len(residuals.points) - len(rejected), on_bone * len(rejected)
+    return _with_copy(a, found, 1.0 if is_same else own / (own + others))
+
+
+def _with_copy(assessment: Assessment, copy: Assessment, share: float) -> Assessment:
+    """The same with the way to a copy in its covariance, and no more probable than its share of both one's points."""
+    a = assessment
+    twist = error_twist(copy.fit.T, a.fit.T, a.source.points)
     covariance = a.uncertainty.covariance + np.outer(twist, twist)
-    apart_mm = se3.rms_apart_mm(found.fit.T, a.fit.T, a.source.points)
-    deformed = {NAME: apart_mm, **a.deformed}
-    return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
+    deformed = {NAME: se3.rms_apart_mm(copy.fit.T, a.fit.T, a.source.points), **a.deformed}
+    a = replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
+    if a.probability <= share:
+        return a
+    contributions = {**a.contributions, NAME: float(logit(share) - logit(a.probability))}
+    return replace(a, probability=share, most=min(a.most, share), contributions=contributions)
 
 
 def _elsewhere(assessment: Assessment, rejected: Array, config: RegistrarConfig) -> Array | None:
@@ -77,15 +97,3 @@ def _registered(points: Array, poses: Array, config: RegistrarConfig, register: 
     except InvalidPointCloudError:
         return None
     return None if isinstance(prepared, Refusal) else register(prepared, poses)
-
-
-def _is_copy(found: Assessment, assessment: Assessment, config: RegistrarConfig) -> bool:
-    """Whether the pose of the rejected points is sure enough, is theirs, and is not far from the answer's."""
-    limits = config.rigidity
-    apart = se3.pose_error(found.fit.T, assessment.fit.T, found.source.points)
-    on_bone = (found.fit.rests_on.weights > 0.0).mean()
-    return bool(
-        found.probability >= limits.doubled
-        and on_bone >= ON_BONE
-        and apart.within(limits.doubled_mm, limits.doubled_deg)
-    )

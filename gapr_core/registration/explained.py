@@ -101,7 +101,7 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
     rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed.
     """
     source, least, in_scene = assessment.source, config.min_confidence, assessment.seen is not None
-    believed = assessment.probability >= least if in_scene else assessment.is_sure(least)
+    believed = assessment.probability >= least if in_scene else assessment.reaches(least)
     if believed or not (in_scene or len(source.points) >= config.source.dense_points):
         return assessment
     if in_scene:

@@ -190,7 +190,7 @@ LIMITS = (
     Limit(
         "doubled",
         shows_most("doubled"),
-        "the points that do not fit lie on the bone in another pose near by; check that bone, reference and sensor did "
+        "the points that do not fit lie on the bone in another pose; check that bone, reference and sensor did "
         "not move while it was measured, or measure it again",
     ),
     Limit(

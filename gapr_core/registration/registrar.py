@@ -208,7 +208,7 @@ class Registrar:
         start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
             assessment = self._as_bone(prepared, target, start, clock, enough)
-            if assessment is None or not (assessment.is_sure(self.config.min_confidence) or enough(assessment)):
+            if assessment is None or not (assessment.reaches(self.config.min_confidence) or enough(assessment)):
                 found = self._of_one_view(source, target, start, clock)
                 if found is not None:
                     return found
@@ -225,17 +225,17 @@ class Registrar:
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
         config = self.config
-        if assessment.is_sure(config.worth_checking):
+        if assessment.reaches(config.worth_checking):
             assessment = checks.unless_grown(assessment, config)
-        if assessment.is_sure(config.worth_checking):
-            believed = assessment.is_sure(config.rules.mirrored_below) or enough(assessment)
+        if assessment.reaches(config.worth_checking):
+            believed = assessment.reaches(config.rules.mirrored_below) or enough(assessment)
             assessment = checks.unless_mirrored(assessment, config, believed, partial(self._of_image, clock=clock))
         clock.lap("assess")
-        if assessment.is_sure(config.worth_checking):
+        if assessment.reaches(config.worth_checking):
             assessment = bias_corrected(assessment, config)
             clock.lap("refine")
         corrected = assessment.corrected(self.precision)
-        if not corrected.is_sure(config.worth_checking):
+        if not corrected.reaches(config.worth_checking):
             return corrected
 
         def register(source: PreparedSource, poses: Array) -> Assessment | None:
@@ -273,7 +273,7 @@ class Registrar:
         clock.lap("prepare")
         for viewpoint, rounds in places:
             found = self._in_scene(scene, target, poses, viewpoint, clock, rounds)
-            if found is None or not found.is_sure(config.accepted_if_inferred):
+            if found is None or not found.reaches(config.accepted_if_inferred):
                 continue
             found = self._checked_and_corrected(replace(found, inferred_viewpoint=viewpoint), clock, never)
             if found.refusal is None:
@@ -315,7 +315,7 @@ class Registrar:
             assessment = assess_fit(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            if assessment.is_sure(config.ends_search) or enough(assessment):
+            if assessment.reaches(config.ends_search) or enough(assessment):
                 break
         return assessment
 
@@ -345,7 +345,7 @@ class Registrar:
             assessment = explained.assess_part(part, candidates, scene, target, self.scene_calibration, config)
             assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
             clock.lap("assess")
-            if assessment.is_sure(config.ends_search):
+            if assessment.reaches(config.ends_search):
                 break
         return assessment
 

@@ -209,7 +209,7 @@ class Tracker:
 
     def _stands(self, assessment: Assessment) -> bool:
         """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""
-        stands = assessment.proposer == Memory.name and assessment.is_sure(self.registrar.config.evidence.stands)
+        stands = assessment.proposer == Memory.name and assessment.reaches(self.registrar.config.evidence.stands)
         return self._was_sure and stands and self._agrees(assessment)
 
     def _agrees(self, assessment: Assessment) -> bool:

@@ -129,8 +129,8 @@ def test_residuals_of_a_scene_are_plain_distances_also_on_a_curved_bone():
 
 
 def test_an_answer_is_sure_from_its_limit_on_unless_a_rule_speaks_against_it(plane):
-    assert made(plane, 0.9).is_sure(0.9) and made(plane, 0.95).is_sure(0.9) and not made(plane, 0.8999).is_sure(0.9)
-    assert not made(plane, 0.9, REFUSED).is_sure(0.0)
+    assert made(plane, 0.9).reaches(0.9) and made(plane, 0.95).reaches(0.9) and not made(plane, 0.8999).reaches(0.9)
+    assert not made(plane, 0.9, REFUSED).reaches(0.0)
 
 
 def test_a_limit_lowers_a_probability_and_never_raises_it(plane):

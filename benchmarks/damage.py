@@ -35,6 +35,7 @@ from gapr_core.pages import markdown
 from gapr_core.runtime.console import say
 from gapr_core.runtime.origin import commit
 
+Case = tuple[str, str, int, bool]  # damage, bone, number, and whether the target is another subject's
 BONES, LEVELS = ("femur", "tibia", "pelvis"), ("L1", "L2")
 NEXT = {"femur": "tibia", "tibia": "femur"}  # the bone on the other side of the knee
 OTHER = ", another subject's bone"
@@ -62,19 +63,23 @@ def main() -> int:
     changed = [name for name in damages if name in CHANGES]
     cases += [(name, bone, number, True) for name in changed for bone in NEXT for number in range(args.others // 2)]
     registrar = Registrar.from_pretrained(RegistrarConfig(num_threads=1, sensor=SensorConfig(args.sensor)))
-    say(table(run(cases, bones, args.out / records.FILE, registrar), damages))
+    say(table(run(cases, bones, args.out / records.FILE, registrar, args.split), damages))
     return 0
 
 
 def run(
-    cases: Sequence[tuple[str, str, int, bool]], bones: dict[str, list[Specimen]], path: Path, registrar: Registrar
+    cases: Sequence[Case], bones: dict[str, list[Specimen]], path: Path, registrar: Registrar, split: str
 ) -> list[Record]:
-    """The records of these cases; those that the file does not hold are made, and appended."""
+    """The records of these cases; those that the file does not hold are made, and appended.
+
+    A name says whose bones they are and how they were asked for: no record passes for one of another run.
+    """
     records.discard_cut_line(path)
     done = {record.pair: record for record in records.read(path)}
     found = []
     for case in tqdm(cases, unit="pair"):
-        name = "_".join(map(str, case))
+        person = whose(bones[case[1]], case[2]).person
+        name = "_".join(map(str, (*case, person, split, registrar.config.sensor.kind)))
         if name not in done:
             done[name] = registered(registrar, replace(pair_of(*case, bones), name=name))
             records.append(path, done[name])
@@ -82,22 +87,26 @@ def run(
     return found
 
 
+def whose(people: Sequence[Specimen], number: int) -> Specimen:
+    """The bone that pair `number` is measured of: everybody's in turn."""
+    return people[number % len(people)]
+
+
 def pair_of(damage: str, bone: str, number: int, is_other: bool, bones: dict[str, list[Specimen]]) -> Pair:
     """Pair `number` of a damage; of another subject's bone it has no true pose."""
     people = bones[bone]
-    whose = people[number % len(people)]
-    seen = make_pair(LEVELS[number // len(people) % len(LEVELS)], whose, 100 + number)
-    next_bone = next((s for s in bones.get(NEXT.get(bone, ""), []) if s.person == whose.person), None)
+    own = whose(people, number)
+    seen = make_pair(LEVELS[number // len(people) % len(LEVELS)], own, 100 + number)
+    next_bone = next((s for s in bones.get(NEXT.get(bone, ""), []) if s.person == own.person), None)
     rng = np.random.default_rng([number, crc32(f"{damage} {bone}".encode())])
-    damaged = DAMAGES[damage](seen, Site.of(whose, seen.metadata["origin_mm"], next_bone), whose, rng)
+    damaged = DAMAGES[damage](seen, Site.of(own, seen.metadata["origin_mm"], next_bone), own, rng)
     if not is_other:
         return replace(damaged, protocol=damage)
-    others = [other for other in without_twins(whose, people) if other is not whose]
+    others = [other for other in without_twins(own, people) if other is not own]
     target = others[(number + number // len(people)) % len(others)]  # every other subject in turn
-    own = make_pair("L1", target, number)
     return replace(
         damaged,
-        target=own.target,
+        target=make_pair("L1", target, number).target,
         T_target_source=np.full((4, 4), np.nan),
         person=target.person,
         protocol=damage + OTHER,

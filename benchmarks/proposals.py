@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
 from gapr_core.data.pair import Pair
-from gapr_core.data.pair_files import load_pair
+from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.geometry import se3
 from gapr_core.pages import markdown
 from gapr_core.registration import source as sources
@@ -61,7 +61,7 @@ def main() -> int:
 
 def chosen(folder: Path, limit: int | None) -> list[Pair]:
     """Pairs with a truth; with a limit every n-th of each protocol."""
-    pairs = [pair for pair in map(load_pair, sorted(folder.glob("*.npz"))) if pair.has_truth]
+    pairs = [pair for pair in map(load_pair, pair_paths(folder)) if pair.has_truth]
     groups: dict[str, list[Pair]] = {}
     for pair in pairs:
         groups.setdefault(pair.protocol, []).append(pair)

@@ -11,7 +11,7 @@ share that ends within 4 mm and 5 deg of the truth is what no search can exceed.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -38,6 +38,7 @@ from gapr_core.runtime.console import say
 
 FAMILIES = "paper,L1,L2,L3,L2-wave,L2-gp,L3-gp,pointer,ultrasound,depth-camera,laser,sweep"
 CHI_SQUARE_MEDIAN = 5.348
+Measured = tuple[float, float, float, bool]
 
 
 def main() -> int:
@@ -60,11 +61,7 @@ def main() -> int:
         sensor = SensorConfig(kinds[0] if args.declared and kinds else "unknown")
         registrar = Registrar(RegistrarConfig(num_threads=1, sensor=sensor))
         found = [measure(registrar, pair(), args.full) for pair in tqdm(pairs, family, leave=False)]
-        rows = np.array([row for row in found if row])
-        (surprise, true_mm, predicted_mm), right = np.median(rows[:, :3], axis=0), rows[:, 3].sum()
-        cells = (family, len(found), f"{100.0 * right / len(found):.1f}", f"{surprise / CHI_SQUARE_MEDIAN:.2f}",
-                 f"{true_mm:.2f}", f"{predicted_mm:.2f}")  # fmt: skip
-        lines.append(markdown.row(cells))
+        lines.append(line(family, found))
     say("\n".join(lines))
     return 0
 
@@ -86,7 +83,18 @@ def of_folder(folder: Path) -> dict[str, list[Callable[[], Pair]]]:
     return found
 
 
-def measure(registrar: Registrar, pair: Pair, full: bool) -> tuple[float, float, float, bool] | None:
+def line(family: str, found: Sequence[Measured | None]) -> str:
+    """One row; without medians where no source can be used."""
+    right = sum(row[3] for row in found if row)
+    cells = [family, len(found), f"{100.0 * right / len(found):.1f}"]
+    rows = np.array([row[:3] for row in found if row])
+    if not len(rows):
+        return markdown.row([*cells, "-", "-", "-"])
+    surprise, true_mm, predicted_mm = np.median(rows, axis=0)
+    return markdown.row([*cells, f"{surprise / CHI_SQUARE_MEDIAN:.2f}", f"{true_mm:.2f}", f"{predicted_mm:.2f}"])
+
+
+def measure(registrar: Registrar, pair: Pair, full: bool) -> Measured | None:
     """NEES, true and predicted error over the bone, mm, and is it right; None where the source cannot be used."""
     target = registrar.prepare(pair.target)
     found = (assessed if full else refined)(registrar, pair, target)

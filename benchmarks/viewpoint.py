@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
 from gapr_core.data.pair import Pair
-from gapr_core.data.pair_files import load_pair
+from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.data.scenes.camera import FIELD_OF_VIEW_DEG, PIXELS
 from gapr_core.geometry import pinhole, quadrics
 from gapr_core.pages import markdown
@@ -38,10 +38,10 @@ def main() -> int:
     parser.add_argument("--every", type=int, default=1, help="only every so many-th pair")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="only these (all)")
     args = parser.parse_args()
+    paths = [path for folder in args.pairs for path in pair_paths(folder)[:: args.every]]
     config = RegistrarConfig(num_threads=1)
     registrar = Registrar.from_pretrained(config)
     blind = Registrar.from_pretrained(replace(config, clutter=replace(config.clutter, infer_viewpoint=False)))
-    paths = [path for folder in args.pairs for path in sorted(folder.glob("*.npz"))[:: args.every]]
     answers: dict[str, list[tuple[list[str], float]]] = {}
     for path in tqdm(paths, unit="scene"):
         pair = load_pair(path)

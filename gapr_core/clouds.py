@@ -26,7 +26,13 @@ OF_FILE = f"pass units={{unit!r}} ({OPTIONS}), or convert it to {{read_as}}"
 WHOLE_BONE_MM = (60.0, 700.0)  # smaller are a patella, bones of hand and foot, the neck's vertebrae; larger is no bone
 
 
-def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: ReadOptions | None = None) -> Surface:
+def load(
+    source: str | Path | ArrayLike | Surface,
+    units: str = "mm",
+    options: ReadOptions | None = None,
+    *,
+    of_bone: bool = True,
+) -> Surface:
     """A surface in mm from a file, an array or another surface.
 
     Args:
@@ -38,6 +44,7 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
             Files in patient coordinates (label maps, markups) and a tracker's recordings are in mm, whatever is named
             here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
+        of_bone: whether it must have the size of a bone or of a piece of one; False for single points.
 
     A mesh file or a label of several separate long bones is read as one body, with a warning.
 
@@ -52,16 +59,21 @@ def load(source: str | Path | ArrayLike | Surface, units: str = "mm", options: R
         name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
         is_in_mm, how = False, OF_ARRAY
     surface = _drop_non_finite(surface, name)
-    _check_apart(surface, name)
+    if of_bone:
+        _check_apart(surface, name)
     if surface.faces is not None and len(surface.faces):
         _check_faces(surface, name)
     if is_in_mm:
-        _check_size(surface, "mm", name, OF_HEADER)
+        if of_bone:
+            _check_size(surface, "mm", name, OF_HEADER)
         _warn_of_several_bones(surface, name)
         return surface
     if isinstance(source, str | Path):
         units = _agreed(units, columns.unit(Path(source)), name)
-    scale = _mm_per_unit(surface, units, name, how)
+    units = _known(surface, units, name)
+    if of_bone:
+        _check_size(surface, units, name, how)
+    scale = MM_PER_UNIT[units]
     camera = None if surface.camera is None else surface.camera * scale
     surface = replace(surface, points=surface.points * scale, camera=camera)
     if isinstance(source, str | Path):
@@ -134,14 +146,14 @@ def _agreed(units: str, said: str | None, name: str) -> str:
     return said
 
 
-def _mm_per_unit(surface: Surface, units: str, name: str, how: str) -> float:
+def _known(surface: Surface, units: str, name: str) -> str:
+    """The unit named, or with "auto" the one that the extent suggests."""
     if units == "auto":
         units = "m" if surface.extent_mm < EXTENT_LIMITS_MM[0] else "mm"
         log.warning("%s is %.3g across: taken to be in %s; name the unit to be sure", name, surface.extent_mm, units)
     if units not in MM_PER_UNIT:
         raise InvalidPointCloudError("units 'mm', 'cm', 'm' or 'auto'", repr(units), "name one of them")
-    _check_size(surface, units, name, how)
-    return MM_PER_UNIT[units]
+    return units
 
 
 def _check_size(surface: Surface, unit: str, name: str, how: str) -> None:

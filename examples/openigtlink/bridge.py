@@ -15,6 +15,7 @@ the pose with x and y negated on the side of the CT. Points of the tracker stay 
 from __future__ import annotations
 
 import argparse
+import logging
 import struct
 import sys
 import time
@@ -27,7 +28,10 @@ from pyigtl.messages import MessageBase, message_type_to_class_constructor
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker, load
 from gapr_core.config import SensorConfig
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.options import ReadOptions
+
+log = logging.getLogger(__name__)
 
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 OK, NOT_FOUND = 1, 4  # codes of STATUS in the specification of OpenIGTLink
@@ -78,7 +82,10 @@ class Bridge:
         self._last_tip = np.full(3, np.inf)
 
     def step(self, timeout_s: float = 1.0) -> Any:
-        """Take in one message of the pointer; the result when this led to a registration, else None."""
+        """Take in one message of the pointer; the result when this led to a registration, else None.
+
+        Points that cannot be of one bone, as with a tip metres away, are left out, and the STATUS says why.
+        """
         message = self.tracker.wait_for_message(self.device, timeout=timeout_s)
         if message is None or not np.isfinite(message.matrix).all():
             return None
@@ -89,7 +96,12 @@ class Bridge:
         if len(self.points) < self.every:
             return None
         group, self.points = np.array(self.points), []
-        result = self.registrar.register(group, self.target)
+        try:
+            result = self.registrar.register(group, self.target)
+        except InvalidPointCloudError as error:
+            log.warning("%d points are left out: %s", len(group), error)
+            self._send_status(NOT_FOUND, str(error))
+            return None
         self.send(result)
         return result
 
@@ -98,8 +110,10 @@ class Bridge:
         if result.ok:
             matrix = LPS_TO_RAS @ result.T_target_source  # tracker to CT, RAS
             self.slicer.send_message(pyigtl.TransformMessage(matrix, device_name="TrackerToCT"), wait=False)
-        code = OK if result.ok else NOT_FOUND
-        self.slicer.send_message(StatusMessage(code, str(result), device_name="Registration"), wait=False)
+        self._send_status(OK if result.ok else NOT_FOUND, str(result))
+
+    def _send_status(self, code: int, text: str) -> None:
+        self.slicer.send_message(StatusMessage(code, text, device_name="Registration"), wait=False)
 
 
 def main() -> int:

@@ -88,12 +88,14 @@ def done(records: Iterable[Record], hashes: dict[str, str], settings: dict[str, 
         settings: method to `Record.settings` of this run.
 
     Raises:
-        ConfigError: a record of a pair of the same name with other clouds, or of a method with other settings.
+        ConfigError: a record of none of these pairs, of one of the same name with other clouds, or of a method with
+            other settings.
     """
     found = set()
     for record in records:
-        if hashes.get(record.pair, record.sha256) != record.sha256:
-            raise ConfigError("records of these pairs", f"other clouds named {record.pair}", "choose another --out")
+        if hashes.get(record.pair) != record.sha256:
+            given = f"{'other clouds named' if record.pair in hashes else 'some of'} {record.pair}"
+            raise ConfigError("records of these pairs", given, "choose another --out")
         wanted = settings.get(record.method, record.settings)
         if wanted != record.settings:
             given = f"records with {record.settings or 'the default settings'}"

@@ -47,7 +47,7 @@ def read_json(path: Path) -> RegistrationResult:
     try:
         status = RegistrationStatus(found["status"])
         transform, covariance, centre = (found[key] for key in ("transform", "covariance", "centre_mm"))
-        factor95 = float(found["factor95"])
+        factor95, confidence = float(found["factor95"]), float(found.get("confidence", 0.0))
     except (ValueError, KeyError, TypeError) as error:
         given = f"no {error} in it" if isinstance(error, KeyError) else str(error)
         raise ConfigError(f"the answer of a registration in {path}", given, how) from error
@@ -57,7 +57,7 @@ def read_json(path: Path) -> RegistrationResult:
     T, C, middle = _array(transform, (4, 4), path), _array(covariance, (6, 6), path), _array(centre, (3,), path)
     if why := se3.why_not_rigid(T):
         raise ConfigError(f"a rigid transform in {path}", f"a matrix whose {why}", how)
-    return RegistrationResult(status, T, C, float(found.get("confidence", 0.0)), centre_mm=middle, factor95=factor95)
+    return RegistrationResult(status, T, C, confidence, centre_mm=middle, factor95=factor95)
 
 
 def _array(values: Any, shape: tuple[int, ...], path: Path) -> NDArray[np.float64]:

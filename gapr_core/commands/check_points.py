@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +18,10 @@ from gapr_core.runtime.console import say
 if TYPE_CHECKING:
     from gapr_core.results import PointCheck
 
+log = logging.getLogger(__name__)
+
 HOLDS, REFUSED = 0, 2
+CLOSE_MM = 1.0  # a bone in m has less than one of them
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -58,13 +63,22 @@ def run(args: Namespace) -> int:
         files.check_writable(args.json)
     bone = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
     how: dict[str, Any] = {"axes": args.points_axes, "tip_mm": args.tip, "tool": args.tool}
-    touched = options.load(args.points, args.points_units or args.units, **how, reference=args.reference)
+    units = args.points_units or args.units
+    touched = options.load(args.points, units, of_bone=False, **how, reference=args.reference)
+    _warn_of_units(args.points, touched.extent_mm)
     target = targets.prepare(bone, "mm", config.target, config.num_threads)
     found = check_points(touched.points, target, result, config, args.within)
     _show(found, args.within)
     if args.json:
         files.write_json(args.json, _as_json(found))
     return HOLDS if found.verdict is Verdict.HOLDS else REFUSED
+
+
+def _warn_of_units(path: Path, extent_mm: float) -> None:
+    """Warn of points that hardly differ, as those of a whole bone in m that are read as mm."""
+    if 0.0 < extent_mm < CLOSE_MM:
+        how = "if they are in another unit, name it with --points-units"
+        log.warning("all points of %s are within %.2g mm: %s", path.name, extent_mm, how)
 
 
 def _show(found: PointCheck, within_mm: float) -> None:

@@ -27,7 +27,8 @@ from gapr_core.runtime.console import say
 
 log = logging.getLogger(__name__)
 Answer = dict[str, Any]
-WRITE_SECONDS = 5.0  # the file holds all answers, and grows: it is written again after so long
+WRITE_SECONDS = 5.0  # the file holds all answers, and grows: it is written again after so long,
+WRITE_TIMES = 10.0  # and after so many times what the last writing took
 INVALID_INPUT = "INVALID_INPUT"  # status of a pair that cannot be read
 OF_PYTHON = re.compile(r"pass units='\w+', or ")  # the pairs are in mm, and no option says otherwise
 OK, BAD_INPUT = 0, 1
@@ -45,6 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """A pose or a refusal for every pair; never looks at the truth."""
+    files.check_writable(args.out)
     paths = pair_paths(args.pairs)[: args.limit]
     answers = _answers_so_far(args.out)
     config = options.registrar_config(args)
@@ -55,13 +57,14 @@ def run(args: Namespace) -> int:
     for path in waiting[:1]:
         _answer(path, method)  # compiled code loads with the first call, whose time is not the method's
     new: dict[str, Answer] = {}
-    written = time.monotonic()
+    written, pause_s = time.monotonic(), WRITE_SECONDS
     try:
         for path in tqdm(waiting, unit="pair", disable=None):
             new[path.stem] = _answer(path, method) | made_of[path]
-            if time.monotonic() - written > WRITE_SECONDS:
+            if (start := time.monotonic()) - written > pause_s:
                 answers |= _written(args.out, new)
                 new, written = {}, time.monotonic()
+                pause_s = max(WRITE_SECONDS, WRITE_TIMES * (written - start))
     finally:  # of an interrupted run, too
         answers |= _written(args.out, new) if new else {}
     options.say_uncalibrated(args.method)

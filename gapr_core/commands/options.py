@@ -83,10 +83,13 @@ def place(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def load(path: Path, units: str | None, **how: Any) -> Surface:
-    """A file in the unit that is named, or that files of its kind usually have; `how` are fields of `ReadOptions`."""
+def load(path: Path, units: str | None, of_bone: bool = True, **how: Any) -> Surface:
+    """A file in the unit that is named, or that files of its kind usually have; `how` are fields of `ReadOptions`.
+
+    See `clouds.load` for `of_bone`.
+    """
     from gapr_core import clouds
     from gapr_core.formats import reading
     from gapr_core.formats.options import ReadOptions
 
-    return clouds.load(path, units or reading.format_of(path).unit, ReadOptions(**how))
+    return clouds.load(path, units or reading.format_of(path).unit, ReadOptions(**how), of_bone=of_bone)

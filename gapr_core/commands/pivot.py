@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
+from gapr_core.commands import checks
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
@@ -20,10 +21,17 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Print the tip in the marker's frame, as `gapr register --tip` takes it, and how well it fits."""
+    """Print the tip in the marker's frame, as `gapr register --tip` takes it, and how well it fits.
+
+    Raises:
+        GaprError: options or a recording that cannot be used.
+    """
     from gapr_core.formats import tracker
     from gapr_core.formats.poses import poses_in
 
+    if args.json:
+        checks.check_collisions([("the recording", args.recording)], [("--json", args.json)])
+        files.check_writable(args.json)
     tip = tracker.pivot(poses_in(args.recording, args.tool, args.reference))
     say(f"--tip {','.join(f'{x:.3f}' for x in tip.tip_mm)}")
     left_out = f", without {tip.left_out} of which the tip had left its place" if tip.left_out else ""

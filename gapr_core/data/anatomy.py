@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -13,13 +12,15 @@ from numpy.typing import NDArray
 
 from gapr_core.clouds import load
 from gapr_core.data.specimen import Specimen
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.reading import FORMATS
+from gapr_core.runtime import files
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
 SPLITS = ("train", "val", "test")
+MESHES = (".ply", ".stl", ".obj", ".vtk", ".vtp", ".npz", ".nii", ".nii.gz", ".nrrd", ".mha", ".dcm")  # they give faces
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,19 @@ def splits(folder: str | Path) -> dict[str, list[str]]:
     """Subjects of train, val and test from `splits.json`; a subject stands in one split only, over all bones.
 
     Raises:
-        ConfigError: no such file, another key, or a subject in two splits.
+        ConfigError: no such file, a damaged one, another key, or a subject in two splits.
     """
-    path = Path(folder) / "splits.json"
+    path, what = Path(folder) / "splits.json", "splits.json with subjects of train, val and test"
     if not path.is_file():
-        raise ConfigError("splits.json with subjects of train, val and test", f"none in {folder}", "write one")
-    people = json.loads(path.read_text())
+        raise ConfigError(what, f"none in {folder}", "write one")
+    people = files.read_json(path, what)
+    how = 'write {"train": [NAME, ...], "val": [...], "test": [...]}'
+    if not isinstance(people, dict):
+        raise ConfigError(what, f"{path} ({type(people).__name__})", how)
     if set(people) != set(SPLITS):
         raise ConfigError(f"the keys {', '.join(SPLITS)}", f"{', '.join(people)} in {path}", "rename them")
+    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in people.values()):
+        raise ConfigError(what, f"{path} (a key without a list of names)", how)
     everybody = [person for split in SPLITS for person in people[split]]
     twice = sorted({person for person in everybody if everybody.count(person) > 1})
     if twice:
@@ -67,14 +73,31 @@ def splits(folder: str | Path) -> dict[str, list[str]]:
 
 
 def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
-    """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty."""
-    found = []
-    for path in sorted(Path(folder).glob(f"{bone}_*.npz")):
+    """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty.
+
+    Raises:
+        InvalidPointCloudError: a file that cannot be read, or has other arrays.
+    """
+    return [_corresponded(path, bone) for path in sorted(Path(folder).glob(f"{bone}_*.npz"))]
+
+
+def _corresponded(path: Path, bone: str) -> Corresponded:
+    try:
         with np.load(path, allow_pickle=False) as data:
             points, faces = data["points"].astype(np.float64), data["faces"].astype(np.int64)
             person = tuple(str(p) for p in data["person"])
-        found.append(Corresponded(points, faces, person, bone, path.stem.removeprefix(f"{bone}_")))
-    return found
+    except KeyError as error:
+        raise _unreadable(path, f"no array {error}") from error
+    except Exception as error:  # NumPy, zipfile and zlib raise many kinds
+        raise _unreadable(path, " ".join(str(error).split())) from error
+    if points.ndim != 3 or points.shape[::2] != (len(person), 3) or faces.ndim != 2 or faces.shape[1] != 3:
+        raise _unreadable(path, f"points {points.shape}, faces {faces.shape} and {len(person)} subjects")
+    return Corresponded(points, faces, person, bone, path.stem.removeprefix(f"{bone}_"))
+
+
+def _unreadable(path: Path, why: str) -> InvalidPointCloudError:
+    wanted = "an .npz with points (P, N, 3), faces (F, 3) and `person` (P,)"
+    return InvalidPointCloudError(wanted, f"{path} ({why})", "write it again")
 
 
 def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | None = None) -> list[Specimen]:
@@ -89,6 +112,7 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
 
     Raises:
         ConfigError: no such folder or an unknown split.
+        InvalidPointCloudError: a damaged file of meshes.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -111,7 +135,7 @@ def _person_of(stem: str) -> str:
 
 
 def meshes(folder: str | Path, bone: str | None = None, split: str = "all", units: str = "mm") -> list[Specimen]:
-    """A user's own meshes, one file per subject, in any format that `clouds.load` reads.
+    """A user's own meshes, one file per subject, in any format that has faces (`MESHES`); other files are left alone.
 
     `folder/<person>.stl` are all of one bone, named `bone` or after the folder; `folder/<bone>/<person>.stl` are of
     several. With `splits.json` in the folder subjects are split by it, else 60/20/20 in an order drawn once from a
@@ -126,10 +150,10 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
         raise ConfigError("a folder with meshes", f"{folder}, which does not exist", "check the path")
     flat, nested = _mesh_files(folder), {d.name: _mesh_files(d) for d in sorted(folder.glob("*")) if d.is_dir()}
     of_bone = {bone or folder.resolve().name: flat} if flat else {b: f for b, f in nested.items() if bone in (None, b)}
-    specimens = [Specimen(load(f, units), b, f.stem, "meshes") for b, files in of_bone.items() for f in files]
+    specimens = [Specimen(load(f, units), b, _stem(f), "meshes") for b, found in of_bone.items() for f in found]
     if not specimens:
         raise ConfigError(
-            f"meshes ({' '.join(FORMATS)})",
+            f"meshes ({' '.join(MESHES)})",
             f"none for {bone or 'any bone'} in {folder}",
             "put one mesh per subject there, or one sub-folder per bone",
         )
@@ -152,7 +176,17 @@ def meshes_hash(folder: str | Path, bones: Sequence[str], split: str = "all") ->
 
 
 def _mesh_files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("*") if p.suffix.lower() in FORMATS)
+    return sorted(p for p in folder.glob("*") if _ending(p) in MESHES)
+
+
+def _ending(path: Path) -> str:
+    """The longest known ending of a name, so that `.igs.mha` is no `.mha`; empty where none is known."""
+    return max((end for end in FORMATS if path.name.lower().endswith(end)), key=len, default="")
+
+
+def _stem(path: Path) -> str:
+    """Whose mesh a file holds."""
+    return path.name[: -len(_ending(path))]
 
 
 def _draw_splits(people: set[str]) -> dict[str, list[str]]:

@@ -133,12 +133,15 @@ def write_pairs(
 def begin(recipe: Recipe, out: Path) -> None:
     """Make the folder with a manifest without pairs, or check that it was begun with this recipe.
 
+    A manifest of another recipe that came to no pair, as after a misspelt name, gives way.
+
     Raises:
         ConfigError: it holds pairs of another recipe or of changed meshes, a damaged manifest, or cannot be written.
     """
-    if not (out / MANIFEST).exists():
+    there = read_manifest(out) if (out / MANIFEST).exists() else None
+    if there is None or not (there["pairs"] or any(out.glob("*.npz"))):
         _write_manifest(out, recipe, [], "")
-    elif read_manifest(out)["recipe"] != recipe.listed():
+    elif there["recipe"] != recipe.listed():
         wanted = "an empty folder or one with pairs of this recipe, of the same meshes and unit"
         raise ConfigError(wanted, f"other pairs in {out}", "choose another --out")
 

@@ -27,7 +27,7 @@ class Acquisition:
         width_mm, slab_mm: what the probe sees at one place, across and along its way.
         swing_deg: how far the probe swings around the bone's axis, to either side, on its way.
         points_per_frame: new points of each frame at most.
-        noise_mm, bias_mm: white noise per axis, and smooth error along the normals (root mean square).
+        noise_mm, bias_mm: white noise per axis, and smooth error along the normals (its peak).
         outlier_share: share of the points that lie 3 to 15 mm off the bone.
     """
 

@@ -57,7 +57,7 @@ def header_of(lines: Iterable[str]) -> Header:
             break
     delimiter = delimiter_of(first)
     cells, commented = _cells(first, delimiter), words(comment.lstrip(" #/"), delimiter)
-    if not first or _are_numbers(cells) or _is_point(cells, found_in_comment(commented, len(cells))):
+    if not first or are_numbers(cells) or _is_point(cells, found_in_comment(commented, len(cells))):
         return Header(delimiter, commented, False, len(cells), comment)
     return Header(delimiter, words(first, delimiter), True, len(cells), first)
 
@@ -154,10 +154,10 @@ def _cells(line: str, delimiter: str | None) -> list[str]:
 
 def _is_point(cells: list[str], columns: Columns | None) -> bool:
     """Whether the cells that a comment names are numbers."""
-    return columns is not None and len(cells) >= 3 and _are_numbers([cells[place] for place in columns.places])
+    return columns is not None and len(cells) >= 3 and are_numbers([cells[place] for place in columns.places])
 
 
-def _are_numbers(cells: list[str]) -> bool:
+def are_numbers(cells: list[str]) -> bool:
     """Whether there are numbers alone, quoted or not; some of them may be missing."""
     filled = [cell for cell in (cell.strip(' \t"') for cell in cells) if cell]
     try:

@@ -20,6 +20,7 @@ Row = tuple[int, list[str]]  # the number of its line in the file, from 1, and i
 
 MANY_ROWS = 12  # of a column that rises all the time by chance one in 12!
 LONGEST_NAMES = 80  # characters of a line that an error quotes
+FEWEST_OF_POINT = 2  # numbers among the words of a first line, which is no title then, but a point
 DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
 DECIMAL_COMMAS = re.compile(r"-?\d+,\d+([;\s]+-?\d+,\d+)+[;\s]*")
 SPLIT_DECIMALS = re.compile(r"-?\d+,\d+(,-?\d+,\d+){2}")  # as x,y,z: six whole numbers
@@ -203,7 +204,16 @@ def _columns(header: Header, count: int, has_normals: bool) -> Columns:
 
 
 def _of_title(header: Header, count: int, has_normals: bool) -> Columns:
-    """By words that are more or fewer than the columns; a title over x y z alone names nothing."""
+    """By words that are more or fewer than the columns; a title over x y z alone names nothing.
+
+    Raises:
+        InvalidPointCloudError: the words are a point with other words, or do not say which columns are the coordinates.
+    """
+    numbers = sum(columns.are_numbers([word]) for word in header.names)
+    if numbers >= FEWEST_OF_POINT:
+        given = f"a first line with {numbers} numbers among its {len(header.names)} words"
+        how = "take out the other words if it is a point, or the line if it is a title"
+        raise InvalidPointCloudError(f"{count} numbers, names of {count} columns or a title", given, how)
     short = [columns.axis(name) for name in header.names]
     no_axes = set("xyz").isdisjoint(short) and not any(set(kind) <= set(short) for kind in columns.AXES)
     if no_axes and (count == 3 or has_normals):

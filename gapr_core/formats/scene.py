@@ -20,8 +20,8 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-TARGETS = "targets.mrk.json"
-FILES = ("target.vtk", "source.vtk", "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `write_slicer`
+TARGETS, OFF_BONE = "targets.mrk.json", "off_bone.vtk"
+FILES = ("target.vtk", "source.vtk", OFF_BONE, "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `write_slicer`
 FULL_COLOUR_MM = 3.0
 BLUE_TO_RED = "vtkMRMLColorTableNodeFileDivergingBlueRed.txt"  # of 3D Slicer; without one VTK's goes from red to blue
 GREY = np.array([150, 150, 150])
@@ -60,6 +60,8 @@ def colours_of(distance_mm: Array) -> NDArray[np.int64]:
 def write_slicer(folder: Path, target: Surface, result: RegistrationResult, errors: Sequence[TargetError]) -> None:
     """A folder with target, source, transform and planned targets, and the scene.mrml that loads them together.
 
+    Points of the source near which no surface is have no distance: they are a grey model of their own, `off_bone`.
+
     Args:
         folder: made if it is not there; files of other names in it stay.
         target: the bone, LPS mm.
@@ -69,15 +71,23 @@ def write_slicer(folder: Path, target: Surface, result: RegistrationResult, erro
     if result.T_target_source is None or result.residuals is None:
         raise ValueError("a scene needs a pose and its residuals")
     files.write_text(folder / "target.vtk", _vtk(target.points, target.faces))
-    residuals = result.residuals
-    files.write_text(folder / "source.vtk", _vtk(residuals.points, None, np.nan_to_num(residuals.distance_mm)))
+    residuals, near = result.residuals, np.isfinite(result.residuals.distance_mm)
+    files.write_text(folder / "source.vtk", _vtk(residuals.points[near], None, residuals.distance_mm[near]))
+    if not near.all():
+        files.write_text(folder / OFF_BONE, _vtk(residuals.points[~near], None))
     write_coloured(folder / "registered.ply", se3.apply(result.T_target_source, residuals.points), residuals)
     transforms.write(folder / "pose.tfm", result.T_target_source)
     if errors:
         planning.save_targets(folder / TARGETS, errors)
-    elif (folder / TARGETS).exists():
-        log.warning("%s in %s is of an earlier run, and not in this scene: it has no --targets", TARGETS, folder.name)
-    files.write_text(folder / "scene.mrml", _mrml(bool(errors)))
+    _warn_of_old(folder / TARGETS, bool(errors), "it has no --targets")
+    _warn_of_old(folder / OFF_BONE, not near.all(), "a surface is near all its points")
+    files.write_text(folder / "scene.mrml", _mrml(not near.all(), bool(errors)))
+
+
+def _warn_of_old(path: Path, is_written: bool, why: str) -> None:
+    """Warn of a file that another scene in the folder had."""
+    if path.exists() and not is_written:
+        log.warning("%s in %s is of an earlier run, and not in this scene: %s", path.name, path.parent.name, why)
 
 
 def _vtk(points: Array, faces: NDArray[np.int64] | None, distances: Array | None = None) -> str:
@@ -94,8 +104,9 @@ def _vtk(points: Array, faces: NDArray[np.int64] | None, distances: Array | None
     return "\n".join(lines) + "\n"
 
 
-def _mrml(with_targets: bool) -> str:
+def _mrml(with_off_bone: bool, with_targets: bool) -> str:
     """The scene: each node with its storage, and the source under the transform."""
+    moved = {"transformNodeRef": "vtkMRMLLinearTransformNodepose"}
     scene = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
     _node(scene, "LinearTransform", "Transform", "pose", "pose.tfm", {})
     _model(scene, "target", "0.9 0.85 0.75", {"opacity": "0.6"}, {})
@@ -103,7 +114,9 @@ def _mrml(with_targets: bool) -> str:
         "scalarVisibility": "true", "activeScalarName": "distance_mm", "pointSize": "4", "colorNodeID": BLUE_TO_RED,
         "scalarRangeFlag": "UseManual", "scalarRange": f"{-FULL_COLOUR_MM:g} {FULL_COLOUR_MM:g}",
     }  # fmt: skip
-    _model(scene, "source", "0.9 0.2 0.2", shown, {"transformNodeRef": "vtkMRMLLinearTransformNodepose"})
+    _model(scene, "source", "0.9 0.2 0.2", shown, moved)
+    if with_off_bone:
+        _model(scene, "off_bone", "{:.2f} {:.2f} {:.2f}".format(*GREY / 255), {"pointSize": "4"}, moved)
     if with_targets:
         _node(scene, "MarkupsFiducial", "MarkupsFiducial", "targets", TARGETS, {})
     return ElementTree.tostring(scene, encoding="unicode", xml_declaration=False) + "\n"

@@ -84,7 +84,8 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Fram
     A transform that is never valid has no poses; the places of the others do not depend on it.
 
     Raises:
-        ValueError: no transform in any valid frame, one with a number that is not finite, or a header that is cut.
+        ValueError: no transform in any valid frame, one in a valid frame with a number that is not finite, or a header
+            that is cut.
     """
     data = (options or ReadOptions()).limits.read(path)
     end = data.find(b"ElementDataFile")
@@ -97,22 +98,18 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Fram
         if kind == "TransformStatus":
             invalid |= {(name, int(number))} if value.strip().upper() != "OK" else set()
         else:
-            values[name, int(number)] = _matrix(value)
+            values[name, int(number)] = np.array(value.split(), dtype=np.float64).reshape(4, 4)
     names = sorted({name for name, _ in values})
     poses: dict[str, Frames] = {name: {} for name in names}
     for (name, number), T in sorted(values.items()):
-        if (name, number) not in invalid:
-            poses[name][number] = T
+        if (name, number) in invalid:
+            continue
+        if not np.isfinite(T).all():
+            raise ValueError(f"{name} of frame {number} with a number that is not finite")
+        poses[name][number] = T
     if not any(poses.values()):
         raise ValueError("no valid transform in its header")
     return poses
-
-
-def _matrix(numbers: str) -> Array:
-    T = np.array(numbers.split(), dtype=np.float64).reshape(4, 4)
-    if not np.isfinite(T).all():
-        raise ValueError("a transform with a number that is not finite")
-    return T
 
 
 def read_folder(path: Path, options: ReadOptions) -> Surface:

@@ -15,6 +15,7 @@ from torch import Tensor
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
+from gapr_core.runtime import files
 
 FORMAT = "gapr-net/1"
 
@@ -22,7 +23,7 @@ FORMAT = "gapr-net/1"
 def save(
     network: GAPRNet, path: str | Path, card: dict[str, Any] | None = None, dtype: torch.dtype = torch.float32
 ) -> str:
-    """Write a network; returns the sha256 of its tensors.
+    """Write a network, whole or not at all; returns the sha256 of its tensors.
 
     Args:
         network: what to write.
@@ -38,7 +39,8 @@ def save(
         "card": json.dumps(card or {}),
         "sha256": digest,
     }
-    save_file(tensors, str(path), metadata=header)
+    with files.replacing(path) as scratch:
+        save_file(tensors, str(scratch), metadata=header)
     return digest
 
 

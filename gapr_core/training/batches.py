@@ -11,14 +11,19 @@ from pathlib import Path
 from torch.utils.data import DataLoader
 
 from gapr_core.model.config import ModelConfig
+from gapr_core.training import provenance
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, one_thread
 from gapr_core.training.targets import TrainingPair
 
 
-def bones_folder(folder: Path, config: TrainConfig) -> Path:
-    """Where the bones in use of a run are kept: a scratch folder of this machine, the same at every call."""
-    name = sha256(f"{folder.resolve()} {json.dumps(config.to_dict())}".encode()).hexdigest()[:16]
+def bones_folder(folder: Path, config: TrainConfig, anatomy: Path | None) -> Path:
+    """Where the bones in use of a run are kept: a scratch folder of this machine, the same at every call.
+
+    Other meshes, and other code that draws parametric bones, have another one: it outlives a run that is stopped.
+    """
+    made_of = [str(folder.resolve()), config.to_dict(), provenance.data(config.bones, anatomy)]
+    name = sha256(json.dumps(made_of).encode()).hexdigest()[:16]
     scratch = Path(tempfile.gettempdir()) / f"gapr-bones-{name}"
     scratch.mkdir(exist_ok=True)
     return scratch

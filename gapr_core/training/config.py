@@ -98,9 +98,21 @@ def default_plan() -> Path:
 
 
 def read_plan(path: Path) -> list[Variant]:
-    """The rows of all tables; paths relative to the working folder, so that they mean the same on another machine."""
+    """The rows of all tables; paths relative to the working folder, so that they mean the same on another machine.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds something else than lists of rows.
+    """
     models = Path(os.path.relpath(path.resolve().parent / "model"))
-    return [_variant(table, row, models, path) for table, rows in read_yaml(path).items() for row in rows or ()]
+    tables = read_yaml(path)
+    return [_variant(table, row, models, path) for table in tables for row in _rows(table, tables[table], path)]
+
+
+def _rows(table: str, rows: Any, path: Path) -> list[Any]:
+    if not isinstance(rows, list | None):
+        how = "write `- {label: NAME, model: NAME}` lines"
+        raise ConfigError(f"a list of rows for each table in {path}", f"{rows!r} under {table}", how)
+    return rows or []
 
 
 def _variant(table: str, row: Any, models: Path, path: Path) -> Variant:

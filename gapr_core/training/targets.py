@@ -77,11 +77,6 @@ def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:
     return T
 
 
-def patch_overlaps(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[np.float32]:
-    """(n, m): for every two patches, the share of points with a match in the other, averaged over both sides."""
-    return _overlaps(source, target, _matches(source, target, T, radius))
-
-
 def _matches(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[Any]:
     """Fine points i of the source and j of the target within `radius` of each other, and how far apart, v."""
     p, q = se3.apply(T, source.fine.points.numpy()), target.fine.points.double().numpy()
@@ -89,6 +84,7 @@ def _matches(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[A
 
 
 def _overlaps(source: Cloud, target: Cloud, matches: NDArray[Any]) -> NDArray[np.float32]:
+    """(n, m): for every two patches, the share of points with a match in the other, averaged over both sides."""
     node_p, node_q = _nodes(source), _nodes(target)
     i, j = matches["i"], matches["j"]
     kept = (node_p[i] >= 0) & (node_q[j] >= 0)

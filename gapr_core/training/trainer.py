@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
 from gapr_core.training import distributed, run_folder
@@ -86,7 +86,7 @@ class Run:
         self.learner = group.wrap(Learner(self.network, config))
         self.lost = 0  # steps in a row without finite gradients
         self.drawn = Drawn.of(anatomy, folder / f"subjects_{group.rank}.json")
-        self.bones = bones_folder(folder, config) if max(1, config.workers) * group.world > 1 else None
+        self.bones = bones_folder(folder, config, anatomy) if max(1, config.workers) * group.world > 1 else None
         first = self.state["step"] * config.batch // config.micro_batch
         pinned = group.device.type == "cuda"
         self.batches = micro_batches(config, model, anatomy, first, group.rank, group.world, self.bones, pinned)
@@ -104,6 +104,8 @@ class Run:
         begun, earlier = time.monotonic(), self.state["seconds"]
         to_validate, to_save = Interval(self.config.validate_minutes), Interval(self.config.checkpoint_minutes)
         ahead = range(self.state["step"], self.steps)
+        if not ahead and self.leads and not self._has_weights():
+            self._save()
         progress = tqdm(ahead, initial=ahead.start, total=self.steps, disable=None if self.leads else True, unit="step")
         for step in progress:
             rate = self._set_rate(step)
@@ -169,6 +171,13 @@ class Run:
     def _validate(self) -> None:
         run_folder.report(self.folder, self.ema, self.held_out, self.state, self.config, self.group.device)
         run_folder.draw_curves(self.folder)
+
+    def _has_weights(self) -> bool:
+        """Whether whole weights of this step are on disk: a run can be killed between its checkpoint and them."""
+        try:
+            return bool(weights.load(self.weights)[1]["step"] == self.state["step"])
+        except WeightsError:
+            return False
 
     def _save(self) -> None:
         self.drawn.write()

@@ -63,9 +63,18 @@ class Scores:
 
 
 def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) -> list[ValidationPair]:
-    """The same pairs at every call: `validation_pairs` of each protocol, bones of the validation split in turn."""
+    """The same pairs at every call: `validation_pairs` of each protocol, bones of the validation split in turn.
+
+    Bones of which nobody is in that split are left out.
+
+    Raises:
+        ConfigError: nobody is in it, or a protocol makes nothing that the network can see.
+    """
     bones = [b for b in train.bones if b in parametric.BONES or (folder and anatomy.surfaces(folder, b))]
-    people = [specimens(bone, "val", 3, folder) for bone in bones]
+    people = [subjects for bone in bones if (subjects := specimens(bone, "val", 3, folder))]
+    if train.validation_pairs and not people:
+        how = "move some subjects to val in splits.json, or set validation_pairs to 0"
+        raise ConfigError(f"subjects of split val with {' or '.join(train.bones)}", f"none in {folder}", how)
     found = []
     for p, protocol in enumerate(train.mix):
         for number in range(train.validation_pairs):

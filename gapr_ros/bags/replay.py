@@ -98,7 +98,7 @@ class Replay:
     def _wait_for_listeners(self) -> None:
         """Volatile messages that go out before a listener was discovered are lost."""
         deadline = time.monotonic() + self._options.wait_s
-        while self._unheard():
+        while self._node.context.ok() and self._unheard():
             if time.monotonic() > deadline:
                 self._say_who_is_not_heard()
                 return
@@ -203,6 +203,10 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         return _play(bag, options)
     except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except RuntimeError:  # of a call to rclpy that was shut down just before
+        if rclpy.ok():
+            raise
         return 0
     finally:
         bag.reader.close()

@@ -107,12 +107,18 @@ def act_of_pairs(specimen: Specimen, path: Path, pairs: Sequence[Pair], period_s
 
 
 def _specimen(bone: str, seed: int, folder: Path) -> tuple[Specimen, Path]:
-    """A parametric bone, written as STL (mm) as a segmented CT would be."""
+    """A parametric bone, and its file."""
     from gapr_core.data.pool import parametric_specimen
 
-    specimen, path = parametric_specimen(bone, seed), folder / f"{bone}.stl"
+    specimen = parametric_specimen(bone, seed)
+    return specimen, write_bone(specimen, folder)
+
+
+def write_bone(specimen: Specimen, folder: Path) -> Path:
+    """STL (mm) of a bone, as a segmented CT would be, under a name that no bone of a user has; returns its path."""
+    path = folder / f"demo_{specimen.bone}.stl"
     write_stl(specimen.surface, path)
-    return specimen, path
+    return path
 
 
 def write_stl(surface: Surface, path: Path) -> None:

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from gapr_core.errors import GaprError
+from gapr_core.runtime.arguments import at_least_one
 from gapr_ros.demo import interrupt
 from gapr_ros.demo.act import DemoError, camera_round, probe_sweep, write_bag
 
 FRAMES = {"sweep": 24, "scene": 12, "guided": 12}
 PERIOD_S = {"sweep": 1.0, "scene": 3.0}
+SHORTEST_S = 0.001  # stamps of two clouds differ by a millisecond or more
 DOING = {"sweep": "sweeping a probe along it", "scene": "circling a wound with a camera"}
 MAKERS = {"sweep": probe_sweep, "scene": camera_round}
 
@@ -34,13 +36,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                      help="small looks, each where the node says that it would help most")  # fmt: skip
     act.add_argument("--real", type=Path, metavar="DIR", help="register the public real data in this folder")
     parser.add_argument("--bone", default="femur", help="femur, pelvis, ...: a parametric bone (default: femur)")
-    parser.add_argument("--seed", type=int, default=1, help="which subject, which way, where the patient lies")
-    parser.add_argument("--frames", type=int, help="clouds in the bag, or most looks (default: 24; --scene and "
-                        "--guided: 12)")  # fmt: skip
-    parser.add_argument("--period", type=float, metavar="S",
+    parser.add_argument("--seed", type=_seed, default=1, help="which subject, which way, where the patient lies")
+    parser.add_argument("--frames", type=at_least_one, help="clouds in the bag, or most looks (default: 24; "
+                        "--scene and --guided: 12)")  # fmt: skip
+    parser.add_argument("--period", type=_period, metavar="S",
                         help="time between two clouds of the bag (default: 1 s; --scene: 3 s)")  # fmt: skip
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag")
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder (default: demo_output)")
+
+
+def _seed(text: str) -> int:
+    """A whole number, 0 or more."""
+    if not text.strip().isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
+    return int(text)
+
+
+def _period(text: str) -> float:
+    """Seconds, a millisecond or more."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not SHORTEST_S <= seconds < float("inf"):  # NaN neither
+        raise argparse.ArgumentTypeError(f"expected seconds, at least {SHORTEST_S:g}, got {text!r}")
+    return seconds
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ from gapr_core.data.pool import parametric_specimen
 from gapr_core.geometry import se3
 from gapr_core.pages.guidance import GuidedStep, guidance_figure
 from gapr_core.pages.report import Report, timeline_figure
-from gapr_ros.demo.act import Act, write_stl
+from gapr_ros.demo.act import Act, write_bone
 from gapr_ros.demo.report import Row, add_frames, facts, judge
 from gapr_ros.demo.running import STARTING, Sender, running
 
@@ -69,8 +69,7 @@ def follow(probe: LookingProbe, observer: Observer, most: int, folder: Path, con
     Raises:
         DemoError: the node did not start, or ended too early.
     """
-    path, looks = folder / f"{probe.specimen.bone}.stl", []
-    write_stl(probe.specimen.surface, path)
+    path, looks = write_bone(probe.specimen, folder), []
     with running(observer, folder, {"model_path": path.resolve(), "model_unit": "mm", **PARAMETERS}) as node:
         sender = Sender(node, "tracker")
         with console.status(STARTING):

@@ -36,6 +36,13 @@ def test_an_input_drops_what_is_not_finite_and_counts_it(name):
     assert INPUTS[name].count(message) == 4
 
 
+@pytest.mark.parametrize(("name", "kept"), [("PointCloud2", XYZ), ("PoseArray", np.vstack([np.zeros(3), XYZ]))])
+def test_a_point_at_zero_is_nothing_seen_in_a_cloud_of_a_camera_alone(name, kept):
+    message = MAKE[name](np.vstack([np.zeros(3), XYZ]))
+    np.testing.assert_allclose(INPUTS[name].points(message), kept)
+    assert INPUTS[name].count(message) == 3
+
+
 @pytest.mark.parametrize("name", INPUTS)
 def test_an_empty_input_has_no_points(name):
     message = INPUTS[name].message()

@@ -7,6 +7,7 @@ import pytest
 
 from gapr_core import Registrar, check_points, cli
 from gapr_core.commands.answer import as_json, read_json
+from gapr_core.formats import markups
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
@@ -52,6 +53,28 @@ def test_points_that_say_little_name_the_next_place_and_exit_with_2(folder, caps
     assert "touch more points, the next one at (" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("places", [[0], [0, 0], [0, 1, 2, 3]])
+def test_few_points_and_near_ones_are_no_reason_to_acquire_more_or_to_change_the_unit(folder, capsys, places):
+    """A cloud of that size was refused: as too small for a bone, and as one in cm."""
+    near = np.loadtxt("touched.txt")[0] + [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]]
+    np.savetxt("near.txt", near[places])
+    markups.save("near.mrk.json", markups.Markups(near[places], tuple("abcd"[: len(places)])))
+    for name in ("near.txt", "near.mrk.json"):
+        assert run(points=name) == 2
+        shown = capsys.readouterr()
+        assert f"{len(places)} point" in shown.out and not shown.err, shown
+
+
+def test_points_in_metres_are_asked_for_their_unit(folder, caplog):
+    """They are no bone's size either, but no touched points lie so near each other."""
+    np.savetxt("metres.txt", np.loadtxt("touched.txt") / 1000.0)
+    assert run(points="metres.txt") == 2
+    assert "all points of metres.txt are within" in caplog.text and "name it with --points-units" in caplog.text
+    caplog.clear()
+    assert run("--points-units", "m", points="metres.txt") == 0
+    assert "within" not in caplog.text
+
+
 def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, capsys):
     moved = np.loadtxt("touched.txt") + [0.0, 0.0, 8.0]
     np.savetxt("moved.txt", np.vstack([moved, [900.0, 0.0, 0.0]]))
@@ -71,6 +94,8 @@ def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, caps
         (json.dumps(as_json(OK) | {"transform": np.diag([2.0, 2, 2, 1]).tolist()}), "a rigid transform in pose.json"),
         (json.dumps(as_json(OK) | {"covariance": [[1.0]]}), "finite numbers (6, 6) in pose.json; got (1, 1)"),
         (json.dumps(as_json(OK) | {"centre_mm": ["a", 0, 0]}), "numbers (3,) in pose.json"),
+        (json.dumps(as_json(OK) | {"confidence": None}), "the answer of a registration in pose.json"),
+        (json.dumps(as_json(OK) | {"confidence": [0.9]}), "the answer of a registration in pose.json"),
     ],
 )
 def test_another_file_than_an_accepted_answer_is_one_line(folder, capsys, content, said):

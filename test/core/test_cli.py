@@ -5,6 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -134,6 +135,42 @@ def test_an_answer_is_added_to_those_of_another_run(tmp_path):
     (tmp_path / "poses.json").write_text('{"a": {"status": "OK"}}')
     answers = evaluate._written(tmp_path / "poses.json", {"b": {"status": "ERROR"}})
     assert set(answers) == {"a", "b"} and json.loads((tmp_path / "poses.json").read_text()) == answers
+
+
+def test_evaluate_spends_little_of_its_time_on_writing(tmp_path, monkeypatch):
+    """The file holds all answers: at 20 000 of them it took half of the time."""
+    from gapr_core.commands import evaluate
+
+    (tmp_path / "pairs").mkdir()
+    for number in range(40):
+        np.savez(tmp_path / "pairs" / f"{number}.npz", source=np.zeros((5, 3)), target=np.zeros((5, 3)))
+    written, sizes = evaluate._written, []
+
+    def slowly(path, new):
+        sizes.append(len(new))
+        time.sleep(0.1)
+        return written(path, new)
+
+    monkeypatch.setattr(evaluate, "WRITE_SECONDS", 0.0)
+    monkeypatch.setattr(evaluate, "_written", slowly)
+    monkeypatch.setattr(evaluate, "_answer", lambda *_: time.sleep(0.002) or {"status": "INVALID_INPUT", "reason": ""})
+    run = ["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "o.json"), "--method", "icp"]
+    cli.main(run)
+    assert sum(sizes) == 40 and len(sizes) <= 4, sizes
+    assert len(json.loads((tmp_path / "o.json").read_text())) == 40
+
+
+def test_evaluate_finds_a_place_that_cannot_be_written_before_the_work(tmp_path, pair, capsys, monkeypatch):
+    from gapr_core.commands import evaluate
+
+    asked = []
+    monkeypatch.setattr(evaluate, "_answer", lambda path, method: asked.append(path))
+    (tmp_path / "pairs").mkdir()
+    np.savez(tmp_path / "pairs" / "a.npz", source=pair.source, target=pair.target)
+    (tmp_path / "file").touch()
+    out = ["--out", str(tmp_path / "file" / "o.json"), "--method", "icp"]
+    assert cli.main(["evaluate", "--pairs", str(tmp_path / "pairs"), *out]) == 1
+    assert not asked and "what should be its folder is a file" in capsys.readouterr().err
 
 
 def test_wrong_usage_is_bad_input_not_a_refusal(capsys):

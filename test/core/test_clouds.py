@@ -148,6 +148,14 @@ def test_points_that_no_unit_helps_are_not_blamed_on_the_unit(tmp_path, monkeypa
         clouds.load("a.xyz", units=unit)
 
 
+@pytest.mark.parametrize(("points", "unit"), [([[1.0, 2.0, 3.0]], "mm"), (VERTICES / 1e3, "mm"), (VERTICES, "m")])
+def test_points_that_need_not_be_a_bone_may_have_any_size(points, unit):
+    found = clouds.load(points, unit, of_bone=False).points
+    np.testing.assert_allclose(found, np.array(points) * clouds.MM_PER_UNIT[unit])
+    with pytest.raises(InvalidPointCloudError, match="units 'mm', 'cm', 'm' or 'auto'"):
+        clouds.load(points, "inch", of_bone=False)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_rows_with_a_number_beyond_any_coordinate_are_dropped_as_they_are_by_a_registration():
     dirty = np.vstack([VERTICES, [[1e300, 0, 0], [0, -1e15, 0]]])

@@ -77,6 +77,9 @@ evaluate --pairs empty --out o.json
 evaluate --pairs cloud.npy --out o.json
 evaluate --pairs pairs --out answers.json --method icp
 evaluate --pairs pairs --out . --method icp
+evaluate --pairs pairs --out /proc/o.json --method icp
+pivot points.csv --json points.csv
+pivot points.csv --json .
 evaluate --pairs pairs --out o.json --limit 0
 evaluate --pairs pairs --out o.json --limit x
 evaluate --pairs pairs --out o.json --method gpr

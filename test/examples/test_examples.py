@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
@@ -64,7 +65,10 @@ class Fixed:
 
     def register(self, points, target):
         self.sources.append(points)
-        return self.results.pop(0)
+        result = self.results.pop(0)
+        if isinstance(result, Exception):
+            raise result
+        return result
 
 
 T = se3.exp([10.0, -70.0, 200.0, 0.3, -1.2, 0.7])
@@ -94,6 +98,27 @@ def test_a_pose_reaches_slicer_in_ras_and_a_refusal_as_a_status_alone(bridge, li
     while (status := slicer.wait_for_message("Registration", WAIT_S)).code != bridge.OK:
         assert status.code == bridge.NOT_FOUND and "AMBIGUOUS" in status.text and time.monotonic() < deadline
     assert status.text.startswith("OK")
+
+
+def test_points_that_cannot_be_of_one_bone_are_a_status_and_the_bridge_goes_on(bridge, linked):
+    """A tip metres away ended it with a traceback."""
+    tracker, client, server, slicer = linked
+    good = RegistrationResult(RegistrationStatus.OK, T, np.eye(6), 0.99)
+    real, target = Accumulator(Registrar(RegistrarConfig(num_threads=1)), most=bridge.GROUPS), None
+    with pytest.raises(InvalidPointCloudError) as refusal:
+        real.collect([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [5000.0, 0.0, 0.0]])
+    made = bridge.Bridge(Fixed(refusal.value, good), target, client, server, DEVICE, every=3)
+    answers = []
+    for point in ([0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [5000.0, 0.0, 0.0]):
+        touch(tracker, point)
+        answers.append(made.step(WAIT_S))
+    assert answers == [None] * 3 and not made.points
+    status = slicer.wait_for_message("Registration", WAIT_S)
+    assert status.code == bridge.NOT_FOUND and "5e+03 mm" in status.text
+    for point in ([20.0, 0.0, 0.0], [30.0, 0.0, 0.0], [40.0, 0.0, 0.0]):
+        touch(tracker, point)
+        answers.append(made.step(WAIT_S))
+    assert answers[-1] is good
 
 
 def test_the_codes_of_a_status_are_those_of_openigtlink(bridge):

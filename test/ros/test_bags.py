@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 
 import numpy as np
@@ -111,6 +112,22 @@ def test_a_looped_bag_starts_over_until_it_is_interrupted(bag_path, listener, tm
     assert player.stop() == 0, player.log
     clocks = [m.sec + m.nanosec * 1e-9 for m in listener.heard["clocks"]]
     assert min(np.diff(clocks)) < -0.3, "time goes back when the bag starts over"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_replay_that_waits_for_listeners_ends_without_a_traceback(tmp_path, number):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write_cloud("/to_nobody", np.ones((1, 3)), "probe", START_NS)
+    ros = context()
+    node = Node("onlooker", context=ros)
+    player = NodeProcess(tmp_path, str(tmp_path / "bag"), "--wait", "600", module="gapr_ros.bags.replay")
+    try:
+        wait_until(lambda: node.count_publishers("/to_nobody"), WAIT_S, lambda: player.log)
+        assert player.stop(number) == 0, player.log
+    finally:
+        player.kill()
+        ros.try_shutdown()
+    assert "Traceback" not in player.log
 
 
 def test_topics_that_nobody_hears_are_named(tmp_path, capfd):

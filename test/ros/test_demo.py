@@ -24,7 +24,7 @@ from gapr_core.geometry import se3
 from gapr_ros.demo import cli as demo
 from gapr_ros.demo import guided, interrupt
 from gapr_ros.demo import report as demo_report
-from gapr_ros.demo.act import Act, DemoError, act_of_pairs, write_bag
+from gapr_ros.demo.act import Act, DemoError, act_of_pairs, probe_sweep, write_bag
 from gapr_ros.demo.children import child
 from gapr_ros.demo.observer import Advice, Answer, Observer, Used
 from gapr_ros.demo.report import Row
@@ -63,7 +63,7 @@ def test_the_demo_finds_right_poses_and_writes_its_report(tmp_path):
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     assert "right poses" in output and "WRONG" not in output
-    assert (tmp_path / "bag" / "metadata.yaml").is_file() and (tmp_path / "femur.stl").is_file()
+    assert (tmp_path / "bag" / "metadata.yaml").is_file() and (tmp_path / "demo_femur.stl").is_file()
     assert (tmp_path / "report.png").stat().st_size > 20_000
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "From a bag to a trusted pose" in page and "Plotly.newPlot(" in page
@@ -108,7 +108,7 @@ def test_a_node_that_cannot_start_ends_the_demo_with_its_reason(tmp_path, monkey
     lines = []
     monkeypatch.setattr("rich.console.Console.print", lambda self, *text, **_: lines.extend(map(str, text)))
     assert demo.run(parser.parse_args(["--out", str(tmp_path), "--frames", "2"])) == 1
-    assert "femur.stl" in " ".join(lines)
+    assert "demo_femur.stl" in " ".join(lines)
 
 
 def test_the_demo_replaces_a_bag_of_its_own_and_no_other(tmp_path):
@@ -122,6 +122,29 @@ def test_the_demo_replaces_a_bag_of_its_own_and_no_other(tmp_path):
     with pytest.raises(DemoError, match="which no demo wrote; choose another --out"):
         write_bag(act, mine.parent, "mcap")
     assert mine.read_bytes() == b"of an afternoon in the laboratory"
+
+
+def test_the_demo_does_not_write_over_a_bone_of_its_user(tmp_path, monkeypatch):
+    mine = [tmp_path / "femur.stl", tmp_path / "tibia.stl"]
+    for path in mine:
+        path.write_bytes(b"of a CT")
+    act = probe_sweep("femur", 1, 2, 1.0, tmp_path)
+    follow_scripted(monkeypatch, tmp_path, [(Answer(refusal="timeout: ..."), None)])  # on a tibia
+    assert [path.read_bytes() for path in mine] == [b"of a CT"] * 2
+    assert act.path.is_file() and (tmp_path / "demo_tibia.stl").is_file()
+
+
+@pytest.mark.parametrize("words", ["--frames 0", "--frames x", "--seed -1", "--seed x", "--period 0", "--period 0.0004",
+                                   "--period nan", "--period inf", "--period x"])  # fmt: skip
+def test_a_number_that_no_demo_can_use_is_refused_in_one_line(capsys, words):
+    """Answers are known by their stamps in ms: with a period of 0 one pose was shown for every cloud."""
+    parser = argparse.ArgumentParser()
+    demo.add_arguments(parser)
+    option, value = words.split()
+    with pytest.raises(SystemExit):
+        parser.parse_args([option, value])
+    said = capsys.readouterr().err
+    assert f"argument {option}: expected " in said and f"got {value!r}" in said
 
 
 def test_an_unknown_bone_is_one_clear_line(tmp_path):

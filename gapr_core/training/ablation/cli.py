@@ -30,7 +30,7 @@ from gapr_core.data.anatomy import SPLITS
 from gapr_core.data.make_pairs import MANIFEST, Recipe, read_manifest, write_pairs
 from gapr_core.data.pair_files import load_pair
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import Pair
+from gapr_core.data.protocols import STRANGERS, Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
@@ -120,7 +120,7 @@ def ablate(
         How many networks are not finished yet.
 
     Raises:
-        ConfigError: `out` holds a comparison with other settings.
+        ConfigError: `out` holds a comparison with other settings, or a protocol of `recipe` has no true pose.
     """
     deadline = time.time() + 60.0 * minutes
     todo = {
@@ -132,7 +132,7 @@ def ablate(
             run_folder.check(folder, settings, settings.network())
     examination(recipe, out / "pairs", anatomy)
     tasks = [Task(folder, settings, anatomy, out / "pairs", deadline, pose) for folder, settings in todo.items()]
-    missing = [task for task in tasks if not (task.folder / "exam.json").exists()]
+    missing = [task for task in tasks if not examined(task)]
     left, written = len(missing), False
     with tqdm(total=len(tasks), initial=len(tasks) - left, unit="network", desc="ablation", disable=None) as bar:
         for done in finish_all(missing, jobs):
@@ -147,8 +147,9 @@ def ablate(
 
 def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
     """The pairs of the examination, made once: the same for every network."""
-    if "wrong" in recipe.protocols:
-        raise ConfigError("protocols with a true pose", "wrong", "leave it out")
+    without = [name for name in recipe.protocols if name in STRANGERS]
+    if without:
+        raise ConfigError("protocols with a true pose", ", ".join(without), "leave them out")
     complete = (folder / MANIFEST).exists() and read_manifest(folder)
     if not (complete and complete["hash"] and complete["recipe"] == recipe.listed()):
         people = {bone: specimens(bone, recipe.split, recipe.people, anatomy) for bone in recipe.bones}
@@ -187,7 +188,26 @@ def finish(task: Task) -> bool:
         examine(network, load_pair(f), task.pose)
         for f in tqdm(pairs, task.folder.name, False, unit="pair", disable=None)
     ]
-    files.write_json(task.folder / "exam.json", {"pairs": read_manifest(task.pairs)["hash"], "records": records})
+    of = {"pairs": read_manifest(task.pairs)["hash"], "pose": task.pose}
+    files.write_json(task.folder / "exam.json", {**of, "records": records})
+    return True
+
+
+def examined(task: Task) -> bool:
+    """Whether the network has its examination; one that does not say how poses were found had the default way.
+
+    Raises:
+        ConfigError: it was of other pairs, or with poses found in another way.
+    """
+    path = task.folder / "exam.json"
+    if not path.exists():
+        return False
+    exam, how = files.read_json(path, "an examination of gapr ablate"), "choose a new --out"
+    if exam["pairs"] != read_manifest(task.pairs)["hash"]:
+        raise ConfigError(f"an examination of the pairs in {task.pairs}", f"one of others in {path}", how)
+    pose = exam.get("pose", METHODS[0])
+    if pose != task.pose:
+        raise ConfigError(f"an examination with --pose {task.pose}", f"{pose} in {path}", how)
     return True
 
 

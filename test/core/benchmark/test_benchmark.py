@@ -132,6 +132,18 @@ def test_results_of_other_pairs_of_the_same_name_are_refused(pairs, fakes, tmp_p
         benchmark.merge([tmp_path / "old", tmp_path / "new"], tmp_path / "merged")
 
 
+def test_results_of_pairs_of_other_names_are_refused(pairs, fakes, tmp_path, in_process):
+    """Two folders of pairs went into one table."""
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    more = shutil.copytree(pairs, tmp_path / "more")
+    save_pair(more / "extra.npz", make_pair(9))
+    assert row_of(benchmark.benchmark(more, fakes("good"), tmp_path / "out"), "all", "good")["pairs"] == 8
+    before = (tmp_path / "out" / records.FILE).read_bytes()
+    with pytest.raises(ConfigError, match="records of these pairs; got some of extra; choose another --out"):
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    assert (tmp_path / "out" / records.FILE).read_bytes() == before
+
+
 def test_a_pair_without_truth_cannot_be_judged(tmp_path, fakes, in_process):
     folder = tmp_path / "bare"
     folder.mkdir()

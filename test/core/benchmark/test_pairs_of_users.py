@@ -1,5 +1,8 @@
 """Pairs and methods that users bring: what cannot be is refused before the first registration, or is a failure."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from benchmark_cases import make_pair
@@ -9,6 +12,12 @@ from gapr_core.benchmark import records, runner
 from gapr_core.commands import benchmark
 from gapr_core.data.pair_files import load_facts, load_pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
+
+sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
+
+import proposals  # noqa: E402
+import uncertainty  # noqa: E402
+import viewpoint  # noqa: E402
 
 PAIR = make_pair(0)
 TRUE = PAIR.T_target_source
@@ -92,3 +101,18 @@ def test_an_answer_that_cannot_be_written_is_a_failure_of_the_method(pairs, fake
     assert len(odd) == 7 and len(found) == 14
     assert all(record.status == "ERROR" and ODD[name] in record.reason for record in odd)
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")  # the records can be read again
+
+
+def test_a_folder_without_pairs_is_no_empty_table(tmp_path, monkeypatch):
+    nowhere = tmp_path / "nowhere"
+    monkeypatch.setattr(sys, "argv", ["viewpoint.py", "--pairs", str(nowhere)])
+    with pytest.raises(ConfigError, match="nowhere; check the path"):
+        viewpoint.main()
+    with pytest.raises(ConfigError, match="nowhere; check the path"):
+        proposals.chosen(nowhere, None)
+
+
+def test_a_family_of_which_no_source_can_be_used_has_a_row_without_medians():
+    assert uncertainty.line("sweep", [None, None]) == "| sweep | 2 | 0.0 | - | - | - |"
+    found = [(5.348, 1.0, 2.0, True), None, (10.696, 3.0, 4.0, False), (16.044, 5.0, 9.0, True)]
+    assert uncertainty.line("sweep", found) == "| sweep | 4 | 50.0 | 2.00 | 3.00 | 4.00 |"

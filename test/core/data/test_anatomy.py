@@ -8,7 +8,8 @@ from shapes import ball_specimen
 
 from gapr_core.data import anatomy
 from gapr_core.data.protocols import make_pair
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.formats.reading import FORMATS
 from gapr_core.geometry import se3
 
 
@@ -51,6 +52,53 @@ def test_a_missing_folder_and_a_missing_splits_file_say_what_to_do(tmp_path):
         anatomy.surfaces(tmp_path / "nowhere", "femur")
     with pytest.raises(ConfigError, match="splits.json"):
         anatomy.splits(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("{", "Expecting"), ("[1]", "list"), ("3", "int"), ('{"train": 1, "val": [], "test": []}', "without a list"),
+     ('{"train": [1], "val": [], "test": []}', "without a list")],
+)  # fmt: skip
+def test_a_damaged_splits_file_is_named(tmp_path, text, said):
+    (tmp_path / "splits.json").write_text(text)
+    with pytest.raises(ConfigError, match=f"splits.json with subjects of train, val and test; got .*{said}"):
+        anatomy.splits(tmp_path)
+
+
+def test_damaged_meshes_are_named(tmp_path):
+    write_set(tmp_path, "femur", "one", ["a", "b"])
+    path = tmp_path / "femur_one.npz"
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    content = path.read_bytes()
+    damaged = {"cut": content[:-200], "text": b"no mesh", "empty": b""}
+    for name, less in (("points", arrays["points"][0]), ("faces", arrays["faces"][:, :2]), ("person", ["a"])):
+        np.savez(path, **{**arrays, name: less})
+        damaged[f"other {name}"] = path.read_bytes()
+        np.savez(path, **{key: array for key, array in arrays.items() if key != name})
+        damaged[f"no {name}"] = path.read_bytes()
+    for broken in damaged.values():
+        path.write_bytes(broken)
+        with pytest.raises(InvalidPointCloudError, match=r"an .npz with points .*; got .*femur_one.npz \(.+\)"):
+            anatomy.surfaces(tmp_path, "femur")
+
+
+def test_label_maps_are_meshes_named_by_all_that_stands_before_their_ending_and_other_files_are_left_alone(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    voxels = np.zeros((40, 40, 60), dtype=np.uint8)
+    voxels[5:35, 5:35, 5:55] = 1
+    for name in ("p.1.nii.gz", "P2.NII.GZ"):
+        nibabel.save(nibabel.Nifti1Image(voxels, np.diag([2.0, 2.0, 2.0, 1.0])), tmp_path / name)
+    for name in ("README.txt", "landmarks.mrk.json", "cloud.xyz", "sweep.igs.mha", "notes"):
+        (tmp_path / name).write_text("no mesh")
+    assert sorted(s.person for s in anatomy.meshes(tmp_path, "femur")) == ["P2", "p.1"]
+    hashed = anatomy.meshes_hash(tmp_path, ["femur"])
+    (tmp_path / "README.txt").write_text("other words")
+    assert anatomy.meshes_hash(tmp_path, ["femur"]) == hashed
+
+
+def test_every_ending_of_a_mesh_can_be_read():
+    assert set(anatomy.MESHES) < set(FORMATS)
 
 
 def test_the_mirrored_bone_is_the_other_side_with_normals_outward():

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from gapr_core.benchmark import records
+from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.data import damage
 from gapr_core.data.damage import CHANGES, DAMAGES, Site
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import extent, se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
+
+import damage as of_damage  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +78,23 @@ def test_what_is_added_has_its_share_and_the_bone_stays(pair, site, specimen, na
     before, after = damaged(name, pair, site, specimen)
     np.testing.assert_allclose(after[: len(before)], before, atol=1e-9)
     assert low <= len(after) / len(before) - 1.0 <= high
+
+
+def test_the_next_bone_lies_where_it_lies_in_the_scan(specimen):
+    """Both bones far from the scan's origin, which the pair has taken off: 60 mm apart as before."""
+    surface, beside = specimen.surface, np.array([60.0, 0.0, 0.0])
+    bone, neighbour = (
+        replace(specimen, surface=replace(surface, points=surface.points + [300.0, -200.0, 900.0] + off))
+        for off in (np.zeros(3), beside)
+    )
+    pair = make_pair("L1", bone, 7)
+    site = Site.of(bone, pair.metadata["origin_mm"], neighbour)
+    before, after = damaged("next bone", pair, site, bone)
+    added = after[len(before) :]
+    assert len(added) >= 0.2 * len(before) - 1
+    assert cKDTree(site.points).query(added)[0].max() < damage.JOINT_MM + 5.0
+    gaps_mm = np.abs(bone.distance(added - beside + pair.metadata["origin_mm"]))
+    assert 0.3 < np.median(gaps_mm) < 1.0 and gaps_mm.max() < 6.0  # noise of 1 mm
 
 
 def test_without_a_neighbour_nothing_is_added(pair, site, specimen):
@@ -155,8 +183,35 @@ def test_the_target_ends_and_the_source_reaches_beyond(pair, site, specimen):
 
 
 def test_a_pair_without_a_true_pose_is_not_damaged(pair, site, specimen):
-    from dataclasses import replace
-
     wrong = replace(pair, T_target_source=np.full((4, 4), np.nan))
     with pytest.raises(ValueError, match="a pair with a true pose"):
         damage.of_source(CHANGES["lines"], wrong, site, specimen, np.random.default_rng(0))
+
+
+class Asked:
+    """A registrar that counts its questions and refuses."""
+
+    def __init__(self, kind="unknown"):
+        self.config, self.asked = RegistrarConfig(sensor=SensorConfig(kind)), 0
+
+    def prepare(self, points):
+        return points
+
+    def register(self, source, target):
+        self.asked += 1
+        return RegistrationResult(RegistrationStatus.AMBIGUOUS)
+
+
+def test_records_of_other_subjects_another_split_and_another_sensor_do_not_pass_for_new_ones(tmp_path):
+    people = [parametric_specimen("femur", number) for number in (3, 8)]
+    cases, path = [("lines", "femur", 0, False), ("lines", "femur", 0, True)], tmp_path / records.FILE
+    asked, camera = Asked(), Asked("depth_camera")
+    first = of_damage.run(cases, {"femur": people}, path, asked, "val")
+    assert of_damage.run(cases, {"femur": people}, path, asked, "val") == first and asked.asked == 2
+    assert [record.person for record in first] == ["parametric_3", "parametric_8"]
+    of_damage.run(cases, {"femur": people}, path, asked, "test")
+    assert asked.asked == 4
+    swapped = of_damage.run(cases, {"femur": people[::-1]}, path, asked, "val")
+    assert asked.asked == 6 and [record.person for record in swapped] == ["parametric_8", "parametric_3"]
+    of_damage.run(cases, {"femur": people}, path, camera, "val")
+    assert camera.asked == 2 and len({record.pair for record in records.read(path)}) == 8

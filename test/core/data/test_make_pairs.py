@@ -114,8 +114,27 @@ def test_an_interrupted_run_is_taken_up_where_it_stopped(tmp_path):
 
 def test_a_folder_with_other_pairs_is_left_alone(tmp_path):
     write_pairs(RECIPE, BONES, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ConfigError, match="other pairs"):
         write_pairs(Recipe(("L1",), ("ball",), count=1), BONES, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    for path in tmp_path.glob("*.npz"):
+        path.unlink()
+    with pytest.raises(ConfigError, match="other pairs"):  # a list of pairs that lie elsewhere
+        write_pairs(Recipe(("L1",), ("ball",), count=1), BONES, tmp_path)
+    (tmp_path / "manifest.json").write_text(json.dumps(json.loads(before["manifest.json"]) | {"pairs": []}))
+    (tmp_path / "L3_ball_0000.npz").write_bytes(before["L3_ball_0000.npz"])  # as a run leaves it that was stopped
+    with pytest.raises(ConfigError, match="other pairs"):
+        write_pairs(Recipe(("L1",), ("ball",), count=1), BONES, tmp_path)
+
+
+def test_a_misspelt_bone_does_not_block_the_folder(tmp_path, capsys):
+    write_meshes(tmp_path / "bones" / "ulna", 1)
+    words = ["make-pairs", "--split", "all", "--protocol", "L1", "--count", "1", "--meshes", str(tmp_path / "bones")]
+    words += ["--out", str(tmp_path / "pairs"), "--bones"]
+    assert main([*words, "unla"]) == 1 and "none for unla" in capsys.readouterr().err
+    assert main([*words, "ulna"]) == 0
+    assert [pair["name"] for pair in read_manifest(tmp_path / "pairs")["pairs"]] == ["L1_ulna_0000"]
 
 
 def test_everybody_has_a_turn(tmp_path):

@@ -271,10 +271,27 @@ def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_
             assert (tmp_path / node.get("fileName")).is_file()
         for key in ("storageNodeRef", "displayNodeRef", "transformNodeRef"):
             assert node.get(key) is None or node.get(key) in names
-    assert sum(node.get("transformNodeRef") is not None for node in nodes) == 1
+    assert sum(node.get("transformNodeRef") is not None for node in nodes) == 2
     np.testing.assert_allclose(clouds.load(tmp_path / "target.vtk").points, femur.points, atol=1e-3)
-    np.testing.assert_allclose(clouds.load(tmp_path / "source.vtk").points, POINTS, atol=1e-3)
+    near = np.isfinite(residuals().distance_mm)
+    np.testing.assert_allclose(clouds.load(tmp_path / "source.vtk").points, POINTS[near], atol=1e-3)
     assert "0.50 mm" in (tmp_path / "targets.mrk.json").read_text() and (tmp_path / "mine.txt").read_text() == "stays"
+
+
+def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(tmp_path, femur, caplog):
+    """They had a distance of 0, which is white: exactly on the bone."""
+    scene.write_slicer(tmp_path, femur, result_with(np.eye(6), residuals()), [])
+    shown = (tmp_path / "source.vtk").read_text().split("LOOKUP_TABLE default\n")[1].split()
+    assert [float(distance) for distance in shown] == [-3.0, 0.0, 3.0] + [0.0] * 16
+    off = clouds.load(tmp_path / "off_bone.vtk", of_bone=False)
+    np.testing.assert_allclose(off.points, POINTS[3:4], atol=1e-3)
+    assert "SCALARS" not in (tmp_path / "off_bone.vtk").read_text()
+    display = ElementTree.parse(tmp_path / "scene.mrml").find(".//ModelDisplay[@name='off_bone display']")
+    assert len(set(display.get("color").split())) == 1 and display.get("scalarVisibility") is None
+    near = Residuals(POINTS, np.zeros(20), np.ones(20, dtype=bool))
+    scene.write_slicer(tmp_path, femur, result_with(np.eye(6), near), [])
+    assert "off_bone" not in (tmp_path / "scene.mrml").read_text()
+    assert "off_bone.vtk in" in caplog.text and "is of an earlier run" in caplog.text
 
 
 def test_targets_of_an_earlier_run_in_the_folder_of_a_scene_are_warned_of(tmp_path, femur, caplog):
@@ -322,6 +339,13 @@ def test_gapr_pivot_prints_what_register_takes(tmp_path, capsys):
     assert "--tip 1.000,2.000,150.000" in capsys.readouterr().out
     assert json.loads((tmp_path / "tip.json").read_text())["poses"] == 30
     assert main(["pivot", str(tmp_path / "none.csv")]) == 1
+    before = (tmp_path / "pivot.csv").read_bytes()
+    capsys.readouterr()
+    for name, said in (("pivot.csv", "which belongs to the recording"), (".", "a folder")):
+        assert main(["pivot", str(tmp_path / "pivot.csv"), "--json", str(tmp_path / name)]) == 1
+        shown = capsys.readouterr()
+        assert said in shown.err and "--tip" not in shown.out  # before the work
+    assert (tmp_path / "pivot.csv").read_bytes() == before
 
 
 def test_a_tip_that_begins_with_a_minus_can_be_pasted(tmp_path, monkeypatch):

@@ -262,6 +262,15 @@ def test_a_transform_that_is_not_finite_is_refused(tmp_path):
         reading.read(path, ReadOptions(tip_mm=tuple(TIP)))
 
 
+@pytest.mark.parametrize("value", [b"nan", b"-inf"])
+def test_a_transform_of_a_frame_that_is_not_valid_may_hold_any_number(tmp_path, value):
+    """As PLUS may write for a tool that was not seen; the whole recording was refused."""
+    path = igs(tmp_path / "tool.igs.mha", turned_poses(3), ["OK", "INVALID", "OK"])
+    path.write_bytes(re.sub(rb"(Seq_Frame0001_\w+Transform = )\S+", rb"\g<1>" + value, path.read_bytes()))
+    points = reading.read(path, ReadOptions(tip_mm=tuple(TIP))).points
+    np.testing.assert_allclose(points, np.tile(PIVOT, (2, 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["two.csv", "two.igs.mha"])
 def test_one_of_several_tools_is_never_guessed(tmp_path, name):
     path, tip = two_tools(tmp_path / name), tuple(TIP)
@@ -462,6 +471,7 @@ TABLES = {
     "c.csv": "\ufeffZ (mm),Y (mm),X (mm)\n30,20,10\n60,5,-40\n90,-8,7\n",
     "d.csv": '"X","Y","Z"\n10,20,30\n-40,5,60\n7,-8,90\n',
     "f.csv": "id,x_mm,y_mm,z_mm\n0,10,20,30\n1,-40,5,60\n2,7,-8,90\n",
+    "o.xyz": "cloud 7\n10 20 30\n-40 5 60\n7 -8 90\n",
     "e.xyz": "a cloud\n10 20 30\n-40 5 60\n7 -8 90\n",
     "g.txt": "# from a probe\n# id x y z\n0 10 20 30\n1 -40 5 60\n2 7 -8 90\n",
     "h.txt": "//Z Y X R G B\n30 20 10 1 2 3\n60 5 -40 1 2 3\n90 -8 7 1 2 3\n",
@@ -632,6 +642,10 @@ UNCLEAR = {
         "x y z in the first columns; got j.csv: a first column that counts",
     ),
     "i.txt": ("x y z x y z\n1 2 3 4 5 6\n", "one column each for x y z; got i.txt: columns x y z x y z; name"),
+    "k.xyz": ("1.0 2.0 3.0 # Doe\n4 5 6\n7 8 9\n", "k.xyz: a first line with 3 numbers among its 5 words; take"),
+    "l.csv": ("1.0,2.0,3.0,Doe\n4,5,6\n7,8,9\n", "3 numbers, names of 3 columns or a title; got l.csv: a first line"),
+    "m.txt": ("1.0 2.0 3.O 4\n4 5 6\n7 8 9\n", "m.txt: a first line with 3 numbers among its 4 words"),
+    "n.xyz": ("1 2 3 0 0 1 Doe\n4 5 6 0 0 1\n7 8 9 0 1 0\n", "n.xyz: a first line with 6 numbers among its 7 words"),
 }
 
 

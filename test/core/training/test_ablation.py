@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,6 +109,35 @@ def test_a_folder_with_other_settings_is_refused(plan, whole, anatomy):
         ablation.ablate(read_plan(plan), replace(BUDGET, pairs=6), whole, anatomy, EXAM)
     with pytest.raises(ConfigError, match="recipe"):
         ablation.ablate(read_plan(plan), BUDGET, whole, anatomy, replace(EXAM, count=3))
+
+
+def test_an_examination_with_poses_found_in_another_way_or_of_other_pairs_is_refused(plan, whole, anatomy, tmp_path):
+    out = shutil.copytree(whole, tmp_path / "out")
+    with pytest.raises(ConfigError, match="--pose ransac; got local_to_global in .*exam.json; choose a new --out"):
+        ablation.ablate(read_plan(plan), BUDGET, out, anatomy, EXAM, pose="ransac")
+    exam = out / "ours_seed0" / "exam.json"
+    written = json.loads(exam.read_text())
+    assert written.pop("pose") == "local_to_global"
+    exam.write_text(json.dumps(written))  # as earlier versions wrote it
+    assert ablation.ablate(read_plan(plan), BUDGET, out, anatomy, EXAM) == 0
+    exam.write_text(json.dumps(written | {"pairs": "others"}))
+    with pytest.raises(ConfigError, match="of the pairs in .*; got one of others"):
+        ablation.ablate(read_plan(plan), BUDGET, out, anatomy, EXAM)
+
+
+def test_a_protocol_without_a_true_pose_is_refused_before_anything_is_trained(plan, anatomy, tmp_path, monkeypatch):
+    monkeypatch.setattr(ablation, "train", lambda *_: pytest.fail("trained"))
+    without = replace(EXAM, protocols=("paper", "scene-wrong", "wrong"))
+    with pytest.raises(ConfigError, match="a true pose; got scene-wrong, wrong; leave them out"):
+        ablation.ablate(read_plan(plan), BUDGET, tmp_path, anatomy, without)
+
+
+def test_a_table_without_rows_is_named(tmp_path):
+    (tmp_path / "plan.yaml").write_text("T: 3\n")
+    with pytest.raises(ConfigError, match="a list of rows for each table in .*plan.yaml; got 3 under T"):
+        read_plan(tmp_path / "plan.yaml")
+    (tmp_path / "plan.yaml").write_text("T:\n")
+    assert read_plan(tmp_path / "plan.yaml") == []
 
 
 def test_the_weights_carry_where_they_come_from(whole):

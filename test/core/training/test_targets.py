@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gapr_core.geometry import se3
-from gapr_core.model.pyramid import build_cloud, target_frame
-from gapr_core.training.targets import fine_labels, join, patch_overlaps, to_units, training_pair, true_patch_pairs
+from gapr_core.model.pyramid import Frame, build_cloud, target_frame
+from gapr_core.training.targets import fine_labels, join, to_units, training_pair, true_patch_pairs
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,8 @@ def test_overlaps_equal_a_loop_over_every_two_patches(pair):
 
 
 def test_a_cloud_overlaps_itself_patch_by_patch(pair):
-    overlaps = patch_overlaps(pair.target, pair.target, np.eye(4), 1e-6)
+    fine = Frame(float(pair.target.scale_mm[0]), 5e-7)  # no two points match
+    overlaps = training_pair(pair.target, pair.target, np.eye(4), fine).overlaps[0].numpy()
     filled = pair.target.patches_valid.any(1).numpy()
     np.testing.assert_allclose(overlaps, np.diag(filled.astype(float)))
 

@@ -3,8 +3,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections import Counter
 from dataclasses import replace
 from itertools import combinations
@@ -22,7 +24,7 @@ from gapr_core.model.config import ModelConfig
 from gapr_core.model.export import leaves
 from gapr_core.runtime.settings import load
 from gapr_core.surface import Surface
-from gapr_core.training import batches, distributed, export, start, trainer, validation
+from gapr_core.training import batches, distributed, export, provenance, start, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
@@ -104,6 +106,25 @@ def test_validation_draws_again_where_a_source_is_too_large_for_the_network(sett
     assert [v.protocol for v in found] == ["L1"] and len(seeds) == 2 and seeds[0] != seeds[1]
 
 
+def only(folder, **people):
+    """A folder with the same meshes and another splits.json."""
+    folder.mkdir()
+    (folder / "splits.json").write_text(json.dumps({"train": [], "val": [], "test": [], **people}))
+    return folder
+
+
+def test_a_bone_without_a_subject_of_val_is_left_out_of_the_validation(settings, anatomy, tmp_path):
+    """It was a division by zero, after hours where no femur was held out."""
+    own = only(tmp_path / "own", train=[f"p{i}" for i in range(9)])
+    shutil.copy(anatomy / "femur_toy.npz", own)
+    model, train = ModelConfig.from_yaml(settings.model), replace(settings, mix={"L1": 1.0}, validation_pairs=2)
+    two = replace(train, bones=("femur", "tibia"))
+    assert [v.bone for v in validation.validation_set(two, model, own)] == ["tibia", "tibia"]  # the parametric one
+    with pytest.raises(ConfigError, match=r"split val with femur; got none in .*own; move some subjects to val"):
+        validation.validation_set(train, model, own)
+    assert validation.validation_set(replace(train, validation_pairs=0), model, own) == []
+
+
 def test_a_run_that_was_refused_leaves_its_folder_to_the_next_one(settings, anatomy, tmp_path):
     with pytest.raises(WeightsError):
         trainer.train(replace(settings, initial=str(tmp_path / "nowhere.safetensors")), tmp_path / "run", anatomy)
@@ -151,6 +172,23 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_by_bit(settings, anatomy,
     }
     with pytest.raises(ConfigError, match="begun"):
         trainer.train(replace(settings, seed=1), tmp_path / "whole", anatomy)
+
+
+@pytest.mark.parametrize("left", ["none", "cut", "of an earlier step"])
+def test_a_finished_run_that_was_killed_before_its_weights_gets_them(settings, anatomy, tmp_path, left):
+    run = tmp_path / "run"
+    trainer.train(settings, run, anatomy, minutes=0.0)
+    earlier = (run / "weights.safetensors").read_bytes()
+    whole = trainer.train(settings, run, anatomy)
+    wanted, log = weights.load(whole)[0], (run / "log.csv").read_bytes()
+    whole.write_bytes(earlier if left == "of an earlier step" else whole.read_bytes()[:-100])
+    if left == "none":
+        whole.unlink()
+    found, card = weights.load(trainer.train(settings, run, anatomy))
+    assert all(torch.equal(a, b) for a, b in zip(wanted.parameters(), found.parameters(), strict=True))
+    assert card["step"] == 3 and card["subjects"] > 0 and (run / "log.csv").read_bytes() == log
+    before = whole.read_bytes()
+    assert trainer.train(settings, run, anatomy).read_bytes() == before
 
 
 def test_a_run_can_begin_with_the_weights_of_another_one(settings, anatomy, tmp_path):
@@ -314,6 +352,23 @@ def test_a_bone_from_the_shared_folder_gives_the_same_pairs_bit_by_bit(settings,
             assert a.source.coarse.lengths == b.source.coarse.lengths and a.subjects == b.subjects
     prune(tmp_path, settings, 10**6)
     assert not list(tmp_path.glob("*.npz"))
+
+
+def test_other_meshes_and_other_parametric_bones_have_a_shared_folder_of_their_own(
+    settings, anatomy, tmp_path, monkeypatch
+):
+    """A run that was stopped and begun again with another anatomy learned from the bones of the first one."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    other = shutil.copytree(anatomy, tmp_path / "other")
+    first = batches.bones_folder(tmp_path / "run", settings, anatomy)
+    assert batches.bones_folder(tmp_path / "run", settings, other) == first  # the same bones, elsewhere
+    with np.load(other / "femur_toy.npz") as data:
+        arrays = {name: data[name] for name in data.files}
+    np.savez(other / "femur_toy.npz", **arrays | {"points": 1.1 * arrays["points"]})
+    found = {first, *(batches.bones_folder(tmp_path / "run", settings, folder) for folder in (other, None))}
+    monkeypatch.setattr(provenance, "parametric_version", lambda: "another one")
+    found.add(batches.bones_folder(tmp_path / "run", settings, None))
+    assert len(found) == 4
 
 
 def test_a_mix_of_what_does_not_exist_or_has_no_pose_is_refused(settings, anatomy):

@@ -60,7 +60,7 @@ BENCHMARKS := one_sided clean scenes scene_stereo scene_noisy scene_joint scene_
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 TRACED     := traced traced-named
 FEW        := $(addprefix few-,pointer ultrasound femora)
-SCRIPTS    := strangers similar mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described \
+SCRIPTS    := strangers similar mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described damage_layer \
               guidance hollow unknowable check_points flat_ends proposals proposals_clean viewpoint viewpoint_wrong
 made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --count 500 --mirrored 60 --sides 12 --out $(OUT)/strangers
 made_by_mirrored          = strangers.py --anatomy $(ANATOMY) --split test --count 4 --mirrored 300 --out $(OUT)/mirrored
@@ -71,6 +71,7 @@ made_by_streams_strangers = tracking.py --anatomy $(ANATOMY) --split test --coun
 made_by_damage            = damage.py --anatomy $(ANATOMY) --split test --count 24 --others 12 --out $(OUT)/damage
 made_by_damage_camera     = $(made_by_damage)_camera --damages 'wrong range,patches'
 made_by_damage_camera_described = $(made_by_damage)_described --damages 'wrong range,patches' --sensor depth_camera
+made_by_damage_layer      = $(made_by_damage)_layer --damages 'even layer'
 made_by_guidance          = guidance.py --anatomy $(ANATOMY) --count 4 --most 40 --plot $(OUT)/figures/guidance.png
 made_by_hollow            = hollow.py --anatomy $(ANATOMY) --split test --count 4
 made_by_unknowable        = unknowable.py --count 8

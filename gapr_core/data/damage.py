@@ -38,6 +38,7 @@ LINES_MM = (1.0, 15.0)  # width of a line, and from line to line
 STITCH_MM = (1.0, 2.0)  # how far one half lies off the other
 RANGE = (0.005, 0.02)  # how far a camera's range is wrong
 PATCH_MM, ALIKE_MM = 1.0, 3.0  # error that near points share, and the standard deviation of the window that they share
+LAYER_MM = (4.0, 8.0)  # thickness of an even layer
 KEPT_LENGTH = 0.6  # of the bone, in a target that a source reaches beyond
 
 
@@ -196,6 +197,11 @@ def smoothed(points: Array, site: Site, rng: Random) -> Array:
     return np.array([points[rows].mean(axis=0) for rows in around])
 
 
+def even_layer(points: Array, site: Site, rng: Random) -> Array:
+    """An even layer of 4 to 8 mm covers all that is seen: muscle, a drape; or the sensor is off by as much."""
+    return np.asarray(points + rng.uniform(*LAYER_MM) * site.outward(points))
+
+
 def of_source(change: Change, pair: Pair, site: Site, specimen: Specimen, rng: Random) -> Pair:
     """The pair with its source changed where it lies on the bone."""
     if not pair.has_truth:
@@ -214,6 +220,7 @@ CHANGES: dict[str, Change] = {
     "cartilage": cartilage, "plate": plate, "soft tissue": tissue, "next bone": joint, "fracture": fracture,
     "heavy tails": heavy_tails, "coarse grid": coarse_grid, "one axis": one_axis, "wrong range": wrong_range,
     "patches": patches, "lines": lines, "stitched": stitched, "bent": bent, "smoothed": smoothed,
+    "even layer": even_layer,
 }  # fmt: skip
 DAMAGES: dict[str, Callable[[Pair, Site, Specimen, Random], Pair]] = {
     **{name: partial(of_source, change) for name, change in CHANGES.items()},

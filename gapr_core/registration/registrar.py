@@ -6,8 +6,8 @@ The order in which an answer comes about, with the function of each step:
 2. `_in_rounds`: each proposer in turn proposes, `verify` keeps some poses, `refine_fully` makes the best exact,
    `assess_fit` says how sure it is, until that is enough. `_on_both_cortices` once more where a bone is hollow.
 3. `_of_one_view`: what is not sure as bone alone may be what a camera saw. With a viewpoint `_in_scene` comes at once.
-4. `_checked_and_corrected`: sizes, then the mirror image, may refuse; `bias_corrected` moves the pose; the precision
-   model, `allowing_for_deformation` and `allowing_for_a_copy` widen its covariance.
+4. `_checked_and_corrected`: sizes, the mirror image, then a stand-off may refuse; `bias_corrected` moves the pose;
+   the precision model, `allowing_for_deformation` and `allowing_for_a_copy` widen its covariance.
 5. In a stream `Tracker` weighs it with the sources before.
 6. `conclude`: `limits` keep it from being sure, thresholds refuse, and the reason gets its words.
 """
@@ -42,7 +42,7 @@ from gapr_core.registration.rigidity import allowing_for_deformation
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.standoff import asking_the_standoff
+from gapr_core.registration.standoff import asking_the_standoff, unless_off_the_bone
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import verify
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
@@ -230,6 +230,8 @@ class Registrar:
         if assessment.reaches(config.worth_checking):
             believed = assessment.reaches(config.rules.mirrored_below) or enough(assessment)
             assessment = checks.unless_mirrored(assessment, config, believed, partial(self._of_image, clock=clock))
+        if assessment.reaches(config.worth_checking):
+            assessment = unless_off_the_bone(assessment, config)
         clock.lap("assess")
         if assessment.reaches(config.worth_checking):
             assessment = bias_corrected(assessment, config)

@@ -63,6 +63,13 @@ def test_cartilage_lifts_the_ends_outwards_and_nothing_else(pair, site, specimen
     assert np.abs(lifted_mm[middle]).max() < 1e-9 and 1.5 <= lifted_mm.max() <= 3.0 and lifted_mm.min() > -1e-9
 
 
+def test_an_even_layer_lifts_all_points_outwards_by_the_same(pair, site, specimen):
+    before, after = damaged("even layer", pair, site, specimen)
+    lifted_mm = np.einsum("ni,ni->n", after - before, site.outward(before))
+    assert 4.0 <= lifted_mm.min() == pytest.approx(lifted_mm.max()) and lifted_mm.max() <= 8.0
+    assert np.linalg.norm(after - before, axis=1) == pytest.approx(lifted_mm)
+
+
 def test_a_plate_lies_on_the_bone_and_hides_what_is_under_it(pair, site, specimen):
     before, after = damaged("plate", pair, site, specimen)
     kept = cKDTree(before).query(after)[0] < 1e-6

@@ -118,17 +118,19 @@ def _jacobian(moved: Array, normals: Array, centre: Array) -> Array:
 def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarConfig) -> Array:
     """(n, n) covariance of what the distances of points err by under the true pose, mm^2.
 
-    Noise, a smooth bias that near points share, a stand-off and an error of the model that all share, and another size,
-    which moves a point along its normal by its place.
+    Noise, a smooth bias that near points share, a stand-off and an error of the model that all share, another size,
+    which moves a point along its normal by its place, and an error of the tracker, which moves all as one body.
     """
     settings = config.covariance
     alike = smooth_correlation(moved, moved, settings.correlation_mm)
     grown = np.einsum("ni,ni->n", moved - moved.mean(axis=0), normals) if len(moved) else np.empty(0)
     own_mm2 = errors.noise_mm**2 + errors.local_mm**2
     shared_mm2 = errors.standoff_mm**2 + settings.model_mm**2
-    return np.asarray(
-        own_mm2 * np.eye(len(moved)) + errors.bias_mm**2 * alike + shared_mm2 + errors.scale**2 * np.outer(grown, grown)
-    )
+    R = own_mm2 * np.eye(len(moved)) + errors.bias_mm**2 * alike + shared_mm2 + errors.scale**2 * np.outer(grown, grown)
+    if len(moved):
+        J = _jacobian(moved, normals, moved.mean(axis=0))
+        R += J @ np.diag(np.repeat(np.square([errors.tracking_mm, np.radians(errors.tracking_deg)]), 3)) @ J.T
+    return np.asarray(R)
 
 
 def _probability(distance_mm: Array, S: Array) -> float:

@@ -2,8 +2,8 @@
 
 Six rules do not weigh the probability: a motion that is not observed, a pose that can be pushed aside, a rival that is
 as good, a source of another size by small changes and by larger ones, a source whose mirror image fits better. Pushing,
-growing and mirroring cost time: they are done only where the pose may still be accepted. Two rules are the user's
-thresholds: `min_confidence` and `max_tre_mm`.
+growing and mirroring cost time: they are done only where the pose may still be accepted. A seventh, a source that fits
+better off the bone, is in `standoff`. Two rules are the user's thresholds: `min_confidence` and `max_tre_mm`.
 """
 
 from __future__ import annotations

@@ -46,12 +46,13 @@ def test_off_the_edge_of_a_model_what_a_point_lies_beyond_it_counts():
 
 
 def test_expected_distances_are_those_of_drawn_poses_and_errors():
-    """Every source of error is there, with its square: poses, noise, what all share, another size and a smooth bias."""
+    """Every error is there, with its square: of poses, noise, what all share, size, smooth bias and tracker."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6)) * np.array([0.3] * 3 + [0.01] * 3)[:, None]
     covariance, points = root @ root.T, on_ellipsoid(5, 3)
     target = ellipsoid(count=4000)
-    sensor = SensorConfig(noise_mm=0.2, bias_mm=0.4, scale=0.02, standoff_mm=0.0, known_standoff_mm=0.3)
+    sensor = SensorConfig(noise_mm=0.2, bias_mm=0.4, scale=0.02, standoff_mm=0.0, known_standoff_mm=0.3,
+                          tracking_mm=0.3, tracking_deg=0.8)  # fmt: skip
     config = RegistrarConfig(sensor=sensor, covariance=CovarianceConfig(model_mm=0.25, correlation_mm=15.0))
     result = answer(covariance=covariance, factor95=1.5)
     found = check(points, target, result, config)
@@ -63,6 +64,8 @@ def test_expected_distances_are_those_of_drawn_poses_and_errors():
     drawn = np.einsum("sni,ni->sn", moves, normals)
     drawn += rng.normal(size=(n, 5)) * 0.2 + rng.normal(size=(n, 1)) * 0.3 + rng.normal(size=(n, 1)) * 0.25
     drawn += rng.normal(size=(n, 1)) * 0.02 * (away * normals).sum(axis=1)
+    shift, turn = rng.normal(size=(n, 1, 3)) * 0.3, rng.normal(size=(n, 1, 3)) * np.radians(0.8)
+    drawn += np.einsum("sni,ni->sn", shift + np.cross(turn, away[None]), normals)
     drawn += 0.4 * rng.multivariate_normal(np.zeros(5), alike, n)
     assert found.expected_mm == pytest.approx(drawn.std(axis=0), rel=0.02)
     S = np.cov(drawn.T)

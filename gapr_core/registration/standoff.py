@@ -3,7 +3,7 @@
 On a patch that faces one way this is a shift of the pose, and no residual shows it. On one that bends, the source looks
 grown and fits badly, so that a right pose is refused. Such a refusal asks for the stand-off that would explain it. On a
 pelvis or a rib cage a layer of 4 to 8 mm fits well enough to be believed, with a pose that is off by as much. But it
-fits the surface of a thicker or thinner bone better: a pose is refused where 3 mm or more fit clearly better.
+fits the surface of a thicker or thinner bone better: where one more than 4 mm off does, the pose is refused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LIES_OFF = "fits best on a surface"
 BETTER = 0.15  # log of mean squares: refused sources without a stand-off hardly fit better by more
 MUCH_BETTER = 0.3  # the same, of a pose that is refused for it: sources on the bone reach 0.2
 FIRST_MM = (-3.0, 3.0)  # unless one of these is better than none, no other is tried
-FAR_MM = (-4.5, *FIRST_MM, 4.5, 6.0, 8.0)  # farther than a tip's radius, cartilage, or a wrong threshold of a model
+FAR_MM = (-6.0, -4.5, 4.5, 6.0, 8.0)  # farther than `se3.RIGHT_MM`, by which the pose may be off as well
 TRIED_MM = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0)  # farther out than the target's surface is taken to be
 
 
@@ -60,7 +60,7 @@ def unless_off_the_bone(assessment: Assessment, config: RegistrarConfig) -> Asse
     a = assessment
     if _best_of(_misfits_mm2(a, FIRST_MM, config))[1] >= 0.0:
         return a
-    best_mm, log_ratio = _best_of(_misfits_mm2(a, (*TRIED_MM, *FAR_MM), config))
+    best_mm, log_ratio = _best_of(_misfits_mm2(a, (*TRIED_MM, *FIRST_MM, *FAR_MM), config))
     if best_mm not in FAR_MM or log_ratio >= -MUCH_BETTER:
         return a
     off_mm = a.target.offset_mm + best_mm

@@ -122,13 +122,13 @@ def test_a_layer_that_is_stated_is_none(registrar, pelvis):
     ("ratios", "is_refused"),
     [
         ({4.5: -0.31, 3.0: -0.2}, True),
-        ({-3.0: -0.31}, True),
+        ({-4.5: -0.31, -3.0: -0.2}, True),
         ({4.5: -0.29, 3.0: -0.2}, False),
-        ({2.5: -0.5, 3.0: -0.4}, False),
+        ({4.5: -0.4, 3.0: -0.5}, False),
         ({4.5: -0.5, 3.0: 0.01}, False),
     ],
 )
-def test_it_has_to_fit_much_better_farther_than_3_mm_off(registrar, target, seen, monkeypatch, ratios, is_refused):
+def test_it_has_to_fit_much_better_farther_than_4_mm_off(registrar, target, seen, monkeypatch, ratios, is_refused):
     answer = registrar.assess(seen(0.0), target)
     monkeypatch.setattr(standoff, "offset_surface", lambda target, sensor: sensor.standoff_mm)
     of = lambda at: np.exp(ratios.get(at, 0.1)) if isinstance(at, float) else 1.0  # noqa: E731

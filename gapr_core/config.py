@@ -302,7 +302,7 @@ class RigidityConfig(Settings):
     fewest_points: int = setting(200, "inliers without which none of these is looked for", low=12, high=1_000_000)
     doubled: float = setting(0.5, "as probable a pose makes rejected points a copy of the bone; above 1: never", low=0)
     doubled_share: float = setting(0.15, "with more points rejected a copy may lie anywhere on the bone", low=0, high=1)
-    rejected_points: int = setting(60, "with fewer rejected points no copy is looked for", low=12, high=1_000_000)
+    rejected_points: int = setting(30, "with fewer rejected points no copy is looked for", low=12, high=1_000_000)
     cells: int = setting(40, "cells over which residuals are averaged", low=12, high=1000)
     groups: int = setting(6, "groups of sources in time, whose residuals are averaged apart", low=2, high=100)
     correlation_mm: float = setting(

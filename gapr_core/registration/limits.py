@@ -7,7 +7,7 @@ limit refuses nothing by itself; it keeps a pose below `LimitsConfig.most`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -213,3 +213,8 @@ LIMITS = (
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )
+
+
+def why_no_surer(contributions: Mapping[str, float]) -> str:
+    """What kept an answer with these contributions from being sure, and what helps; "" where no limit did."""
+    return next((limit.why for limit in LIMITS if limit.name in contributions), "")

@@ -249,3 +249,9 @@ def test_a_registration_of_a_strained_source_says_so_and_widens_its_bound(regist
     assert found.ok and found.confidence <= 0.89 and "strained" in found.contributions
     assert "strained" not in blind.contributions
     assert found.tre95_mm > 1.5 * blind.tre95_mm
+
+
+def test_the_limit_that_held_says_what_helps_and_features_say_nothing():
+    assert limits.why_no_surer({"margin": -2.0, "scale_z": 1.0}) == ""
+    for limit in limits.LIMITS:
+        assert limits.why_no_surer({"margin": -2.0, limit.name: -1.5}) == limit.why

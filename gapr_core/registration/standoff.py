@@ -21,7 +21,7 @@ from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 
 LIES_OFF = "fits best on a surface"
 BETTER = 0.15  # log of mean squares: refused sources without a stand-off hardly fit better by more
-MUCH_BETTER = 0.3  # the same, of a pose that is refused for it: sources on the bone reach 0.2
+MUCH_BETTER = 0.3  # the same, of a pose that is refused for it: answers to sources on the bone reach 0.23
 FIRST_MM = (-3.0, 3.0)  # unless one of these is better than none, no other is tried
 FAR_MM = (-4.5, -3.0, 4.5, 6.0, 8.0)  # outside farther than a right pose may be off (`se3.RIGHT_MM`); inside is nothing
 TRIED_MM = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0)  # farther out than the target's surface is taken to be

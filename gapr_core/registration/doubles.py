@@ -37,8 +37,8 @@ ON_BONE = 0.6  # share of the rejected points that count for their pose
 def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, register: Register) -> Assessment:
     """The same; where its rejected points are another copy of the bone, less probable, and with the way there.
 
-    Near the answer a copy is looked for first, which costs little. Only where much is rejected it may lie anywhere.
-    The way goes into the covariance. What else than bone is in a camera's cloud is rejected anyway: it is not asked.
+    Near the answer a copy is looked for first, which costs little. Only where much is rejected it may lie anywhere, but
+    not in a camera's cloud, where tissue is rejected. The way goes into the covariance.
 
     Args:
         assessment: an answer that may be accepted.
@@ -46,14 +46,13 @@ def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, registe
         register: a source in full, the poses among its hypotheses.
     """
     a, limits = assessment, config.rigidity
-    if a.seen is not None:
-        return a
     residuals = a.residuals
     rejected = residuals.points[~residuals.inlier]
     if len(rejected) < limits.rejected_points:
         return a
     T = _elsewhere(a, rejected, config)
-    if T is None and len(rejected) < limits.doubled_share * len(residuals.points):
+    rejects_much = len(rejected) >= limits.doubled_share * len(residuals.points)
+    if T is None and (a.seen is not None or not rejects_much):
         return a
     found = _registered(rejected, a.fit.T[None] if T is None else np.stack([T, a.fit.T]), config, register)
     if found is None:

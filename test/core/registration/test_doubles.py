@@ -114,3 +114,10 @@ def test_a_stream_makes_no_answer_surer_than_its_share(registrar, twice, target)
     rng = np.random.default_rng(6)
     answers = [tracker.register(twice + rng.normal(0.0, 0.1, twice.shape), target) for _ in range(3)]
     assert all(0.5 < result.confidence < 0.8 for result in answers), [result.confidence for result in answers]
+
+
+def test_two_copies_in_a_camera_s_cloud_are_not_believed_either(registrar, seen, twice, target):
+    viewpoint = seen.mean(axis=0) - [0.0, 420.0, 0.0]
+    answers = [registrar.register(points, target, viewpoint=viewpoint) for points in (seen, twice)]
+    assert doubles.NAME not in answers[0].contributions and answers[0].confidence > 0.9
+    assert doubles.NAME in answers[1].contributions and answers[1].confidence < 0.8

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gapr_core.clouds import load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
-from gapr_core.formats.reading import FORMATS
+from gapr_core.formats.reading import ending_of
 from gapr_core.runtime import files
 from gapr_core.surface import Surface
 
@@ -176,17 +176,12 @@ def meshes_hash(folder: str | Path, bones: Sequence[str], split: str = "all") ->
 
 
 def _mesh_files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("*") if _ending(p) in MESHES)
-
-
-def _ending(path: Path) -> str:
-    """The longest known ending of a name, so that `.igs.mha` is no `.mha`; empty where none is known."""
-    return max((end for end in FORMATS if path.name.lower().endswith(end)), key=len, default="")
+    return sorted(p for p in folder.glob("*") if ending_of(p) in MESHES)
 
 
 def _stem(path: Path) -> str:
     """Whose mesh a file holds."""
-    return path.name[: -len(_ending(path))]
+    return path.name[: -len(ending_of(path))]
 
 
 def _draw_splits(people: set[str]) -> dict[str, list[str]]:

@@ -143,7 +143,7 @@ def format_of(path: Path) -> Format | plugins.Plugin:
         return FOLDER
     if not path.is_file():
         raise InvalidPointCloudError("a file that exists", str(path), "check the path")
-    ending = _ending(path)
+    ending = ending_of(path)
     signatures.check_packed(path, ending)
     signatures.check_sequence(path, ending)
     if ending in DETACHED:
@@ -174,7 +174,7 @@ def unreadable(path: Path, why: str) -> InvalidPointCloudError:
     """The error for a file that cannot be read, in one line."""
     if path.is_dir():
         return InvalidPointCloudError("a readable folder", f"{path.name} ({_short(why)})", "name a file in it")
-    ending = _ending(path)
+    ending = ending_of(path)
     if path.is_file() and path.stat().st_size == 0:
         why = "0 bytes, an empty file"
     if signatures.is_utf_16(path):
@@ -190,7 +190,7 @@ def _short(why: str) -> str:
     return reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
 
 
-def _ending(path: Path) -> str:
+def ending_of(path: Path) -> str:
     """The longest known ending of a name, so that `.igs.mha` is no `.mha`."""
     name = path.name.lower()
     return max((end for end in FORMATS if name.endswith(end)), key=len, default=path.suffix.lower())

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig, RulesConfig
 from gapr_core.registration import covariance, kernels, precision, rules
@@ -134,9 +135,12 @@ class Assessment:
             return self
         return replace(self, refusal=refusal, probability=min(self.probability, config.ruled_out))
 
-    def capped(self, most: float) -> Assessment:
-        """The same with a probability of at most `most`."""
-        return replace(self, probability=min(self.probability, most))
+    def capped(self, most: float, by: str = "") -> Assessment:
+        """The same with a probability of at most `most`; what that takes off its log odds stands under `by`."""
+        if not self.probability > most:
+            return self
+        off = {by: float(logit(most) - logit(self.probability))} if by else {}
+        return replace(self, probability=most, contributions={**self.contributions, **off})
 
 
 def assess_fit(

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import InvalidPointCloudError
@@ -73,11 +72,8 @@ def _with_copy(assessment: Assessment, copy: Assessment, share: float) -> Assess
     twist = error_twist(copy.fit.T, a.fit.T, a.source.points)
     covariance = a.uncertainty.covariance + np.outer(twist, twist)
     deformed = {NAME: se3.rms_apart_mm(copy.fit.T, a.fit.T, a.source.points), **a.deformed}
-    a = replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
-    if a.probability <= share:
-        return a
-    contributions = {**a.contributions, NAME: float(logit(share) - logit(a.probability))}
-    return replace(a, probability=share, most=min(a.most, share), contributions=contributions)
+    uncertainty = replace(a.uncertainty, covariance=covariance)
+    return replace(a.capped(share, NAME), uncertainty=uncertainty, deformed=deformed, most=min(a.most, share))
 
 
 def _elsewhere(assessment: Assessment, rejected: Array, config: RegistrarConfig) -> Array | None:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import sampling, se3
@@ -49,8 +48,7 @@ def applied(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     limit = next((each for each in LIMITS if each.holds(a, config)), None)
     if limit is None:
         return a
-    lowered = {**a.contributions, limit.name: float(logit(most) - logit(a.probability))}
-    found = replace(a, probability=most, contributions=lowered)
+    found = a.capped(most, limit.name)
     if a.refusal is not None or most >= config.min_confidence:
         return found
     reason = f"the pose is right with a probability of {most:g} at most, {config.min_confidence:g} is asked for"

@@ -97,7 +97,8 @@ def of_motion(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Mot
     time = ((order - order.min()) / (order.max() - order.min()))[inlier]
     steps = step_times(config.groups)
     group = np.searchsorted(steps, time, side="right")
-    changes = [when[:, None] * motions(fit) for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in steps)]]
+    moved = motions(fit)
+    changes = [when[:, None] * moved for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in steps)]]
     found = findings(blocks(fit, fit.jacobian[inlier], changes, group, config), config)
     any_of_steps = np.log(len(steps))  # each of them is as likely as the others, before the residuals
     ratios = [found[0].log_ratio, *(each.log_ratio - any_of_steps for each in found[1:])]

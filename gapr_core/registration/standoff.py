@@ -8,6 +8,7 @@ fits the surface of a thicker or thinner bone better: where one more than 4 mm o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -58,9 +59,11 @@ def better_mm(assessment: Assessment, config: RegistrarConfig) -> float | None:
 def unless_off_the_bone(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same; refused where the source, or the part of it that is bone, fits much better far outside or inside."""
     a = assessment
-    if _best_of(_misfits_mm2(a, FIRST_MM, config))[1] >= 0.0:
+    first = _misfits_mm2(a, FIRST_MM, config)
+    if _best_of(first)[1] >= 0.0:
         return a
-    best_mm, log_ratio = _best_of(_misfits_mm2(a, (*TRIED_MM, *FIRST_MM, *FAR_MM), config))
+    others = [mm for mm in (*TRIED_MM, *FAR_MM) if mm not in first]
+    best_mm, log_ratio = _best_of(first | _misfits_mm2(a, others, config))
     if best_mm not in FAR_MM or log_ratio >= -MUCH_BETTER:
         return a
     off_mm = a.target.offset_mm + best_mm
@@ -69,7 +72,7 @@ def unless_off_the_bone(assessment: Assessment, config: RegistrarConfig) -> Asse
     return a.with_refusal(Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {how}"), config.rules)
 
 
-def _misfits_mm2(assessment: Assessment, tried_mm: tuple[float, ...], config: RegistrarConfig) -> dict[float, float]:
+def _misfits_mm2(assessment: Assessment, tried_mm: Sequence[float], config: RegistrarConfig) -> dict[float, float]:
     """Mean square residual, mm^2, of the source refined on surfaces so much farther out than now, and on this one."""
     a, settings = assessment, config.verification
     some, limits_mm = a.source.subset(settings.middle_points), np.linspace(*settings.middle_limits_mm)

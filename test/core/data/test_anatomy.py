@@ -84,7 +84,7 @@ def test_damaged_meshes_are_named(tmp_path):
 
 
 def test_label_maps_are_meshes_named_by_all_that_stands_before_their_ending_and_other_files_are_left_alone(tmp_path):
-    nibabel = pytest.importorskip("nibabel")
+    nibabel = pytest.importorskip("nibabel", reason="it writes the label maps to read: pip install nibabel")
     voxels = np.zeros((40, 40, 60), dtype=np.uint8)
     voxels[5:35, 5:35, 5:55] = 1
     for name in ("p.1.nii.gz", "P2.NII.GZ"):

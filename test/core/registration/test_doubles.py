@@ -121,3 +121,10 @@ def test_two_copies_in_a_camera_s_cloud_are_not_believed_either(registrar, seen,
     answers = [registrar.register(points, target, viewpoint=viewpoint) for points in (seen, twice)]
     assert doubles.NAME not in answers[0].contributions and answers[0].confidence > 0.9
     assert doubles.NAME in answers[1].contributions and answers[1].confidence < 0.8
+
+
+def test_an_answer_that_is_less_probable_than_its_share_stays_so_in_a_stream(registrar, twice, target):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    doubtful = replace(alone, probability=0.55)
+    found = doubles._with_copy(doubtful, alone, 0.6)
+    assert (found.probability, found.most) == (0.55, 0.6) and doubles.NAME not in found.contributions

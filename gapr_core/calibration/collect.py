@@ -58,8 +58,10 @@ FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
 UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
 AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # what is refused as bone is recorded as that
 EXACT_MODELS = CovarianceConfig(model_mm=0.0)  # a simulated source lies on its model
-SETTINGS = RegistrarConfig(num_threads=1, clutter=AS_IT_IS, rules=UNCHECKED, covariance=EXACT_MODELS)
-ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`, so that every round is asked
+SETTINGS = RegistrarConfig(
+    num_threads=1, clutter=AS_IT_IS, rules=UNCHECKED, covariance=EXACT_MODELS, searched_below=2.0
+)
+ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`: every round of a scene is asked
 
 
 def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = None) -> list[Record]:
@@ -243,7 +245,7 @@ def _proposers() -> tuple[Proposer, Proposer]:
 
 @cache
 def _registrars(sensor: str) -> dict[str, Registrar]:
-    """The two rounds, as they are when the answer of the first one is not sure, and what users may ask for instead.
+    """The two rounds, as they are when the answer of the first one is doubtful, and what users may ask for instead.
 
     "first round" is that of a scene, of which "search" answers after the last one.
     """

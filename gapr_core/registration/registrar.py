@@ -66,8 +66,9 @@ def never(assessment: Assessment) -> bool:
 class Registrar:
     """Lays partial sources on one or many prepared targets.
 
-    Proposers are asked in turn, each round with the poses of all so far, until an answer is sure: with the shipped
-    weights the network first, and the exhaustive search only if the network's answer is not sure.
+    Proposers are asked in turn, each round with the poses of all so far, until an answer is as sure as
+    `RegistrarConfig.searched_below`: with the shipped weights the network first, and the exhaustive search only if the
+    network's answer is less sure.
 
     Args:
         config: every setting.
@@ -300,7 +301,7 @@ class Registrar:
     def _in_rounds(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough = never
     ) -> Assessment | None:
-        """Ask one proposer after the other, each with the poses of all so far, until an answer is sure or enough."""
+        """Ask one proposer after the other, each with the poses of all so far, until an answer is good enough."""
         config, assessment = self.config, None
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(config.seed)
@@ -317,9 +318,13 @@ class Registrar:
             assessment = assess_fit(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            if assessment.reaches(config.ends_search) or enough(assessment):
+            if assessment.reaches(self._searched_below(assessment)) or enough(assessment):
                 break
         return assessment
+
+    def _searched_below(self, assessment: Assessment) -> float:
+        """From here on no further proposer is asked; `memory.MemoryFirst` wants more of what it remembers."""
+        return max(self.config.searched_below, self.config.min_confidence)
 
     def _in_scene(
         self,
@@ -347,7 +352,7 @@ class Registrar:
             assessment = explained.assess_part(part, candidates, scene, target, self.scene_calibration, config)
             assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
             clock.lap("assess")
-            if assessment.reaches(config.ends_search):
+            if assessment.reaches(config.sure_from):
                 break
         return assessment
 

@@ -245,7 +245,7 @@ class Tracker:
 
         As it does not count either, a refused full registration is followed by another one.
         """
-        self._is_sure = result.ok and result.confidence >= self.registrar.config.ends_search
+        self._is_sure = result.ok and result.confidence >= self.registrar.config.sure_from
         if result.T_target_source is None:
             return
         followed = result.proposer == Memory.name

@@ -88,6 +88,12 @@ def test_the_network_is_asked_once_for_both_rounds(truth):
     assert truth.asked == 1
 
 
+def test_the_search_answers_though_the_first_round_would_be_accepted(truth, pair):
+    registrar = collect._registrars("pointer")["search"]
+    found = registrar.assess(pair.source, registrar.prepare(pair.target))
+    assert found.reaches(0.85) and (found.proposer, found.rounds) == ("search", 2)
+
+
 def test_simulated_models_are_exact_in_the_fit_and_others_are_not(truth):
     registrars = collect._registrars("pointer").values()
     assert {registrar.config.covariance.model_mm for registrar in registrars} == {0.0}

@@ -53,10 +53,21 @@ def test_a_sure_answer_ends_the_rounds(pair):
     assert (right.prepared, right.asked, never.prepared, never.asked) == (1, 1, 1, 0)
 
 
+@pytest.mark.parametrize(("probability", "settings", "rounds"), [
+    (0.85, {}, 1), (0.75, {}, 2), (0.75, {"searched_below": 0.7}, 1), (0.85, {"searched_below": 0.9}, 2),
+    (0.85, {"min_confidence": 0.9}, 2), (0.75, {"sure": 0.7}, 2), (0.85, {"sure": 1.1}, 1),
+])  # fmt: skip
+def test_the_next_proposer_is_asked_below_the_setting_and_below_what_is_accepted(pair, probability, settings, rounds):
+    proposers = [Fixed(name, pair.T_target_source[None]) for name in ("network", "search")]
+    as_probable = [Calibration(each.name, Additive(float(logit(probability)), ()), {}) for each in proposers]
+    registrar = Registrar(replace(ONE_THREAD, **settings), proposers, as_probable)
+    assert registrar.register(pair.source, registrar.prepare(pair.target)).rounds == rounds
+
+
 def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair):
     near = se3.exp([6.0, -5.0, 4.0, 0.05, 0.05, -0.05]) @ pair.T_target_source
     first, second = Fixed("network", near[None]), Fixed("search", np.eye(4)[None])
-    config = RegistrarConfig(num_threads=1, sure=1.1)
+    config = RegistrarConfig(num_threads=1, searched_below=1.1)
     registrar = Registrar(config, [first, second])
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     assert (first.asked, second.asked, result.rounds) == (1, 1, 2)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.data.specimen import Specimen
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
 
 Array = NDArray[np.float64]
 POINTS, ROUNDS = 1200, 30
@@ -27,7 +27,7 @@ def on_own_side(mirrored: Specimen, specimen: Specimen) -> Array:
 
 def _turns(moving: Array, fixed: Array) -> list[Array]:
     """(4, 4) the four rotations that lay the principal axes of one on those of the other."""
-    of_moving, of_fixed = (np.linalg.eigh(np.cov(points.T))[1] for points in (moving, fixed))
+    of_moving, of_fixed = (extent.principal(points).axes.T for points in (moving, fixed))
     turns = [of_fixed @ np.diag(signs) @ of_moving.T for signs in product((1.0, -1.0), repeat=3)]
     rotations = [turn for turn in turns if np.linalg.det(turn) > 0.0]
     shifts = [fixed.mean(axis=0) - turn @ moving.mean(axis=0) for turn in rotations]

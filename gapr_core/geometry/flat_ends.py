@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
+from gapr_core.geometry import extent
+
 Array = NDArray[np.float64]
 
 THIN_MM = 0.05  # a layer as thin as what a smoothed or a binary segmentation leaves of a plane
@@ -58,7 +60,7 @@ def _end_of(points: Array, normals: Array, spacing_mm: float, least_mm2: float) 
         near = height > height.max() - THICK_MM
         if np.count_nonzero(near) < fewest:
             continue
-        normal = np.linalg.eigh(np.cov(points[near].T))[1][:, 0]
+        normal = extent.principal(points[near]).axes[2]
         height = points @ (normal if normal @ outward > 0.0 else -normal)
         depth = np.quantile(height[near], HIGHEST) - height
         thin, thick = (np.count_nonzero(depth < limit) for limit in (THIN_MM, THICK_MM))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig, VerificationConfig
-from gapr_core.geometry import se3
+from gapr_core.geometry import extent, se3
 from gapr_core.registration.refinement import evaluate, refine_many
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
@@ -161,17 +161,12 @@ def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: 
 
 def _reflections(T: Array, points: Array, target: PreparedTarget) -> list[Array]:
     """(4, 4) reflections, target frame: at planes through the bone's long axis and at the source's own main planes."""
-    axes, centre = target.main_axes, target.centre_mm
+    (_, middle, shortest), centre = target.main_axes, target.centre_mm
     angles = np.arange(PLANES) * np.pi / PLANES
-    of_bone = [np.cos(angle) * axes[0] + np.sin(angle) * axes[1] for angle in angles]
+    of_bone = [np.cos(angle) * shortest + np.sin(angle) * middle for angle in angles]
     moved = se3.apply(T, points)
-    own = [(normal, moved.mean(axis=0)) for normal in _axes(moved)]
+    own = [(normal, moved.mean(axis=0)) for normal in extent.principal(moved).axes]
     return [_reflection(normal, at) for normal, at in [*((normal, centre) for normal in of_bone), *own]]
-
-
-def _axes(points: Array) -> Array:
-    """(3, 3) principal axes as rows, the longest last."""
-    return np.asarray(np.linalg.eigh(np.cov(points.T))[1].T)
 
 
 def _reflection(normal: Array, through: Array) -> Array:

@@ -80,8 +80,8 @@ class PreparedTarget:
 
     @cached_property
     def main_axes(self) -> Array:
-        """(3, 3) principal axes as rows, the longest last."""
-        return np.asarray(np.linalg.eigh(np.cov(self.points.T))[1].T)
+        """(3, 3) principal axes as rows, the longest first."""
+        return extent.principal(self.points).axes
 
     @cached_property
     def centre_mm(self) -> Array:

@@ -63,7 +63,8 @@ class Residuals:
     Attributes:
         points: (N, 3) the source points that were used, source frame, mm.
         distance_mm: (N,) signed distance to the surface, positive outside; NaN where no surface is near. The stand-off
-            of the sensor is taken off: a pointer's points are near 0 where they lie a stand-off outside of the bone.
+            of the sensor is taken off: a pointer's points are near 0 where they lie a stand-off outside of the bone. So
+            is what noise adds on a curved surface, but for a camera's cloud.
         inlier: (N,) bool, the points that count for the pose.
     """
 
@@ -146,8 +147,8 @@ class RegistrationResult:
         stage_ms: wall time of each stage, ms.
         method: name of the method that answered.
         reason: one sentence for users: why it was refused; empty when there is nothing to say.
-        centre_mm: (3,) mean of the source points that were used, in the target frame; None unless `OK`, and where a
-            method does not say.
+        centre_mm: (3,) mean of the source points that the pose was found with, drawn from those that were used where
+            there are many, in the target frame; None unless `OK`, and where a method does not say.
         proposer: name of the last proposer that was asked; empty where nothing was registered.
         rounds: rounds of proposals: of how many proposers, of a camera's cloud of how many sets of regions.
         features: what the confidence is computed from, by name.

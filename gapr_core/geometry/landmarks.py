@@ -49,7 +49,11 @@ def paired_pose(source: ArrayLike, target: ArrayLike) -> LandmarkPose:
 
 
 def _checked(points: ArrayLike, name: str) -> Array:
-    points = np.asarray(points, dtype=np.float64)
+    try:
+        points = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        how = "pass one row of x, y, z for each"
+        raise InvalidPointCloudError(f"{name} landmarks (K, 3), mm", str(error), how) from error
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST_PAIRS or not np.isfinite(points).all():
         expected = f"at least {FEWEST_PAIRS} finite {name} landmarks (K, 3), mm"
         raise InvalidPointCloudError(expected, f"an array of shape {points.shape}", "add or correct them")

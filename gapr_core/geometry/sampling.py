@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+ROUNDING = 1e-9  # of distances and coordinates, mm: in another frame, or order, the same ones differ by less
 
 
 def voxel_indices(points: Array, voxel_mm: float) -> NDArray[np.int64]:
@@ -95,7 +96,10 @@ def _voxels(points, low, high, voxel):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
-    """Of the points in each voxel, the index of the one nearest to their mean; the first of equally near ones."""
+    """Of the points in each voxel, the index of the one nearest to their mean.
+
+    Of equally near ones, as two in a voxel are but for rounding, the one that comes first by x, y, z.
+    """
     voxel_of = _voxels(points, low, high, voxel)
     found = voxel_of.max() + 1
     means, counts = np.zeros((found, 3)), np.zeros(found)
@@ -103,16 +107,29 @@ def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
         counts[voxel_of[p]] += 1.0
         for axis in range(3):
             means[voxel_of[p], axis] += points[p, axis]
-    nearest, least = np.empty(found, dtype=np.int64), np.full(found, np.inf)
+    distances, least = np.empty(len(points)), np.full(found, np.inf)
     for p in range(len(points)):
         c = voxel_of[p]
         x = points[p, 0] - means[c, 0] / counts[c]
         y = points[p, 1] - means[c, 1] / counts[c]
         z = points[p, 2] - means[c, 2] / counts[c]
-        distance = np.sqrt(x * x + y * y + z * z)  # two points are equally near but for rounding: it decides as NumPy's
-        if distance < least[c]:
-            nearest[c], least[c] = p, distance
+        distances[p] = np.sqrt(x * x + y * y + z * z)
+        least[c] = min(least[c], distances[p])
+    nearest = np.full(found, -1)
+    for p in range(len(points)):
+        c = voxel_of[p]
+        if distances[p] <= least[c] + ROUNDING and (nearest[c] < 0 or _comes_before(points, p, nearest[c])):
+            nearest[c] = p
     return nearest
+
+
+@numba.njit(cache=True, nogil=True)
+def _comes_before(points, p, q):  # type: ignore[no-untyped-def]
+    """True where point p comes before point q by x, y, z."""
+    for axis in range(3):
+        if abs(points[p, axis] - points[q, axis]) > ROUNDING:
+            return points[p, axis] < points[q, axis]
+    return False
 
 
 @numba.njit(cache=True, nogil=True)

@@ -64,19 +64,19 @@ def _pixels(direction, points, pixel_mm):  # type: ignore[no-untyped-def]
     a, b, c = a / size, b / size, c / size
     d, e, f = y * c - z * b, z * a - x * c, x * b - y * a
     count = len(points)
-    height, row, column = np.empty(count), np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    height, across, along = np.empty(count), np.empty(count), np.empty(count)
+    row, column = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     for p in range(count):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]
         height[p] = px * x + py * y + pz * z
-        row[p] = np.int64(np.floor((px * a + py * b + pz * c) / pixel_mm))
-        column[p] = np.int64(np.floor((px * d + py * e + pz * f) / pixel_mm))
-    first_row, last_row, first_column, last_column = row[0], row[0], column[0], column[0]
+        across[p], along[p] = px * a + py * b + pz * c, px * d + py * e + pz * f
+    lowest_across, lowest_along = across.min(), along.min()  # the pixels move with the points
     for p in range(count):
-        first_row, last_row = min(first_row, row[p]), max(last_row, row[p])
-        first_column, last_column = min(first_column, column[p]), max(last_column, column[p])
-    rows, columns = last_row - first_row + 3, last_column - first_column + 3
+        row[p] = np.int64(np.floor((across[p] - lowest_across) / pixel_mm))
+        column[p] = np.int64(np.floor((along[p] - lowest_along) / pixel_mm))
+    rows, columns = row.max() + 3, column.max() + 3
     for p in range(count):
-        row[p] = (row[p] - first_row + 1) * columns + column[p] - first_column + 1
+        row[p] = (row[p] + 1) * columns + column[p] + 1
     return height, row, rows, columns
 
 

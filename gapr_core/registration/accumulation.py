@@ -13,8 +13,7 @@ from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling
 from gapr_core.registration import rigidity
-from gapr_core.registration.kernels import residuals_at
-from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import fingerprint
 from gapr_core.registration.sensor import offset_surface
@@ -246,8 +245,7 @@ def _of_many_places(method: Registrar | Tracker) -> Registrar | Tracker:
 
 def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:
     """Median distance of (N, 3) points to the surface; what lies beyond its end is off it."""
-    signed, _, aside, _ = residuals_at(T, points, *target.kernel_view, 0.0)
-    return float(np.median(np.hypot(np.nan_to_num(signed, nan=np.inf), aside)))
+    return float(np.median(distances_mm(T, points, target)))
 
 
 def _together(sources: list[Array]) -> Array:

@@ -28,7 +28,6 @@ BIASES_MM = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6,
 DETERMINED = 1e-5  # information of a field over the largest, below which its score is rounding
 UNKNOWNS = 6  # of a pose: as few points say nothing of their errors
 POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
-ROUNDED = 6  # digits after the point, mm, by which centres are chosen: where two are as good, rounding must not choose
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
 
 
@@ -47,7 +46,7 @@ def _spanned(points: Array, inlier: NDArray[np.bool_], correlation_mm: float, ce
     inliers = points[inlier]
     if not len(inliers):
         return np.zeros((len(points), 1))
-    chosen = inliers[sampling.thin(inliers.round(ROUNDED), min(centres, len(inliers)))]
+    chosen = inliers[sampling.thin(inliers, min(centres, len(inliers)))]
     among = smooth_correlation(chosen, chosen, correlation_mm)
     to_points = smooth_correlation(points, chosen, correlation_mm)
     root = np.linalg.cholesky(among + PIVOT * np.eye(len(chosen)))

@@ -81,7 +81,7 @@ def check_points(
     best = _next(alone, target, centre, float(np.diag(R).mean()) if near.any() else 1.0)
     return PointCheck(
         _verdict(probability, unseen_mm, within_mm), probability, points, distance_mm, expected_mm, unseen_mm,
-        precision.bound_mm(together, target.points, centre), target.points[best], target.normals[best],
+        precision.bound_mm(together, target.points, centre), target.points[best].copy(), target.normals[best].copy(),
     )  # fmt: skip
 
 

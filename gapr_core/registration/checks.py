@@ -55,7 +55,7 @@ def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: b
     found = mirror.image_margin(a.fit.T, a.source, a.target, config)
     by_chance = len(a.source.points) <= config.rules.mirrored_points or not believed
     if not _is_known_scene(a) and by_chance and rules.by_mirror(found, config.rules) is None:
-        found = min(found, full_image_margin(a, config, register))
+        found = full_image_margin(a, config, register)
     return a.with_refusal(rules.by_mirror(found, config.rules), config.rules)
 
 

@@ -88,6 +88,6 @@ class Calibration:
     def contributions(self, features: Mapping[str, float]) -> dict[str, float]:
         """Log odds that each feature adds to those of the usual answer: above 0 it speaks for the pose.
 
-        Their sum and `model.constant` are the log odds of `probability`.
+        Their sum and `model.constant` are the log odds of `probability`, which goes no farther than `LARGEST_LOG_ODDS`.
         """
         return self.model.contributions(features)

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import sampling, se3
-from gapr_core.registration import kernels, precision
+from gapr_core.registration import precision
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import POSE_PRIOR
-from gapr_core.registration.refinement import Fit, refine_fully, refine_many, tukey_limit
+from gapr_core.registration.refinement import Fit, distances_mm, refine_fully, refine_many, tukey_limit
 
 Array = NDArray[np.float64]
 
@@ -133,8 +133,7 @@ class Follower:
     def _described(self, fit: Fit, moved_mm: float, points: Array) -> PartialFit:
         """What the limits are set for, by the weights that the assessed source had."""
         a = self._assessment
-        signed_mm, _, aside_mm, _ = kernels.residuals_at(fit.T, points, *a.target.kernel_view, 0.0)
-        distance_mm = np.hypot(np.nan_to_num(signed_mm, nan=np.inf), aside_mm)
+        distance_mm = distances_mm(fit.T, points, a.target)
         on_bone = distance_mm[distance_mm < self._limit_mm]
         residual_mm = float(np.sqrt((on_bone**2).mean())) if len(on_bone) else np.inf
         return PartialFit(fit.T, moved_mm, len(on_bone) / len(points), residual_mm, self._spread_mm(fit))

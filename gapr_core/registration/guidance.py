@@ -19,6 +19,7 @@ from gapr_core.config import GuidanceConfig
 from gapr_core.geometry import sampling, se3
 from gapr_core.registration import precision
 from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.refinement import distances_mm
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Guidance, Hypothesis, Patch
 
@@ -60,11 +61,9 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
     now_mm = float(np.sqrt(assessment.tre95_mm**2 + now_mm2))
     after_mm = np.sqrt(bounds**2 + left_mm2)
     order = np.argsort(after_mm, kind="stable")
-    ranked = tuple(
-        Patch(target.points[i], target.normals[i], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k]))
-        for k, i in zip(order, patches.centres[order], strict=True)
-    )
-    return Guidance(target.points, _spread(target, patches, now_mm - after_mm), now_mm, ranked)
+    places = np.stack([target.points[patches.centres], target.normals[patches.centres]], axis=1)
+    ranked = tuple(Patch(*places[k], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k])) for k in order)
+    return Guidance(target.points.copy(), _spread(target, patches, now_mm - after_mm), now_mm, ranked)
 
 
 def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array:
@@ -106,14 +105,14 @@ def _unseen(patches: Patches, assessment: Assessment, config: GuidanceConfig) ->
 def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: float, bias_mm: float) -> Array:
     """(K,) 95 % bound of the error over the bone after a look of so many points at each patch."""
     target, centre = assessment.target, assessment.centre_mm
-    known = np.linalg.inv(assessment.uncertainty.covariance)
+    known, anchors = np.linalg.inv(assessment.uncertainty.covariance), target.points[target.anchors]
+    over_all = assessment.tre95_mm / assessment.bound_mm(anchors)  # a few points stand for the bone
     bounds = []
     for members in patches.members:
         normals = target.normals[members]
         J = np.hstack([normals, np.cross(target.points[members] - centre, normals)])
         covariance = np.asarray(np.linalg.inv(known + information(J, points, noise_mm, bias_mm)), np.float64)
-        bound_mm = precision.bound_mm(covariance, target.points[target.anchors], centre)
-        bounds.append(assessment.factor95 * bound_mm)
+        bounds.append(over_all * assessment.factor95 * precision.bound_mm(covariance, anchors, centre))
     return np.array(bounds)
 
 
@@ -143,11 +142,12 @@ def _excluded(
     """(R,) share of each rival's probability that a look at the patch would take.
 
     Under a rival the patch of the best pose lies d off the surface; its likelihood falls by exp(-d^2 / 2 (s^2 + b^2)).
+    What slides along the surface tells nothing, however far it goes.
     """
     target, best = assessment.target, assessment.hypotheses[0]
     variance = noise_mm**2 + bias_mm**2
     points = se3.apply(se3.inverse(best.T_target_source), target.points[members])
-    off = [target.tree.query(se3.apply(rival.T_target_source, points))[0] for rival in rivals]
+    off = [distances_mm(rival.T_target_source, points, target) for rival in rivals]
     return np.array([1.0 - np.exp(-0.5 * (d**2).mean() / variance) for d in off])
 
 

@@ -143,6 +143,12 @@ def trust_of_whole(fit: Fit, source: PreparedSource, config: RefinementConfig) -
     return np.asarray(fit_kernels.shared_out(trust, source.patches, len(source.whole)))
 
 
+def distances_mm(T: Array, points: Array, target: PreparedTarget) -> Array:
+    """(N,) distances of points (N, 3) to the surface under a pose; infinite where none is near, or beyond its end."""
+    signed, _, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
+    return np.hypot(np.nan_to_num(signed, nan=np.inf), aside)
+
+
 def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
     """Residuals, scale and weights of a pose as it is; no patch is distrusted."""
     signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)

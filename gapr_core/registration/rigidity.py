@@ -22,7 +22,7 @@ from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.geometry import extent, sampling
 from gapr_core.geometry.twists import covariance_about
 from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.bias_field import ROUNDED, smooth_correlation
+from gapr_core.registration.bias_field import smooth_correlation
 from gapr_core.registration.covariance import covariance_added_by, strains
 from gapr_core.registration.refinement import Fit
 
@@ -225,7 +225,7 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], c
     """
     inlier = fit.weights > 0.0
     feet, weights = fit.feet[inlier], fit.weights[inlier]
-    centres = feet[sampling.thin(feet.round(ROUNDED), min(config.cells, len(feet)))]
+    centres = feet[sampling.thin(feet, min(config.cells, len(feet)))]
     cell = cKDTree(centres).query(feet)[1]
     block = np.unique(group * len(centres) + cell, return_inverse=True)[1].reshape(-1)
     most = max(each.shape[1] for each in more)

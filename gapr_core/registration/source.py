@@ -106,10 +106,9 @@ def prepare(
         InvalidPointCloudError: for a wrong shape or type, or an extent that cannot be a piece of a bone in mm.
     """
     config = config or SourceConfig()
-    points = clouds.finite_points(source)
+    points = sampling.distinct(clouds.finite_points(source))
     if len(points) > config.most_raw_points:
-        points = points[np.random.default_rng(0).choice(len(points), config.most_raw_points, replace=False)]
-    points = sampling.distinct(points)
+        points = points[_drawn(points, config.most_raw_points)]
     if len(points):
         points = sampling.without_crowds(points, CONTACT_MM, *CROWD)
     if len(points) > config.fitted_points and not in_scene:
@@ -132,11 +131,10 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
     whole = points if is_clean else without_isolated(points, config)
     if len(whole) > config.most_points:
         whole = whole[sampling.thin(whole, config.most_points)]
-    count = min(config.fitted_points, len(whole))
-    some = whole[np.sort(np.random.default_rng(0).choice(len(whole), count, replace=False))]
+    some = whole[_drawn(whole, config.fitted_points)]
     k = _neighbour_count(len(whole), config)
     gaps, near = quadrics.nearest(some, max(k, config.companions + 1), cKDTree(whole), num_threads)
-    if len(whole) >= config.dense_points:
+    if len(whole) >= max(config.dense_points, config.companions + 1):
         stays = _has_companions(gaps[:, config.companions], config)
         some, gaps, near = some[stays], gaps[stays], near[stays]
     refusal = _too_little(some, config)
@@ -144,6 +142,16 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
         return refusal
     around = quadrics.nearest(some, _around_count(len(some), config), num_threads=num_threads)[1]
     return _described(some, around, gaps[:, :k], whole, np.ascontiguousarray(near[:, :k]))
+
+
+def _drawn(points: Array, most: int) -> NDArray[np.int64]:
+    """Ascending indices of at most `most` of the points (N, 3), drawn at random: the same points in every frame.
+
+    The draw is among their distances to the centroid, which no frame changes, and not in the order of coordinates.
+    """
+    by_distance = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
+    chosen = np.random.default_rng(0).choice(len(points), min(most, len(points)), replace=False)
+    return np.asarray(np.sort(by_distance[chosen]))
 
 
 def _too_little(points: Array, config: SourceConfig) -> Refusal | None:

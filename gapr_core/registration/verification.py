@@ -22,8 +22,8 @@ class Candidates:
 
     Attributes:
         poses: (K, 4, 4) T_target_source, mm.
-        scores: (K,) small is good: mean squared distance of all source points, truncated, mm^2; of a camera's cloud
-            1 / the score of lines of sight (`clutter.small_is_good`).
+        scores: (K,) small is good: mean squared distance of the drawn source points, truncated, mm^2; of a camera's
+            cloud 1 / the score of lines of sight (`clutter.small_is_good`).
         support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
     """
 
@@ -35,7 +35,7 @@ class Candidates:
 def verify(
     poses: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
 ) -> Candidates:
-    """Refine all on a few points, the distinct best on more, the best of those on all points.
+    """Refine all on a few points, the distinct best on more, the best of those on all that were drawn.
 
     Args:
         poses: (K, 4, 4) hypotheses T_target_source, mm, K >= 1.

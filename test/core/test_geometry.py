@@ -29,15 +29,26 @@ def central_points(points, voxel_mm):
     cells = np.floor((points - points.min(axis=0)) / voxel_mm).astype(np.int64)
     _, voxel, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(voxel, weights=axis) for axis in points.T], axis=1) / counts[:, None]
-    order = np.lexsort((np.linalg.norm(points - means[voxel], axis=1), voxel))
+    distance = np.linalg.norm(points - means[voxel], axis=1).round(9)  # ties are those but for rounding
+    order = np.lexsort((*points.T[::-1], distance, voxel))
     return np.sort(order[np.concatenate([[0], np.cumsum(counts)[:-1]])])
 
 
 @pytest.mark.parametrize("voxel_mm", [0.01, 0.8, 5.0, 1000.0])
-def test_every_voxel_keeps_the_point_nearest_to_the_mean_even_where_rounding_decides(voxel_mm):
+def test_every_voxel_keeps_the_point_nearest_to_the_mean_and_of_two_the_first_by_x_y_z(voxel_mm):
     rng = np.random.default_rng(0)  # most voxels of 0.8 mm with two points have two that are equally near
     points = np.vstack([rng.uniform(-5, 5, (1000, 3)), rng.normal(size=(300, 3)) * [1, 1, 300], np.zeros((3, 3))])
     np.testing.assert_array_equal(sampling.voxel_indices(points, voxel_mm), central_points(points, voxel_mm))
+
+
+def test_the_same_points_are_thinned_to_the_same_wherever_they_lie_and_in_any_order():
+    points = np.random.default_rng(0).uniform(-5, 5, (3000, 3))
+    kept = points[sampling.thin(points, 900)]
+    for shift in ([0.37, 0.81, -0.4], [1234.5, -777.7, 3000.1]):
+        moved = points + shift
+        np.testing.assert_allclose(moved[sampling.thin(moved, 900)] - shift, kept, atol=1e-9)
+    mixed = np.random.default_rng(1).permutation(points)
+    np.testing.assert_array_equal(sampling.distinct(mixed[sampling.thin(mixed, 900)]), sampling.distinct(kept))
 
 
 def test_no_voxel_keeps_more_than_so_many_points_or_times_the_typical_ones():
@@ -152,7 +163,8 @@ def in_a_view(direction, points, pixel_mm):
     """Heights (N,), and for each point the indices of those in the 3 x 3 pixels around it."""
     side = np.cross(direction, [1.0, 0.0, 0.0] if abs(direction[0]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
-    pixel = np.floor(points @ np.stack([side, np.cross(direction, side)], axis=1) / pixel_mm)
+    flat = points @ np.stack([side, np.cross(direction, side)], axis=1)
+    pixel = np.floor((flat - flat.min(axis=0)) / pixel_mm)
     return points @ direction, [np.flatnonzero((np.abs(pixel - own) <= 1).all(axis=1)) for own in pixel]
 
 
@@ -174,7 +186,8 @@ def test_a_point_is_free_when_no_highest_point_of_a_pixel_near_it_is_above_its_p
     height, around = in_a_view(direction, points, 2.0)
     side = np.cross(direction, [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
-    pixel = np.floor(points @ np.stack([side, np.cross(direction, side)], axis=1) / 2.0)
+    flat = points @ np.stack([side, np.cross(direction, side)], axis=1)
+    pixel = np.floor((flat - flat.min(axis=0)) / 2.0)
     highest = {tuple(own): p for own, p in zip(pixel[np.argsort(height)], np.argsort(height), strict=True)}
     expected = np.abs(normals @ direction) > 0.1
     for p, near in enumerate(around):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import logit
 
 from gapr_core import Registrar, Tracker
@@ -62,6 +63,24 @@ def test_only_this_limit_keeps_two_copies_from_being_sure(registrar, seen, twice
     assert se3.pose_error(found.fit.T, np.eye(4), seen).is_right, "the copy of most points"
 
 
+@pytest.mark.parametrize(("on_bone", "is_copy"), [(0.59, False), (0.61, True)])
+def test_of_the_rejected_points_most_lie_on_the_bone_in_a_copy_and_only_these_are_its_own(
+    registrar, twice, target, on_bone, is_copy
+):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    rejected = (~alone.residuals.inlier).sum()
+
+    def register(source, poses):
+        weights = (np.arange(len(source.points)) < on_bone * len(source.points)).astype(float)
+        on_some = replace(alone.fit, T=poses[0], weights=weights, whole=None)
+        return replace(alone, fit=on_some, source=source, probability=0.9)
+
+    found = doubles.allowing_for_a_copy(alone, registrar.config, register)
+    own = len(twice) - rejected
+    assert found.most == (pytest.approx(own / (own + on_bone * rejected), abs=1e-3) if is_copy else 1.0)
+    assert (doubles.NAME in found.deformed) is is_copy
+
+
 def test_outliers_tissue_and_few_rejected_points_are_no_copy(registrar, seen, target):
     rng = np.random.default_rng(5)
     some = rng.random(len(seen)) < 0.25
@@ -107,6 +126,10 @@ def test_where_much_is_rejected_a_copy_may_lie_anywhere(registrar, seen, target)
     assert found.tre95_mm > se3.rms_apart_mm(far, np.eye(4), target.points) / 2.0
     alone, _ = assessed(registrar, points, target, doubled_share=0.5)
     assert doubles.NAME not in alone.deformed and alone.probability > 0.9, "nothing else knows it"
+    asked = []
+    for a in (alone, replace(alone, seen=alone.source)):
+        assert doubles.allowing_for_a_copy(a, registrar.config, lambda *_: asked.append(1)) is a
+    assert len(asked) == 1, "and not in a camera's cloud, whose rejected points are tissue"
 
 
 def test_a_stream_makes_no_answer_surer_than_its_share(registrar, twice, target):
@@ -121,6 +144,23 @@ def test_two_copies_in_a_camera_s_cloud_are_not_believed_either(registrar, seen,
     answers = [registrar.register(points, target, viewpoint=viewpoint) for points in (seen, twice)]
     assert doubles.NAME not in answers[0].contributions and answers[0].confidence > 0.9
     assert doubles.NAME in answers[1].contributions and answers[1].confidence < 0.8
+
+
+def test_the_way_to_a_copy_of_the_source_is_added_to_the_covariance_in_full(registrar, seen, twice, target):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    way = se3.exp(STEP, seen.mean(axis=0))
+    rejected = replace(alone.source, points=alone.source.points[:50] + 30.0)
+    copy = replace(alone, fit=replace(alone.fit, T=way @ alone.fit.T), source=rejected)
+    added = doubles._with_copy(alone, copy, 0.6).uncertainty.covariance - alone.uncertainty.covariance
+    middle = alone.centre_mm
+    twist = np.r_[se3.apply(way, middle[None])[0] - middle, Rotation.from_matrix(way[:3, :3]).as_rotvec()]
+    np.testing.assert_allclose(added, np.outer(twist, twist), atol=1e-9)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.0, 0.6), (0.5, 0.5)])
+def test_a_copy_makes_no_answer_surer_than_it_may_be(registrar, twice, target, before, after):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    assert doubles._with_copy(replace(alone, most=before), alone, 0.6).most == after
 
 
 def test_an_answer_that_is_less_probable_than_its_share_stays_so_in_a_stream(registrar, twice, target):

@@ -1,6 +1,7 @@
 """Where to look next: the information of a look, what it excludes, and what it is worth."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import GuidanceConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import guidance, precision
+from gapr_core.registration import target as targets
 from gapr_core.registration.guidance import guide, information
 from gapr_core.registration.sensor import offset_surface
+from gapr_core.results import Hypothesis
 
 CONFIG = GuidanceConfig(patches=120)
 
@@ -75,7 +78,8 @@ def test_the_expected_bound_is_that_of_the_updated_covariance(distal):
     after = np.linalg.inv(distal.uncertainty.covariance)
     after = np.linalg.inv(after + information(J, CONFIG.points, noise_mm, bias_mm))
     bound_mm = precision.bound_mm(after, target.points[target.anchors], centre)
-    assert patch.tre95_mm == pytest.approx(distal.factor95 * bound_mm)
+    over_all = distal.tre95_mm / distal.bound_mm(target.points[target.anchors])
+    assert patch.tre95_mm == pytest.approx(over_all * distal.factor95 * bound_mm)
 
 
 def test_a_rival_sends_the_probe_to_where_it_differs(distal):
@@ -87,7 +91,37 @@ def test_a_rival_sends_the_probe_to_where_it_differs(distal):
     found = guide(rival, CONFIG)
     assert found.now_mm > 2.0 * distal.tre95_mm
     assert found.patches[0].rivals_excluded > 0.95
-    assert min(patch.rivals_excluded for patch in found.patches) < 0.9
+    assert min(patch.rivals_excluded for patch in found.patches) < 0.7
+
+
+def test_a_rival_that_slides_a_patch_along_the_bone_is_not_excluded_there():
+    """However far it goes: what lies on the surface under both poses says nothing of either."""
+    around = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+    angle, height = map(np.ravel, np.meshgrid(around, np.arange(-60.0, 60.1, 2.0)))
+    radial = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    tube = targets.prepare(20.0 * radial + np.outer(height, [0.0, 0.0, 1.0]))
+    poses = [np.eye(4), se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 7.0])]
+    poses += [se3.from_rotation_translation(np.eye(3), [0.0, 3.0, 0.0])]
+    hypotheses = tuple(Hypothesis(pose, 0.3) for pose in poses)
+    assessment = SimpleNamespace(target=tube, hypotheses=hypotheses)
+    members = np.flatnonzero(np.linalg.norm(tube.points - [0.0, 20.0, 0.0], axis=1) < 15.0)
+    slid, lifted = guidance._excluded(assessment, hypotheses[1:], members, 0.8, 0.7)
+    assert slid < 0.05 and lifted > 0.9
+
+
+def test_a_look_that_says_nothing_gains_nothing(distal):
+    """What is known now is the bound over the same points as what would be known then."""
+    found = guide(distal, replace(CONFIG, noise_mm=100.0, points=1))
+    gains = np.array([patch.gain_mm for patch in found.patches])
+    assert np.all(gains >= 0.0) and gains.max() < 1e-3 * found.now_mm
+
+
+def test_what_is_handed_out_is_nobody_else_s(distal):
+    points = distal.target.points.copy()
+    found = guide(distal, CONFIG)
+    found.points[:] /= 1000.0
+    found.patches[0].centre[:] = found.patches[0].normal[:] = 0.0
+    np.testing.assert_array_equal(distal.target.points, points)
 
 
 def rivalled(distal, turn_rad, probability=0.4):

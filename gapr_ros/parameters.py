@@ -67,6 +67,9 @@ class NodeParameters(Settings):
         0.1, "longest wait for a transform: of output_frame, crop_frame, viewpoint, initialpose",
         unit="s", low=0.0, high=60.0,
     )  # fmt: skip
+    max_tf_gap: float = setting(
+        0.25, "where a frame was not heard for longer than this, nothing is interpolated; 0: off", unit="s", low=0.0
+    )
     cloud_type: str = setting("PointCloud2", "message type of the clouds", choices=tuple(INPUTS), live=False)
     cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "cm", "mm"))
     cloud_reliability: str = setting("auto", "auto: reliable, and best effort once a publisher offers only that",
@@ -175,16 +178,21 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
     if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
         sentences.append(f"assess_every is not used: {why}")
-    if 0.0 < parameters.range_max <= parameters.range_min:
-        limits = f"range_min {parameters.range_min} is not below range_max {parameters.range_max}"
-        sentences.append(f"{limits}: every cloud is refused until it is")
     if 0 < parameters.max_points < parameters.min_points:
         limits = f"max_points {parameters.max_points} is below min_points {parameters.min_points}"
         sentences.append(f"{limits}: points are counted before a cloud is thinned, so fewer than min_points may decide")
-    low, high = parameters.crop_min, parameters.crop_max
-    if low != high and any(least >= most for least, most in zip(low, high, strict=True)):
-        sentences.append(f"crop_min {low} is not below crop_max {high}: every cloud is refused until it is")
     return sentences
+
+
+def empty_limits(parameters: NodeParameters) -> list[str]:
+    """One sentence for each pair of limits that no point can lie between."""
+    least, most, pairs = parameters.range_min, parameters.range_max, []
+    if 0.0 < most <= least:
+        pairs.append(f"range_min {least} is not below range_max {most}")
+    low, high = parameters.crop_min, parameters.crop_max
+    if low != high and any(start >= end for start, end in zip(low, high, strict=True)):
+        pairs.append(f"crop_min {low} is not below crop_max {high}")
+    return [f"{pair}: every cloud is refused until it is" for pair in pairs]
 
 
 def why_all_assessed(parameters: NodeParameters) -> str:
@@ -323,6 +331,8 @@ def _is_triple(value: Any) -> bool:
 def _example(default: Any, value: Any) -> str:
     if isinstance(default, float) and type(value) is int:
         return f"{value}.0"
+    if type(default) is int and type(value) is float and value.is_integer():
+        return str(int(value))  # 1e5 is a double
     if isinstance(default, float) and not default:
         return "1.0"  # 0.0 switches a limit off
     if isinstance(default, str):

@@ -50,14 +50,18 @@ def _started(args: list[str] | None) -> int:
 
     from gapr_ros.node.guard import describe
     from gapr_ros.node.lifecycle import RegisterNode
+    from gapr_ros.node.parameter_files import without_entry
     from gapr_ros.parameters import ParameterError
 
+    given = sys.argv if args is None else ["register_node", *args]
     try:
-        unused = remove_ros_args(sys.argv if args is None else ["register_node", *args])[1:]
+        unused = remove_ros_args(given)[1:]
         if unused:
             return _fail(f"{' '.join(unused)} is not used: write --ros-args before -p, -r and --params-file")
         rclpy.init(args=args)
         node = RegisterNode()
+        for sentence in without_entry(given, node.get_fully_qualified_name()):
+            node.get_logger().warning(sentence)
         executor = SingleThreadedExecutor()
     except Exception as error:
         rclpy.try_shutdown()

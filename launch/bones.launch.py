@@ -7,6 +7,7 @@ The file names a node a bone, `/femur/register_node`, `/tibia/register_node`, ..
 """
 # ruff: noqa: I001  (this folder is not the package launch)
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,7 @@ def nodes(context: LaunchContext) -> list[Node]:
     """One node a bone."""
     check_launch_names(context, FILE, ARGUMENTS, NOT_NEAR, get_logger(FILE.name).warning)
     chosen = context.launch_configurations
+    path = os.path.expanduser(chosen["params_file"])
     return [
         Node(
             package="gapr_ros",
@@ -90,10 +92,10 @@ def nodes(context: LaunchContext) -> list[Node]:
             output="screen",
             emulate_tty=True,
             sigterm_timeout=PATIENCE_S,
-            parameters=[chosen["params_file"]],
+            parameters=[path],
             remappings=[("points", chosen["points"])],
         )
-        for namespace in bones(chosen["params_file"])
+        for namespace in bones(path)
     ]
 
 

@@ -4,7 +4,10 @@ ros2 launch gapr_ros register.launch.py model_path:=/path/to/bone.stl points:=/c
 """
 # ruff: noqa: I001  (this folder is not the package launch)
 
+import json
+import os
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import yaml
@@ -28,6 +31,8 @@ ARGUMENTS = {
     "params_file": ("", "parameter file; what is given here as an argument, and not empty, wins"),
     "rviz": ("false", "show clouds and bone"),
 }
+# in every namespace, and in no other file: rcl joins entries of one name where the first one is, and the last one wins
+ENTRY = "/**/register_node/**"
 NOT_NEAR = "--show-args lists those that there are"
 
 
@@ -51,9 +56,23 @@ def _value(name: str, text: str) -> Any:
         value = yaml.safe_load(text)
         if isinstance(default, tuple):
             return [float(number) for number in value]
-        return float(value) if isinstance(default, float) else value
+        is_whole = isinstance(value, bool | int) and not isinstance(default, float)
+        return value if is_whole else float(value)  # YAML 1.1 reads 1e5 as text
     except (TypeError, ValueError, yaml.YAMLError):
         return text  # the node says what it wants instead
+
+
+def _files(path: str, parameters: dict[str, Any]) -> list[str]:
+    """The parameter file, and one with what the arguments say, which wins.
+
+    The latter is written here, as JSON: every text is in quotes. launch leaves those out that YAML needs none for,
+    and rcl takes 1e3, y or nan for a number or a boolean.
+    """
+    if not parameters:
+        return [path]
+    with NamedTemporaryFile("w", prefix="launch_params_", suffix=".yaml", delete=False, encoding="utf-8") as file:
+        json.dump({ENTRY: {"ros__parameters": parameters}}, file, ensure_ascii=False)
+    return [path, file.name]
 
 
 def _shown(chosen: dict[str, str]) -> dict[str, str]:
@@ -67,7 +86,8 @@ def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
     check_launch_names(context, FILE, (*ARGUMENTS, *FIELDS), NOT_NEAR, get_logger(FILE.name).warning)
     parameters = given(context)
     chosen = context.launch_configurations
-    if not Path(chosen["params_file"]).is_file():  # launch only warns, and the node would run with other limits
+    path = os.path.expanduser(chosen["params_file"])
+    if not Path(path).is_file():  # launch only warns, and the node would run with other limits
         raise ValueError(f"params_file: expected a parameter file, got {chosen['params_file']!r}")
     register = Node(
         package="gapr_ros",
@@ -77,7 +97,7 @@ def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
         output="screen",
         emulate_tty=True,
         sigterm_timeout=PATIENCE_S,
-        parameters=[chosen["params_file"], parameters],
+        parameters=_files(path, parameters),
         remappings=[("points", chosen["points"]), ("initialpose", chosen["initialpose"])],
     )
     rviz = Node(

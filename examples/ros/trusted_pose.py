@@ -4,7 +4,8 @@ python examples/ros/trusted_pose.py --ros-args -p min_confidence:=0.9 -p max_tre
 
 It hears ~/status, which comes with every cloud and carries the cloud's stamp, and takes the pose that ~/transform has
 for exactly that stamp. Neither the latest transform nor tf2's transform of the bone is used: they may be those of
-another cloud. For a pose in another frame (`frame`) tf2 gives where the cloud's frame was at that stamp.
+another cloud. For a pose in another frame (`frame`) tf2 gives where the cloud's frame was at that stamp, unless that
+was not heard for a while: tf2 draws a straight line over any gap.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from rclpy.time import Time
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Header
 
+from gapr_ros.node.heard import Heard
 from msg_adapters import matrix_to_transform, transform_to_matrix
 
 Stamp = tuple[int, int]
@@ -41,12 +43,14 @@ class TrustedPose(Node):
         self.max_tre = declare("max_tre", 0.002).value  # m, 95 % bound over the whole bone
         self.frame = declare("frame", "").value  # that of the pose when empty; another one needs tf2
         self.bone = declare("bone_frame", "").value  # the only bone that is acted on; empty: any
+        self.max_tf_gap = declare("max_tf_gap", 0.25).value  # s, between the transforms around a pose; 0: any
         source = declare("register_node", "register_node").value
         self.waiting: dict[Stamp, dict[str, str]] = {}  # statuses without their transform
         self.transforms: dict[Stamp, TransformStamped] = {}  # and the other way round
         self.since: dict[Stamp, float] = {}
         self.held: set[Stamp] = set()  # whose transform is still to come, and to be left
         self.newest: Stamp = (-1, 0)  # of the statuses that come with a transform
+        self.heard: Heard | None = None  # what goes into the buffer
         self.buffer = self._listen_to_tf2()
         self.create_subscription(DiagnosticStatus, f"{source}/status", self._on_status, 10)
         self.create_subscription(TransformStamped, f"{source}/transform", self._on_transform, 10)
@@ -78,8 +82,8 @@ class TrustedPose(Node):
         if key < self.newest:
             self._forget(max(self.newest, *self.transforms, *self.waiting))
             self.held.clear()
-            if self.buffer is not None and not self.get_parameter("use_sim_time").value:  # with it, tf2 does so itself
-                self.buffer.clear()  # or tf2 interpolates between what it heard before and after
+            if self.heard is not None and not self.get_parameter("use_sim_time").value:  # with it, tf2 does so itself
+                self.heard.start_over()  # or tf2 interpolates between what it heard before and after
         self.newest = key
 
     def _leave(self, key: Stamp, its_transform_comes: bool) -> None:
@@ -141,7 +145,9 @@ class TrustedPose(Node):
             return ""
         stamp = Time.from_msg(transform.header.stamp)
         there, why = self.buffer.can_transform(self.frame, cloud_frame, stamp, return_debug_tuple=True)
-        return "" if there else f"no transform {self.frame} <- {cloud_frame}: {why}"
+        if there and self.heard is not None:
+            why = self.heard.why_not(self.frame, cloud_frame, stamp.nanoseconds, self.max_tf_gap)
+        return "" if there and not why else f"no transform {self.frame} <- {cloud_frame}: {why}"
 
     def _at(self, transform: TransformStamped) -> TransformStamped:
         """The pose in the frame that was asked for, at the stamp of the cloud."""
@@ -161,7 +167,8 @@ class TrustedPose(Node):
         import tf2_ros
 
         buffer = tf2_ros.Buffer(node=self)
-        self.listener = tf2_ros.TransformListener(buffer, self)  # no thread: it would not end with the program
+        self.heard = Heard(buffer, lambda stamp: False, self)
+        self.listener = tf2_ros.TransformListener(self.heard, self)  # no thread: it would not end with the program
         self.create_timer(POLL_S, self._meet)
         return buffer
 

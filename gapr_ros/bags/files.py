@@ -12,6 +12,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 
+DEEPEST = 2**31 - 1  # history that rclpy takes
+
 
 class BagError(ValueError):
     """A bag that cannot be played; the text says why."""
@@ -98,14 +100,26 @@ def import_type(name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{kind}"), message)
 
 
-def recorded_qos(profiles: Sequence[Qos]) -> QoSProfile:
-    """The QoS to publish with: what every recorded publisher offered; reliable, volatile, keep last 10 when unknown."""
-    reliable = all(p.reliability is not QosReliability.BEST_EFFORT for p in profiles)
-    latched = bool(profiles) and all(p.durability is QosDurability.TRANSIENT_LOCAL for p in profiles)
+def recorded_qos(connections: Sequence[Connection]) -> QoSProfile:
+    """The QoS of one publisher that serves every listener of the recorded ones.
+
+    Reliable and latched where any of them was, since such a publisher serves best effort and volatile listeners too;
+    as many messages as they kept together. Reliable, volatile, keep last 10 where nothing is known.
+    """
+    recorded: list[Sequence[Qos]] = [_offered(connection) for connection in connections]
+    profiles = [profile for each in recorded for profile in each]
+    reliable = not all(recorded) or any(p.reliability is not QosReliability.BEST_EFFORT for p in profiles)
+    latched = any(p.durability is QosDurability.TRANSIENT_LOCAL for p in profiles)
     keep_all = any(p.history is QosHistory.KEEP_ALL for p in profiles)
     return QoSProfile(
         history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
-        depth=max([p.depth for p in profiles if p.depth] or [10]),
+        depth=min(sum(p.depth for p in profiles), DEEPEST) or 10,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
+
+
+def _offered(connection: Connection) -> Sequence[Qos]:
+    of_ros2: Any = connection.ext
+    profiles: Sequence[Qos] = of_ros2.offered_qos_profiles
+    return profiles

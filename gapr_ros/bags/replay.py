@@ -73,7 +73,7 @@ class Replay:
         if options.rate <= 0.0:
             raise ValueError(f"the rate must be positive, got {options.rate:g}")
         self._node, self._bag, self._options, self._on_message = node, bag, options, on_message
-        self._publishers = {c.topic: self._advertise(c) for c in bag.connections}
+        self._publishers = {topic: self._advertise(topic) for topic in dict.fromkeys(c.topic for c in bag.connections)}
         self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock_hz > 0.0 else None
 
     def run(self) -> int:
@@ -90,10 +90,13 @@ class Replay:
         for publisher in [*self._publishers.values(), *([self._clock] if self._clock else [])]:
             self._node.destroy_publisher(publisher)
 
-    def _advertise(self, connection: Connection) -> Any:
-        of_ros2: Any = connection.ext
-        qos = recorded_qos(of_ros2.offered_qos_profiles)
-        return self._node.create_publisher(self._bag.types[connection.msgtype], connection.topic, qos)
+    def _advertise(self, topic: str) -> Any:
+        """One publisher for all that was recorded on a topic: a bag has a connection for each recorded publisher."""
+        connections = [c for c in self._bag.connections if c.topic == topic]
+        first, *others = dict.fromkeys(c.msgtype for c in connections)
+        if others:
+            raise BagError(f"{self._bag.reader.path}: {topic} has messages of {first} and {', '.join(others)}")
+        return self._node.create_publisher(self._bag.types[first], topic, recorded_qos(connections))
 
     def _wait_for_listeners(self) -> None:
         """Volatile messages that go out before a listener was discovered are lost."""

@@ -72,24 +72,35 @@ class Frames:
             self._heard = Heard(self._buffer, self._is_future, self._node)
             self._listener = self._tf2.TransformListener(self._heard, self._node)
 
-    def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float) -> Array:
+    def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float, most_gap_s: float = 0.0) -> Array:
         """T_parent_child (4, 4), metres, at a time. Waits in the caller's thread, by the wall clock.
+
+        Args:
+            parent, child: names of frames.
+            stamp: when; 0 for the newest transform there is.
+            timeout_s: longest wait.
+            most_gap_s: between transforms that are farther apart than this, s, nothing is interpolated; 0: any.
 
         Raises:
             RefusedError: tf_missing, never the identity.
         """
         if parent == child:
             return np.eye(4)
-        buffer = self._buffer  # `close` may take it away meanwhile
-        if self._tf2 is None or buffer is None:
+        buffer, heard = self._buffer, self._heard  # `close` may take them away meanwhile
+        if self._tf2 is None or buffer is None or heard is None:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {MISSING}")
         deadline = time.monotonic() + timeout_s  # tf2's own wait never ends while simulated time stands still
-        while not buffer.can_transform(parent, child, stamp) and time.monotonic() < deadline:
+        while not buffer.can_transform(parent, child, stamp) or heard.turned(parent, child):
+            if time.monotonic() >= deadline:
+                break
             time.sleep(POLL_S)
         try:
-            return transform_to_matrix(buffer.lookup_transform(parent, child, stamp))
+            found = transform_to_matrix(buffer.lookup_transform(parent, child, stamp))
         except (self._tf2.TransformException, InvalidMessageError) as error:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {str(error).strip()}") from error
+        if why := heard.why_not(parent, child, stamp.nanoseconds, most_gap_s):
+            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {why}")
+        return found
 
     def start_over(self) -> None:
         """What was heard so far is of another round of time: between that and what comes tf2 would interpolate."""

@@ -1,23 +1,27 @@
-"""What of /tf goes into the buffer: no transform from the future, and never those of two rounds of time."""
+"""What of /tf goes into the buffer, no future and never two rounds of time, and what must not be looked up in it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from gapr_ros.node.timeline import BACK_NS, RESTART_AFTER, stamp_ns
+from gapr_ros.node.intake import plain_frame
+from gapr_ros.node.links import Links
+from gapr_ros.node.timeline import RESTART_AFTER, stamp_ns
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import TransformStamped
 
 THROTTLE_S = 5.0
+BACK_NS = 10_000_000  # a transform may be so much older than the newest one of its frame, as where threads race
 
 
 class Heard:
     """Stands between tf2's listener and its buffer, which takes everything and interpolates between any two stamps.
 
-    A stamp that goes back by more than a second is judged as those of clouds are: one is a straggler and is left out;
-    several in a row that go forward among themselves are another round, and what was heard before is forgotten.
+    A stamp that goes back is judged as those of clouds are: one is a straggler and is left out; several in a row that
+    go forward among themselves are another round, and what was heard before is forgotten. Until it is clear which,
+    nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden.
 
     Args:
         buffer: of tf2.
@@ -29,11 +33,13 @@ class Heard:
         self._buffer, self._is_future, self._node = buffer, is_future, node
         self._newest_ns: dict[str, int] = {}  # by child frame
         self._back_ns: dict[str, list[int]] = {}  # stamps in a row that went back
+        self._links = Links()
         self._any_older: set[str] = set()
 
     def start_over(self) -> None:
         """Forget all but what is static: between that and what comes tf2 would interpolate."""
         self._newest_ns, self._back_ns, self._any_older = {}, {}, set()
+        self._links.forget()
         self._buffer.clear()
 
     def expect_older(self) -> None:
@@ -42,20 +48,43 @@ class Heard:
 
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf."""
-        child, stamp = transform.child_frame_id, stamp_ns(transform.header)
+        child, stamp = plain_frame(transform.child_frame_id), stamp_ns(transform.header)
         if self._is_future(stamp):
             self._warn(f"a transform of '{child}' is left out: its stamp is ahead of the clock; synchronise the clocks")
         elif self._is_of_now(child, stamp):
+            self._links.note(child, transform.header.frame_id, stamp)
             self._buffer.set_transform(transform, authority)
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf_static: it holds at all times."""
+        self._links.note_static(transform.child_frame_id, transform.header.frame_id)
         self._buffer.set_transform_static(transform, authority)
+
+    def why_not(self, frame: str, other: str, stamp: int, most_gap_s: float) -> str:
+        """Why no transform between two frames at a stamp, ns, can be believed; empty where one can.
+
+        Args:
+            frame, other: names.
+            stamp: ns; 0 for the newest transform there is.
+            most_gap_s: the transforms of a frame around the stamp may be so far apart, s; 0: any.
+        """
+        if turned := self.turned(frame, other):
+            return f"the stamps of the transforms of '{turned}' went back, and whether time did is not clear yet"
+        frames = self._links.between(frame, other)
+        gap_s, child = max(((self._links.gap_ns(each, stamp) * 1e-9, each) for each in frames), default=(0.0, ""))
+        if stamp == 0 or not 0.0 < most_gap_s < gap_s:
+            return ""
+        return f"'{child}' was not heard for {gap_s:.3g} s around this stamp, max_tf_gap is {most_gap_s:g} s"
+
+    def turned(self, frame: str, other: str) -> str:
+        """A frame between two whose stamps went back, and the next one will say why; empty without one."""
+        return min((each for each in self._links.between(frame, other) if each in self._back_ns), default="")
 
     def _is_of_now(self, child: str, stamp: int) -> bool:
         newest, any_older = self._newest_ns.get(child, 0), child in self._any_older
         self._any_older.discard(child)
-        if stamp < newest - (0 if any_older else BACK_NS):
+        row = self._back_ns.get(child, [])
+        if stamp < newest - (0 if any_older or row else BACK_NS) or len(row) > 1:
             if not (any_older or self._is_another_round(child, stamp)):
                 return False
             self._warn(f"the stamps of the transforms of '{child}' went back: those of before are forgotten")

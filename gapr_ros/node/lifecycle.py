@@ -183,6 +183,8 @@ class RegisterNode(LifecycleNode):
         model = str(ready.model)
         for sentence in parameters.remarks(self.parameters):
             self.get_logger().info(sentence)
+        for sentence in parameters.empty_limits(self.parameters):
+            self.get_logger().warning(sentence)
         self.get_logger().info(model)
         self.session = Session(self, ready, self._method_factory)
         return super().on_configure(state)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -55,7 +56,7 @@ def read_settings(path: str) -> RegistrarConfig:
     from gapr_core import RegistrarConfig
     from gapr_core.runtime import settings
 
-    return settings.load(RegistrarConfig, path or None)
+    return settings.load(RegistrarConfig, _expanded(path) or None)
 
 
 def check_file(config: RegistrarConfig, parameters: NodeParameters, named: Collection[str]) -> None:
@@ -79,11 +80,15 @@ def check_file(config: RegistrarConfig, parameters: NodeParameters, named: Colle
             raise ConfigError(what, f"{value} in settings_file", how)
 
 
+def _expanded(path: str) -> str:
+    return os.path.expanduser(path)  # a shell leaves the ~ of settings_file:=~/settings.yaml as it is
+
+
 def _named_in(path: str) -> set[str]:
     """Dotted names of all that stands in a YAML file; none without one."""
     from gapr_core.runtime import settings
 
-    waiting: list[tuple[str, Any]] = list(settings.read_yaml(path).items()) if path else []
+    waiting: list[tuple[str, Any]] = list(settings.read_yaml(_expanded(path)).items()) if path else []
     names = set()
     while waiting:
         name, value = waiting.pop()

@@ -154,5 +154,6 @@ class Services:
     def _session(self) -> Session:
         session = self._configured()
         if session is None:
-            raise NotNowError(f"the node is {self._state()}: configure it")
+            state = self._state()
+            raise NotNowError(f"the node is {state}: {'start it again' if state == 'finalized' else 'configure it'}")
         return session

@@ -46,6 +46,7 @@ from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
 Array = NDArray[np.float64]
+STREAM_AFTER = 5  # guesses without an answer between them
 OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
 
 
@@ -66,6 +67,7 @@ class Session:
         self._changes = Changes(ready.parameters, host.parameters)
         self.enabled, self._closed = True, False
         self.last_outcome: Outcome | None = None
+        self._guesses = 0  # since the last cloud that none of them superseded
         self._standing: Outcome | None = None  # of the last accepted pose, until it is withdrawn
         self.conflicts = Conflicts(host.ros.get_logger().warning)
         self.course = Course()
@@ -138,7 +140,10 @@ class Session:
         if frame == self._host.parameters.model_frame:
             self._host.ros.get_logger().warning(f"initialpose is ignored: it is in '{frame}', the bone's own frame")
             return
-        self._begin_again("an initialpose", Seed(T_frame_model, frame))
+        self._guesses += 1
+        often = f", {self._guesses} came since the last answer: send one guess, not a stream of them"
+        why = "an initialpose" + (often if self._guesses >= STREAM_AFTER else "")
+        self._begin_again(why, Seed(T_frame_model, frame))
         if frame:
             self._frames.listen()
 
@@ -221,6 +226,7 @@ class Session:
     def _answer(self, outcome: Outcome) -> None:
         """Count an outcome, send it, and tell who waits for it."""
         self.last_outcome = outcome
+        self._guesses = self._guesses if outcome.reason is Reason.SUPERSEDED_BY_RESET else 0
         self._standing = outcome if outcome.ok else self._standing
         self._host.counters.answered(outcome)
         if not outcome.ok:
@@ -244,7 +250,13 @@ class Session:
 
     def _clear(self, why: str) -> None:
         self._begin_again(why)
+        self._outdate()
+
+    def _outdate(self) -> None:
+        """Nothing that was found or refused so far says anything of now."""
         self.worker.outdate(self.course.epoch)
+        self.last_outcome = None
+        self._host.counters.forget_refusals()
         self._withdraw_pose()
 
     def clock_jumped(self, is_another: bool) -> None:
@@ -279,9 +291,8 @@ class Session:
         with self._swapping:
             self._ready = ready
         self._changes = Changes(ready.parameters, self._host.parameters)
-        self.worker.outdate(self.course.epoch)
+        self._outdate()
         self.parameters_changed()
-        self._withdraw_pose()
         self.send_model()
 
     def send_model(self) -> None:

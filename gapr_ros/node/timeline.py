@@ -77,11 +77,12 @@ class Timeline:
     """Judges the clouds as they arrive and their answers; what it refuses changes nothing, here or elsewhere.
 
     The poses that go out are in the order of their stamps, one for each stamp: tf2 has one transform for a stamp, and
-    its latest one is that with the newest stamp. A stamp that went back, by more than a second or behind the last
-    answer with a pose, is that of a straggler, or time has started over, as in a bag that is looped without simulated
-    time. One cloud cannot say which: it is refused. Several in a row that arrive one after the other with stamps that
-    go forward among themselves can: with the last of them time starts over. So it does with one that has the very
-    stamp with which this round began, where all clouds come from one publisher: a bag that is played once more.
+    its latest one is that with the newest stamp. A stamp behind the last answer with a pose is that of a straggler, as
+    of a camera that is slower than another one. One that went back by more than a second may be one, too, or time has
+    started over, as in a bag that is looped without simulated time. One cloud cannot say which: it is refused. Several
+    in a row that arrive one after the other with stamps that go forward among themselves can: with the last of them
+    time starts over. So it does with one that has the very stamp with which this round began, where all clouds come
+    from one publisher: a bag that is played once more.
     """
 
     def __init__(self) -> None:
@@ -165,13 +166,13 @@ class Timeline:
         return stamp == self._first_ns and self._count >= RESTART_AFTER
 
     def _note_back(self, stamp: int) -> int:
-        """Count a stamp that went back, and refuse it until there are enough of them; the first of them."""
+        """Count a stamp that went far back, and refuse it until there are enough of them; the first of them."""
+        if stamp >= self._newest_ns - BACK_NS:
+            raise RefusedError(Reason.STALE, self._older(stamp))
         goes_on = bool(self._back_ns) and stamp > self._back_ns[-1]
         self._back_ns = [*self._back_ns, stamp] if goes_on else [stamp]
         if len(self._back_ns) < RESTART_AFTER:
             behind_s = (self._newest_ns - stamp) * 1e-9
-            far = stamp < self._newest_ns - BACK_NS
-            text = f"the stamp is {behind_s:.3g} s behind the newest cloud's" if far else self._older(stamp)
             count = f"{len(self._back_ns)} of {RESTART_AFTER} in a row that start time over"
-            raise RefusedError(Reason.STALE, f"{text} ({count})")
+            raise RefusedError(Reason.STALE, f"the stamp is {behind_s:.3g} s behind the newest cloud's ({count})")
         return self._back_ns[0]

@@ -11,13 +11,16 @@ from geometry_msgs.msg import TransformStamped
 from harness import DOMAIN, NodeProcess, Spinner, context, wait_until
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gapr_ros.bags import replay as bag_replay
 from gapr_ros.bags.files import BagError, open_bag
 from gapr_ros.bags.replay import Replay, ReplayOptions
-from gapr_ros.bags.writing import BagWriter, offered
+from gapr_ros.bags.writing import STORAGES, BagWriter, offered, type_name
 from msg_adapters import cloud_to_xyz
 
 START_NS = 1_700_000_000_250_000_000
@@ -153,6 +156,61 @@ def test_the_recorded_qos_is_offered(reliable, tmp_path, listener):
     assert info.durability is DurabilityPolicy.TRANSIENT_LOCAL
     opened.reader.close()
     ros.try_shutdown()
+
+
+RECORDED = {
+    "reliable, best effort": [offered(depth=5), offered(reliable=False, depth=5)],
+    "best effort, reliable": [offered(reliable=False, depth=5), offered(depth=5)],
+    "best effort, not known": [offered(reliable=False), None],
+    "latched, volatile": [offered(latched=True, depth=1), offered(depth=1)],
+    "latched twice": [offered(latched=True, depth=1), offered(reliable=False, latched=True, depth=1)],
+}
+
+
+def of_two_connections(path, storage, profiles, kinds=(PointCloud2, PointCloud2)):
+    """A bag with two clouds, each of a connection of its own on one topic; an empty message of another type."""
+    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as bag:
+        for number, (profile, kind) in enumerate(zip(profiles, kinds, strict=True)):
+            message, types = kind(), get_typestore(Stores.ROS2_JAZZY)
+            message.header.frame_id = str(number)
+            given = {"typestore": types, "offered_qos_profiles": [profile] if profile else []}
+            connection = bag.add_connection("/points", type_name(message), **given)
+            bag.write(connection, START_NS + number, serialize_message(message))
+    return path
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("case", ["reliable, best effort", "best effort, reliable", "best effort, not known"])
+def test_two_recorded_publishers_of_one_topic_are_played_by_one_that_a_reliable_listener_hears(
+    tmp_path, listener, storage, case
+):
+    assert play(of_two_connections(tmp_path / "bag", storage, RECORDED[case])) == 2
+    wait_until(lambda: [m.header.frame_id for m in listener.heard["clouds"]] == ["0", "1"], WAIT_S)
+
+
+@pytest.mark.parametrize("case", ["latched, volatile", "latched twice"])
+def test_who_comes_late_hears_as_much_of_one_publisher_as_of_the_recorded_ones(tmp_path, case):
+    ros, opened = context(), open_bag(of_two_connections(tmp_path / "bag", "mcap", RECORDED[case]))
+    node = Node("player", context=ros)
+    replay = Replay(node, opened, ReplayOptions(wait_s=0.0, progress=False))
+    assert node.count_publishers("/points") == 1
+    assert replay.run() == 2
+    late, heard = Spinner(context()), []
+    latecomer = Node("latecomer", context=late.context)
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    latecomer.create_subscription(PointCloud2, "/points", lambda m: heard.append(m.header.frame_id), latched)
+    late.start(latecomer)
+    wait_until(lambda: heard == ["0", "1"], WAIT_S)
+    late.close()
+    opened.reader.close()
+    ros.try_shutdown()
+
+
+def test_two_types_on_one_topic_are_refused(tmp_path):
+    bag = of_two_connections(tmp_path / "bag", "mcap", [None, None], (PointCloud2, TransformStamped))
+    kinds = "sensor_msgs/msg/PointCloud2 and geometry_msgs/msg/TransformStamped"
+    with pytest.raises(BagError, match=f"/points has messages of {kinds}"):
+        play(bag)
 
 
 def test_a_type_that_is_not_installed_is_left_out_and_said(bag_path, tmp_path, capfd):

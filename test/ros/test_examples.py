@@ -23,6 +23,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.node.heard import Heard
 from gapr_ros.node.publishers import TOPICS
 from gapr_ros.parameters import FIELDS
 from msg_adapters import matrix_to_transform
@@ -157,11 +158,42 @@ def test_where_stamps_go_back_the_consumer_forgets_the_frames_of_before(consumer
             cleared.append(len(done))
 
     node.frame, node.buffer = "world", Buffer()
+    node.heard = Heard(node.buffer, lambda stamp: False, node)
     for stamp in (100, 101, 50, 51):
         node._on_status(status(stamp, SURE))
         node._on_transform(transform_at(stamp, 0.5))
     assert [each[0] for each in done] == [100, 101, 50, 51]
     assert cleared == [2], "before the pose at 50, and then no more"
+
+
+def test_no_pose_is_taken_into_another_frame_over_a_time_in_which_that_was_not_heard(consumer):
+    node, done = consumer
+
+    class Buffer:
+        def can_transform(self, target, source, stamp, return_debug_tuple):
+            return True, ""
+
+        def set_transform(self, transform, authority):
+            """As tf2 does, it interpolates whatever comes."""
+
+        def lookup_transform(self, target, source, stamp):
+            return transform_at(0, 1.0)
+
+    node.frame, node.buffer = "world", Buffer()
+    node.heard = Heard(node.buffer, lambda stamp: False, node)
+    for second in (99, 101, 102):
+        heard = transform_at(second, 0.0, "camera")
+        heard.header.frame_id = "world"
+        node.heard.set_transform(heard, "the tracker")
+    for second in (100, 101):
+        node._on_transform(transform_at(second, 0.5))
+        node._on_status(status(second, SURE))
+    wait_until(lambda: node._meet() or len(done) == 2)
+    assert (
+        done[0]
+        == "no transform world <- camera: 'camera' was not heard for 2 s around this stamp, max_tf_gap is 0.25 s"
+    )
+    assert done[1] == (101, 1.5)
 
 
 def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import sys
+import tempfile
 import types
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from harness import DOMAIN
 from rclpy.context import Context
 from rclpy.node import Node
 
-from gapr_ros.parameters import FIELDS, problem
+from gapr_ros.parameters import FIELDS, plain, problem
 
 ROOT = Path(__file__).parents[2]
 DEFAULTS = str(ROOT / "config" / "register_node.yaml")
@@ -69,25 +70,73 @@ def started(module, typed=(), others=None, **arguments):
     return opaque.named["function"](chosen, *opaque.named.get("args", []))
 
 
+@pytest.fixture(autouse=True)
+def scratch(monkeypatch, tmp_path):
+    """Where a launch file writes the parameters that its arguments name."""
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
+
+
+def heard(files, namespace="/"):
+    """The parameters that a node of this name gets from files, by name; rcl reads them."""
+    ros = Context()
+    given = [word for file in files for word in ("--params-file", str(file))]
+    ros.init(args=["--ros-args", *given, "-r", f"__ns:={namespace}"], domain_id=DOMAIN)
+    node = Node("register_node", context=ros, start_parameter_services=False)
+    found = {name: plain(parameter.value) for name, parameter in node._parameter_overrides.items()}
+    node.destroy_node()
+    ros.try_shutdown()
+    return found
+
+
 def test_every_parameter_of_the_node_is_an_argument_and_none_is_given_unasked(load):
     module = load("register.launch.py")
     declared = {argument.given[0] for argument in module.generate_launch_description().given[0][:-1]}
     assert set(FIELDS) <= declared
     _, register = started(module)
-    assert register.named["parameters"] == [DEFAULTS, {}]
+    assert register.named["parameters"] == [DEFAULTS]
 
 
 def test_arguments_become_parameters_of_the_type_that_the_node_wants(load):
     arguments = {"min_confidence": "1", "accumulate": "50", "model_path": "007", "guide": "true", "max_tre": "0.002",
                  "crop_min": "[0, 0, -1]", "use_sim_time": "true"}  # fmt: skip
     rviz, register = started(load("register.launch.py"), points="/camera/points", namespace="/left", **arguments)
-    given = register.named["parameters"][1]
+    given = heard(register.named["parameters"][1:], "/left")
     wanted = {"min_confidence": 1.0, "accumulate": 50, "model_path": "007", "guide": True, "use_sim_time": True,
-              "crop_min": [0.0, 0.0, -1.0], "max_tre": 0.002}  # fmt: skip
+              "crop_min": (0.0, 0.0, -1.0), "max_tre": 0.002}  # fmt: skip
     assert given == wanted
     assert [problem(FIELDS[name], value) for name, value in given.items() if name in FIELDS] == [""] * 6
     assert ("points", "/camera/points") in register.named["remappings"] and register.named["namespace"] == "/left"
     assert rviz.named["parameters"] == [{"use_sim_time": True}]
+
+
+NUMBERS = ["1e3", "007", "0x10", "nan", ".inf"]
+WORDS = ["yes", "y", "OFF", "null", "~", "a: b", "[1]", """a "b" 'c'""", "für 😀", "#"]
+
+
+@pytest.mark.parametrize("text", NUMBERS + WORDS)
+def test_an_argument_for_a_text_stays_a_text_whatever_yaml_takes_it_for(load, text):
+    _, register = started(load("register.launch.py"), output_frame=text, model_path=text)
+    assert heard(register.named["parameters"][1:]) == {"output_frame": text, "model_path": text}
+
+
+@pytest.mark.parametrize("order", [("/**", "/femur/register_node"), ("/femur/register_node", "/**")])
+def test_an_argument_wins_over_every_entry_of_the_file(load, tmp_path, order):
+    file = tmp_path / "mine.yaml"
+    file.write_text("".join(f'"{name}": {{ros__parameters: {{max_tre: 0.005, seed: 3}}}}\n' for name in order))
+    _, register = started(load("register.launch.py"), params_file=str(file), namespace="/femur", max_tre="0.002")
+    assert heard(register.named["parameters"], "/femur") == {"max_tre": 0.002, "seed": 3}
+
+
+@pytest.mark.parametrize(("name", "count"), [("register", 1), ("bones", 2)])
+def test_the_tilde_of_a_parameter_file_is_the_home_folder_which_a_shell_leaves_as_it_is(
+    load, monkeypatch, tmp_path, name, count
+):
+    (tmp_path / "mine.yaml").write_text((ROOT / "config" / "two_bones.yaml").read_text())
+    monkeypatch.setenv("HOME", str(tmp_path))
+    nodes = started(load(f"{name}.launch.py"), params_file="~/mine.yaml")
+    files = [node.named["parameters"] for node in nodes[-count:]]
+    assert files == [[str(tmp_path / "mine.yaml")]] * count
 
 
 def test_a_parameter_file_that_does_not_exist_is_refused(load):
@@ -95,10 +144,13 @@ def test_a_parameter_file_that_does_not_exist_is_refused(load):
         started(load("register.launch.py"), params_file="/no/such.yaml")
 
 
-@pytest.mark.parametrize(("name", "text"), [("min_confidence", "high"), ("crop_min", "1"), ("crop_min", "[1")])
+@pytest.mark.parametrize(("name", "text"), [
+    ("min_confidence", "high"), ("crop_min", "1"), ("crop_min", "[1"), ("seed", "1e3"), ("seed", "2026-01-01"),
+    ("continuous", "{a: 1}"),
+])  # fmt: skip
 def test_what_is_no_value_of_a_parameter_goes_to_the_node_which_says_what_it_wants(load, name, text):
     _, register = started(load("register.launch.py"), **{name: text})
-    assert f"parameter '{name}' must be" in problem(FIELDS[name], register.named["parameters"][1][name])
+    assert f"parameter '{name}' must be" in problem(FIELDS[name], heard(register.named["parameters"][1:])[name])
 
 
 def test_rviz_shows_what_the_node_hears_and_says(load):
@@ -209,13 +261,8 @@ def test_a_bone_in_every_form_that_rcl_reads_gets_a_node_and_its_parameters(load
     namespaces = [node.named["namespace"] for node in started(load("bones.launch.py"), params_file=str(path))]
     assert namespaces == ["/femur", "/tibia", "/tibia2", "/left/knee/patella"]
     for namespace, frame in zip(namespaces, "abcd", strict=True):
-        ros = Context()
-        ros.init(args=["--ros-args", "--params-file", str(path), "-r", f"__ns:={namespace}"], domain_id=DOMAIN)
-        node = Node("register_node", context=ros)
-        found = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+        found = heard([path], namespace)
         assert (found["model_frame"], found["model_unit"]) == (frame, "mm")
-        node.destroy_node()
-        ros.try_shutdown()
 
 
 @pytest.mark.parametrize(

@@ -159,6 +159,24 @@ def test_the_settings_file_is_read_when_configuring_and_limits_hold_whatever_has
         assert not client.change_state(Transition.TRANSITION_CONFIGURE), "now it is read again"
 
 
+def test_the_tilde_of_a_settings_file_is_the_home_folder_which_a_shell_leaves_as_it_is(tmp_path, monkeypatch):
+    (tmp_path / "settings.yaml").write_text("refinement: {rounds: 11}\nmin_confidence: 0.5\n")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    method = ShippedMethod()(replace(NodeParameters(), settings_file="~/settings.yaml", track=False))
+    assert method.config.refinement.rounds == 11
+    with pytest.raises(ConfigError, match="min_confidence"):
+        ShippedMethod()(replace(NodeParameters(), settings_file="~/settings.yaml", min_confidence=0.9))
+
+
+def test_a_node_that_was_shut_down_says_to_start_it_again(blob_path, client, method):
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        assert client.change_state(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        for service in ("register", "reset", "reload_model"):
+            answer = client.call(service)
+            assert (answer.success, answer.message) == (False, "the node is finalized: start it again")
+
+
 def state_of(client):
     future = client.ready(GetState, "/register_node/get_state").call_async(GetState.Request())
     wait_until(future.done)

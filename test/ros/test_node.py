@@ -18,6 +18,7 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -620,6 +621,43 @@ def test_a_seed_reaches_the_method_until_a_pose_is_accepted(live):
     assert method.calls[-1]["initial"] is None
 
 
+@pytest.mark.parametrize("service", ["reset", "reload_model"])
+def test_the_diagnostics_say_nothing_of_the_bone_or_the_time_before(live, service):
+    _, client, _ = live
+    assert client.ask(GOOD)["level"] == 0
+    assert client.ask(np.empty((0, 3)))["last_refusal"].startswith("empty_cloud")
+    assert client.values()["cloud_stamp"]
+    assert client.call(service).success
+    wait_until(lambda: client.values()["last_refusal"] == "")
+    values = client.values()
+    assert not {"confidence", "tre_mm", "found_by", "cloud_stamp"} & {key for key, value in values.items() if value}
+    assert values["level"] == 0
+    assert (values["frames_accepted"], values["frames_refused"]) == ("1", "1"), "the counts go on"
+
+
+def test_who_sends_a_stream_of_guesses_learns_why_no_pose_comes(live):
+    node, client, method = live
+    wait_until(client.seeds.get_subscription_count)
+    method.gate.clear()
+    calls = len(method.calls)
+    client.send(GOOD)
+    wait_until(lambda: len(method.calls) > calls)
+    for _ in range(5):
+        epoch = node.session.course.epoch
+        client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="probe")))
+        wait_until(lambda epoch=epoch: node.session.course.epoch > epoch)
+    method.gate.set()
+    wait_until(
+        lambda: client.values()["last_refusal"].endswith(
+            "5 came since the last answer: send one guess, not a stream of them"
+        )
+    )
+    assert client.ask(GOOD)["level"] == 0
+    client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="probe")))
+    wait_until(lambda: node.session.course.seed)
+    assert node.session.course.why == "an initialpose", "after an answer they are counted from the start"
+
+
 def test_a_method_that_remembers_poses_forgets_that_of_the_warm_up_and_with_every_reset(blob_path, client, method):
     method.forgotten_after = []
     method.reset = lambda: method.forgotten_after.append(len(method.calls))
@@ -885,7 +923,7 @@ def test_a_look_up_that_fails_raises_tf_missing_even_while_simulated_time_stands
     looked_up = frames.Frames(None, publish=False, listen=True)
     start = time.monotonic()
     with pytest.raises(RefusedError) as caught:
-        looked_up.lookup("tracker", "unknown", None, 0.1)
+        looked_up.lookup("tracker", "unknown", Time(), 0.1)
     assert caught.value.reason is Reason.TF_MISSING
     assert 0.1 <= time.monotonic() - start < 30.0
 
@@ -897,7 +935,7 @@ def test_a_look_up_that_has_begun_goes_on_while_the_node_ends(monkeypatch):
     looked_up = frames.Frames(node, publish=False, listen=True)
     buffer, known = looked_up._buffer, looked_up._buffer.can_transform
     buffer.can_transform = lambda *names: looked_up.close() or known(*names)
-    np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", None, 1.0), np.eye(4))
+    np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", Time(), 1.0), np.eye(4))
 
 
 @pytest.mark.parametrize(("unit", "mm"), [("m", 1000.0), ("cm", 10.0)])
@@ -960,4 +998,4 @@ def test_a_seed_in_another_frame_is_looked_up_though_nothing_goes_to_tf(monkeypa
     monkeypatch.setattr(frames, "_import_tf2", lambda: FakeTf2(np.eye(4)))
     looked_up = frames.Frames(None, publish=False, listen=False)
     looked_up.listen()
-    np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", None, 1.0), np.eye(4))
+    np.testing.assert_array_equal(looked_up.lookup("tracker", "probe", Time(), 1.0), np.eye(4))

@@ -47,7 +47,9 @@ def ros():
         ("min_confidence", 1, "'min_confidence' must be of type double, got 1: write 1.0"),
         ("max_rate", 10, "write 10.0"),
         ("max_tre", "two", "write 1.0"),
-        ("min_points", 3.5, "must be of type integer, got 3.5"),
+        ("min_points", 3.5, "must be of type integer, got 3.5: write 200"),
+        ("max_points", 1e5, "must be of type integer, got 100000.0: write 100000"),
+        ("max_points", float("inf"), "must be of type integer, got inf: write 200000"),
         ("model_path", 5, 'write "5"'),
         ("model_label", 75, """write "75" in a file, -p 'model_label:="75"' in a shell"""),
         ("continuous", "yes", "write true"),
@@ -198,7 +200,7 @@ def test_a_cloud_that_is_thinned_below_what_is_asked_of_it_is_said(most, said):
 @pytest.mark.parametrize(("least", "most", "said"), [(5.0, 1.0, True), (1.0, 1.0, True), (0.5, 1.0, False),
                                                     (5.0, 0.0, False), (0.0, 1.0, False)])  # fmt: skip
 def test_a_range_that_no_point_can_be_in_is_said_when_it_is_configured(least, most, said):
-    remarks = parameters.remarks(parameters.NodeParameters(range_min=least, range_max=most))
+    remarks = parameters.empty_limits(parameters.NodeParameters(range_min=least, range_max=most))
     assert sum(f"range_min {least} is not below range_max {most}" in remark for remark in remarks) == said
 
 
@@ -213,5 +215,13 @@ def test_a_range_that_no_point_can_be_in_is_said_when_it_is_configured(least, mo
     ids=["no box", "a box", "a corner above the other", "a box without a volume"],
 )
 def test_a_box_that_no_point_can_be_in_is_said_when_it_is_configured(low, high, said):
-    remarks = parameters.remarks(parameters.NodeParameters(crop_min=low, crop_max=high))
+    remarks = parameters.empty_limits(parameters.NodeParameters(crop_min=low, crop_max=high))
     assert sum("crop_min" in remark for remark in remarks) == said
+
+
+def test_limits_that_refuse_every_cloud_are_warned_of_and_a_remark_is_not(blob_path, client, method, capfd):
+    with node_in_thread(method, blob_path, crop_min=[0.0, 0.0, 1.0]):
+        client.wait_for_state("active")
+    lines = capfd.readouterr().err.splitlines()
+    levels = {text: line for line in lines for text in ("crop_min (0.0, 0.0, 1.0)", "max_tre is 0") if text in line}
+    assert "[WARN]" in levels["crop_min (0.0, 0.0, 1.0)"] and "[INFO]" in levels["max_tre is 0"]

@@ -108,7 +108,7 @@ def accumulate_agreeing(
         total += w
         put_row(rows, count, w, x, y, z, middle, r, nx, ny, nz)
         count += 1
-    add_up(rows, count, H, g)
+    normal_equations(rows, count, H, g)
     return total
 
 
@@ -124,7 +124,7 @@ def put_row(rows, i, w, x, y, z, middle, r, nx, ny, nz):
 
 
 @numba.njit(**FAST)
-def add_up(rows, count, H, g):
+def normal_equations(rows, count, H, g):
     """Normal equations (6, 6) and (6,) of the first `count` columns of `rows` (7, N), filled in place.
 
     One product of whole rows after the other, and padded, so that the compiler takes several columns at a time.

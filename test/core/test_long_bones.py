@@ -55,11 +55,12 @@ def test_up_to_four_long_bones_are_found_and_more_are_a_hand_or_a_foot(count, fo
         joined(FEMUR, DEBRIS, moved(DEBRIS, (0.0, 60.0, 0.0))),
         joined(FEMUR, moved(FEMUR, sizes=(0.7, 0.7, 0.9))),
         joined(PELVIS, moved(PELVIS, (300.0, 0.0, 0.0))),
+        joined(*(moved(PELVIS, (0.0, 300.0 * side, 0.0), (1.0, 0.2, 1.0)) for side in (0, 1))),
         joined(*(moved(PELVIS, (150.0 * side, 0.0, 0.0), (0.5, 1.0, 1.0)) for side in (-1, 0, 1))),
         joined(*(moved(TIBIA, (0.0, 40.0 * rib, 0.0), (0.1, 0.1, 0.4)) for rib in range(24))),
         joined(FEMUR, moved(FEMUR, (150.0, 0.0, 0.0), (0.3, 0.3, 0.3))),
     ],
-    ids=["one bone", "debris", "inner wall", "two hips", "pelvis in three parts", "rib cage", "a small bone near"],
+    ids=["one bone", "debris", "inner wall", "two hips", "two plates", "pelvis in three parts", "rib cage", "a small bone near"],
 )
 def test_what_is_one_body_is_left_alone(surface):
     assert lengths_of(surface) == []

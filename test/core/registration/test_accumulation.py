@@ -11,7 +11,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter
+from gapr_core.registration import clutter, rigidity
 from gapr_core.results import RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
@@ -205,6 +205,16 @@ def test_a_source_that_cannot_be_registered_costs_no_older_one(registrar, frames
     np.testing.assert_array_equal(accumulator.collected, kept)
 
 
+def test_a_collection_that_restarted_with_a_source_that_fails_is_empty(registrar, frames, prepared, monkeypatch):
+    accumulator = Accumulator(registrar, most=5)
+    accumulator.collect(frames[0].source)
+    monkeypatch.setattr(type(registrar), "register", lambda *_: 1 / 0)
+    for error in (InvalidPointCloudError, InvalidPointCloudError, ZeroDivisionError):
+        with pytest.raises(error):
+            accumulator.register(frames[1].source + [5e3, 0.0, 0.0], prepared)
+    assert not len(accumulator.collected)
+
+
 def test_a_reset_reaches_the_tracker_of_the_collection(registrar):
     class Counting(Tracker):
         resets = 0
@@ -361,6 +371,14 @@ def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
     assert result.ok is not is_refused and (result.T_target_source is None) is is_refused
     kept = accumulator.collected
     assert len(kept) == (150 * 3 if is_refused else 150 * count)
+
+
+@pytest.mark.parametrize(("log_ratio", "is_refused"), [(5.9, False), (6.1, True)])
+def test_a_motion_is_believed_from_the_setting_on(registrar, target, femur, monkeypatch, log_ratio, is_refused):
+    monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(log_ratio, 1.0)))
+    accumulator, result = creeping(registrar, target, femur, 0.0, 6.0)
+    assert ("the bone moves against the frame" in result.reason) is is_refused and result.ok is not is_refused
+    assert len(accumulator.collected) == (150 * 3 if is_refused else 150 * 9)
 
 
 @pytest.mark.parametrize(("step_mm", "is_refused"), [(0.005, True), (0.0, False)])

@@ -13,6 +13,7 @@ from gapr_core.registration import source as sources
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.features import SCENE_FEATURES
+from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.source import prepare
 from gapr_core.results import Refusal
@@ -161,6 +162,20 @@ def test_a_stream_takes_the_wound_for_one_and_never_more_than_that(target, scene
     assert all(result.ok and result.inferred_viewpoint is not None for result in results)
     assert max(result.confidence for result in results) <= RegistrarConfig().limits.most
     assert tracker._evidence is not None and not tracker._is_sure
+
+
+def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target, scene, monkeypatch):
+    memory, given = Memory(), []
+    memory.keep([se3.inverse(T_SOURCE_TARGET), np.eye(4)])
+    method = MemoryFirst(memory, Calibration.shipped(Memory.name), Registrar(RegistrarConfig(num_threads=1)))
+
+    def nothing(scene, target, poses, *settings):
+        given.append(poses)
+        return clutter.Pool(np.empty((0, 4, 4)), np.empty(0, dtype=int), np.empty(0))
+
+    monkeypatch.setattr(clutter, "propose", nothing)
+    method.assess(scene[0], target)
+    assert given and all(np.array_equal(poses, memory.poses[:1]) for poses in given)
 
 
 def test_frames_that_spoke_against_the_bone_refuse_an_inferred_pose(target, scene):

@@ -112,6 +112,23 @@ def test_a_plane_with_the_noise_of_a_scanner_is_no_border_of_a_scan(cut_femur):
     assert not flat_ends(noisy, normals, spacing_mm, 200.0).any()
 
 
+@pytest.mark.parametrize("burr_mm", [0.12, 0.2])
+def test_a_single_point_above_an_end_does_not_tilt_its_plane(cut_femur, middle_mm, burr_mm):
+    points, normals, spacing_mm = spread(cut_femur)
+    expected = flat_ends(points, normals, spacing_mm, 200.0)
+    burr = np.flatnonzero(expected & (normals @ UP > 0.9))[20]
+    points[burr] += burr_mm * UP
+    assert np.array_equal(flat_ends(points, normals, spacing_mm, 200.0), expected)
+
+
+def test_the_end_of_a_hollow_bone_is_left_out_of_both_its_targets(cut_femur, middle_mm):
+    points, normals = cut_femur.sample(12_000, np.random.default_rng(1))
+    inner = (np.arange(len(points)) % 5 < 2) & (normals @ UP < 0.9)
+    prepared = targets.prepare(points - 4.0 * normals * inner[:, None])
+    for each in (prepared, prepared.both_cortices):
+        assert not (each.points[:, 2] > middle_mm - 0.02).any() and len(each.points) > 5000
+
+
 def test_the_end_is_left_out_of_the_target_with_a_warning_that_says_how_to_keep_it(cut_femur, middle_mm, caplog):
     with caplog.at_level(logging.WARNING):
         prepared = targets.prepare(cut_femur)

@@ -9,6 +9,7 @@ import pytest
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.config import RulesConfig, SensorConfig
 from gapr_core.registration import checks, other_size, rules
+from gapr_core.registration import source as sources
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,13 @@ def test_few_points_and_a_part_of_a_scene_are_not_asked(registrar, target, seen,
     assert checks.unless_grown(enough, registrar.config).refusal is not None and asked == [other_size.HALFWAY]
     nobody_called_it_a_scene = replace(enough, seen=answer.source, inferred_viewpoint=np.zeros(3))
     assert checks.unless_grown(nobody_called_it_a_scene, registrar.config).refusal is not None
+
+
+def test_residuals_that_grow_with_the_source_speak_for_no_size(registrar, target, seen, monkeypatch):
+    source = sources.prepare(seen)
+    monkeypatch.setattr(other_size, "refine_many", lambda T, points, *_: (T, [points.var(axis=0).sum()]))
+    found = other_size.margin(np.eye(4), source, target, registrar.config.verification)
+    assert found == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("log_ratio", "refuses"), [(-0.49, False), (-0.51, True), (0.6, False), (np.nan, False)])

@@ -200,6 +200,14 @@ def test_all_points_of_a_source_are_registered_mirrored(pelvis):
     assert found == np.inf and np.array_equal(np.sort(asked[0], axis=0), np.sort(flipped, axis=0))
 
 
+def test_the_image_of_what_a_camera_saw_is_compared_by_distances_and_not_by_scores_of_lines_of_sight(target, pelvis):
+    answer, image = (Registrar(CONFIG).assess(seen(pelvis) * flip, target) for flip in (1.0, FLIP))
+    in_scene = [replace(a, seen=a.source, candidates=replace(a.candidates, scores=1.0 / a.candidates.scores))
+                for a in (answer, image)]  # fmt: skip
+    found = [checks.full_image_margin(b, CONFIG, lambda *_, a=a: a) for a, b in ((answer, image), in_scene)]
+    assert found[0] == found[1] < -1.0, "the source is flipped, and its image lies on the bone"
+
+
 @pytest.mark.parametrize(
     ("seen_from", "refused"), [({}, True), ({"seen": 1}, False), ({"seen": 1, "inferred_viewpoint": np.zeros(3)}, True)]
 )

@@ -12,6 +12,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_core.registration import registrar as registrars
 from gapr_core.registration import standoff
+from gapr_core.registration.sensor import offset_surface
 
 REFUSING = RegistrarConfig(num_threads=1, min_confidence=1.0)
 
@@ -138,3 +139,19 @@ def test_it_has_to_fit_much_better_farther_than_4_mm_off(registrar, target, seen
     found = standoff.unless_off_the_bone(answer, registrar.config)
     assert (found.refusal is not None) == is_refused
     assert found.probability <= registrar.config.rules.ruled_out or not is_refused
+
+
+@pytest.mark.parametrize(
+    ("stated_mm", "best_mm", "says"),
+    [(2.0, 4.5, "6.5 mm outside"), (2.0, -4.5, "2.5 mm inside"), (6.0, -4.5, "1.5 mm outside")],
+)
+def test_where_a_standoff_is_stated_the_layer_that_refuses_is_named_from_the_bone(
+    registrar, target, seen, monkeypatch, stated_mm, best_mm, says
+):
+    answer = registrar.assess(seen(0.0), target)
+    answer = replace(answer, target=offset_surface(target, SensorConfig(standoff_mm=stated_mm)))
+    misfits_mm2 = {best_mm: 50.0, np.copysign(3.0, best_mm): 80.0}
+    monkeypatch.setattr(standoff, "offset_surface", lambda target, sensor: sensor.standoff_mm)
+    monkeypatch.setattr(standoff, "refine_many", lambda T, points, at, *_: (T, [misfits_mm2.get(at, 100.0)]))
+    found = standoff.unless_off_the_bone(answer, registrar.config)
+    assert f"fits best on a surface about {says} of the bone" in found.refusal.reason

@@ -401,6 +401,23 @@ def test_a_source_that_is_sent_again_is_no_surer(registrar, frames, prepared, ju
         assert tracker.register(again, prepared).confidence <= first.confidence + (1e-4 if jitter_mm else 1e-9)
 
 
+def test_a_source_that_jumped_counts_once_however_often_it_is_sent_again(scripted, frames, prepared, monkeypatch):
+    """Sent again, it does not continue the frames before the jump, and so brings nothing of them back."""
+    assess, elsewhere = Registrar.assess, se3.exp([60.0, 0.0, 0.0, 0.0, 0.0, 0.3])
+    before, jumped = (
+        [pair.source for pair in frames[:2]],
+        [se3.apply(elsewhere, pair.source) for pair in frames[2:]],
+    )
+    monkeypatch.setattr(Registrar, "assess", lambda *a, **k: replace(assess(*a, **k), probability=0.8))
+
+    def said_last(*sources):
+        tracker = scripted(*[None] * 4)
+        return [tracker.register(source, prepared).confidence for source in sources][-1]
+
+    once = said_last(*before, *jumped)
+    assert said_last(*before, jumped[0], *jumped) == once < said_last(*before, *(pair.source for pair in frames[2:]))
+
+
 @pytest.mark.parametrize("count", [12, 2000, 120_000])
 def test_a_cloud_is_the_same_in_any_order_and_rounding_and_another_one_with_noise_of_its_own(count):
     rng = np.random.default_rng(0)

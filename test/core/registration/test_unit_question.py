@@ -1,8 +1,11 @@
 """A cloud in cm that is read as mm is refused, and the reason asks for its unit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from gapr_core import Registrar
 from gapr_core.registration import rules
 from gapr_core.results import Refusal, RegistrationStatus
 
@@ -49,3 +52,13 @@ def test_both_ways_to_be_degenerate_are_asked(registrar, target):
     reasons = [registrar.register(source, target).reason for source in (line, blob)]
     assert "a line" in reasons[0] and "the rotation about" in reasons[1]
     assert all("is the cloud in cm?" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("is_scene", [False, True])
+def test_a_part_that_was_found_in_a_scene_is_not_asked_for_its_unit(registrar, femur_cloud, target, monkeypatch, is_scene):
+    answer = registrar.assess(femur_cloud, target)
+    refused = replace(answer, refusal=LINE, seen=answer.source if is_scene else None)
+    monkeypatch.setattr(Registrar, "_in_scene", lambda *_: refused)
+    found = registrar.register(femur_cloud / 10.0, target, viewpoint=[0.0, -500.0, 0.0])
+    assert found.status is RegistrationStatus.DEGENERATE
+    assert ("is the cloud in cm?" in found.reason) is not is_scene

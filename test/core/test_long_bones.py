@@ -60,7 +60,7 @@ def test_up_to_four_long_bones_are_found_and_more_are_a_hand_or_a_foot(count, fo
         joined(*(moved(TIBIA, (0.0, 40.0 * rib, 0.0), (0.1, 0.1, 0.4)) for rib in range(24))),
         joined(FEMUR, moved(FEMUR, (150.0, 0.0, 0.0), (0.3, 0.3, 0.3))),
     ],
-    ids=["one bone", "debris", "inner wall", "two hips", "two plates", "pelvis in three parts", "rib cage", "a small bone near"],
+    ids=["one bone", "debris", "inner cortex", "two hips", "two plates", "pelvis in parts", "rib cage", "small bone"],
 )
 def test_what_is_one_body_is_left_alone(surface):
     assert lengths_of(surface) == []

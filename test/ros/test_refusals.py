@@ -199,7 +199,8 @@ class Slow:
     def __init__(self, seconds):
         self.seconds, self.waits = seconds, []
 
-    def lookup(self, parent, child, stamp, timeout_s):
+    def lookup(self, parent, child, stamp, timeout_s, most_gap_s):
+        assert most_gap_s == NodeParameters().max_tf_gap
         self.waits.append(timeout_s)
         time.sleep(min(self.seconds, timeout_s))
         if timeout_s < self.seconds:

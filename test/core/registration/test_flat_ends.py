@@ -113,7 +113,7 @@ def test_a_plane_with_the_noise_of_a_scanner_is_no_border_of_a_scan(cut_femur):
 
 
 @pytest.mark.parametrize("burr_mm", [0.12, 0.2])
-def test_a_single_point_above_an_end_does_not_tilt_its_plane(cut_femur, middle_mm, burr_mm):
+def test_a_single_point_above_an_end_does_not_tilt_its_plane(cut_femur, burr_mm):
     points, normals, spacing_mm = spread(cut_femur)
     expected = flat_ends(points, normals, spacing_mm, 200.0)
     burr = np.flatnonzero(expected & (normals @ UP > 0.9))[20]

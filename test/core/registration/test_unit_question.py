@@ -55,7 +55,7 @@ def test_both_ways_to_be_degenerate_are_asked(registrar, target):
 
 
 @pytest.mark.parametrize("is_scene", [False, True])
-def test_a_part_that_was_found_in_a_scene_is_not_asked_for_its_unit(registrar, femur_cloud, target, monkeypatch, is_scene):
+def test_a_part_found_in_a_scene_is_not_asked_for_its_unit(registrar, femur_cloud, target, monkeypatch, is_scene):
     answer = registrar.assess(femur_cloud, target)
     refused = replace(answer, refusal=LINE, seen=answer.source if is_scene else None)
     monkeypatch.setattr(Registrar, "_in_scene", lambda *_: refused)

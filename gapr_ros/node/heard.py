@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.links import Links
-from gapr_ros.node.timeline import RESTART_AFTER, stamp_ns
+from gapr_ros.node.timeline import BACK_NS, RESTART_AFTER, stamp_ns
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import TransformStamped
 
 THROTTLE_S = 5.0
-BACK_NS = 10_000_000  # a transform may be so much older than the newest one of its frame, as where threads race
+OUT_OF_ORDER_NS = 10_000_000  # a transform may be so much older than the newest of its frame, as where threads race
 
 
 class Heard:
@@ -21,7 +21,8 @@ class Heard:
 
     A stamp that goes back is judged as those of clouds are: one is a straggler and is left out; several in a row that
     go forward among themselves are another round, and what was heard before is forgotten. Until it is clear which,
-    nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden.
+    nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden. Frames
+    through which nothing was looked up yet may be out of order by a second: they are no reason to forget the others.
 
     Args:
         buffer: of tf2.
@@ -33,7 +34,7 @@ class Heard:
         self._buffer, self._is_future, self._node = buffer, is_future, node
         self._newest_ns: dict[str, int] = {}  # by child frame
         self._back_ns: dict[str, list[int]] = {}  # stamps in a row that went back
-        self._links = Links()
+        self._links, self._needed = Links(), set[str]()  # frames through which something was looked up
         self._any_older: set[str] = set()
 
     def start_over(self) -> None:
@@ -78,13 +79,15 @@ class Heard:
 
     def turned(self, frame: str, other: str) -> str:
         """A frame between two whose stamps went back, and the next one will say why; empty without one."""
-        return min((each for each in self._links.between(frame, other) if each in self._back_ns), default="")
+        frames = self._links.between(frame, other)
+        self._needed |= frames
+        return min((each for each in frames if each in self._back_ns), default="")
 
     def _is_of_now(self, child: str, stamp: int) -> bool:
         newest, any_older = self._newest_ns.get(child, 0), child in self._any_older
         self._any_older.discard(child)
-        row = self._back_ns.get(child, [])
-        if stamp < newest - (0 if any_older or row else BACK_NS) or len(row) > 1:
+        row, most_ns = self._back_ns.get(child, []), OUT_OF_ORDER_NS if child in self._needed else BACK_NS
+        if stamp < newest - (0 if any_older or row else most_ns) or len(row) > 1:
             if not (any_older or self._is_another_round(child, stamp)):
                 return False
             self._warn(f"the stamps of the transforms of '{child}' went back: those of before are forgotten")

@@ -264,6 +264,17 @@ def test_while_the_stamps_of_a_frame_may_have_gone_back_it_is_not_looked_up(buff
     assert seen_at(buffer, 1000.65) == pytest.approx(3.0) and seen_at(buffer, 1000.95) is None
 
 
+def test_frames_that_nobody_looks_through_may_be_out_of_order(buffer):
+    """Such as a marker that two cameras see, one of them late."""
+    heard, hear, said = hears(buffer)
+    for i in range(100):
+        hear(1000.0 + 0.02 * i, 1.0)
+        late_s = 0.3 if i % 4 else 0.0
+        heard.set_transform(_transform(0.0, 1000.0 + 0.02 * i - late_s, child="marker"), "two cameras")
+        assert i < 2 or why_not(heard, 1000.0 + 0.02 * i - 0.01) == ""
+    assert seen_at(buffer, 1000.01) == pytest.approx(1.0) and not said
+
+
 @pytest.mark.parametrize("step_s", [0.5, 0.05])
 def test_after_a_small_step_back_of_the_clock_no_place_of_before_is_believed(buffer, step_s):
     """The camera moves by 1 m/s; clouds come 30 ms behind its transforms."""
@@ -321,6 +332,7 @@ def test_only_the_limit_refuses_a_cloud_between_transforms_that_are_far_apart(
 def test_a_cloud_waits_until_it_is_clear_whether_time_went_back(blob_path, client, method, heard):
     with node_in_thread(method, blob_path, output_frame="world", tf_timeout=60.0, max_future=0.0):
         client.wait_for_state("active")
+        assert see(client, heard, 999.0, camera_x=1.0)["level"] == 0
         for stamp_s, x in ((1000.0, 1.0), (1000.2, 1.0), (1000.1, 9.0)):
             heard.hear(_transform(x, stamp_s), "the camera")
         received = int(client.values()["frames_received"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -72,7 +73,15 @@ class Frames:
             self._heard = Heard(self._buffer, self._is_future, self._node)
             self._listener = self._tf2.TransformListener(self._heard, self._node)
 
-    def lookup(self, parent: str, child: str, stamp: Time, timeout_s: float, most_gap_s: float = 0.0) -> Array:
+    def lookup(
+        self,
+        parent: str,
+        child: str,
+        stamp: Time,
+        timeout_s: float,
+        most_gap_s: float = 0.0,
+        arrived_s: float = -math.inf,
+    ) -> Array:
         """T_parent_child (4, 4), metres, at a time. Waits in the caller's thread, by the wall clock.
 
         Args:
@@ -80,6 +89,7 @@ class Frames:
             stamp: when; 0 for the newest transform there is.
             timeout_s: longest wait.
             most_gap_s: between transforms that are farther apart than this, s, nothing is interpolated; 0: any.
+            arrived_s: when the cloud came that asks, `time.monotonic`; one that came late waits for another transform.
 
         Raises:
             RefusedError: tf_missing, never the identity.
@@ -90,9 +100,12 @@ class Frames:
         if self._tf2 is None or buffer is None or heard is None:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {MISSING}")
         deadline = time.monotonic() + timeout_s  # tf2's own wait never ends while simulated time stands still
-        while not buffer.can_transform(parent, child, stamp) or heard.turned(parent, child):
-            if time.monotonic() >= deadline:
-                break
+
+        def is_ready() -> bool:
+            is_known = buffer.can_transform(parent, child, stamp) and not heard.turned(parent, child)
+            return is_known and heard.is_settled(parent, child, stamp.nanoseconds, arrived_s)
+
+        while not is_ready() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         try:
             found = transform_to_matrix(buffer.lookup_transform(parent, child, stamp))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from geometry_msgs.msg import TransformStamped
 
 THROTTLE_S = 5.0
+LATE_NS = 50_000_000  # a cloud that is so much older than a transform came late, or the clock was set back before it
 OUT_OF_ORDER_NS = 10_000_000  # a transform may be so much older than the newest of its frame, as where threads race
 
 
@@ -34,6 +36,7 @@ class Heard:
         self._buffer, self._is_future, self._node = buffer, is_future, node
         self._newest_ns: dict[str, int] = {}  # by child frame
         self._back_ns: dict[str, list[int]] = {}  # stamps in a row that went back
+        self._came_s: dict[str, float] = {}  # when the last one came, `time.monotonic`
         self._links, self._needed = Links(), set[str]()  # frames through which something was looked up
         self._any_older: set[str] = set()
 
@@ -50,6 +53,7 @@ class Heard:
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf."""
         child, stamp = plain_frame(transform.child_frame_id), stamp_ns(transform.header)
+        self._came_s[child] = time.monotonic()
         if self._is_future(stamp):
             self._warn(f"a transform of '{child}' is left out: its stamp is ahead of the clock; synchronise the clocks")
         elif self._is_of_now(child, stamp):
@@ -82,6 +86,17 @@ class Heard:
         frames = self._links.between(frame, other)
         self._needed |= frames
         return min((each for each in frames if each in self._back_ns), default="")
+
+    def is_settled(self, frame: str, other: str, stamp: int, arrived_s: float) -> bool:
+        """False where a cloud that came late has to wait for another transform: that shows whether time went back.
+
+        Args:
+            frame, other: names.
+            stamp: of the cloud, ns; 0 for none.
+            arrived_s: when it came, `time.monotonic`.
+        """
+        late = [each for each in self._links.between(frame, other) if self._newest_ns.get(each, 0) > stamp + LATE_NS]
+        return stamp == 0 or all(self._came_s[each] > arrived_s for each in late)
 
     def _is_of_now(self, child: str, stamp: int) -> bool:
         newest, any_older = self._newest_ns.get(child, 0), child in self._any_older

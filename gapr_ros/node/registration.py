@@ -175,8 +175,8 @@ class Registration:
         stamp, start = Time.from_msg(outcome.header.stamp), time.monotonic()
         left_s = max(now.parameters.tf_timeout - outcome.tf_wait_s, 0.0)
         try:
-            gap_s = now.parameters.max_tf_gap
-            return self._frames.lookup(intake.plain_frame(frame), outcome.cloud_frame, stamp, left_s, gap_s)
+            gap_s, arrived_s = now.parameters.max_tf_gap, outcome.job.arrived_s
+            return self._frames.lookup(intake.plain_frame(frame), outcome.cloud_frame, stamp, left_s, gap_s, arrived_s)
         except RefusedError as refusal:
             raise RefusedError(refusal.reason, _who_asks(frame, now.parameters) + refusal.text) from refusal
         finally:

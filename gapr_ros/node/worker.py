@@ -24,6 +24,7 @@ class Job:
         received_ns: the node's clock when it arrived, ns.
         waiters: futures of service calls that want its outcome.
         urgent: asked for by a service: neither `continuous` nor `max_rate` holds it back.
+        arrived_s: by the wall clock (`time.monotonic`).
     """
 
     cloud: bytes
@@ -31,6 +32,7 @@ class Job:
     received_ns: int
     waiters: list[Any] = field(default_factory=list)
     urgent: bool = False
+    arrived_s: float = field(default_factory=time.monotonic)
 
 
 class Worker:

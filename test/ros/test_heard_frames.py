@@ -264,6 +264,48 @@ def test_while_the_stamps_of_a_frame_may_have_gone_back_it_is_not_looked_up(buff
     assert seen_at(buffer, 1000.65) == pytest.approx(3.0) and seen_at(buffer, 1000.95) is None
 
 
+def test_a_cloud_that_came_late_is_settled_by_the_next_transform_of_each_frame(buffer):
+    heard, hear, _ = hears(buffer)
+
+    def settled(stamp_s, arrived_s):
+        return heard.is_settled("world", "camera", round(stamp_s * NS), arrived_s)
+
+    hear(1000.0, 1.0)
+    now_s = time.monotonic()
+    assert settled(999.96, now_s) and settled(1000.5, now_s), "40 ms is not late"
+    assert not settled(999.94, now_s)
+    assert settled(0.0, now_s) and heard.is_settled("world", "bed", 0, now_s) and settled(999.0, now_s - 1.0)
+    hear(999.5, 1.0)
+    assert settled(999.94, now_s), "whatever it says: whether the stamps went back is asked apart"
+
+
+def test_a_cloud_after_a_step_back_that_comes_before_the_first_transform_is_not_put_where_the_camera_was(
+    blob_path, client, method, heard
+):
+    with node_in_thread(method, blob_path, output_frame="world", tf_timeout=60.0, max_future=0.0) as node:
+        client.wait_for_state("active")
+        for i in range(50):
+            heard.hear(_transform(1.0, 1000.0 + 0.02 * i), "the camera")
+        received, calls = node.counters.received, len(method.calls)
+        stamp = client.send(GOOD, frame="camera", stamp_s=1000.5)
+        wait_until(lambda: node.counters.received > received)
+        time.sleep(0.2)
+        assert len(method.calls) == calls, "it waits"
+        for i in range(6):
+            heard.hear(_transform(3.0, 1000.46 + 0.02 * i), "the camera")
+        wait_until(lambda: client.values()["cloud_stamp"] == stamp)
+        assert where(method) == pytest.approx(3.0, abs=1e-2)
+
+
+def test_a_late_cloud_after_which_nothing_comes_is_registered_when_it_has_waited(blob_path, client, method, heard):
+    with node_in_thread(method, blob_path, output_frame="world", tf_timeout=0.1, max_future=0.0):
+        client.wait_for_state("active")
+        for i in range(50):
+            heard.hear(_transform(1.0, 1000.0 + 0.02 * i), "the camera")
+        assert client.ask(GOOD, frame="camera", stamp_s=1000.5)["level"] == 0
+        assert where(method) == pytest.approx(1.0, abs=1e-2)
+
+
 def test_frames_that_nobody_looks_through_may_be_out_of_order(buffer):
     """Such as a marker that two cameras see, one of them late."""
     heard, hear, said = hears(buffer)

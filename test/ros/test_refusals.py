@@ -199,8 +199,8 @@ class Slow:
     def __init__(self, seconds):
         self.seconds, self.waits = seconds, []
 
-    def lookup(self, parent, child, stamp, timeout_s, most_gap_s):
-        assert most_gap_s == NodeParameters().max_tf_gap
+    def lookup(self, parent, child, stamp, timeout_s, most_gap_s, arrived_s):
+        assert most_gap_s == NodeParameters().max_tf_gap and arrived_s <= time.monotonic()
         self.waits.append(timeout_s)
         time.sleep(min(self.seconds, timeout_s))
         if timeout_s < self.seconds:

@@ -472,8 +472,8 @@ class RegistrarConfig(Settings):
     guide: bool = setting(False, "say with every answer where another look would help most")
     min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
     max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
-    searched_below: float = setting(0.8, "below this probability the next proposer is asked as well", low=0, high=2)
-    sure: float = setting(0.95, "the same for a tracked pose and a camera's; makes a stream sure", low=0, high=2)
+    searched_below: float = setting(0.8, "below it, and above limits.most, the next proposer is asked", low=0, high=2)
+    sure: float = setting(0.95, "from here on it is not; nor is a tracked pose or a camera's", low=0, high=2)
     num_threads: int = setting(0, "threads of a registration and its target; 0: all cores", low=0, high=1024)
     seed: int = setting(
         0, "seed of proposers that draw (ransac); other draws are always the same", low=0, high=2**31 - 1

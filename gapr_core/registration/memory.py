@@ -77,10 +77,11 @@ class MemoryFirst(Registrar):
         super().__init__(full.config, proposers, calibrations, full._scene_calibration, full.precision)
         self._full, self._memory = full, memory
 
-    def _searched_below(self, assessment: Assessment) -> float:
-        """More is asked of a remembered pose: what misled the answer before may mislead this one."""
-        remembered = assessment.proposer == Memory.name
-        return self.config.sure_from if remembered else super()._searched_below(assessment)
+    def _is_enough(self, assessment: Assessment) -> bool:
+        """A remembered pose has to be sure: what misled the answer before may mislead this one."""
+        if assessment.proposer == Memory.name:
+            return assessment.reaches(self.config.sure_from)
+        return super()._is_enough(assessment)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         return self._full._of_image(flipped, target, clock)

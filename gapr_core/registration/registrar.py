@@ -66,9 +66,9 @@ def never(assessment: Assessment) -> bool:
 class Registrar:
     """Lays partial sources on one or many prepared targets.
 
-    Proposers are asked in turn, each round with the poses of all so far, until an answer is as sure as
-    `RegistrarConfig.searched_below`: with the shipped weights the network first, and the exhaustive search only if the
-    network's answer is less sure.
+    Proposers are asked in turn, each round with the poses of all so far, until an answer is sure, or good enough to be
+    accepted and no more (`RegistrarConfig.searched_below`): with the shipped weights the network first, and the
+    exhaustive search only if the network's answer is less, or may be sure and is not.
 
     Args:
         config: every setting.
@@ -318,13 +318,19 @@ class Registrar:
             assessment = assess_fit(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            if assessment.reaches(self._searched_below(assessment)) or enough(assessment):
+            if self._is_enough(assessment) or enough(assessment):
                 break
         return assessment
 
-    def _searched_below(self, assessment: Assessment) -> float:
-        """From here on no further proposer is asked; `memory.MemoryFirst` wants more of what it remembers."""
-        return max(self.config.searched_below, self.config.min_confidence)
+    def _is_enough(self, assessment: Assessment) -> bool:
+        """True where no further proposer need be asked: the pose is sure, or good enough and too doubtful to be sure.
+
+        What may be sure is searched for once more: where both agree, fewer bones of other subjects are. A memory
+        (`memory.MemoryFirst`) has to be sure.
+        """
+        config = self.config
+        is_good = assessment.reaches(max(config.searched_below, config.min_confidence))
+        return assessment.reaches(config.sure_from) or (is_good and assessment.probability <= config.limits.most)
 
     def _in_scene(
         self,

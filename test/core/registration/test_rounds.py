@@ -9,6 +9,7 @@ from scipy.special import logit
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.benchmark import methods
+from gapr_core.config import LimitsConfig
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, MethodUnavailableError
@@ -55,9 +56,11 @@ def test_a_sure_answer_ends_the_rounds(pair):
 
 @pytest.mark.parametrize(("probability", "settings", "rounds"), [
     (0.85, {}, 1), (0.75, {}, 2), (0.75, {"searched_below": 0.7}, 1), (0.85, {"searched_below": 0.9}, 2),
-    (0.85, {"min_confidence": 0.9}, 2), (0.75, {"sure": 0.7}, 2), (0.85, {"sure": 1.1}, 1),
+    (0.85, {"min_confidence": 0.9}, 2), (0.85, {"sure": 1.1}, 1), (0.75, {"sure": 0.7}, 1), (0.92, {}, 2),
+    (0.96, {}, 1), (0.92, {"sure": 0.9}, 1), (0.92, {"limits": LimitsConfig(most=0.93)}, 1),
+    (0.92, {"searched_below": 0.5}, 2),
 ])  # fmt: skip
-def test_the_next_proposer_is_asked_below_the_setting_and_below_what_is_accepted(pair, probability, settings, rounds):
+def test_the_next_proposer_is_asked_for_what_is_doubtful_and_for_what_may_be_sure(pair, probability, settings, rounds):
     proposers = [Fixed(name, pair.T_target_source[None]) for name in ("network", "search")]
     as_probable = [Calibration(each.name, Additive(float(logit(probability)), ()), {}) for each in proposers]
     registrar = Registrar(replace(ONE_THREAD, **settings), proposers, as_probable)
@@ -67,7 +70,7 @@ def test_the_next_proposer_is_asked_below_the_setting_and_below_what_is_accepted
 def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair):
     near = se3.exp([6.0, -5.0, 4.0, 0.05, 0.05, -0.05]) @ pair.T_target_source
     first, second = Fixed("network", near[None]), Fixed("search", np.eye(4)[None])
-    config = RegistrarConfig(num_threads=1, searched_below=1.1)
+    config = RegistrarConfig(num_threads=1, searched_below=1.1, sure=1.1)
     registrar = Registrar(config, [first, second])
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     assert (first.asked, second.asked, result.rounds) == (1, 1, 2)

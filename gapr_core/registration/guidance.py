@@ -61,8 +61,10 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
     now_mm = float(np.sqrt(assessment.tre95_mm**2 + now_mm2))
     after_mm = np.sqrt(bounds**2 + left_mm2)
     order = np.argsort(after_mm, kind="stable")
-    places = np.stack([target.points[patches.centres], target.normals[patches.centres]], axis=1)
-    ranked = tuple(Patch(*places[k], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k])) for k in order)
+    points, normals = target.points[patches.centres], target.normals[patches.centres]  # copies
+    ranked = tuple(
+        Patch(points[k], normals[k], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k])) for k in order
+    )
     return Guidance(target.points.copy(), _spread(target, patches, now_mm - after_mm), now_mm, ranked)
 
 

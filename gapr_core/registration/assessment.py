@@ -106,7 +106,7 @@ class Assessment:
         """All distinct poses, best first; the first one is the refined one."""
         poses = (self.fit.T, *self.candidates.poses[1:])
         shares = shared_probability(self.probability, self.candidates.scores, self.independent_points)
-        return tuple(map(Hypothesis, map(np.copy, poses), shares))
+        return tuple(map(Hypothesis, poses, shares))
 
     @property
     def residuals(self) -> Residuals:
@@ -114,11 +114,11 @@ class Assessment:
         if self.seen is None or self.members is None:
             fit = self.fit.rests_on
             points = self.source.points if fit is self.fit else self.source.whole
-            return Residuals(points.copy(), fit.signed_mm.copy(), fit.weights > 0.0)
+            return Residuals(points, fit.signed_mm, fit.weights > 0.0)
         distance_mm = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
         counts = np.zeros(len(self.members), dtype=bool)
         counts[self.members] = self.fit.weights > 0.0
-        return Residuals(self.seen.points.copy(), distance_mm, counts)
+        return Residuals(self.seen.points, distance_mm, counts)
 
     def reaches(self, limit: float) -> bool:
         """True when no rule speaks against the pose and its probability reaches `limit`."""
@@ -140,8 +140,10 @@ class Assessment:
         """The same with a probability of at most `most`; what that takes off its log odds stands under `by`."""
         if not self.probability > most:
             return self
-        off = float(logit(most) - logit(self.probability)) + self.contributions.get(by, 0.0)
-        return replace(self, probability=most, contributions={**self.contributions, **({by: off} if by else {})})
+        contributions = dict(self.contributions)
+        if by:
+            contributions[by] = contributions.get(by, 0.0) + float(logit(most) - logit(self.probability))
+        return replace(self, probability=most, contributions=contributions)
 
 
 def assess_fit(
@@ -225,10 +227,10 @@ def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResul
     return replace(
         common,
         status=RegistrationStatus.OK,
-        T_target_source=a.fit.T.copy(),
-        covariance=a.uncertainty.covariance.copy(),
+        T_target_source=a.fit.T,
+        covariance=a.uncertainty.covariance,
         tre_mm=a.tre_mm,
         tre95_mm=tre95_mm,
         factor95=a.factor95,
-        centre_mm=a.centre_mm.copy(),
+        centre_mm=a.centre_mm,
     )

@@ -125,9 +125,11 @@ def _of_rivals(
     if not rivals:
         return 0.0, np.zeros(len(patches.centres)), np.ones(len(patches.centres))
     target, best = assessment.target, assessment.hypotheses[0]
+    in_source = se3.apply(se3.inverse(best.T_target_source), target.points)
     distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
     weights = np.array([rival.probability for rival in rivals])
-    excluded = np.array([_excluded(assessment, rivals, members, noise_mm, bias_mm) for members in patches.members])
+    variance = noise_mm**2 + bias_mm**2
+    excluded = np.array([_excluded(in_source[members], rivals, target, variance) for members in patches.members])
     left_mm2 = (weights * distances**2) @ (1.0 - excluded).T
     return float(weights @ distances**2), left_mm2, excluded @ weights / max(float(weights.sum()), 1e-12)
 
@@ -138,18 +140,13 @@ def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> fl
     return se3.rms_apart_mm(np.eye(4), motion, target.points[target.anchors])
 
 
-def _excluded(
-    assessment: Assessment, rivals: Sequence[Hypothesis], members: NDArray[np.int64], noise_mm: float, bias_mm: float
-) -> Array:
+def _excluded(patch: Array, rivals: Sequence[Hypothesis], target: PreparedTarget, variance: float) -> Array:
     """(R,) share of each rival's probability that a look at the patch would take.
 
-    Under a rival the patch of the best pose lies d off the surface; its likelihood falls by exp(-d^2 / 2 (s^2 + b^2)).
-    What slides along the surface tells nothing, however far it goes.
+    Under a rival the patch (n, 3), by the best pose in the source's frame, lies d off the surface; its likelihood falls
+    by exp(-d^2 / 2 (s^2 + b^2)), with that variance, mm^2. What slides along the surface tells nothing, however far.
     """
-    target, best = assessment.target, assessment.hypotheses[0]
-    variance = noise_mm**2 + bias_mm**2
-    points = se3.apply(se3.inverse(best.T_target_source), target.points[members])
-    off = [distances_mm(rival.T_target_source, points, target) for rival in rivals]
+    off = [distances_mm(rival.T_target_source, patch, target) for rival in rivals]
     return np.array([1.0 - np.exp(-0.5 * (d**2).mean() / variance) for d in off])
 
 

@@ -15,7 +15,7 @@ The order in which an answer comes about, with the function of each step:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -171,7 +171,8 @@ class Registrar:
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
         """The answer to an assessment: limits, names for clutter, thresholds, the question of a stand-off, guidance.
 
-        What decides comes in this order. Of an inferred viewpoint more is asked (`accepted_if_inferred`).
+        What decides comes in this order. Of an inferred viewpoint more is asked (`accepted_if_inferred`). All of the
+        answer is the caller's own: what is remembered of a stream, or of a target, shares no array with it.
         """
         if isinstance(assessment, Refusal):
             reason = assessment.reason
@@ -182,7 +183,7 @@ class Registrar:
         asked = replace(self.config, min_confidence=self.config.accepted_if_inferred) if inferred else self.config
         result = asking_the_standoff(answer(named, asked), named, self.config)
         clock.lap("assess")
-        return replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages)
+        return deepcopy(replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages))
 
     @single_threaded_libraries
     def assess(

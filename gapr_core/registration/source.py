@@ -106,9 +106,10 @@ def prepare(
         InvalidPointCloudError: for a wrong shape or type, or an extent that cannot be a piece of a bone in mm.
     """
     config = config or SourceConfig()
-    points = sampling.distinct(clouds.finite_points(source))
-    if len(points) > config.most_raw_points:
+    points = clouds.finite_points(source)
+    if len(points) > config.most_raw_points:  # before they are sorted, which takes longer
         points = points[_drawn(points, config.most_raw_points)]
+    points = sampling.distinct(points)
     if len(points):
         points = sampling.without_crowds(points, CONTACT_MM, *CROWD)
     if len(points) > config.fitted_points and not in_scene:

@@ -34,21 +34,20 @@ class Heard:
 
     def __init__(self, buffer: Any, is_future: Callable[[int], bool], node: Any) -> None:
         self._buffer, self._is_future, self._node = buffer, is_future, node
-        self._newest_ns: dict[str, int] = {}  # by child frame
-        self._back_ns: dict[str, list[int]] = {}  # stamps in a row that went back
+        self._back_ns: dict[str, list[int]] = {}  # by child frame: stamps in a row that went back
         self._came_s: dict[str, float] = {}  # when the last one came, `time.monotonic`
         self._links, self._needed = Links(), set[str]()  # frames through which something was looked up
         self._any_older: set[str] = set()
 
     def start_over(self) -> None:
         """Forget all but what is static: between that and what comes tf2 would interpolate."""
-        self._newest_ns, self._back_ns, self._any_older = {}, {}, set()
+        self._back_ns, self._any_older = {}, set()
         self._links.forget()
         self._buffer.clear()
 
     def expect_older(self) -> None:
         """After a reset: the next stamp of a frame begins another round however small the step back is."""
-        self._any_older = set(self._newest_ns)
+        self._any_older = self._links.moving
 
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf."""
@@ -95,11 +94,11 @@ class Heard:
             stamp: of the cloud, ns; 0 for none.
             arrived_s: when it came, `time.monotonic`.
         """
-        late = [each for each in self._links.between(frame, other) if self._newest_ns.get(each, 0) > stamp + LATE_NS]
+        late = [each for each in self._links.between(frame, other) if self._links.newest_ns(each) > stamp + LATE_NS]
         return stamp == 0 or all(self._came_s[each] > arrived_s for each in late)
 
     def _is_of_now(self, child: str, stamp: int) -> bool:
-        newest, any_older = self._newest_ns.get(child, 0), child in self._any_older
+        newest, any_older = self._links.newest_ns(child), child in self._any_older
         self._any_older.discard(child)
         row, most_ns = self._back_ns.get(child, []), OUT_OF_ORDER_NS if child in self._needed else BACK_NS
         if stamp < newest - (0 if any_older or row else most_ns) or len(row) > 1:
@@ -107,8 +106,6 @@ class Heard:
                 return False
             self._warn(f"the stamps of the transforms of '{child}' went back: those of before are forgotten")
             self.start_over()
-            newest = 0
-        self._newest_ns[child] = max(stamp, newest)
         self._back_ns.pop(child, None)
         return True
 

@@ -40,6 +40,17 @@ class Links:
                 del self._parents[child]
             self._stamps = {}
 
+    def newest_ns(self, child: str) -> int:
+        """The newest stamp of a frame; 0 of one that was not heard."""
+        with self._lock:
+            return self._stamps.get(child, [0])[-1]
+
+    @property
+    def moving(self) -> set[str]:
+        """Every frame that was heard on /tf."""
+        with self._lock:
+            return set(self._stamps)
+
     def between(self, frame: str, other: str) -> set[str]:
         """The moving frames whose transforms lead from one frame to the other."""
         with self._lock:

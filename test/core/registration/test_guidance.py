@@ -1,7 +1,6 @@
 """Where to look next: the information of a look, what it excludes, and what it is worth."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -103,9 +102,8 @@ def test_a_rival_that_slides_a_patch_along_the_bone_is_not_excluded_there():
     poses = [np.eye(4), se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 7.0])]
     poses += [se3.from_rotation_translation(np.eye(3), [0.0, 3.0, 0.0])]
     hypotheses = tuple(Hypothesis(pose, 0.3) for pose in poses)
-    assessment = SimpleNamespace(target=tube, hypotheses=hypotheses)
     members = np.flatnonzero(np.linalg.norm(tube.points - [0.0, 20.0, 0.0], axis=1) < 15.0)
-    slid, lifted = guidance._excluded(assessment, hypotheses[1:], members, 0.8, 0.7)
+    slid, lifted = guidance._excluded(tube.points[members], hypotheses[1:], tube, 0.8**2 + 0.7**2)
     assert slid < 0.05 and lifted > 0.9
 
 

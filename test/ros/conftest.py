@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +24,13 @@ def pytest_collection_modifyitems(items) -> None:
 
 def pytest_report_header() -> str:
     return "rclpy: " + ("missing, test/ros is left out" if ROS_IS_MISSING else "found")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _what_lives_already_is_not_looked_through_again():
+    """Every test collects the nodes of the one before: among all objects of the other tests that takes seconds."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -348,12 +348,12 @@ def test_one_transform_a_little_ahead_makes_no_place_wrong(buffer):
 
 def test_what_is_known_of_a_frame_stays_small_and_is_forgotten_with_its_round(buffer):
     heard, hear, _ = hears(buffer)
-    for i in range(30_000):
+    for i in range(5000):
         hear(1000.0 + 0.01 * i, 1.0)
     assert 1000 <= len(heard._links._stamps["camera"]) <= 2001
-    assert why_not(heard, 1299.985, most_gap_s=0.005) != ""
+    assert why_not(heard, 1049.985, most_gap_s=0.005) != ""
     heard.start_over()
-    assert why_not(heard, 1299.985, most_gap_s=0.005) == "" and not heard._links.between("world", "camera")
+    assert why_not(heard, 1049.985, most_gap_s=0.005) == "" and not heard._links.between("world", "camera")
 
 
 @pytest.mark.parametrize(("max_tf_gap", "level"), [(0.25, 1), (0.0, 0), (2.0, 0)])
@@ -406,7 +406,7 @@ def test_the_node_puts_no_transform_from_the_future_into_its_buffer(blob_path, c
         )
         for stamp_s, x in ((999.5, 1.0), (3e7, 1.0), (999.7, 2.0), (999.9, 2.0)):
             heard.hear(_transform(x, stamp_s), "the camera")
-        assert client.ask(GOOD, frame="camera", stamp_s=999.8)["level"] == 0
+        assert client.ask(GOOD, frame="camera", stamp_s=999.86)["level"] == 0
         assert where(method) == pytest.approx(2.0, abs=1e-2)
 
 

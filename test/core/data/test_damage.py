@@ -125,9 +125,14 @@ def test_the_grid_is_of_2_mm_and_one_axis_is_longer_by_a_twenty_eighth(pair, sit
     before, after = damaged("coarse grid", pair, site, specimen)
     assert 0.5 < np.linalg.norm(after - before, axis=1).mean() < 1.74  # sqrt(3) at most, for 2 mm
     assert len(np.unique(after.round(6), axis=0)) < len(before)
-    before, after = damaged("one axis", pair, site, specimen)
-    sizes = np.linalg.svd(np.linalg.lstsq(before - before.mean(axis=0), after - after.mean(axis=0), rcond=None)[0])[1]
-    np.testing.assert_allclose(np.sort(np.abs(sizes - 1.0)), [0.0, 0.0, 0.035], atol=1e-9)
+    largest = set()
+    for seed in range(6):
+        before, after = damaged("one axis", pair, site, specimen, seed)
+        change = np.linalg.lstsq(before - before.mean(axis=0), after - after.mean(axis=0), rcond=None)[0]
+        sizes = np.linalg.svd(change)[1] - 1.0
+        np.testing.assert_allclose(np.sort(np.abs(sizes)), [0.0, 0.0, 0.035], atol=1e-9)
+        largest.add(round(sizes[np.abs(sizes).argmax()], 3))
+    assert largest == {-0.035, 0.035}
 
 
 def test_a_wrong_range_changes_the_size_and_nothing_else(pair, site, specimen):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import pickle
 from argparse import ArgumentParser
+from dataclasses import replace
 
 import numpy as np
 import open3d as o3d
@@ -75,6 +76,19 @@ def test_the_same_seed_gives_the_same_hash_and_another_seed_another_one(tmp_path
     other = write_pairs(Recipe(("L3", "wrong"), ("ball", "knob"), count=3, seed=8), BONES, tmp_path / "other")
     assert first["hash"] == again["hash"] != other["hash"]
     assert len(first["pairs"]) == 2 * 2 * 3 == len(list((tmp_path / "first").glob("*.npz")))
+
+
+@pytest.mark.parametrize("part", ["source", "target", "T_target_source"])
+def test_the_hash_of_a_pair_is_of_both_clouds_and_of_the_pose(part):
+    pair = make_pair("L1", BONES["ball"][0], 1)
+    changed = getattr(pair, part).copy()
+    changed[0, 0] += 1.0
+    assert pair_hash(replace(pair, **{part: changed})) != pair_hash(pair)
+
+
+def test_lists_of_two_seeds_share_no_draw():
+    drawn = [{job.seed for job in make_pairs._plan(replace(RECIPE, count=9, seed=seed), BONES)} for seed in (7, 8)]
+    assert not drawn[0] & drawn[1]
 
 
 def test_pairs_drawn_on_a_cluster_have_the_same_hash(tmp_path, dask_address):

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shapes import ball_specimen, knob_specimen
 
-from gapr_core.data import degradation
+from gapr_core.data import degradation, protocols
 from gapr_core.data.protocols import LEVELS, PROTOCOLS, TARGET_POINTS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
@@ -79,6 +79,23 @@ def test_on_long_bones_the_paper_crops_at_an_end_and_on_round_ones_anywhere():
     long_bone, round_bone = np.abs(crop_heights(6.0)), np.abs(crop_heights(1.0))
     assert long_bone.min() > 0.3
     assert round_bone.min() < 0.3
+
+
+@pytest.mark.parametrize(("stretch", "at_an_end"), [(1.8, False), (2.2, True)])
+def test_a_bone_is_long_where_it_is_twice_as_long_as_wide(stretch, at_an_end):
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(-1.0, 1.0, (4000, 3)) * [1.0, 1.0, stretch]
+    heights = np.array([cloud[protocols._crop_centre(cloud, rng), 2] for _ in range(60)]) / stretch
+    assert (np.abs(heights).min() > 0.88) == at_an_end
+
+
+def test_a_ball_is_thinned_to_half_or_filled_with_half_as_many_between_its_points(monkeypatch):
+    monkeypatch.setattr(degradation, "ROUNDS", 1)
+    points = np.random.default_rng(0).normal(size=(101, 3))
+    found = [degradation.vary_density(points, 1e3, np.random.default_rng(seed)) for seed in range(8)]
+    assert {len(each) for each in found} == {101 - 50, 101 + 51}
+    for each in found:
+        assert (each.min(axis=0) >= points.min(axis=0)).all() and (each.max(axis=0) <= points.max(axis=0)).all()
 
 
 def test_a_sweep_covers_a_narrow_band_from_end_to_end():
@@ -199,7 +216,8 @@ def test_wrong_pairs_come_from_another_bone_or_another_person_and_have_no_pose()
     pairs = [make_pair("wrong", ball_specimen(), 1, OTHERS, turn) for turn in range(8)]
     assert all(np.isnan(p.T_target_source).all() and not p.has_truth for p in pairs)
     assert [p.metadata["wrong_kind"] for p in pairs[:2]] == ["other_bone", "other_person"]
-    assert {p.metadata["degraded_as"] for p in pairs} == {"L1", "L2", "L3", "paper"}
+    both = {(p.metadata["wrong_kind"], p.metadata["degraded_as"]) for p in pairs}
+    assert both == {(kind, seen) for kind in ("other_bone", "other_person") for seen in ("L1", "L2", "L3", "paper")}
     for pair in pairs:
         same_bone = pair.metadata["source_bone"] == pair.bone
         assert not same_bone or pair.metadata["source_person"] != pair.person

@@ -13,7 +13,7 @@ from shapes import ball_specimen, knob_specimen
 from gapr_core.data.pair_files import load_pair, save_pair
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
-from gapr_core.data.scenes import camera, limb, scene
+from gapr_core.data.scenes import camera, joint, limb, scene
 from gapr_core.data.scenes.scene import SCENE_LEVELS
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
@@ -195,6 +195,15 @@ def test_a_wrong_scene_is_seen_by_a_stereo_camera_or_under_layers_too(turn):
     pair = make_pair("scene-wrong-stereo", ball_specimen(person="p0"), 3, others, turn)
     assert not pair.has_truth and pair.metadata["source_person"] == ("p2", "p1")[turn % 2]
     assert pair.metadata["degraded_as"] == ("scene-stereo", "scene-layers")[turn // 2]
+
+
+def test_a_wound_at_a_joint_is_where_both_bones_are_near(monkeypatch):
+    own, neighbour = ball_specimen(50.0), knob_specimen()
+    monkeypatch.setattr(joint.wounds, "somewhere", lambda *arguments: arguments[-1])
+    near = joint._between(own, neighbour, own, np.random.default_rng(0), None)
+    assert not near(own.surface.points[:9]).any() and not near(neighbour.surface.points[:9]).any()
+    near = joint._between(own, own, own, np.random.default_rng(0), None)
+    assert near(own.surface.points[:9]).all()
 
 
 def test_a_wound_at_a_joint_holds_the_next_bone_of_the_same_subject():

@@ -60,13 +60,13 @@ def test_a_ridge_becomes_round(only):
 
 def test_the_noise_has_its_size_and_near_pixels_share_it(only):
     alike = {}
-    for patchy in (0.0, 1.0):
+    for patchy in (0.0, 0.5, 1.0):
         only(noise_mm=1.0, PATCHY=(patchy, patchy), WINDOW_MM=(4.0, 4.0))
         found = off_mm(seen(plate()))
         assert found.std() == pytest.approx(1.0, rel=0.1)
         neighbours = cKDTree(plate().points).query(plate().points, k=2)[1][:, 1]
         alike[patchy] = np.corrcoef(found, found[neighbours])[0, 1]
-    assert abs(alike[0.0]) < 0.1 and alike[1.0] > 0.8
+    assert abs(alike[0.0]) < 0.1 and 0.4 < alike[0.5] < 0.6 and alike[1.0] > 0.8
 
 
 def test_pixels_fly_only_along_an_edge_between_its_two_depths_and_are_on_no_surface(only):

@@ -3,7 +3,7 @@ import pytest
 
 from gapr_core.data import degradation
 from gapr_core.data.protocols import LEVELS
-from gapr_core.data.smooth_bias import SMOOTH_BIASES
+from gapr_core.data.smooth_bias import SMOOTH_BIASES, process
 
 SHEET = np.stack(np.meshgrid(np.arange(0.0, 300.0, 5.0), np.arange(0.0, 300.0, 5.0), [0.0]), axis=-1).reshape(-1, 3)
 
@@ -37,6 +37,11 @@ def test_a_gaussian_process_forgets_within_a_hundred_millimetres():
     fields = np.array([SMOOTH_BIASES["gp-peak"](pair, 1.0, np.random.default_rng(seed)) for seed in range(400)])
     near, far = (np.corrcoef(fields[:, 0], fields[:, other])[0, 1] for other in (1, 2))
     assert near > 0.8 > 0.2 > abs(far)
+
+
+def test_a_gaussian_process_has_a_variance_of_1():
+    values = np.concatenate([process(np.eye(3) * 300.0, np.random.default_rng(seed)) for seed in range(600)])
+    assert values.std() == pytest.approx(1.0, abs=0.07)
 
 
 def test_the_bias_of_the_levels_is_as_it_always_was():

@@ -151,7 +151,9 @@ def _of_fcsv(data: bytes) -> Markups:
 
 
 def _mm_per_unit(said: object) -> float:
-    """Of one unit, or of one for each axis if they are the same."""
+    """Of one unit, of one with its code (mm, UCUM, millimeter; schema 1.0.3), or of the same one for each axis."""
+    if isinstance(said, list) and len(said) in (2, 3) and said[1] == "UCUM":
+        said = said[0]
     units = set(map(str, said)) if isinstance(said, list) else {str(said)}
     if len(units) != 1 or not units <= MM_PER_UNIT.keys():
         raise ValueError(f"coordinateUnits {said!r}, none of {' '.join(MM_PER_UNIT)}")

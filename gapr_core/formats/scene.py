@@ -118,7 +118,9 @@ def _mrml(with_off_bone: bool, with_targets: bool) -> str:
     if with_off_bone:
         _model(scene, "off_bone", "{:.2f} {:.2f} {:.2f}".format(*GREY / 255), {"pointSize": "4"}, moved)
     if with_targets:
-        _node(scene, "MarkupsFiducial", "MarkupsFiducial", "targets", TARGETS, {})
+        display = "vtkMRMLMarkupsFiducialDisplayNodetargets"  # a scene that is loaded makes none of its own
+        ElementTree.SubElement(scene, "MarkupsFiducialDisplay", id=display, name="targets display")
+        _node(scene, "MarkupsFiducial", "MarkupsJson", "targets", TARGETS, {"displayNodeRef": display})
     return ElementTree.tostring(scene, encoding="unicode", xml_declaration=False) + "\n"
 
 

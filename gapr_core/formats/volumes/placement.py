@@ -19,7 +19,7 @@ from gapr_core.formats.volumes import nifti
 Array = NDArray[np.float64]
 
 FARTHEST_MM = 0.01  # between the two places of a voxel in a NIfTI file, as well as what rounding explains
-LARGEST_SCALE = 0.01  # of a voxel by the sform to one by pixdim
+STRETCHED_MM = 0.1  # by how much an image may be longer by the sform than by pixdim, whose numbers are often rounded
 SQUARE_ROUNDING = 3.0 * np.finfo(np.float32).eps  # of 1 - b^2 - c^2 - d^2
 MHA = {  # all spellings that ITK reads
     "TransformMatrix": ("TransformMatrix", "Rotation", "Orientation"),
@@ -51,7 +51,7 @@ def _check_nifti(geometry: nifti.Geometry) -> None:
     if sform is None:  # then pixdim is the size of the voxels
         return
     columns = np.linalg.norm(sform[:, :3], axis=0)
-    if not (np.abs(columns - geometry.pixdim) <= LARGEST_SCALE * geometry.pixdim).all():
+    if not (np.abs(columns - geometry.pixdim) * np.ptp(corners[:, :3], axis=0) <= STRETCHED_MM).all():
         given = f"{_numbers(columns)} in the sform and {_numbers(geometry.pixdim)} in pixdim"
         raise InvalidPointCloudError("one size of the voxels", given, "write it again with nibabel or 3D Slicer")
     if geometry.quaternion is None:
@@ -91,6 +91,9 @@ def _check_nrrd(fields: dict[str, str]) -> None:
 
 def _check_mha(fields: dict[str, str]) -> None:
     _check_there(MHA, [name for name, words in MHA.items() if any(fields.get(word) for word in words)])
+    unit = fields.get("DistanceUnits", "mm")
+    if unit not in ("mm", "?", ""):  # ITK reads all numbers as mm, whatever stands here
+        raise InvalidPointCloudError("DistanceUnits of mm", unit, "write it again in mm")
 
 
 def _check_there(names: Iterable[str], found: list[str]) -> None:

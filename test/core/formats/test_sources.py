@@ -286,7 +286,9 @@ def test_one_of_several_tools_is_never_guessed(tmp_path, name):
 
 def test_units_of_markups_are_one_for_all_axes(tmp_path):
     points = [{"label": f"L{i}", "position": (p / 10.0).tolist()} for i, p in enumerate(POINTS)]
-    for said, expected in ((["cm", "cm", "cm"], POINTS), ("cm", POINTS), (["cm", "mm", "cm"], None), ("inch", None)):
+    coded = ["cm", "UCUM", "centimeter"], ["cm", "UCUM"]  # schema 1.0.3 of 3D Slicer
+    right = [(each, POINTS) for each in (["cm", "cm", "cm"], "cm", *coded)]
+    for said, expected in (*right, (["cm", "mm", "cm"], None), (["inch", "UCUM"], None), ("inch", None)):
         node = {"coordinateSystem": "LPS", "coordinateUnits": said, "controlPoints": points}
         (tmp_path / "a.mrk.json").write_text(json.dumps({"markups": [node]}))
         if expected is not None:

@@ -77,7 +77,10 @@ def test_a_quaternion_rounded_to_float32_is_normalised():
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0, 1.0)])
+NO_ROTATIONS = [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), (0.0, 0.612, 0.0, 0.816), (float("nan"), 0.0, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize("q", NO_ROTATIONS)
 def test_a_quaternion_that_is_no_rotation_raises(q):
     orientation = Quaternion(x=q[0], y=q[1], z=q[2], w=q[3])
     with pytest.raises(InvalidMessageError, match="unit length"):
@@ -93,9 +96,10 @@ def test_a_position_that_is_not_finite_raises():
 
 @pytest.mark.parametrize(
     "T",
-    [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1]), np.diag([-1.0, 1, 1, 1]), np.diag([1.0, 1, 1, 2])],
-    ids=["shape", "nan", "scaled", "mirrored", "projective"],
-)
+    [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1]), np.diag([1.01, 1.01, 1.01, 1]),
+     np.diag([-1.0, 1, 1, 1]), np.diag([1.0, 1, 1, 2])],
+    ids=["shape", "nan", "scaled", "scaled by a hundredth", "mirrored", "projective"],
+)  # fmt: skip
 def test_a_matrix_that_is_no_rigid_motion_is_not_written(T):
     with pytest.raises(InvalidMessageError):
         matrix_to_pose(T)

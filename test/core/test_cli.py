@@ -6,14 +6,17 @@ import shlex
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gapr_core import cli
+from gapr_core.benchmark import methods
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
+from gapr_core.results import RegistrationResult, RegistrationStatus
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +181,57 @@ def test_evaluate_finds_a_place_that_cannot_be_written_before_the_work(tmp_path,
     out = ["--out", str(tmp_path / "file" / "o.json"), "--method", "icp"]
     assert cli.main(["evaluate", "--pairs", str(tmp_path / "pairs"), *out]) == 1
     assert not asked and "what should be its folder is a file" in capsys.readouterr().err
+
+
+class SlowAtFirst:
+    """Its first call takes 0.4 s longer, as where compiled code loads; preparing takes 20 ms, registering none."""
+
+    name = "gapr"
+
+    def __init__(self, config):
+        self.calls = 0
+
+    def prepare(self, target, units="mm"):
+        time.sleep(0.02)
+        return target
+
+    def register(self, source, target):
+        self.calls += 1
+        time.sleep(0.4 if self.calls == 1 else 0.0)
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9)
+
+
+def test_the_seconds_of_evaluate_are_without_the_first_call_and_without_preparing(tmp_path, pair, monkeypatch):
+    monkeypatch.setitem(methods.OWN, "gapr", SlowAtFirst)
+    (tmp_path / "pairs").mkdir()
+    for name in "ab":
+        np.savez(tmp_path / "pairs" / f"{name}.npz", source=pair.source, target=pair.target)
+    assert cli.main(["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "o.json")]) == 0
+    answers = json.loads((tmp_path / "o.json").read_text())
+    assert set(answers) == {"a", "b"}
+    assert all(answer["prepare_seconds"] >= 0.02 for answer in answers.values())
+    assert all(answer["seconds"] < 0.2 for answer in answers.values())
+
+
+def test_the_times_of_an_answer_are_those_of_registering_and_of_preparing(tmp_path, pair, monkeypatch):
+    """By a clock that the method moves: 2 s for the one, 7 s for the other."""
+    from gapr_core.commands import evaluate
+
+    now = [100.0]
+
+    class Timed:
+        def prepare(self, target, units="mm"):
+            now[0] += 2.0
+            return target
+
+        def register(self, source, target):
+            now[0] += 7.0
+            return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9)
+
+    monkeypatch.setattr(evaluate, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    np.savez(tmp_path / "a.npz", source=pair.source, target=pair.target)
+    answer = evaluate._answer(tmp_path / "a.npz", Timed())
+    assert (answer["prepare_seconds"], answer["seconds"]) == (2.0, 7.0)
 
 
 def test_wrong_usage_is_bad_input_not_a_refusal(capsys):

@@ -140,6 +140,14 @@ def test_the_view_colours_points_by_their_distance_and_shows_rivals_apart(femur)
     np.testing.assert_allclose(rival.others, se3.apply(RIVAL.T_target_source, POINTS))
 
 
+def test_the_page_says_within_which_distances_half_and_95_percent_of_the_points_lie(register):
+    """Of 19 sizes in order the 10th, and what lies at 0.95 of the 18 steps between them: a tenth from 18th to 19th."""
+    sizes = sorted(abs(float(d)) for d in DISTANCES[:19])
+    most = sizes[17] + 0.1 * (sizes[18] - sizes[17])
+    _, page = register()
+    assert f"Half of them lie within {sizes[9]:.2f} mm, 95 % within {most:.2f} mm." in text_of(page)
+
+
 def test_the_histogram_counts_every_point_once():
     near = np.isfinite(DISTANCES)
     counted, aside = registration_report.residual_figure(DISTANCES[near], RESIDUALS.inlier[near]).data

@@ -15,6 +15,7 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.errors import InvalidPointCloudError, MethodUnavailableError
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry import se3
+from gapr_ros.bags.files import Bag
 from gapr_ros.bags.writing import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
@@ -47,6 +48,20 @@ def test_the_clouds_of_a_topic_are_joined_and_a_slice_of_them_chosen(bag, caplog
     np.testing.assert_allclose(read(bag, topic="/tip"), 1000.0 * PIECES[0], atol=1e-9)
     (file,) = [path for path in bag.iterdir() if path.suffix in (".mcap", ".db3")]
     np.testing.assert_allclose(read(file, topic="/tip"), 1000.0 * PIECES[0], atol=1e-9)
+
+
+def test_a_bag_is_read_no_further_than_the_clouds_that_are_asked_for(bag, monkeypatch):
+    """An hour of clouds for its first second; one more is taken to know that there are enough."""
+    read_all, taken = Bag.messages, []
+
+    def counted(self):
+        for message in read_all(self):
+            taken.append(message)
+            yield message
+
+    monkeypatch.setattr(Bag, "messages", counted)
+    np.testing.assert_allclose(read(bag, topic="/points", clouds=(0, 2)), 1000.0 * PIECES[:2].reshape(-1, 3), atol=1e-4)
+    assert len(taken) <= 3
 
 
 @pytest.mark.parametrize(("how", "expected"), [

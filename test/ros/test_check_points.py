@@ -13,6 +13,8 @@ from std_msgs.msg import Header
 from gapr_core import Registrar
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.node import touches
+from gapr_ros.parameters import NodeParameters
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
 T = pose_mm([0.3, -1.1, 0.7], [120.0, -40.0, 300.0])
@@ -99,3 +101,13 @@ def test_a_method_that_says_no_covariance_or_prepares_nothing_is_named(client, b
         client.ask(GOOD)
         level, text, _ = pointer.touch(GOOD[:5])
         assert level == WARN and "expected a prepared target; got" in text
+
+
+@pytest.mark.parametrize(("sensor", "standoff", "usual_mm"), [("pointer", 0.002, 2.0), ("pointer", 0.0, None),
+                                                              ("laser", 0.002, None)])  # fmt: skip
+def test_touched_points_are_a_pointers_whatever_the_clouds_are_and_a_stand_off_is_that_of_its_own_sensor(
+    sensor, standoff, usual_mm
+):
+    """The node's stand-off is of its clouds: a laser's says nothing of the pointer."""
+    config = touches._config(NodeParameters(sensor=sensor, standoff=standoff))
+    assert (config.sensor.kind, config.sensor.standoff_mm) == ("pointer", usual_mm)

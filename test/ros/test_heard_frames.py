@@ -397,6 +397,17 @@ def test_after_a_reset_another_round_of_transforms_may_begin_however_little_they
     assert seen_at(buffer, 1000.39) == pytest.approx(3.0) and seen_at(buffer, 1000.45) is None
 
 
+def test_after_a_reset_only_the_first_transform_may_begin_another_round_with_a_small_step_back(buffer):
+    """The one after it is out of order by 5 ms, as where threads race."""
+    heard, hear, said = hears(buffer)
+    for stamp_s in (1000.0, 1000.9):
+        hear(stamp_s, 1.0)
+    heard.expect_older()
+    for stamp_s in (1001.0, 1001.02, 1001.015):
+        hear(stamp_s, 1.0)
+    assert seen_at(buffer, 1000.5) == seen_at(buffer, 1001.01) == pytest.approx(1.0) and not said
+
+
 def test_the_node_puts_no_transform_from_the_future_into_its_buffer(blob_path, client, method, heard):
     now_s = 1000.0
     with node_in_thread(method, blob_path, output_frame="world", tf_timeout=60.0, use_sim_time=True) as node:

@@ -86,6 +86,33 @@ def test_a_held_cloud_waits_until_it_is_asked_for():
     bench.worker.stop(5.0)
 
 
+def test_a_cloud_that_takes_the_place_of_one_that_was_asked_for_is_not_held():
+    bench = Bench()
+    bench.worker.put(job(b"busy"))
+    wait_until(lambda: bench.worker._slot is None)
+    bench.held = True
+    bench.worker.put(job(b"old"))
+    assert bench.worker.ask("waiter", epoch=0)
+    bench.worker.put(job(b"new"))
+    bench.gate.set()
+    wait_until(lambda: bench.names() == [b"busy", b"new"], 5.0)
+    assert bench.done[1][0].waiters == ["waiter"]
+    bench.worker.stop(5.0)
+
+
+def test_what_was_cleared_cannot_be_asked_for_again():
+    """Neither the cloud that waits nor the one that was processed last, of whatever epoch they are."""
+    bench = Bench()
+    bench.gate.set()
+    bench.worker.put(job(b"1"))
+    wait_until(lambda: bench.names() == [b"1"])
+    bench.held = True
+    bench.worker.put(job(b"2"))
+    assert bench.worker.clear().cloud == b"2"
+    assert not bench.worker.ask("waiter", epoch=0)
+    assert bench.worker.stop(5.0) and bench.names() == [b"1"]
+
+
 def test_without_a_cloud_there_is_nothing_to_ask_for():
     bench = Bench()
     assert not bench.worker.ask("waiter", epoch=0)

@@ -7,6 +7,7 @@ import shutil
 import tracemalloc
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -194,6 +195,68 @@ def test_a_damaged_line_in_the_middle_is_no_silent_loss(tmp_path):
     (tmp_path / records.FILE).write_text('{"a": 1}\n{"a": \n{"a": 3}\n')
     with pytest.raises(ConfigError, match="damaged"):
         records.read(tmp_path / records.FILE)
+
+
+def test_of_two_records_of_one_pair_and_method_the_first_one_counts():
+    """A later one was made while the first was not on disk yet; the order of the methods is that of the table."""
+    first, other = (record(make_pair(k), ok(np.eye(4)), "a") for k in (0, 1))
+    again, second = replace(first, seconds=9.0), replace(first, method="b")
+    found = records.sort([other, first, again, second], ["b", "a"])
+    assert [(r.pair, r.method, r.seconds) for r in found] == [
+        (first.pair, "b", 0.5), (first.pair, "a", 0.5), (other.pair, "a", 0.5),
+    ]  # fmt: skip
+
+
+SLOW_AT_FIRST = """
+import time
+from fakes import Fake
+
+class SlowAtFirst(Fake):
+    calls = 0
+
+    def register(self, source, target):
+        self.calls += 1
+        time.sleep(1.0 if self.calls == 1 else 0.0)
+        return super().register(source, target)
+
+made = lambda: SlowAtFirst("made")
+"""
+
+
+def test_the_first_call_of_a_method_does_not_count_in_the_time_of_its_first_pair(pairs, fakes, tmp_path, in_process):
+    """Compiled code loads with it."""
+    (tmp_path / "modules" / "slow_at_first.py").write_text(SLOW_AT_FIRST)
+    found = runner.run_task(runner.Task(sorted(pairs.glob("L1*.npz"))[0], "slow_at_first:made"))
+    assert found.right and found.seconds < 0.8
+
+
+def test_the_time_of_an_answer_is_without_that_of_preparing(monkeypatch):
+    """By a clock that the method moves: 2 s for the one, 7 s for the other."""
+    now = [100.0]
+
+    class Timed:
+        def prepare(self, target, units="mm"):
+            now[0] += 2.0
+            return target
+
+        def register(self, source, target):
+            now[0] += 7.0
+            return ok(np.eye(4))
+
+    monkeypatch.setattr(runner, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    assert runner._timed(Timed(), make_pair(0))[1] == (7.0, 2.0)
+
+
+def test_results_of_two_commits_are_said_to_be_so(pairs, fakes, tmp_path, in_process):
+    """As where one shard ran before an update and the other one after it."""
+    folders = [tmp_path / name for name in ("a", "b")]
+    for k, folder in enumerate(folders, 1):
+        benchmark.benchmark(pairs, fakes("good"), folder, shard=(k, 2))
+        found = records.read(folder / records.FILE)
+        records.write(folder / records.FILE, [replace(each, commit=f"c0ffee{k}") for each in found])
+    benchmark.merge(folders, tmp_path / "both")
+    assert "Results of different commits: c0ffee1, c0ffee2." in (tmp_path / "both" / "table.md").read_text()
+    assert "different commits" not in (folders[0] / "table.md").read_text()
 
 
 def test_reading_and_writing_records_needs_no_more_memory_than_they_do(tmp_path):

@@ -150,3 +150,53 @@ def test_the_error_bound_is_judged_on_every_accepted_pose_right_or_wrong():
     covariance = np.diag([1.0] * 3 + [1e-4] * 3)
     exact = table.summary([record(pair, ok(shifted(pair, mm), covariance=covariance)) for mm in (1.0, 2.0, 5.0)])
     assert exact["nees_median"] == pytest.approx(4.0 / 5.348, rel=1e-3)
+
+
+def test_the_covariance_is_judged_on_right_answers_alone():
+    """1 and 3 mm at a standard deviation of 1 mm; the accepted one at 30 mm is in another basin."""
+    pair, covariance = make_pair(0), np.diag([1.0] * 3 + [1e-4] * 3)
+    found = [record(pair, ok(shifted(pair, mm), covariance=covariance)) for mm in (1.0, 3.0, 30.0)]
+    row = table.summary(found)
+    assert row["nees_6"] == pytest.approx((1.0 + 9.0) / 2.0 / 6.0, rel=1e-4)
+    bound = found[0].bound_rmse_mm
+    assert row["bound_rmse_mm"] == pytest.approx(bound, rel=1e-4)
+    assert row["bound_ratio"] == pytest.approx(np.sqrt((1.0 + 9.0) / 2.0) / bound, rel=1e-4)  # the root of mean squares
+    assert row["bound_ratio_median"] == pytest.approx(2.0 / bound, rel=1e-4)
+
+
+def test_a_false_accept_at_the_limit_itself_is_a_sure_one():
+    pair = make_pair(0)
+    for confidence, sure in ((0.9, 1), (0.8999, 0)):
+        row = table.summary([record(pair, ok(shifted(pair, 30.0), confidence))])
+        assert (row["false_accepts"], row["false_accepts_sure"]) == (1, sure)
+
+
+def test_the_time_that_nine_in_ten_stay_below_stands_beside_the_median():
+    pair = make_pair(0)
+    row = table.summary([record(pair, ok(shifted(pair, 1.0)), seconds=float(k)) for k in range(11)])
+    assert (row["seconds"], row["seconds_p90"]) == (5.0, 9.0)
+
+
+def test_the_confidence_is_judged_on_every_best_pose_behind_refusals_too():
+    """Accepted, right, 0.8; refused, wrong, 0.3; refused without a pose, 0.9: that one says nothing."""
+    pair = make_pair(0)
+    behind = (Hypothesis(shifted(pair, 50.0), 0.3),)
+    refused = RegistrationResult(RegistrationStatus.AMBIGUOUS, confidence=0.3, hypotheses=behind)
+    without = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, confidence=0.9)
+    row = table.summary([record(pair, answer) for answer in (ok(shifted(pair, 1.0)), refused, without)])
+    assert row["auroc"] == 1.0
+    assert row["ece"] == pytest.approx((0.2 + 0.3) / 2.0)  # each in a bin of its own
+
+
+def test_pairs_count_one_by_one_in_the_interval_where_a_subject_is_not_known():
+    """Six pairs of two subjects, all right of one and all wrong of the other; without one of the names they are six."""
+    pairs = [make_pair(k) for k in range(6)]
+    named = [replace(pair, person=f"person {k % 2}") for k, pair in enumerate(pairs)]
+    ends = {}
+    for name, given in {"known": named, "not all": [*named[:5], replace(named[5], person="")]}.items():
+        found = [record(pair, ok(shifted(pair, 30.0 * (k % 2)))) for k, pair in enumerate(given)]
+        row = table.summary(found)
+        ends[name] = (row["rr_4_5_low"], row["rr_4_5_high"])
+    assert ends["known"] == (0.0, 1.0)  # the same subject twice is as likely as both
+    # of six throws of a coin none comes up with 1.6 %, at most one with 10.9 %
+    assert ends["not all"] == pytest.approx((1.0 / 6.0, 5.0 / 6.0), abs=1e-5)

@@ -18,6 +18,8 @@ from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import build_cloud, target_frame
+from gapr_core.training import peer as training
+from gapr_core.training.config import TrainConfig
 
 RNG = np.random.default_rng(0)
 ORIGIN = Origin("peer_of_a_test", "Peer", "https://example.org/peer", "own/network.py", "a_library")
@@ -199,3 +201,41 @@ def test_tensors_stay_on_the_cpu_where_the_code_would_move_them():
         assert tensor.device.type == "cpu"
         assert tensor.to(torch.float64).dtype == torch.float64
     assert torch.Tensor.to(torch.ones(2), torch.device("cpu")).device.type == "cpu"
+
+
+class Sum:
+    """A lesson whose loss is five times the sum of the weights; every second pair teaches nothing."""
+
+    names = ("loss",)
+
+    def __init__(self, code, sizes):
+        self.pairs = 0
+
+    def __call__(self, network, pair, voxel, log):
+        self.pairs += 1
+        return {"loss": 5.0 * network.weight.sum()} if self.pairs % 2 else None
+
+
+@pytest.fixture
+def learner():
+    """Makes one that learns from parametric bones, two pairs a step."""
+    config = TrainConfig(pairs=4, batch=2, micro_batch=1, mix={"L1": 1.0}, pool=2, share=1, bones=("femur",),
+                         model_settings={"width": 16})  # fmt: skip
+    return lambda: training.Learner(code_of("first"), Sum, config, None)
+
+
+def test_a_step_learns_by_the_mean_over_the_pairs_of_its_batch(learner):
+    """One of two taught: half of its gradient, which is five in each weight."""
+    one = learner()
+    assert [one._learn(number) is None for number in range(2)] == [False, True]
+    assert torch.equal(one.network.weight.grad, torch.full((3, 3), 5.0 / 2.0))
+
+
+def test_how_many_pairs_taught_nothing_is_counted_on_after_a_stop(learner):
+    first, second = learner(), learner()
+    first.step(0.001)
+    second.go_on(first.state())
+    second.step(0.001)
+    rows = [line.split(",")[:3] for line in second.table().splitlines()]
+    assert rows == [["step", "pairs", "left_out"], ["1", "2", "1"], ["2", "4", "2"]]
+    assert second.card()["left_out"] == 2 and second.steps_done == 2

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from benchmark_cases import make_pair, ok, record, shifted, some_records
 from gapr_core.benchmark import table
 from gapr_core.benchmark.records import Plan
 from gapr_core.data.pair_files import save_pair
+from gapr_core.geometry import se3
 from gapr_core.pages import benchmark_report, pictures, plots
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
@@ -26,6 +28,27 @@ def test_recall_against_threshold_steps_at_the_errors_and_never_counts_a_refusal
     assert y[-2] == pytest.approx(1 / 3)
     assert y[-1] == pytest.approx(2 / 3)  # the third is exactly 30 mm off, the second was refused
     assert curve(plots.recall_against_threshold(some_records(), ["a", "b"]), "b")[1][-1] == 1.0
+
+
+def test_a_refusal_is_within_no_limit_though_its_stand_in_is_on_the_truth():
+    """Centroid on centroid is where it belongs; without an answer that is no success."""
+    pair = make_pair(0)
+    on_centroid = pair.source - pair.source.mean(axis=0) + pair.target.mean(axis=0)
+    aligned = replace(pair, source=on_centroid, T_target_source=np.eye(4))
+    found = record(aligned, RegistrationResult(RegistrationStatus.LOW_CONFIDENCE))
+    assert found.rte_mm < 1e-6 and found.rre_deg < 1e-6
+    assert curve(plots.recall_against_threshold([found], ["m"]), "m")[1].max() == 0.0
+
+
+def test_a_turn_counts_from_the_limit_on_at_which_an_angle_of_it_is_let_pass():
+    """4 degrees without a shift: 1.25 degrees go with every mm, so from 3.2 mm on."""
+    pair = make_pair(0)
+    centre = pair.source.mean(axis=0)
+    turn = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, np.radians(4.0)], se3.apply(pair.T_target_source, centre[None])[0])
+    found = record(pair, ok(turn @ pair.T_target_source))
+    assert found.rte_mm < 1e-6 and found.rre_deg == pytest.approx(4.0)
+    x, y = curve(plots.recall_against_threshold([found], ["m"]), "m")
+    assert y.tolist() == (x >= 4.0 / 1.25).astype(float).tolist()
 
 
 def test_recall_against_overlap_has_one_dot_per_value_and_none_without_variation():
@@ -60,12 +83,31 @@ def test_the_ellipse_found_is_that_of_the_errors():
     assert plots.error_ellipsoids(found[:2], "m") is None
 
 
+def test_errors_are_drawn_along_the_axes_of_the_bone_with_their_mean_in_the_ellipse():
+    """Axis 1 of the bone is y, 2 is z, 3 is x; all errors are 2 to 4 mm along y, and that offset is no accuracy."""
+    base = record(make_pair(0), ok(shifted(make_pair(0), 1.0)))
+    axes, shifts = np.roll(np.eye(3), 1, axis=1).tolist(), np.array([2.0, 3.0, 4.0])
+    found = [replace(base, axes=axes, twist=[0.0, y, 0.1, 0.0, 0.0, 0.0], bound_covariance=None) for y in shifts]
+    first = plots.error_ellipsoids(found, "m").axes[0]
+    np.testing.assert_allclose(first.collections[0].get_offsets(), [[y, 0.1] for y in shifts])
+    (ellipse,) = first.patches
+    second_moments = [[np.mean(shifts**2), 0.1 * np.mean(shifts)], [0.1 * np.mean(shifts), 0.01]]
+    longest = np.linalg.eigvalsh(second_moments)[-1]
+    assert max(ellipse.get_width(), ellipse.get_height()) == pytest.approx(2.0 * np.sqrt(5.991 * longest))
+
+
 def test_the_worst_cases_begin_with_the_most_confident_false_accept():
     worst = pictures.worst(some_records(), "a")
     assert [r.accepted for r in worst] == [True, False, True]
     assert worst[0].false_accept and worst[0].confidence == 0.95
     assert "FALSE ACCEPT" in pictures.caption(worst[0]) and "refused" in pictures.caption(worst[1])
     assert pictures.worst(some_records(), "b")[0].protocol == "wrong"
+
+
+def test_of_two_false_accepts_the_more_confident_one_is_worse_though_it_is_nearer():
+    pairs = [make_pair(k) for k in range(2)]
+    far, near = record(pairs[0], ok(shifted(pairs[0], 90.0), 0.6)), record(pairs[1], ok(shifted(pairs[1], 10.0), 0.95))
+    assert [r.pair for r in pictures.worst([far, near], "m")] == [near.pair, far.pair]
 
 
 @pytest.fixture(scope="module")

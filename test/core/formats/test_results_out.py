@@ -274,8 +274,10 @@ def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_
     assert sum(node.get("transformNodeRef") is not None for node in nodes) == 2
     of_targets = {node.get("name"): node.tag for node in nodes if node.get("name", "").startswith("targets")}
     assert of_targets == {  # a MarkupsFiducialStorage reads every line of a .mrk.json as a point, and reports success
-        "targets display": "MarkupsFiducialDisplay", "targets storage": "MarkupsJsonStorage", "targets": "MarkupsFiducial",
-    }  # fmt: skip
+        "targets display": "MarkupsFiducialDisplay",
+        "targets storage": "MarkupsJsonStorage",
+        "targets": "MarkupsFiducial",
+    }
     np.testing.assert_allclose(clouds.load(tmp_path / "target.vtk").points, femur.points, atol=1e-3)
     near = np.isfinite(residuals().distance_mm)
     np.testing.assert_allclose(clouds.load(tmp_path / "source.vtk").points, POINTS[near], atol=1e-3)

@@ -7,14 +7,18 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from gapr_core import cli
 from gapr_core.data.make_pairs import Recipe
+from gapr_core.data.pair import Pair
 from gapr_core.errors import ConfigError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
+from gapr_core.model.pyramid import matching_radius, target_frame
 from gapr_core.training.ablation import cli as ablation
 from gapr_core.training.ablation import table as ablation_table
 from gapr_core.training.config import TrainConfig, default_plan, read_plan, trained_as
@@ -193,3 +197,20 @@ def test_the_table_shows_the_differences(whole):
     text = (whole / "table.md").read_text()
     assert text.count("Less the last row, on the same pairs with the same seeds (ours):") == 3
     assert {r["network"] for r in json.loads((whole / "table.json").read_text())["differences"]} == {"standard"}
+
+
+def test_a_pose_of_the_examination_agrees_with_what_lies_within_one_and_a_half_matching_radii(toy, monkeypatch):
+    config = toy.small_config(superpoints=(10, 20), width=8, global_width=16)
+    target = toy.bone(600)
+    pair = Pair(toy.view(target), target, np.eye(4), "a", "femur", "p1", "paper")
+    propose, radii_mm = ablation.consensus, []
+
+    def heard(pose, found, radius_mm):
+        radii_mm.append(radius_mm)
+        return propose(pose, found, radius_mm)
+
+    monkeypatch.setattr(ablation, "consensus", heard)
+    record = ablation.examine(GAPRNet(config).eval(), pair)
+    assert record["pair"] == "a" and set(ablation_table.FIGURES) <= record.keys()
+    frame = target_frame(target, config)
+    assert radii_mm == [pytest.approx(1.5 * matching_radius(frame) * frame.scale_mm)]

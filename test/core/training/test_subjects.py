@@ -72,3 +72,8 @@ def test_the_record_goes_on_where_an_earlier_call_stopped(tmp_path):
         drawn.add(["parametric_0", "parametric_0", "parametric_1"])
         drawn.write()
     assert json.loads(path.read_text()) == {"parametric_0": 4, "parametric_1": 2}
+
+
+def test_a_pair_of_a_drawn_bone_names_everybody_whom_the_bone_was_drawn_from(settings, anatomy):
+    pairs = dataset.TrainingPairs(replace(settings, synthetic=1.0), settings.network(), anatomy)
+    assert set(pairs.pair(0).subjects) == TRAIN and len(pairs[0].subjects) == settings.micro_batch * len(TRAIN)

@@ -106,6 +106,36 @@ def test_validation_draws_again_where_a_source_is_too_large_for_the_network(sett
     assert [v.protocol for v in found] == ["L1"] and len(seeds) == 2 and seeds[0] != seeds[1]
 
 
+def test_everybody_of_a_bone_has_a_turn_in_the_validation_and_each_protocol_begins_with_another_one(
+    settings, anatomy, monkeypatch
+):
+    """Bones take turns; p5 and p6 are in split val."""
+    seen = []
+
+    def heard(protocol, specimen, seed):
+        seen.append((protocol, specimen.bone, specimen.person))
+        return protocols.make_pair(protocol, specimen, seed)
+
+    monkeypatch.setattr(validation, "make_pair", heard)
+    train = replace(settings, mix={"L1": 1.0, "L2": 1.0}, bones=("femur", "tibia"), validation_pairs=4)
+    validation.validation_set(train, ModelConfig.from_yaml(settings.model), anatomy)
+    order = dict.fromkeys(seen)  # a pair that the network cannot see is made again
+    femurs = [(protocol, person) for protocol, bone, person in order if bone == "femur"]
+    assert femurs == [("L1", "p5"), ("L1", "p6"), ("L2", "p6"), ("L2", "p5")]
+    tibias = {protocol: [who for p, bone, who in order if (p, bone) == (protocol, "tibia")] for protocol in train.mix}
+    assert len(set(tibias["L1"])) == 2 and tibias["L2"][0] == tibias["L1"][1]
+
+
+def test_a_validated_pose_agrees_with_what_lies_within_one_and_a_half_matching_radii(settings, anatomy, monkeypatch):
+    model = ModelConfig.from_yaml(settings.model)
+    (v,) = validation.validation_set(replace(settings, mix={"L1": 1.0}), model, anatomy)
+    propose, radii_mm = validation.local_to_global, []
+    monkeypatch.setattr(validation, "local_to_global", lambda found, mm: (radii_mm.append(mm), propose(found, mm))[1])
+    validation.validate(trainer.GAPRNet(model), [v], torch.device("cpu"))
+    unit_mm = float(v.pair.source.scale_mm[0])
+    assert radii_mm == [pytest.approx(1.5 * float(v.pair.radius[0]) * unit_mm)]
+
+
 def only(folder, **people):
     """A folder with the same meshes and another splits.json."""
     folder.mkdir()
@@ -293,6 +323,58 @@ def test_a_run_whose_gradients_are_never_finite_ends_with_an_error(settings, ana
         trainer.train(replace(settings, pairs=48), tmp_path / "run", anatomy)
 
 
+@pytest.fixture
+def run(settings, anatomy, tmp_path):
+    """A run before its first step, its gradients all 0.01."""
+    made = trainer.Run(replace(settings, validation_pairs=0), tmp_path / "run", anatomy, distributed.start("cpu"), {})
+    made.optimizer.param_groups[0]["lr"] = 0.01
+    for parameter in made.learns:
+        parameter.grad = torch.full_like(parameter, 0.01)
+    return made
+
+
+def values(network):
+    return torch.cat([parameter.detach().flatten() for parameter in network.parameters()]).clone()
+
+
+def test_the_first_steps_hardly_count_the_weights_that_the_run_began_with(run):
+    """Of step s, from 0 on, the average keeps (1 + s) / (10 + s), until that is more than `ema`."""
+    begun = values(run.network)
+    run._move(0)
+    first = values(run.network)
+    assert not torch.equal(first, begun)
+    torch.testing.assert_close(values(run.ema), 0.1 * begun + 0.9 * first)
+    before = values(run.ema)
+    run._move(10**6)
+    ema = run.config.ema
+    torch.testing.assert_close(values(run.ema), ema * before + (1.0 - ema) * values(run.network))
+
+
+def test_a_step_whose_gradients_are_not_finite_changes_no_weight_and_the_next_one_does(run):
+    before = values(run.network)
+    run.learns[0].grad[0] = float("inf")
+    run._move(0)
+    assert torch.equal(values(run.network), before) and run.lost == 1
+    for parameter in run.learns:
+        parameter.grad = torch.full_like(parameter, 0.01)
+    run._move(1)
+    assert torch.isfinite(values(run.network)).all() and not torch.equal(values(run.network), before) and not run.lost
+
+
+def test_every_micro_batch_draws_its_patches_by_a_seed_of_its_own(settings, anatomy, tmp_path, monkeypatch):
+    """By its number in the run, on from where the run stopped: 4 of them, two to a step."""
+    compute, seeds = trainer.compute_losses, []
+
+    def heard(network, pair, generator, *more):
+        seeds.append(generator.initial_seed())
+        return compute(network, pair, generator, *more)
+
+    monkeypatch.setattr(trainer, "compute_losses", heard)
+    for _ in range(2):  # one step a call
+        trainer.train(replace(settings, pairs=8, validation_pairs=0, seed=5), tmp_path, anatomy, minutes=0.0)
+    assert seeds == [5 + 7919 * number for number in range(4)]
+
+
 def test_a_run_goes_on_without_the_weights_that_it_began_with(settings, anatomy, tmp_path):
     first = trainer.train(replace(settings, pairs=4), tmp_path / "first", anatomy)
     going_on = replace(settings, initial=str(first))
@@ -390,6 +472,16 @@ def test_a_drawn_person_lies_in_the_span_of_the_people():
     model = ShapeModel(mean, np.array([-1.0, 0.0, 1.0])[:, None, None] * mode, np.zeros((1, 3), dtype=int))
     drawn = model.draw(rng).points - mean
     assert np.linalg.matrix_rank(np.stack([drawn.ravel(), mode.ravel()]), tol=1e-6) == 1
+
+
+def test_drawn_people_vary_as_the_people_do():
+    """By the covariance of a sample of three, whose divisor is two."""
+    rng = np.random.default_rng(0)
+    people = rng.normal(size=(3, 2, 3)) * 10.0
+    model = ShapeModel(people.mean(axis=0), people - people.mean(axis=0), np.zeros((1, 3), dtype=int))
+    drawn = np.array([model.draw(rng).points.ravel() for _ in range(6000)])
+    wanted = np.cov(people.reshape(3, 6).T)
+    np.testing.assert_allclose(np.cov(drawn.T), wanted, atol=0.08 * np.diag(wanted).max())
 
 
 def test_a_varied_bone_keeps_its_faces_outward(toy):

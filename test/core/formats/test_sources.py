@@ -728,3 +728,14 @@ def test_a_first_column_of_times_or_of_frames_with_gaps_is_no_x(tmp_path, gap):
     np.testing.assert_allclose(reading.read(path).points, table[:, 1:], atol=1e-3)
     np.savetxt(path, table[:11], delimiter=",", fmt="%.4f")  # so few rise by chance
     assert len(reading.read(path).points) == 11
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_numbers_of_frames_with_several_points_each_are_no_x(tmp_path, step):
+    rows = [f"{step * (k // 10)} {k * 0.7 % 9:.2f} {k * 1.3 % 7:.2f} {k * 2.1 % 5:.2f}" for k in range(40)]
+    (tmp_path / "a.xyz").write_text("\n".join([*rows, ""]))
+    with pytest.raises(InvalidPointCloudError, match="x y z in the first columns"):
+        clouds.load(tmp_path / "a.xyz")
+    grid = [f"{k // 10} {k % 10} {k * k % 7} {k * 2.1 % 5:.2f}" for k in range(40)]  # whole mm, and an intensity
+    (tmp_path / "b.xyz").write_text("\n".join([*grid, ""]))
+    np.testing.assert_allclose(clouds.load(tmp_path / "b.xyz").points[:2], [[0, 0, 0], [0, 1, 1]])

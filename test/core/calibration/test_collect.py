@@ -3,9 +3,11 @@
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gapr_core.calibration import collect, pairs
 from gapr_core.calibration import shapes as odd_shapes
@@ -88,6 +90,33 @@ def test_the_network_is_asked_once_for_both_rounds(truth):
     assert truth.asked == 1
 
 
+def test_a_proposer_that_is_asked_once_is_asked_again_for_another_target_or_source():
+    proposer, points = Truth(np.eye(4)), np.zeros((5, 3))
+    asked_once = collect.AskedOnce(proposer)
+    first, other = SimpleNamespace(points=points), SimpleNamespace(points=points.copy())
+    for source, target, count in ((first, first, 1), (other, first, 1), (first, other, 2), (first, first, 3)):
+        asked_once.propose(source, target, np.random.default_rng(0))
+        assert proposer.asked == count
+    asked_once.propose(SimpleNamespace(points=points + 1.0), first, np.random.default_rng(0))
+    assert proposer.asked == 4
+
+
+def test_the_true_error_is_over_the_whole_bone_and_its_nees_is_about_the_points_that_were_fitted(pair):
+    registrar = collect.accepting([Truth(pair.T_target_source, "search")], "unknown")
+    seen = replace(pair, source=np.vstack([pair.source, pair.source[:40] + [0.0, 0.0, 600.0]]))
+    found = registrar.assess(seen.source, registrar.prepare(pair.target))
+    truth = se3.exp([3.0, -2.0, 1.0, 0.05, -0.04, 0.03]) @ pair.T_target_source
+    answer = collect.judged_answer(found, replace(seen, T_target_source=truth))
+    pose, points = found.fit.T, found.source.points
+    on_bone = se3.apply(np.linalg.inv(truth), pair.target)
+    apart = se3.apply(pose, on_bone) - pair.target
+    assert answer["true_mm"] == pytest.approx(np.sqrt((apart**2).sum(axis=1).mean()))
+    shift = (se3.apply(pose, points) - se3.apply(truth, points)).mean(axis=0)
+    turn = Rotation.from_matrix(pose[:3, :3] @ truth[:3, :3].T).as_rotvec()
+    error = np.concatenate([shift, turn])
+    assert answer["nees"] == pytest.approx(error @ np.linalg.inv(found.uncertainty.covariance) @ error, rel=1e-6)
+
+
 def test_the_search_answers_though_the_first_round_would_be_accepted(truth, pair):
     registrar = collect._registrars("pointer")["search"]
     found = registrar.assess(pair.source, registrar.prepare(pair.target))
@@ -156,6 +185,25 @@ def test_the_next_source_of_a_stream_is_a_part_of_the_view_and_the_memory_is_off
         error = se3.pose_error(memory.poses[0], best, moved.source)
         assert error.rte_mm <= collect.STEP_MM + 1e-6 and error.rre_deg <= collect.STEP_DEG + 1e-6
     assert 3 <= forgotten <= 18
+
+
+def test_the_memory_of_a_stream_is_off_by_motions_of_all_sizes_and_its_rivals_by_the_same_motion(pair):
+    truth = pair.T_target_source
+    rival = se3.exp([30.0, 0.0, 10.0, 0.5, 0.0, 1.0]) @ truth
+    shifts, turns = [], []
+    for seed in range(60):
+        moved, memory = collect.moved_on(pair, [Hypothesis(truth, 0.5), Hypothesis(rival, 0.4)],
+                                         np.random.default_rng(seed))  # fmt: skip
+        motion, of_rival = (np.linalg.inv(pose) @ kept for pose, kept in zip((truth, rival), memory.poses, strict=True))
+        np.testing.assert_allclose(motion, of_rival, atol=1e-9)
+        centre = moved.source.mean(axis=0, keepdims=True)
+        shifts.append((se3.apply(motion, centre) - centre)[0])
+        turns.append(np.degrees(Rotation.from_matrix(motion[:3, :3]).as_rotvec()))
+    for motions, most in ((np.array(shifts), collect.STEP_MM), (np.array(turns), collect.STEP_DEG)):
+        sizes = np.linalg.norm(motions, axis=1) / most
+        assert sizes.mean() == pytest.approx(0.5, abs=0.12)
+        assert sizes.min() < 0.15 and 0.85 < sizes.max() <= 1.0 + 1e-6
+        assert np.abs(motions.mean(axis=0)).max() < 0.25 * most  # to all sides
 
 
 def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tmp_path, monkeypatch):

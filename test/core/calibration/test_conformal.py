@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from answer_cases import made_answers
+from scipy.stats import chi2
 
 from gapr_core.calibration import conformal
 from gapr_core.registration.features import FEATURES
@@ -49,6 +50,24 @@ def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_famil
     new = made_answers(2000, seed=5, error_scale=doubled_where_smooth)
     rows = conformal.coverage(new, conformal.scales(conformal.fit_scale(answers), new), factor)
     assert all(row["covered"] > 0.93 for row in rows.values())
+
+
+def test_the_table_holds_medians_of_true_errors_over_scaled_ones_for_each_family():
+    answers = made_answers(400, error_scale=2.0)
+    scale = np.random.default_rng(1).uniform(0.9, 3.0, 400)
+    rows = conformal.coverage(answers, scale, 1.5)
+    for name in np.unique(answers.family):
+        of_it = answers.family == name
+        true, nees = answers.true_mm[of_it], answers.nees[of_it]
+        bound = 1.5 * scale[of_it] * answers.tre95_mm[of_it]
+        assert rows[name] == pytest.approx({
+            "accepted": of_it.sum(),
+            "covered": (true <= bound).mean(),
+            "bound_over_true": np.median(bound / true),
+            "true_over_tre": np.median(true / scale[of_it] / answers.tre_mm[of_it]),
+            "nees_over_median": np.median(nees / scale[of_it] ** 2) / chi2.median(6),
+            "nees_before": np.median(nees) / chi2.median(6),
+        }, abs=1e-3)  # fmt: skip
 
 
 def test_a_family_with_larger_errors_has_a_say_of_its_own():

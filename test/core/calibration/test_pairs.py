@@ -12,10 +12,13 @@ from gapr_core.calibration import collect, pairs
 from gapr_core.calibration.other_side import on_own_side
 from gapr_core.calibration.pairs import Task
 from gapr_core.calibration.shapes import SHAPES, turned_pair
-from gapr_core.data import anatomy
+from gapr_core.calibration.views import thinned_view
+from gapr_core.config import SENSOR_KINDS
+from gapr_core.data import anatomy, protocols
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.surface import Surface
 
 FOLDER = "folder"
 
@@ -59,6 +62,29 @@ def test_of_another_bone_no_pose_is_right(people, monkeypatch, what, target):
     np.testing.assert_array_equal(drawn.pair.target, right.pair.target)
 
 
+@pytest.mark.parametrize("what", ["person", "bone"])
+def test_of_another_bone_the_same_end_is_seen_where_the_target_is_short(people, monkeypatch, what):
+    monkeypatch.setattr(pairs, "TARGETS", {"short": 1.0})
+    task = Task(FOLDER, "train", 0, 5, what=what)
+    setting = pairs.setting_of(FOLDER, "train", 0, 1)
+    _, source = pairs.source_of(task, setting, np.random.default_rng(0))
+    (whole,) = (bone for bone in people[source.bone] if bone.person == source.person)
+    assert (source.bone, source.person) != (setting.whole.bone, setting.whole.person)
+    np.testing.assert_array_equal(source.surface.points, whole.end(*setting.end).surface.points)
+    assert np.ptp(source.surface.points, axis=0).max() < 0.7 * np.ptp(whole.surface.points, axis=0).max()
+
+
+@pytest.mark.parametrize("seen_as", pairs.OWN_TARGET)
+def test_a_piece_of_another_subject_is_put_before_the_target_and_not_before_the_bone_that_it_was_cut_out_of(
+    people, monkeypatch, seen_as
+):
+    target = draw(monkeypatch, "L2", "own").pair.target
+    of_another, own = (draw(monkeypatch, seen_as, what).pair for what in ("person", "own"))
+    np.testing.assert_array_equal(of_another.target, target)
+    assert not of_another.has_truth
+    assert own.has_truth and (len(own.target) != len(target) or not np.array_equal(own.target, target))
+
+
 def test_a_bone_of_a_wrong_scale_is_four_to_seven_percent_larger_or_smaller(people):
     rng, bone = np.random.default_rng(0), people["femur"][0]
     sizes = [np.ptp(pairs._scaled(bone, (), rng).surface.points, axis=0) / np.ptp(bone.surface.points, axis=0)
@@ -95,6 +121,15 @@ def test_the_other_side_of_a_bone_that_is_its_own_image_lies_on_the_bone():
     assert np.median(bone.distance(se3.apply(T, mirrored.sample(500, rng)[0]))) < 3.0
 
 
+def test_what_only_the_mirrored_bone_has_does_not_move_its_pose():
+    bone = parametric_specimen("femur", 0)
+    surface, more = bone.surface, bone.end(0.06, upper=True).surface  # 9 % of the area
+    faces = np.vstack([surface.triangles, more.triangles + len(surface.points)])
+    grown = replace(bone, surface=Surface(np.vstack([surface.points, more.points + [60.0, 0.0, 0.0]]), faces))
+    moved = se3.apply(on_own_side(grown, bone), surface.points)
+    assert np.sqrt(((moved - surface.points) ** 2).sum(axis=1).mean()) < 4.0  # 10 if all distances counted
+
+
 def test_a_scanned_target_is_of_the_bone_but_not_on_its_surface(people, monkeypatch):
     own, scanned = (draw(monkeypatch, "L2", "own", target).pair for target in ("own", "scanned"))
     bone = next(s for s in people["tibia"] if s.person == scanned.person)
@@ -109,6 +144,15 @@ def test_twins_are_no_wrong_answer_to_each_other():
     own, twin, stranger = (replace(femur, person=who) for who in ("jhu_15", "jhu_25", "jhu_1"))
     assert pairs.without_twins(own, [own, twin, stranger]) == [own, stranger]
     assert pairs.without_twins(stranger, [own, twin, stranger]) == [own, twin, stranger]
+
+
+def test_no_pair_of_different_subjects_is_of_twins(monkeypatch):
+    femur = parametric_specimen("femur", 0)
+    everybody = [replace(femur, person=who) for who in ("jhu_15", "jhu_25", "jhu_1", "jhu_2")]
+    monkeypatch.setattr(pairs, "_KEPT", {(FOLDER, "train"): {"femur": everybody}})
+    setting = pairs.Setting(everybody[0], everybody[0], None, np.zeros((1, 3)), np.zeros(3))
+    task, rng = Task(FOLDER, "train", 0, 0, what="person"), np.random.default_rng(0)
+    assert {pairs.source_of(task, setting, rng)[1].person for _ in range(40)} == {"jhu_1", "jhu_2"}
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -134,6 +178,23 @@ def test_the_shares_hold(people, monkeypatch):
     assert what.count("own") / 400 == pytest.approx(0.66, abs=0.07)
     assert set(what) == set(pairs.WHAT)
     assert len({each.family for each in drawn}) == len(pairs.SEEN_AS)
+    kinds = {name: name.replace("-", "_") for name in pairs.SEEN_AS if name.replace("-", "_") in SENSOR_KINDS}
+    assert all(each.sensor in ("unknown", kinds.get(each.family, "unknown")) for each in drawn)
+    sensors = [each.sensor for each in drawn if each.family in kinds]
+    assert len(sensors) > 80 and sensors.count("unknown") / len(sensors) == pytest.approx(0.5, abs=0.12)
+
+
+def test_a_thinned_view_is_of_means_or_of_points_of_the_dense_one_each_in_half_of_the_cases(people, monkeypatch):
+    one_sided, dense = protocols.one_sided, []
+    monkeypatch.setattr(protocols, "one_sided", lambda *args: dense.append(one_sided(*args)) or dense[-1])
+    thinned = [thinned_view(people["femur"][0], np.random.default_rng(seed)) for seed in range(30)]
+    shares = []
+    for before, after in zip(dense, thinned, strict=True):
+        points = {tuple(point) for point in before.source}
+        shares.append(np.mean([tuple(point) in points for point in after.source]))
+        assert len(after.source) < 0.5 * len(before.source)
+    assert all(share == 1.0 or share < 0.5 for share in shares)
+    assert 8 <= shares.count(1.0) <= 22
 
 
 def test_a_list_of_one_family_holds_nothing_else_and_is_a_list_of_its_own(people, monkeypatch):

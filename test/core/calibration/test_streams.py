@@ -60,6 +60,24 @@ def test_streams_have_targets_of_their_own(people, own):
     assert not np.array_equal(streams.draw_stream(TASK)[-1][0].target, alone)
 
 
+def test_one_of_five_streams_jumps_halfway_and_biases_reach_the_largest_of_their_kind(people, own, monkeypatch):
+    motions = []
+    monkeypatch.setattr(streams, "simulate", lambda source, seed, motion: motions.append(motion) or [])
+    setting = pairs.setting_of("folder", "train", 0, 0)
+    monkeypatch.setattr(pairs, "setting_of", lambda *_: setting)
+    families = [streams.draw_stream(replace(TASK, number=number))[0] for number in range(300)]
+    jumps = [motion.jump_every for motion in motions]
+    assert set(jumps) == {0, 6} and jumps.count(6) / 300 == pytest.approx(0.2, abs=0.07)
+    largest_mm = {"wave": 1.5, "waves-peak": 1.5, "waves-rms": 1.06, "gp-peak": 1.5, "gp-rms": 1.06}
+    assert {motion.smooth_bias for motion in motions} == set(largest_mm)
+    for family, motion in zip(families, motions, strict=True):
+        assert motion.smooth_bias.split("-")[0] == family
+    for kind, most_mm in largest_mm.items():
+        sizes = np.array([motion.bias_mm for motion in motions if motion.smooth_bias == kind]) / most_mm
+        assert 0.0 <= sizes.min() < 0.15 and 0.85 < sizes.max() <= 1.0
+        assert sizes.mean() == pytest.approx(0.5, abs=0.12)
+
+
 @pytest.mark.parametrize("stays", [True, False])
 def test_a_bias_is_that_of_the_bone_or_of_the_frame(people, monkeypatch, stays):
     drawn = []

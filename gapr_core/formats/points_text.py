@@ -232,13 +232,14 @@ def _check_first(names: list[str], values: Array) -> None:
     Numbers of frames have gaps, and times are no whole numbers: what rises from each of many rows to the next is one.
     So is a whole number that never turns back, where the columns behind it are none: several points of each frame.
     """
-    is_said = len(names) == values.shape[1] and columns.found(names) is not None
-    steps = np.diff(values[:, 0])
-    counts = len(steps) > 1 and (steps == 1.0).all() or len(values) >= MANY_ROWS and (steps > 0.0).all()
-    is_whole, never_turns = values == np.round(values), (steps >= 0.0).all() or (steps <= 0.0).all()
-    if len(values) >= MANY_ROWS and never_turns and len(np.unique(values[:, 0])) > 2:
-        counts = counts or is_whole[:, 0].all() and not is_whole[:, 1:3].all()
-    if not is_said and values.shape[1] > 3 and counts:
+    if values.shape[1] <= 3 or len(names) == values.shape[1] and columns.found(names) is not None:
+        return
+    steps, is_whole = np.diff(values[:, 0]), (values == np.round(values)).all(axis=0)
+    counts = len(steps) > 1 and (steps == 1.0).all()
+    if len(values) >= MANY_ROWS:
+        frames = is_whole[0] and not is_whole[1:3].all() and len(np.unique(values[:, 0])) > 2
+        counts |= (steps > 0.0).all() or frames and ((steps >= 0.0).all() or (steps <= 0.0).all())
+    if counts:
         given = "a first column that counts the points, or their times"
         raise InvalidPointCloudError("x y z in the first columns", given, "leave it out, or begin with a line of names")
 

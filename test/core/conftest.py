@@ -1,7 +1,9 @@
 """One bone of the project's own for the tests of the core."""
 
 import os
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,38 @@ import pytest
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.specimen import Specimen
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+
+class OnOwnClock:
+    """A method that moves the clock: by 2 s to prepare, by 7 s to register, at the first call by 60."""
+
+    name = "gapr"
+
+    def __init__(self):
+        self.now, self.calls = 100.0, 0
+
+    def prepare(self, target, units="mm"):
+        self.now += 2.0
+        return target
+
+    def register(self, source, target):
+        self.calls += 1
+        self.now += 60.0 if self.calls == 1 else 7.0
+        return RegistrationResult(RegistrationStatus.OK, np.eye(4), confidence=0.9)
+
+
+@pytest.fixture
+def on_own_clock(monkeypatch):
+    """Makes a method by whose clock a module times what it does."""
+
+    def made(module):
+        method = OnOwnClock()
+        clock = SimpleNamespace(perf_counter=lambda: method.now, monotonic=time.monotonic)
+        monkeypatch.setattr(module, "time", clock)
+        return method
+
+    return made
 
 
 @pytest.fixture(scope="session")

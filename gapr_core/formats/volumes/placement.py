@@ -91,8 +91,8 @@ def _check_nrrd(fields: dict[str, str]) -> None:
 
 def _check_mha(fields: dict[str, str]) -> None:
     _check_there(MHA, [name for name, words in MHA.items() if any(fields.get(word) for word in words)])
-    unit = fields.get("DistanceUnits", "mm")
-    if unit not in ("mm", "?", ""):  # ITK reads all numbers as mm, whatever stands here
+    unit = fields.get("DistanceUnits", "")
+    if not MILLIMETRES.fullmatch(unit.strip(" ?")):  # ITK reads all numbers as mm, whatever stands here
         raise InvalidPointCloudError("DistanceUnits of mm", unit, "write it again in mm")
 
 

@@ -7,7 +7,6 @@ import shutil
 import tracemalloc
 import weakref
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -207,44 +206,14 @@ def test_of_two_records_of_one_pair_and_method_the_first_one_counts():
     ]  # fmt: skip
 
 
-SLOW_AT_FIRST = """
-import time
-from fakes import Fake
-
-class SlowAtFirst(Fake):
-    calls = 0
-
-    def register(self, source, target):
-        self.calls += 1
-        time.sleep(1.0 if self.calls == 1 else 0.0)
-        return super().register(source, target)
-
-made = lambda: SlowAtFirst("made")
-"""
-
-
-def test_the_first_call_of_a_method_does_not_count_in_the_time_of_its_first_pair(pairs, fakes, tmp_path, in_process):
-    """Compiled code loads with it."""
-    (tmp_path / "modules" / "slow_at_first.py").write_text(SLOW_AT_FIRST)
-    found = runner.run_task(runner.Task(sorted(pairs.glob("L1*.npz"))[0], "slow_at_first:made"))
-    assert found.right and found.seconds < 0.8
-
-
-def test_the_time_of_an_answer_is_without_that_of_preparing(monkeypatch):
-    """By a clock that the method moves: 2 s for the one, 7 s for the other."""
-    now = [100.0]
-
-    class Timed:
-        def prepare(self, target, units="mm"):
-            now[0] += 2.0
-            return target
-
-        def register(self, source, target):
-            now[0] += 7.0
-            return ok(np.eye(4))
-
-    monkeypatch.setattr(runner, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    assert runner._timed(Timed(), make_pair(0))[1] == (7.0, 2.0)
+def test_the_seconds_of_a_record_are_without_the_first_call_and_without_preparing(
+    pairs, in_process, monkeypatch, on_own_clock
+):
+    method = on_own_clock(runner)
+    monkeypatch.setitem(known_methods.OWN, "gapr", lambda config: method)
+    for path in sorted(pairs.glob("L1*.npz"))[:2]:
+        found = runner.run_task(runner.Task(path, "gapr"))
+        assert (found.prepare_seconds, found.seconds) == (2.0, 7.0)
 
 
 def test_results_of_two_commits_are_said_to_be_so(pairs, fakes, tmp_path, in_process):

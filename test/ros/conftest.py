@@ -26,8 +26,8 @@ def pytest_report_header() -> str:
     return "rclpy: " + ("missing, test/ros is left out" if ROS_IS_MISSING else "found")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _what_lives_already_is_not_looked_through_again():
+@pytest.fixture(scope="session", autouse=True)
+def _what_lives_before_any_node_is_not_looked_through_again():
     """Every test collects the nodes of the one before: among all objects of the other tests that takes seconds."""
     gc.collect()
     gc.freeze()

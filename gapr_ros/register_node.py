@@ -54,19 +54,21 @@ def _started(args: list[str] | None) -> int:
     from gapr_ros.parameters import ParameterError
 
     given = sys.argv if args is None else ["register_node", *args]
+    is_begun = False
     try:
         unused = remove_ros_args(given)[1:]
         if unused:
             return _fail(f"{' '.join(unused)} is not used: write --ros-args before -p, -r and --params-file")
         rclpy.init(args=args)
+        is_begun = True
         node = RegisterNode()
         for sentence in without_entry(given, node.get_fully_qualified_name()):
             node.get_logger().warning(sentence)
         executor = SingleThreadedExecutor()
     except Exception as error:
-        rclpy.try_shutdown()
-        if "context is invalid" in str(error):  # asked to stop while starting
+        if is_begun and not rclpy.ok():  # asked to stop while starting: whatever is made then fails
             return 0
+        rclpy.try_shutdown()
         return _fail(str(error) if isinstance(error, ParameterError) else describe(error))
     return _run(node, executor)
 

@@ -54,7 +54,7 @@ class Accumulator:
         if not isinstance(most, int | np.integer) or most < 1:
             raise ConfigError("a whole number of sources to keep, at least 1", repr(most), "1 registers each by itself")
         self.method, self.most = _of_many_places(method), most
-        self.config = (self.method.registrar if isinstance(self.method, Tracker) else self.method).config
+        self.config = self.method.config
         self._target: PreparedTarget | None = None
         self.reset()
 

@@ -87,16 +87,21 @@ class Tracker:
         self.recheck = recheck
         self._memory = Memory()
         self._tracking = MemoryFirst(self._memory, calibration or Calibration.shipped(Memory.name), self.registrar)
-        self._evidence = Evidence(self.registrar.config.evidence)
+        self._evidence = Evidence(self.config.evidence)
         self._stream = stream or Calibration.shipped(STREAM)
         self._stream.check_is_for(STREAM)
-        self._misfit = StreamMisfit(self.registrar.config.evidence.memory, self._stream)
+        self._misfit = StreamMisfit(self.config.evidence.memory, self._stream)
         self.reset()
 
     @classmethod
     def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu", recheck: int = 10) -> Tracker:
         """A tracker over `Registrar.from_pretrained`, which see."""
         return cls(Registrar.from_pretrained(config, device), recheck)
+
+    @property
+    def config(self) -> RegistrarConfig:
+        """That of its registrar."""
+        return self.registrar.config
 
     def reset(self) -> None:
         """Forget the track and what the frames said: the next source is registered in full."""
@@ -164,7 +169,7 @@ class Tracker:
         if isinstance(assessment, Assessment):
             self._remember(result, assessment.source.points)
             if self._is_sure and self._has_track and assessment.seen is None:
-                self._follower = Follower(assessment, source, self.registrar.config)
+                self._follower = Follower(assessment, source, self.config)
         return result
 
     @single_threaded_libraries
@@ -209,7 +214,7 @@ class Tracker:
 
     def _stands(self, assessment: Assessment) -> bool:
         """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""
-        stands = assessment.proposer == Memory.name and assessment.reaches(self.registrar.config.evidence.stands)
+        stands = assessment.proposer == Memory.name and assessment.reaches(self.config.evidence.stands)
         return self._was_sure and stands and self._agrees(assessment)
 
     def _agrees(self, assessment: Assessment) -> bool:
@@ -217,7 +222,7 @@ class Tracker:
         if self._last is None:
             return False
         moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last.T_target_source, assessment.source.points)
-        return moved_mm <= self.registrar.config.evidence.agree_mm
+        return moved_mm <= self.config.evidence.agree_mm
 
     def _with_evidence(self, assessment: Assessment, cloud: Fingerprint) -> Assessment:
         """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.
@@ -228,7 +233,7 @@ class Tracker:
         if assessment.refusal is not None:
             return assessment
         if assessment.inferred_viewpoint is not None:
-            assessment = assessment.capped(self.registrar.config.limits.most)
+            assessment = assessment.capped(self.config.limits.most)
         a, last = assessment, self._last
         again = last is not None and cloud.is_of_same(last.cloud)
         agrees = self._agrees(a) and (last is None or last.agreed or not again)
@@ -245,7 +250,7 @@ class Tracker:
 
         As it does not count either, a refused full registration is followed by another one.
         """
-        self._is_sure = result.ok and result.confidence >= self.registrar.config.sure_from
+        self._is_sure = result.ok and result.confidence >= self.config.sure_from
         if result.T_target_source is None:
             return
         followed = result.proposer == Memory.name

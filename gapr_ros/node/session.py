@@ -151,7 +151,7 @@ class Session:
         """Touched points, which check the last accepted pose: what they say goes out, and the pose stays."""
         found: PointCheck | str
         try:
-            found = touches.check(message, self._standing, self.model, self._host.parameters)
+            found = touches.check(message, self._standing, self._ready, self._host.parameters)
         except touches.NothingToCheckError as error:
             found = str(error)
             self._host.ros.get_logger().warning(f"nothing was checked: {found}")

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
 
+from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.errors import GaprError
 from gapr_core.results import PointCheck, Verdict
 from gapr_ros.node import wire
 from gapr_ros.node.diagnostics import status_message
 from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.method import configured
-from gapr_ros.node.model import Model
+from gapr_ros.node.model import Ready
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.parameters import NodeParameters
-
-if TYPE_CHECKING:
-    from gapr_core import RegistrarConfig
 
 Array = NDArray[np.float64]
 LEVELS = {
@@ -35,14 +33,15 @@ class NothingToCheckError(Exception):
     """There is no verdict; the text says why."""
 
 
-def check(message: PoseArray, accepted: Outcome | None, model: Model, parameters: NodeParameters) -> PointCheck:
+def check(message: PoseArray, accepted: Outcome | None, ready: Ready, parameters: NodeParameters) -> PointCheck:
     """What touched points say of the last accepted pose.
 
     Args:
         message: positions of the pointer's tip, metres, in the frame of the pose; orientations do not count.
         accepted: what became of the last cloud with a pose that still stands; None where there is none.
-        model: the bone.
-        parameters: of the node; where `sensor` is not a pointer, what is usual of one is assumed.
+        ready: the bone, and the method whose settings say what the bone's model and a pointer err by.
+        parameters: of the node, for a method that has no settings; where `sensor` is not a pointer, what is usual of
+            one is assumed.
 
     Raises:
         NothingToCheckError: no pose, another frame, no points, or a method that says no covariance.
@@ -57,7 +56,7 @@ def check(message: PoseArray, accepted: Outcome | None, model: Model, parameters
     positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses]
     points_mm = wire.to_mm(np.array(positions, dtype=np.float64).reshape(-1, 3), "m")
     try:
-        return check_points(points_mm, model.target, accepted.result, _config(parameters))
+        return check_points(points_mm, ready.model.target, accepted.result, _config(ready.method, parameters))
     except GaprError as error:
         raise NothingToCheckError(str(error)) from error
 
@@ -86,9 +85,8 @@ def status(message: PoseArray, found: PointCheck | str, name: str, hardware_id: 
     return status_message(LEVELS[found.verdict], f"{name}: check points", hardware_id, str(found), values)
 
 
-def _config(parameters: NodeParameters) -> RegistrarConfig:
-    """The library's settings for a pointer: the node's own where its clouds are a pointer's, else what is usual."""
-    from gapr_core import RegistrarConfig
-
-    standoff = parameters.standoff if parameters.sensor == "pointer" else 0.0
-    return configured(RegistrarConfig(), replace(parameters, sensor="pointer", standoff=standoff))
+def _config(method: Any, parameters: NodeParameters) -> RegistrarConfig:
+    """The settings that clouds are registered with; of the pointer what is usual, where the clouds are not its own."""
+    own = getattr(method, "config", None)
+    config = own if isinstance(own, RegistrarConfig) else configured(RegistrarConfig(), parameters)
+    return config if config.sensor.kind == "pointer" else replace(config, sensor=SensorConfig(kind="pointer"))

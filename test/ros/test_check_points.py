@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import bones
 import numpy as np
 import pytest
@@ -10,10 +13,13 @@ from geometry_msgs.msg import Point, Pose, PoseArray
 from harness import NODE, StandIn, accepted, node_in_thread, pose_mm, wait_until
 from std_msgs.msg import Header
 
-from gapr_core import Registrar
+from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
+from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros.node import touches
+from gapr_ros.node.method import configured
+from gapr_ros.node.model import Ready, load_model
 from gapr_ros.parameters import NodeParameters
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
@@ -109,5 +115,37 @@ def test_touched_points_are_a_pointers_whatever_the_clouds_are_and_a_stand_off_i
     sensor, standoff, usual_mm
 ):
     """The node's stand-off is of its clouds: a laser's says nothing of the pointer."""
-    config = touches._config(NodeParameters(sensor=sensor, standoff=standoff))
-    assert (config.sensor.kind, config.sensor.standoff_mm) == ("pointer", usual_mm)
+    parameters = NodeParameters(sensor=sensor, standoff=standoff)
+    of_method = Registrar(configured(RegistrarConfig(), parameters))
+    for method in (of_method, SimpleNamespace()):  # the other one has no settings
+        config = touches._config(method, parameters)
+        assert (config.sensor.kind, config.sensor.standoff_mm) == ("pointer", usual_mm)
+
+
+@pytest.mark.parametrize("of", [Registrar, lambda config: Tracker(Registrar(config)),
+                                lambda config: Accumulator(Registrar(config), 3)])  # fmt: skip
+def test_touched_points_err_by_what_the_settings_file_says_of_the_pointer_and_of_the_bone(of):
+    """A right pose with a pointer that is known to be noisy was called contradicted."""
+    said = RegistrarConfig(sensor=SensorConfig(kind="pointer", noise_mm=2.0), covariance=CovarianceConfig(model_mm=1.5))
+    found = touches._config(of(said), NodeParameters(sensor="pointer"))
+    assert (found.sensor, found.covariance) == (said.sensor, said.covariance)
+    lasers = replace(said, sensor=SensorConfig(kind="laser", noise_mm=0.1))
+    found = touches._config(of(lasers), NodeParameters(sensor="laser"))
+    assert (found.sensor, found.covariance.model_mm) == (SensorConfig(kind="pointer"), 1.5)
+
+
+def test_the_node_gives_check_points_the_settings_of_its_method(bone):
+    points, path = bone
+    noisy = RegistrarConfig(sensor=SensorConfig(kind="pointer", noise_mm=3.0))
+    usual = RegistrarConfig(sensor=SensorConfig(kind="pointer"))
+    touched = points[::20] + np.random.default_rng(0).normal(0.0, 3.0, (200, 3))
+    poses = [Pose(position=Point(x=float(x), y=float(y), z=float(z))) for x, y, z in touched * 1e-3]
+    message = PoseArray(header=Header(frame_id="probe"), poses=poses)
+    parameters = NodeParameters(sensor="pointer", model_path=str(path))
+    stands = SimpleNamespace(result=accepted(np.eye(4), centre_mm=np.zeros(3)), header=Header(frame_id="probe"))
+    verdicts = []
+    for config in (noisy, usual):
+        method = Registrar(config)
+        ready = Ready(method, load_model(method, parameters), parameters)
+        verdicts.append(touches.check(message, stands, ready, parameters).verdict)
+    assert verdicts == ["HOLDS", "CONTRADICTED"]

@@ -9,8 +9,6 @@ The pages of docs/results show the file as it is. Paths of this machine are shor
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 import re
 from pathlib import Path
 
@@ -45,8 +43,7 @@ def printed(text: str, command: str, commit: str) -> str:
     lines = [line for line in text.splitlines() if line.startswith("|")]
     rules = {number for number, line in enumerate(lines) if RULE.match(line)}
     table = "\n".join("\n" * (number > 0 and number + 1 in rules) + line for number, line in enumerate(lines))
-    machine = f"{origin.cpu_name()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    return f"{table}\n\nMade by `{command}` at commit {commit}, {machine}.\n"
+    return f"{table}\n\nMade by `{command}` at commit {commit}, {origin.machine()}.\n"
 
 
 if __name__ == "__main__":

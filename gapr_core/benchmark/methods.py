@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
@@ -15,7 +17,7 @@ from gapr_core.baselines.base import takes
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, GaprError
 from gapr_core.results import RegistrationResult
-from gapr_core.runtime import settings
+from gapr_core.runtime import origin, settings
 
 if TYPE_CHECKING:
     from gapr_core import Registrar
@@ -153,6 +155,29 @@ def config_of(name: str, config: RegistrarConfig) -> RegistrarConfig | None:
 def settings_of(name: str, config: RegistrarConfig) -> str:
     """What of them is not the default, as `name=value` with commas."""
     return ", ".join(settings.changes(config)) if name in OWN else ""
+
+
+def made_of(name: str) -> str:
+    """A short text that changes with the weights or the module behind a name; empty for a baseline.
+
+    Of a module only its own file counts, not what it imports, nor its folder where it is a package.
+    """
+    method, weights = _with_weights(name)
+    if name in OWN or (method in TRAINED and weights is None):
+        return origin.shipped_weights()
+    if method in TRAINED:
+        return _digest_or_none(Path(weights or ""))
+    if ":" not in name:
+        return ""
+    try:
+        found = importlib.util.find_spec(name.split(":", 1)[0])
+    except Exception:  # whatever its package does when it is imported: `make` says what is wrong
+        return ""
+    return _digest_or_none(Path(found.origin)) if found and found.origin else ""
+
+
+def _digest_or_none(path: Path) -> str:
+    return origin.digest_of([path]) if path.is_file() else ""
 
 
 def register(

@@ -118,8 +118,10 @@ class Record(PairFacts, Answer, Verdict):
         file, sha256: of the pair.
         method: its name on the command line.
         seconds, prepare_seconds: wall time; None after an error.
-        commit: of the code that ran.
+        commit, machine, threads: what ran, on what, and how many cores it had.
         settings: those that were not the defaults, as `name=value` with commas; none of the baselines has any.
+        made_of: changes with the weights or the module that the method is made of; empty for a baseline.
+        facts: changes with what the pair's file says of it besides the clouds and the transform.
     """
 
     file: str
@@ -128,7 +130,11 @@ class Record(PairFacts, Answer, Verdict):
     seconds: float | None = None
     prepare_seconds: float | None = None
     commit: str = ""
+    machine: str = ""
+    threads: int = 0
     settings: str = ""
+    made_of: str = ""
+    facts: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; None for what is not finite. `runtime.settings.from_dict` reads it back."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from gapr_core.benchmark.record import Record
@@ -18,11 +18,10 @@ PLAN = "plan.json"
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run was asked, and what it ran on.
+    """What a run was asked the last time; on what it ran, its records say.
 
     Attributes:
-        command, commit, machine, started: where and when it ran, in words.
-        threads: of each worker.
+        command, started: how and when it was asked, in words.
         ours: the method that the others are compared with.
         methods: in the order of the tables.
         folder: of the pairs.
@@ -30,14 +29,27 @@ class Plan:
     """
 
     command: str
-    commit: str
-    machine: str
-    threads: int
     started: str
     ours: str
     methods: list[str]
     folder: str
     pairs: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the records of a run depend on.
+
+    Attributes:
+        pairs: name to sha256.
+        settings, made_of: method to those of `Record`.
+        facts: name of a pair to those of `Record`, of some pairs or all.
+    """
+
+    pairs: dict[str, str]
+    settings: dict[str, str]
+    made_of: dict[str, str]
+    facts: dict[str, str] = field(default_factory=dict)
 
 
 def append(path: Path, record: Record) -> None:
@@ -79,29 +91,38 @@ def discard_cut_line(path: Path) -> None:
         raise files.unwritable(path, error) from error
 
 
-def done(records: Iterable[Record], hashes: dict[str, str], settings: dict[str, str]) -> set[tuple[str, str]]:
-    """(pair, method) of every record.
-
-    Args:
-        records: of an earlier, interrupted run.
-        hashes: pair name to sha256 of this run's pairs.
-        settings: method to `Record.settings` of this run.
+def done(records: Iterable[Record], inputs: Inputs) -> set[tuple[str, str]]:
+    """(pair, method) of every record of an earlier, interrupted run.
 
     Raises:
-        ConfigError: a record of none of these pairs, of one of the same name with other clouds, or of a method with
-            other settings.
+        ConfigError: a record of none of these pairs, of one of the same name with other clouds or other facts, or of a
+            method with other settings, or made of other weights or code.
     """
     found = set()
     for record in records:
-        if hashes.get(record.pair) != record.sha256:
-            given = f"{'other clouds named' if record.pair in hashes else 'some of'} {record.pair}"
-            raise ConfigError("records of these pairs", given, "choose another --out")
-        wanted = settings.get(record.method, record.settings)
+        pair, method = record.pair, record.method
+        if inputs.pairs.get(pair) != record.sha256:
+            given = f"{'other clouds named' if pair in inputs.pairs else 'some of'} {pair}"
+            raise _others("records of these pairs", given)
+        if inputs.facts.get(pair, record.facts) != record.facts:
+            raise _others("records of these pairs", f"{pair}, whose file said something else of it than now")
+        wanted = inputs.settings.get(method, record.settings)
         if wanted != record.settings:
             given = f"records with {record.settings or 'the default settings'}"
-            raise ConfigError(f"{record.method} with {wanted or 'the default settings'}", given, "choose another --out")
-        found.add((record.pair, record.method))
+            raise _others(f"{method} with {wanted or 'the default settings'}", given)
+        if inputs.made_of.get(method, record.made_of) != record.made_of:
+            raise _others(f"records of {method} as it is now", "some of other weights, or other code, of that name")
+        found.add((pair, method))
     return found
+
+
+def _others(expected: str, given: str) -> ConfigError:
+    return ConfigError(expected, given, "choose another --out")
+
+
+def conditions(records: Sequence[Record]) -> dict[str, list[str]]:
+    """What ran, and on what: every "commit", number of "threads" and "machine" of the records."""
+    return {name: sorted({str(getattr(r, name)) for r in records}) for name in ("commit", "threads", "machine")}
 
 
 def sort(records: Iterable[Record], methods: Sequence[str]) -> list[Record]:

@@ -19,10 +19,10 @@ from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts, why
 from gapr_core.benchmark.record import Answer, Record, Verdict
 from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair import Pair
-from gapr_core.data.pair_files import load_facts, load_pair, pair_hash
+from gapr_core.data.pair_files import facts_hash, load_facts, load_pair, pair_hash
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult
-from gapr_core.runtime import cluster
+from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.parallel import end_with_parent
 
 log = logging.getLogger(__name__)
@@ -113,15 +113,22 @@ def run_task(task: Task) -> Record:
     return _record(task, pair, answer_of(result), judge(pair, result), *times)
 
 
-def check_pairs(paths: Iterable[Path]) -> None:
+def check_pairs(paths: Iterable[Path]) -> dict[str, str]:
     """Check before the first registration what every file says of its pair; the clouds are not read.
+
+    Returns:
+        Name of the file to `facts_hash`.
 
     Raises:
         InvalidPointCloudError: a file that is no pair, or says what cannot be.
         ConfigError: a pair without a truth.
     """
+    hashes = {}
     for path in paths:
-        check_truth(load_facts(path))
+        pair = load_facts(path)
+        check_truth(pair)
+        hashes[path.stem] = facts_hash(pair)
+    return hashes
 
 
 def check_truth(pair: Pair) -> None:
@@ -158,6 +165,7 @@ def _record(
     return Record(
         **facts, file=task.path.name, sha256=pair_hash(pair), method=task.method, seconds=seconds,
         prepare_seconds=prepare_seconds, settings=methods.settings_of(task.method, task.config),
+        facts=facts_hash(pair), machine=origin.machine(),
     )  # fmt: skip
 
 

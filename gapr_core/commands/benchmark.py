@@ -7,8 +7,6 @@ gapr benchmark merge OUT_1 OUT_2 ... --out OUT
 
 from __future__ import annotations
 
-import os
-import platform
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
@@ -21,7 +19,7 @@ from tqdm import tqdm
 from gapr_core.benchmark import methods as known_methods
 from gapr_core.benchmark import records, runner, table
 from gapr_core.benchmark.record import ERROR, Record
-from gapr_core.benchmark.records import Plan
+from gapr_core.benchmark.records import Inputs, Plan
 from gapr_core.benchmark.table import Row
 from gapr_core.commands import options
 from gapr_core.config import RegistrarConfig
@@ -33,6 +31,7 @@ from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import a_path, at_least_one
 from gapr_core.runtime.console import say
 
+DIFFERENT = {"commit": "commits", "threads": "numbers of threads", "machine": "machines"}
 DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
 
 
@@ -110,28 +109,32 @@ def benchmark(
     if config != RegistrarConfig() and not any(name in known_methods.OWN for name in methods):
         raise ConfigError(f"settings with one of {', '.join(known_methods.OWN)}", ", ".join(methods), "leave them out")
     chosen = [path.resolve() for path in paths[shard[0] - 1 :: shard[1]]]
-    runner.check_pairs(tqdm(chosen, desc="checking pairs", disable=None, leave=False))
-    plan, done = _begin(pairs, paths, methods, out, threads, ours, config)
+    facts = runner.check_pairs(tqdm(chosen, desc="checking pairs", disable=None, leave=False))
+    commit, made_of = _commit(), {name: known_methods.made_of(name) for name in methods}
+    inputs = Inputs(
+        _hashes(pairs, paths), {name: known_methods.settings_of(name, config) for name in methods}, made_of, facts
+    )
+    plan, done = _begin(pairs, inputs, methods, out, ours)
     tasks = [runner.Task(path, method, config) for path in chosen for method in methods]
     open_tasks = [task for task in tasks if (task.path.stem, task.method) not in done]
     with tqdm(total=len(tasks), initial=len(tasks) - len(open_tasks), desc="benchmark", disable=None) as bar:
         for record in runner.run_on_cluster(open_tasks, dask) if dask else runner.run(open_tasks, jobs, threads):
             check_content(record, plan)
-            records.append(out / records.FILE, replace(record, commit=plan.commit))
+            ran = replace(record, commit=commit, threads=threads, made_of=made_of[record.method])
+            records.append(out / records.FILE, ran)
             bar.set_postfix_str(f"{record.method} {record.pair}", refresh=False)
             bar.update()
     return write(out, plan)
 
 
 def _begin(
-    pairs: Path, paths: Sequence[Path], methods: Sequence[str], out: Path, threads: int, ours: str | None,
-    config: RegistrarConfig,
-) -> tuple[Plan, set[tuple[str, str]]]:  # fmt: skip
+    pairs: Path, inputs: Inputs, methods: Sequence[str], out: Path, ours: str | None
+) -> tuple[Plan, set[tuple[str, str]]]:
     """Write the plan; hand it back with what an earlier run has done. Its records do not stay in memory."""
     known = records.read(out / records.FILE)
     all_methods = list(dict.fromkeys([*(record.method for record in records.sort(known, methods)), *methods]))
-    plan = _plan(pairs, paths, all_methods, threads, ours)
-    done = records.done(known, plan.pairs, {name: known_methods.settings_of(name, config) for name in methods})
+    plan = _plan(pairs, inputs.pairs, all_methods, ours)
+    done = records.done(known, inputs)
     records.write_plan(out, plan)
     records.discard_cut_line(out / records.FILE)
     return plan, done
@@ -160,7 +163,9 @@ def _join(folders: Sequence[Path], out: Path, ours: str | None) -> None:
     methods = list(dict.fromkeys(named))
     _check_ours(ours, methods)
     _check_same_pairs(joined, pairs, out)
-    records.done(joined, pairs, {record.method: record.settings for record in reversed(joined)})
+    of = {record.method: record for record in reversed(joined)}
+    settings, made_of = ({name: getattr(r, key) for name, r in of.items()} for key in ("settings", "made_of"))
+    records.done(joined, Inputs(pairs, settings, made_of))
     records.write(out / records.FILE, records.sort(joined, methods))
     plan = replace(plans[0], ours=ours or plans[0].ours)
     records.write_plan(out, replace(plan, pairs=pairs, methods=methods, command=_command()))
@@ -171,25 +176,28 @@ def write(out: Path, plan: Plan) -> list[Row]:
     found = records.sort(records.read(out / records.FILE), plan.methods)
     if not found:
         raise ConfigError("results", f"none in {out}", "this shard has no pairs: use fewer shards")
-    rows, notes = table.rows(found, plan.methods), _notes(found, plan)
-    writers.write_json(out / "table.json", rows, plan)
+    conditions = records.conditions(found)
+    rows, notes = table.rows(found, plan.methods), _notes(found, plan, conditions)
+    ran = {name: " and ".join(values) for name, values in conditions.items()}
+    writers.write_json(out / "table.json", rows, plan, ran)
     writers.write_csv(out / "table.csv", rows)
-    writers.write_markdown(out / "table.md", rows, plan, notes)
-    benchmark_report.write(out, found, rows, plan, notes)
+    writers.write_markdown(out / "table.md", rows, plan, ran, notes)
+    benchmark_report.write(out, found, rows, plan, ran, notes)
     return rows
 
 
-def _plan(pairs: Path, paths: Sequence[Path], methods: Sequence[str], threads: int, ours: str | None) -> Plan:
-    _check_ours(ours, methods)
+def _hashes(pairs: Path, paths: Sequence[Path]) -> dict[str, str]:
+    """Name to sha256 of all pairs of a folder."""
     listed = listed_hashes(pairs)
     missing = [path for path in paths if path.stem not in listed]
     read = {path.stem: pair_hash(load_pair(path)) for path in tqdm(missing, desc="reading pairs", disable=None)}
-    hashes = {path.stem: listed.get(path.stem) or read[path.stem] for path in paths}
+    return {path.stem: listed.get(path.stem) or read[path.stem] for path in paths}
+
+
+def _plan(pairs: Path, hashes: dict[str, str], methods: Sequence[str], ours: str | None) -> Plan:
+    _check_ours(ours, methods)
     return Plan(
         command=_command(),
-        commit=_commit(),
-        machine=_machine(),
-        threads=threads,
         started=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         ours=ours or (known_methods.OURS if known_methods.OURS in methods else methods[0]),
         methods=list(methods),
@@ -225,15 +233,15 @@ def _check_same_pairs(joined: Sequence[Record], pairs: dict[str, str], out: Path
         raise ConfigError("an --out that is empty, or of the same pairs", f"{unknown[0]} in {out}", "choose another")
 
 
-def _notes(found: Sequence[Record], plan: Plan) -> list[str]:
+def _notes(found: Sequence[Record], plan: Plan, conditions: dict[str, list[str]]) -> list[str]:
     """What a reader must know before the numbers."""
     notes = []
     wanted, there = len(plan.pairs) * len(plan.methods), len(found)
     if there < wanted:
         notes.append(f"{wanted - there} of {wanted} results are missing: one shard, or an interrupted run.")
-    commits = sorted({r.commit for r in found})
-    if len(commits) > 1:
-        notes.append(f"Results of different commits: {', '.join(commits)}.")
+    for name, values in conditions.items():
+        if len(values) > 1:
+            notes.append(f"Results of different {DIFFERENT[name]}: {', '.join(values)}.")
     changed = sorted({f"Settings of {r.method}: {r.settings}." for r in found if r.settings})
     failed = {f"{r.method} on {r.pair} ({r.reason})" for r in found if r.status == ERROR}
     return [*notes, *changed, *(f"Failed: {line}." for line in sorted(failed))]
@@ -256,7 +264,3 @@ def _command() -> str:
 def _commit() -> str:
     """Commit of the source tree that runs, or the version of the installed package."""
     return origin.commit() or f"version {origin.release() or 'unknown'}"
-
-
-def _machine() -> str:
-    return f"{origin.cpu_name()}, {os.cpu_count()} cores, Python {platform.python_version()}"

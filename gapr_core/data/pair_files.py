@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -188,6 +189,13 @@ def pair_hash(pair: Pair) -> str:
         digest.update(f"{key}{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def facts_hash(pair: Pair) -> str:
+    """sha256 of what a file says of its pair besides the clouds and the transform, whether these were read or not."""
+    said = {**{name: getattr(pair, name) for name in NAMES}, **pair.metadata}
+    facts = {name: np.asarray(value).tolist() for name, value in said.items() if _is_fact(name)}
+    return sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
 def _content(pair: Pair) -> dict[str, NDArray[np.floating]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -17,7 +17,9 @@ from gapr_core.pages.sections import LEGEND, Section, sections, where_beaten
 from gapr_core.runtime import files
 
 
-def write(out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan, notes: Sequence[str]) -> None:
+def write(
+    out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]
+) -> None:
     """`report.html` and the folder `plots` with its pictures as PNG."""
     report = Report("Benchmark", f"{len(plan.pairs)} pairs, {len(plan.methods)} methods.")
     for note in notes:
@@ -33,8 +35,8 @@ def write(out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan,
     worst = pictures.worst(records, plan.ours)
     report.heading(f"The worst {len(worst)} cases of {plan.ours}")
     report.images([_case(out, number, record, plan) for number, record in enumerate(worst, 1)])
-    made = {"command": plan.command, "commit": plan.commit, "machine": plan.machine, "threads": plan.threads}
-    report.note(" · ".join(f"{name}: {value}" for name, value in (made | {"started": plan.started}).items()))
+    made = {"command": plan.command, **ran, "started": plan.started}
+    report.note(" · ".join(f"{name}: {value}" for name, value in made.items()))
     report.write(out / "report.html")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,9 +14,9 @@ from gapr_core.pages.sections import LEGEND, sections, where_beaten
 from gapr_core.runtime import files
 
 
-def write_json(path: Path, rows: Sequence[Row], plan: Plan) -> None:
-    """Rows and what made them."""
-    files.write_json(path, {"run": asdict(plan), "rows": list(rows)})
+def write_json(path: Path, rows: Sequence[Row], plan: Plan, ran: Mapping[str, str]) -> None:
+    """Rows, and what made them: the plan, and what ran, and on what."""
+    files.write_json(path, {"run": asdict(plan) | dict(ran), "rows": list(rows)})
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -27,7 +27,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows(rows)
 
 
-def write_markdown(path: Path, rows: Sequence[Row], plan: Plan, notes: Sequence[str]) -> None:
+def write_markdown(path: Path, rows: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]) -> None:
     """The table as Markdown."""
     parts = ["# Benchmark", *(f"> {note}" for note in notes)]
     for section in sections(rows):
@@ -36,5 +36,5 @@ def write_markdown(path: Path, rows: Sequence[Row], plan: Plan, notes: Sequence[
         parts += [f"## {section.title}", markdown.table(section.header, body)]
     beaten = where_beaten(rows, plan.ours)
     parts += [f"## Where another method beats {plan.ours}", "\n".join(f"- {line}" for line in beaten)]
-    made = f"Made by `{plan.command}` at commit {plan.commit}, {plan.threads} thread(s), {plan.machine}."
+    made = f"Made by `{plan.command}` at commit {ran['commit']}, {ran['threads']} thread(s), {ran['machine']}."
     files.write_text(path, "\n\n".join([*parts, LEGEND, made]) + "\n")

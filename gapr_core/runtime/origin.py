@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Iterable
@@ -39,8 +40,18 @@ def of_answers(config: Any) -> dict[str, str]:
     return {
         "version": f"{__version__} {commit() or ''}".strip(),
         "settings": settings(config),
-        "weights": _digest(path.read_bytes() for path in sorted(WEIGHTS.iterdir()) if path.suffix != ".md"),
+        "weights": shipped_weights(),
     }
+
+
+def shipped_weights() -> str:
+    """A short text that changes with the network or any model that is installed."""
+    return digest_of(path for path in sorted(WEIGHTS.iterdir()) if path.suffix != ".md")
+
+
+def digest_of(paths: Iterable[Path]) -> str:
+    """A short text that changes with the content of any of these files, or their order."""
+    return _digest(path.read_bytes() for path in paths)
 
 
 def settings(config: Any) -> str:
@@ -61,6 +72,11 @@ def release() -> str | None:
         return version("gapr_ros")
     except PackageNotFoundError:
         return None
+
+
+def machine() -> str:
+    """Processor, cores and Python, in words; nothing that names the computer."""
+    return f"{cpu_name()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
 def cpu_name() -> str:

@@ -1,5 +1,6 @@
 """The command's contracts: exit codes, JSON, one line for bad input."""
 
+import importlib
 import json
 import os
 import shlex
@@ -253,6 +254,31 @@ def test_evaluate_answers_again_what_other_settings_have_answered(tmp_path, pair
     assert answers[1] == answers[2]  # not asked again
     assert answers[0]["version"].startswith("0.") and answers[0]["weights"]
     assert answers[0]["tre95_mm"] is None and answers[0]["covariance"] is None
+
+
+def test_evaluate_answers_again_what_a_method_of_other_code_has_answered(tmp_path, pair, monkeypatch):
+    (tmp_path / "pairs").mkdir()
+    np.savez(tmp_path / "pairs" / "a.npz", source=pair.source, target=pair.target)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = ["evaluate", "--pairs", str(tmp_path / "pairs"), "--out", str(tmp_path / "o.json"), "--method", "mine:make"]
+    asked = tmp_path / "asked"
+    code = f"""
+from gapr_core.results import RegistrationResult, RegistrationStatus
+class Mine:
+    name = "mine"
+    def prepare(self, target, units="mm"): return target
+    def register(self, source, target):
+        open({str(asked)!r}, "a").write("x")
+        return RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="REASON")
+make = Mine
+"""
+    for reason, times in (("one", 2), ("one", 2), ("another", 4)):  # the first pair is asked twice, to load code
+        (tmp_path / "mine.py").write_text(code.replace("REASON", reason))
+        monkeypatch.delitem(sys.modules, "mine", raising=False)
+        importlib.invalidate_caches()
+        assert cli.main(run) == 0
+        assert json.loads((tmp_path / "o.json").read_text())["a"]["reason"] == reason
+        assert len(asked.read_text()) == times
 
 
 @pytest.mark.parametrize("is_unbuffered", [False, True])

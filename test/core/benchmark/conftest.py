@@ -32,6 +32,7 @@ def fakes(tmp_path, monkeypatch):
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / "fakes.py").write_text(FAKES)
     monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+    monkeypatch.delitem(sys.modules, "fakes", raising=False)  # that of the test before
     return lambda *names: [f"fakes:{name}" for name in names]
 
 

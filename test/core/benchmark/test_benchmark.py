@@ -228,6 +228,73 @@ def test_results_of_two_commits_are_said_to_be_so(pairs, fakes, tmp_path, in_pro
     assert "different commits" not in (folders[0] / "table.md").read_text()
 
 
+def test_a_table_names_what_its_records_ran_on_whatever_asked_for_it_last(
+    pairs, fakes, tmp_path, in_process, monkeypatch
+):
+    """A finished run that was asked for again named the new commit, machine and threads for the old times."""
+    ran = {"commit": "c0ffee", "machine": "an old one", "threads": 4}
+    monkeypatch.setattr(benchmark, "_commit", lambda: "c0ffee")
+    monkeypatch.setattr(runner.origin, "machine", lambda: "an old one")
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", threads=4)
+    monkeypatch.setattr(benchmark, "_commit", lambda: "decade")
+    monkeypatch.setattr(runner.origin, "machine", lambda: "a new one")
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", threads=8)
+    for folder in (tmp_path / "out", tmp_path / "merged"):
+        text = (folder / "table.md").read_text()
+        assert text.endswith("at commit c0ffee, 4 thread(s), an old one.\n") and "different" not in text
+        run = json.loads((folder / "table.json").read_text())["run"]
+        assert {name: run[name] for name in ran} == {name: str(value) for name, value in ran.items()}
+        benchmark.merge([tmp_path / "out"], tmp_path / "merged")
+    benchmark.benchmark(pairs, fakes("turned"), tmp_path / "out", threads=8)
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "at commit c0ffee and decade, 4 and 8 thread(s), a new one and an old one." in text
+    assert "> Results of different machines: a new one, an old one." in text
+    assert "> Results of different numbers of threads: 4, 8." in text
+
+
+def test_records_of_a_method_that_has_changed_are_refused(pairs, fakes, tmp_path, in_process):
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    module = tmp_path / "modules" / "fakes.py"
+    module.write_text(module.read_text() + "# changed\n")
+    with pytest.raises(ConfigError, match="fakes:good as it is now; got some of other weights, or other code"):
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "new")
+    with pytest.raises(ConfigError, match="fakes:good as it is now"):
+        benchmark.merge([tmp_path / "out", tmp_path / "new"], tmp_path / "merged")
+
+
+def test_what_a_method_is_made_of(tmp_path, fakes):
+    weights = tmp_path / "weights.safetensors"
+    weights.write_bytes(b"1")
+    names = [f"gapr_paper@{weights}", f"predator@{weights}+point_to_plane", *fakes("good")]
+    before = [known_methods.made_of(name) for name in names]
+    weights.write_bytes(b"2")
+    module = tmp_path / "modules" / "fakes.py"
+    module.write_text(module.read_text() + "# changed\n")
+    after = [known_methods.made_of(name) for name in names]
+    assert all(before) and all(after) and not set(before) & set(after)
+    shipped = {
+        known_methods.made_of(name) for name in ("gapr", "gapr_search", "gapr_paper", "gapr_paper+point_to_plane")
+    }
+    assert len(shipped) == 1 and not shipped & {"", *before, *after}
+    nothing = ("icp", "no_such_module:good", "no.such:good", "gapr_paper@nowhere", "sys:good")
+    assert {known_methods.made_of(name) for name in nothing} == {""}
+
+
+@pytest.mark.parametrize("change", [{"protocol": "L3"}, {"person": "another"}, {"metadata": {"noise_mm": 0.2}}, {
+    "metadata": {"noise_mm": 0.3, "overlap": 0.15, "viewpoint": np.array([0.0, 0.0, 500.0])}
+}, {"metadata": {"noise_mm": 0.3, "overlap": 0.15, "landmark_a": np.zeros(3)}}])  # fmt: skip
+def test_records_of_a_pair_whose_file_says_something_else_now_are_refused(change, pairs, fakes, tmp_path, in_process):
+    """The table named the old protocol, and answers without the camera's place counted as those with it."""
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    path = pairs / "L1_femur_0001.npz"
+    save_pair(path, load_pair(path))
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    save_pair(path, replace(load_pair(path), **change))
+    with pytest.raises(ConfigError, match="L1_femur_0001, whose file said something else of it"):
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+
+
 def test_reading_and_writing_records_needs_no_more_memory_than_they_do(tmp_path):
     each = record(make_pair(0), ok(np.eye(4)))
     records.write(tmp_path / records.FILE, (replace(each, reason=f"{number:09d}" * 1000) for number in range(300)))

@@ -118,12 +118,12 @@ def report(tmp_path_factory):
         save_pair(folder / f"{pair.name}.npz", pair)
     plan = Plan(
         ours="a", methods=["a", "b"], folder=str(folder), pairs={p.name: "0" for p in pairs},
-        command="gapr benchmark <&>", commit="c0ffee", machine="m", threads=1, started="now",
+        command="gapr benchmark <&>", started="now",
     )  # fmt: skip
     found = some_records()
     refused = record(pairs[3], RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="<b>two</b> poses"), "a")
     found = [*found[:-2], refused, found[-1]]
-    benchmark_report.write(folder, found, table.rows(found, ["a", "b"]), plan, ["One <note>."])
+    benchmark_report.write(folder, found, table.rows(found, ["a", "b"]), plan, {"commit": "c0ffee"}, ["One <note>."])
     return folder
 
 

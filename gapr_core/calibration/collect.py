@@ -37,7 +37,7 @@ from gapr_core.registration.features import FEATURES_OF, STREAM
 from gapr_core.registration.memory import Memory
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposals, Proposer
-from gapr_core.registration.proposals.network import NetworkProposer
+from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.source import PreparedSource
@@ -65,7 +65,7 @@ ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below 
 
 
 def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = None) -> list[Record]:
-    """Register every pair that the records file does not hold yet, or holds of other bones, settings or features.
+    """Register every pair that the records file does not hold yet, or holds of other bones, models or settings.
 
     Args:
         tasks: of one folder and split.
@@ -79,13 +79,15 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = Non
     path.parent.mkdir(parents=True, exist_ok=True)
     wanted, bones = {_name(task) for task in tasks}, (_anatomy(tasks[0]), tasks[0].split)
     of_these = [record for record in _read(path) if (record.get("anatomy"), record.get("split")) == bones]
-    done = {record["name"]: record for record in of_these if _is_current(record)}
+    made_of = _made_of(tasks[0].folder)
+    done = {record["name"]: record for record in of_these if _is_current(record, made_of)}
     left = [task for task in tasks if _name(task) not in done]
     where = (tasks[0].folder, tasks[0].split)
     shared = *where, pairs.bones_of(*where) if left else {}
     found = _on_cluster(left, dask, shared) if dask else _in_processes(left, jobs, shared)
     with path.open("a") as file:
-        for record in tqdm(found, total=len(left), unit="pair"):
+        for made in tqdm(found, total=len(left), unit="pair"):
+            record = made | {"made_of": made_of[_is_stream(made)]}
             file.write(json.dumps(record) + "\n")
             file.flush()
             done[record["name"]] = record
@@ -292,8 +294,23 @@ def _read(path: Path) -> list[Record]:
         ) from error
 
 
-def _is_current(record: Record) -> bool:
+def _made_of(folder: str) -> dict[bool, str]:
+    """A short text that changes with the folder's bones, and the network (False) or, for streams, any model (True)."""
+    bones = sorted(path for path in Path(folder).glob("*") if path.suffix in (".npz", ".json"))
+    return {
+        False: origin.digest_of([*bones, SHIPPED]),
+        True: f"{origin.digest_of(bones)} {origin.shipped_weights()}",
+    }
+
+
+def _is_stream(record: Record) -> bool:
+    return str(record.get("seen_as")) == STREAM
+
+
+def _is_current(record: Record, made_of: dict[bool, str]) -> bool:
     answers = record.get("answers", {}).items()
-    return record.get("settings") == origin.settings(SETTINGS) and all(
-        set(FEATURES_OF.get(round_of(name), ())) == answer["features"].keys() for name, answer in answers
+    return (
+        record.get("settings") == origin.settings(SETTINGS)
+        and record.get("made_of") == made_of[_is_stream(record)]
+        and all(set(FEATURES_OF.get(round_of(name), ())) == answer["features"].keys() for name, answer in answers)
     )

@@ -26,6 +26,7 @@ from gapr_core.data.protocols import Pair
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.model.config import ModelConfig
 from gapr_core.runtime import files
+from gapr_core.training import run_folder
 from gapr_core.training.bone_cache import PooledBone
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import OWN_TARGET, TrainingPairs
@@ -95,19 +96,23 @@ def main(description: str, checkout: type[Checkout], teacher: Teacher) -> int:
 
 
 def train(code: Checkout, teacher: Teacher, config: TrainConfig, anatomy: Path | None, folder: Path) -> None:
-    """Run until the schedule ends; `folder` gets checkpoint.pt, log.csv and weights.safetensors.
+    """Run until the schedule ends, or go on; the same as a run that was never stopped.
+
+    `folder` gets config.json, provenance.json, checkpoint.pt, log.csv and weights.safetensors.
 
     Raises:
-        ConfigError: a protocol whose target is not the whole bone, of which the first voxel is not known here.
+        ConfigError: a protocol whose target is not the whole bone, of which the first voxel is not known here; a folder
+            that holds another run.
     """
     if partial := sorted(set(config.mix) & set(OWN_TARGET)):
         raise ConfigError("protocols with whole targets", ", ".join(partial), "leave it out of `mix`")
-    torch.manual_seed(config.seed)
-    np.random.seed(config.seed)  # kernels are turned at random
+    run_folder.check(folder, config, config.network())
+    seed(config.seed)
     learner = Learner(code, teacher, config, anatomy)
     checkpoint = folder / "checkpoint.pt"
     if checkpoint.exists():
         learner.go_on(torch.load(checkpoint, weights_only=True))
+    run_folder.claim(folder, config, config.network(), anatomy, learner.steps_done, world=1)
     steps, saved = config.pairs // config.batch, time.monotonic()
     progress = tqdm(range(learner.steps_done, steps), initial=learner.steps_done, total=steps, unit="step")
     for step in progress:
@@ -121,6 +126,12 @@ def train(code: Checkout, teacher: Teacher, config: TrainConfig, anatomy: Path |
             files.write_text(folder / "log.csv", learner.table())
 
 
+def seed(number: int) -> None:
+    """Of all that the authors' code draws: kernels that are turned, pairs of points that the loss looks at."""
+    torch.manual_seed(number)
+    np.random.seed(number)
+
+
 class Learner:
     """The network, what it learns from, and how far it has come.
 
@@ -132,7 +143,7 @@ class Learner:
     """
 
     def __init__(self, code: Checkout, teacher: Teacher, config: TrainConfig, anatomy: Path | None) -> None:
-        self.config, self.sizes = config, config.network()
+        self.config, self.sizes, self._name = config, config.network(), code.origin.name
         self.network, self._lessons = code.network(self.sizes), teacher(code, self.sizes)
         self._optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.98), weight_decay=config.weight_decay
@@ -151,6 +162,7 @@ class Learner:
         for parameters in self._optimizer.param_groups:
             parameters["lr"] = rate
         first = self.steps_done * self.config.batch
+        seed(self.config.seed + 1 + self.steps_done)  # of each step, so that a run that goes on draws the same
         found = [self._learn(first + number) for number in range(self.config.batch)]
         used = [losses for losses in found if losses is not None]
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -179,10 +191,16 @@ class Learner:
     def state(self) -> dict[str, Any]:
         """What `go_on` needs."""
         parts = {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
-        return parts | {"log": self._log, "left_out": self._left_out}
+        return parts | {"of": self._name, "log": self._log, "left_out": self._left_out}
 
     def go_on(self, state: dict[str, Any]) -> None:
-        """From where a run stopped."""
+        """From where a run stopped.
+
+        Raises:
+            ConfigError: it trained the network of other authors.
+        """
+        if state["of"] != self._name:
+            raise ConfigError(f"a run of {self._name}", f"one of {state['of']} in this folder", "choose a new folder")
         self.network.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._log, self._left_out = state["log"], state["left_out"]

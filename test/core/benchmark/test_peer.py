@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
+from dataclasses import replace
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -239,3 +241,57 @@ def test_how_many_pairs_taught_nothing_is_counted_on_after_a_stop(learner):
     rows = [line.split(",")[:3] for line in second.table().splitlines()]
     assert rows == [["step", "pairs", "left_out"], ["1", "2", "1"], ["2", "4", "2"]]
     assert second.card()["left_out"] == 2 and second.steps_done == 2
+
+
+class Chance:
+    """A lesson whose loss is drawn at random, by torch and by NumPy; it is stopped before one of its pairs."""
+
+    names = ("loss",)
+    stops_before = 99
+
+    def __init__(self, code, sizes):
+        self.pairs = 0
+
+    def __call__(self, network, pair, voxel, log):
+        self.pairs += 1
+        if self.pairs == self.stops_before:
+            raise KeyboardInterrupt
+        return {"loss": (torch.rand(()) + np.random.random()) * network.weight.sum()}
+
+
+class Stopped(Chance):
+    stops_before = 6
+
+
+@pytest.fixture
+def config():
+    """Four steps of two pairs of parametric bones."""
+    return TrainConfig(pairs=8, batch=2, micro_batch=1, mix={"L1": 1.0}, pool=2, share=1, bones=("femur",),
+                       model_settings={"width": 16})  # fmt: skip
+
+
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(config, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "SAVE_S", -1.0)  # after every step
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    whole.mkdir()
+    parts.mkdir()
+    training.train(code_of("first"), Chance, config, None, whole)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(code_of("first"), Stopped, config, None, parts)
+    assert len((parts / "log.csv").read_text().splitlines()) == 3  # two of four steps
+    training.train(code_of("first"), Chance, config, None, parts)
+    assert (parts / "log.csv").read_text() == (whole / "log.csv").read_text()
+    assert torch.equal(peer.load(code_of("first"), parts / "weights.safetensors")[0].weight,
+                       peer.load(code_of("first"), whole / "weights.safetensors")[0].weight)  # fmt: skip
+
+
+def test_a_folder_of_another_run_is_refused(config, tmp_path):
+    training.train(code_of("first"), Chance, config, None, tmp_path)
+    before = (tmp_path / "weights.safetensors").read_bytes()
+    for other in ({"seed": 7}, {"pairs": 16}, {"mix": {"L2": 1.0}}, {"learning_rate": 0.1}):
+        with pytest.raises(ConfigError, match="settings this folder was begun with"):
+            training.train(code_of("first"), Chance, replace(config, **other), None, tmp_path)
+    with pytest.raises(ConfigError, match="a run of second; got one of first"):
+        training.train(code_of("second"), Chance, config, None, tmp_path)
+    assert (tmp_path / "weights.safetensors").read_bytes() == before
+    assert json.loads((tmp_path / "provenance.json").read_text())[0]["step"] == 0

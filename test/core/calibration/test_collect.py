@@ -212,6 +212,7 @@ def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tm
     answer = {"refusal": None, "right": True}
     path = tmp_path / "records.jsonl"
     bones = {"anatomy": "folder", "split": "train", "settings": origin.settings(collect.SETTINGS)}
+    bones["made_of"] = collect._made_of("folder")[False]
     lines = [json.dumps(bones | {"name": f"0-{number}", "answers": {"search": answer | {"features": values}}}) + "\n"
              for number, values in enumerate((features, old, features))]  # fmt: skip
     path.write_text("".join(lines) + '{"name": "0-3", "answ')
@@ -225,11 +226,13 @@ def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tm
     assert collect.collect(tasks, path, 1) and len(asked) == 2
 
 
-@pytest.mark.parametrize("other", [{"split": "val"}, {"anatomy": "others"}, {"split": None}, {"settings": "others"}])
+@pytest.mark.parametrize("other", [{"split": "val"}, {"anatomy": "others"}, {"split": None}, {"settings": "others"},
+                                   {"made_of": "others"}])  # fmt: skip
 def test_records_of_other_bones_or_settings_are_made_again(tmp_path, monkeypatch, other):
     path, asked = tmp_path / "records.jsonl", []
     record = {"name": "0-1", "anatomy": "folder", "split": "train", "answers": {}}
     record["settings"] = origin.settings(collect.SETTINGS)
+    record["made_of"] = collect._made_of(str(tmp_path / "folder"))[False]
     monkeypatch.setattr(pairs, "bones_of", lambda folder, split: {})
     monkeypatch.setattr(collect, "ProcessPoolExecutor", lambda *_: nullcontext(_Pool(asked)))
     task = Task(str(tmp_path / "folder"), "train", 0, 1)
@@ -237,6 +240,27 @@ def test_records_of_other_bones_or_settings_are_made_again(tmp_path, monkeypatch
     assert collect.collect([task], path, 1) == [record] and not asked
     path.write_text(json.dumps(record | other) + "\n")
     assert collect.collect([task], path, 1) and asked == [task]
+
+
+def test_records_change_with_bones_and_network_and_those_of_streams_with_every_model(tmp_path, monkeypatch):
+    """Those of the old network counted as done, and went into the fit of the new one."""
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    bones = tmp_path / "bones"
+    bones.mkdir()
+    for path in (bones / "femur_a.npz", bones / "splits.json", weights / "net", weights / "precision.json"):
+        path.write_bytes(b"1")
+    monkeypatch.setattr(origin, "WEIGHTS", weights)
+    monkeypatch.setattr(collect, "SHIPPED", weights / "net")
+    found = [collect._made_of(str(bones))]
+    changes = {bones / "femur_a.npz": True, bones / "splits.json": True, weights / "net": True,
+               weights / "precision.json": False, bones / "notes.txt": None}  # fmt: skip
+    for path, of_single_answers in changes.items():
+        path.write_bytes(b"2")
+        found.append(collect._made_of(str(bones)))
+        before, after = found[-2:]
+        assert (before[False] != after[False]) == bool(of_single_answers), path
+        assert (before[True] != after[True]) == (of_single_answers is not None), path
 
 
 class _Pool:

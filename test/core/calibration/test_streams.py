@@ -121,7 +121,9 @@ def test_every_frame_of_which_others_say_something_is_an_answer(monkeypatch, sta
     monkeypatch.setattr(streams, "_registrar", lambda: SimpleNamespace(prepare=lambda target: None))
     record = collect.record_of(TASK)
     assert record["family"] == "stream-waves" and list(record["answers"]) == [f"{STREAM} {k}" for k in (1, 2, 3)]
-    assert collect._is_current(record)
+    made_of = {False: "of single answers", True: "of streams"}
+    assert collect._is_current(record | {"made_of": "of streams"}, made_of)
+    assert not collect._is_current(record | {"made_of": "of single answers"}, made_of)
     answers = answers_of([record], STREAM)
     assert len(answers) == 3 and answers.right.tolist() == [right] * 3
     assert not answers.refused.any()

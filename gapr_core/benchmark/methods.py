@@ -98,10 +98,17 @@ TRAINED = RAW | {name + REFINED: partial(_refined, maker) for name, maker in RAW
 
 
 def _with_weights(name: str) -> tuple[str, str | None]:
-    """The method and the weights of a name: "gapr_paper@runs/mine/weights.safetensors+point_to_plane" has both."""
+    """The method and the weights of a name: "gapr_paper@runs/mine/weights.safetensors+point_to_plane" has both.
+
+    Raises:
+        ConfigError: no weights after the `@` of a method that takes some, as of a variable that is not set.
+    """
     method, has_weights, rest = name.partition("@")
     ending = REFINED if has_weights and rest.endswith(REFINED) else ""
-    return method + ending, rest.removesuffix(REFINED) or None
+    weights = rest.removesuffix(REFINED) or None
+    if has_weights and weights is None and method in RAW:
+        raise ConfigError(f"{method}@WEIGHTS", f"no weights in {name!r}", "name their file, or leave @ out")
+    return method + ending, weights
 
 
 def names() -> tuple[str, ...]:

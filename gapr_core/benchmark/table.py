@@ -35,7 +35,7 @@ def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
 
 def summary(records: Sequence[Record]) -> Row:
     """Every number of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
-    row: Row = {"pairs": len(records), "persons": len({r.person for r in records})}
+    row: Row = {"pairs": len(records), "persons": len({r.person for r in records} - {""})}
     row |= _answers(records) | _accuracy([r for r in records if r.has_truth])
     row |= _calibration(records) | _uncertainty([r for r in records if r.right]) | _times(records)
     row |= _precision([r for r in records if r.accepted and r.has_truth])

@@ -87,7 +87,9 @@ def coverage(answers: Answers, scale: Array, factor: float) -> dict[str, dict[st
     groups = {"all": np.full(len(answers), True)}
     groups |= {str(name): answers.family == name for name in np.unique(answers.family)}
     groups |= {f"round: {name}": answers.rounds == name for name in np.unique(answers.rounds)}
-    groups |= {f"tre95 {edges_mm[k - 1]:.1f} to {edges_mm[k]:.1f} mm": quarter == k for k in range(1, 5)}
+    for k in range(1, 5):
+        name = f"tre95 {edges_mm[k - 1]:.1f} to {edges_mm[k]:.1f} mm"  # two that read alike are one
+        groups[name] = groups.get(name, False) | (quarter == k)
     for name, of_it in groups.items():
         if not of_it.any():
             continue

@@ -28,7 +28,7 @@ from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
 from gapr_core.pages import benchmark_report, writers
 from gapr_core.runtime import cluster, origin
-from gapr_core.runtime.arguments import a_path, at_least_one
+from gapr_core.runtime.arguments import a_path, at_least_one, names
 from gapr_core.runtime.console import say
 
 DIFFERENT = {"commit": "commits", "threads": "numbers of threads", "machine": "machines"}
@@ -61,7 +61,7 @@ def run(args: Namespace) -> int:
     else:
         if args.pairs is None:
             raise ConfigError("--pairs DIR", "none", "make some with gapr make-pairs")
-        methods = [name.strip() for name in args.methods.split(",") if name.strip()]
+        methods = names(args.methods)
         config, shard = options.registrar_config(args), _shard(args.shard)
         rows = benchmark(args.pairs, methods, args.out, shard, args.jobs, args.threads, args.ours, config, args.dask)
     say(f"{len(rows)} rows in {args.out / 'table.md'}; to look at: {args.out / 'report.html'}")

@@ -20,7 +20,7 @@ from gapr_core.data import anatomy
 from gapr_core.data.make_pairs import Recipe, write_pairs
 from gapr_core.data.pool import specimens
 from gapr_core.errors import ConfigError
-from gapr_core.runtime.arguments import a_path, above_zero, at_least_one
+from gapr_core.runtime.arguments import a_path, above_zero, at_least_one, names
 from gapr_core.runtime.console import say
 
 PROTOCOLS = {
@@ -50,7 +50,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Make the table, and say where it is."""
-    bones = tuple(args.bones.split(","))
+    bones = names(args.bones)
     origin = "anatomy" if args.anatomy else "parametric"
     recipe = Recipe(PROTOCOLS.get(args.table, ("paper",)), bones, args.count, 0, args.split, args.count, origin)
     left = trained_table(args, recipe) if args.table in TRAINED else compared_table(args, recipe)
@@ -68,7 +68,7 @@ def compared_table(args: Namespace, recipe: Recipe) -> int:
     people = {bone: specimens(bone, recipe.split, recipe.people, args.anatomy) for bone in recipe.bones}
     write_pairs(recipe, people, pairs)
     ours = f"gapr_paper@{args.weights}"
-    methods = [ours, ours + REFINED, *filter(None, args.also.split(",")), "icp"]
+    methods = [ours, ours + REFINED, *names(args.also), "icp"]
     benchmark(pairs, methods, args.out, jobs=args.jobs, ours=ours)
     return 0
 

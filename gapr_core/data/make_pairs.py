@@ -18,7 +18,7 @@ from gapr_core.data.protocols import PROTOCOLS, make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.runtime import cluster, files
-from gapr_core.runtime.arguments import a_path, at_least_one
+from gapr_core.runtime.arguments import a_path, at_least_one, names
 from gapr_core.runtime.console import say
 
 FORMAT = 1
@@ -80,10 +80,11 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Make the pairs that the arguments name; says what it made, or takes up what an earlier run left."""
     origin = "anatomy" if args.anatomy else "meshes" if args.meshes else "parametric"
-    named = _names(args.bones) if args.bones else pool.bones_in(args.meshes) if args.meshes else anatomy.BONES
+    there = pool.bones_in(args.meshes, args.units) if args.meshes and not args.bones else anatomy.BONES
+    named = names(args.bones) if args.bones else there
     made_of = anatomy.meshes_hash(args.meshes, named, args.split) if args.meshes else ""
     recipe = Recipe(
-        _names(args.protocol), tuple(named), args.count, args.seed, args.split, args.people, origin,
+        names(args.protocol), tuple(named), args.count, args.seed, args.split, args.people, origin,
         args.units if args.meshes else "mm", made_of,
     )  # fmt: skip
     begin(recipe, args.out)
@@ -94,11 +95,6 @@ def run(args: Namespace) -> int:
         say(f"{bone}: {len(found)} subjects of split {recipe.split} ({cohorts})")
     say(f"{len(manifest['pairs'])} pairs in {args.out}, hash {manifest['hash'][:16]}")
     return 0
-
-
-def _names(text: str) -> tuple[str, ...]:
-    """Each name of a list with commas once: a pair stood twice in the manifest."""
-    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def write_pairs(

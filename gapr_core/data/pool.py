@@ -55,6 +55,6 @@ def specimens(
     return [parametric_specimen(bone, number) for number in parametric_people(split, people)]
 
 
-def bones_in(meshes_folder: str | Path) -> list[str]:
-    """The bone names that a folder of meshes holds."""
-    return sorted({s.bone for s in anatomy.meshes(meshes_folder)})
+def bones_in(meshes_folder: str | Path, units: str = "mm") -> list[str]:
+    """The bone names that a folder of meshes in this unit holds."""
+    return sorted({s.bone for s in anatomy.meshes(meshes_folder, units=units)})

@@ -58,9 +58,10 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet,
     try:
         network = GAPRNet(ModelConfig.from_dict(json.loads(header["config"])))
         network.load_state_dict({name: t.float() for name, t in tensors.items()}, strict=True)
-    except (ConfigError, RuntimeError, KeyError, TypeError) as error:
+        card = json.loads(header.get("card", "{}"))
+    except (ConfigError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise WeightsError("weights that fit their configuration", f"{path}: {error}", "export them again") from error
-    return network.to(device).eval(), json.loads(header.get("card", "{}"))
+    return network.to(device).eval(), card
 
 
 def checksum(tensors: dict[str, Tensor]) -> str:

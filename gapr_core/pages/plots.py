@@ -143,7 +143,7 @@ def _bins(values: Array) -> Array:
     """Edges of bins with about equally many pairs, at most six; one bin per value where there are few values."""
     distinct = np.unique(np.round(values, 6))
     if len(distinct) <= 6:
-        return np.r_[distinct, np.inf]
+        return np.r_[distinct - 1e-6, np.inf]  # below all that rounds to it
     return np.unique(np.quantile(values, np.linspace(0, 1, min(6, max(2, len(values) // 8)) + 1)))
 
 

@@ -24,6 +24,11 @@ def at_least_one(text: str) -> int:
     return int(text)
 
 
+def names(text: str) -> tuple[str, ...]:
+    """The words of a list with commas, each once: pairs of a name that came twice were made twice."""
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
 def a_path(text: str) -> Path:
     """A path; an empty one, as of a variable that is not set, would be the folder that one is in."""
     if not text.strip():

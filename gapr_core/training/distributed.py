@@ -37,6 +37,11 @@ class Group:
         dist.broadcast(flag, 0)
         return bool(flag.item())
 
+    def wait(self) -> None:
+        """Until every process is here."""
+        if self.world > 1:
+            dist.barrier()
+
     def share(self, batch: int, micro_batch: int) -> int:
         """Micro-batches of every process in one step.
 

@@ -12,13 +12,16 @@ from gapr_core.data.pool import parametric_split
 from gapr_core.errors import ConfigError
 from gapr_core.runtime import files
 
+RECORDS = "subjects_*.json"
+WHAT = "subjects of a training run"
+
 
 @dataclass
 class Drawn:
     """Pairs for every subject who contributed to them; a shape model counts for everybody that it is made of.
 
     Attributes:
-        path: of the record, JSON; one a process.
+        path: of the record, JSON; one a process, of the names `RECORDS`.
         held_out: subjects of val and test.
         pairs: subject to how many pairs.
     """
@@ -31,7 +34,7 @@ class Drawn:
     def of(cls, folder: Path | None, path: Path) -> Drawn:
         """The record that an earlier call left in `path`, or a new one; `folder` has the bones and splits.json."""
         people = anatomy.splits(folder) if folder else {"val": [], "test": []}
-        known = files.read_json(path, "subjects of a training run") if path.exists() else {}
+        known = files.read_json(path, WHAT) if path.exists() else {}
         return cls(path, frozenset([*people["val"], *people["test"]]), Counter(known))
 
     def add(self, subjects: Iterable[str]) -> None:
@@ -52,8 +55,9 @@ class Drawn:
         files.write_json(self.path, dict(sorted(self.pairs.items())))
 
     def count(self) -> int:
-        """How many subjects contributed so far."""
-        return len(self.pairs)
+        """How many subjects contributed so far, by what the other processes of the run have written as well."""
+        others = (path for path in self.path.parent.glob(RECORDS) if path != self.path)
+        return len(set(self.pairs).union(*(files.read_json(path, WHAT) for path in others)))
 
 
 HELD_OUT = ("val", "test")

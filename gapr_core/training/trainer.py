@@ -120,10 +120,12 @@ class Run:
                 run_folder.append(self.folder / "log.csv", row)
                 if last or to_validate.is_over():
                     self._validate()
-            if last or to_save.is_over():
-                self._save()
-            if self.group.agree(last):
+            if ends := self.group.agree(last):
                 self.drawn.write()
+                self.group.wait()  # the header of the weights counts the subjects of all processes
+            if ends or to_save.is_over():
+                self._save()
+            if ends:
                 break
 
     def leave(self) -> None:

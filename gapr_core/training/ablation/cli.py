@@ -40,7 +40,7 @@ from gapr_core.registration.proposals.consensus import sharpened
 from gapr_core.registration.proposals.network import METHODS, consensus, correspondences_mm
 from gapr_core.registration.refinement import refine_fully
 from gapr_core.runtime import files
-from gapr_core.runtime.arguments import above_zero, at_least_one
+from gapr_core.runtime.arguments import above_zero, at_least_one, names
 from gapr_core.runtime.console import say
 from gapr_core.runtime.parallel import end_with_parent
 from gapr_core.training import run_folder
@@ -86,7 +86,7 @@ def run(args: Namespace) -> int:
     config = replace(TrainConfig.from_yaml(args.config) if args.config else TrainConfig(), pairs=args.pairs)
     plan = read_plan(args.plan or default_plan())
     origin = "anatomy" if args.anatomy else "parametric"
-    recipe = Recipe(tuple(args.protocols.split(",")), config.bones, args.count, 0, args.split, args.count, origin)
+    recipe = Recipe(names(args.protocols), config.bones, args.count, 0, args.split, args.count, origin)
     missing = ablate(plan, config, args.out, args.anatomy, recipe, args.seeds, args.jobs, args.minutes, args.pose)
     say(f"table in {args.out / 'table.md'}" + (f"; {missing} networks are left, call again" if missing else ""))
     return 0

@@ -200,3 +200,9 @@ def test_pairs_count_one_by_one_in_the_interval_where_a_subject_is_not_known():
     assert ends["known"] == (0.0, 1.0)  # the same subject twice is as likely as both
     # of six throws of a coin none comes up with 1.6 %, at most one with 10.9 %
     assert ends["not all"] == pytest.approx((1.0 / 6.0, 5.0 / 6.0), abs=1e-5)
+
+
+def test_pairs_of_nobody_known_are_no_subject():
+    found = some_records()
+    assert table.summary(found)["persons"] == 3
+    assert table.summary([replace(r, person="") for r in found])["persons"] == 0

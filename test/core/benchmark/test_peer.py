@@ -175,6 +175,14 @@ def test_without_weights_it_says_how_to_train_them(monkeypatch, name):
         methods.make(f"{name}@weights.safetensors")
 
 
+@pytest.mark.parametrize("name", ["gapr_paper@", "predator@+point_to_plane", "geotransformer_ransac@"])
+def test_a_name_that_ends_before_its_weights_is_refused(name):
+    """As of a variable of the shell that is not set: the shipped network answered instead."""
+    for ask in (methods.make, lambda name: methods.check([name]), methods.made_of):
+        with pytest.raises(ConfigError, match="@WEIGHTS; got no weights in"):
+            ask(name)
+
+
 def code_of(name, width=3):
     return SimpleNamespace(
         origin=Origin(name, name.title(), "", "", ""), network=lambda sizes: torch.nn.Linear(width, width)

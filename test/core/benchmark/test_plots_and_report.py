@@ -57,6 +57,14 @@ def test_recall_against_overlap_has_one_dot_per_value_and_none_without_variation
     assert plots.recall_against(some_records(), ["a", "b"], "noise_mm", "noise") is None
 
 
+def test_values_that_round_up_stay_in_a_bin_of_their_own():
+    """Two thirds fell into the bin of one third."""
+    found = [record(pair, ok(shifted(pair, 1.0 if k < 4 else 90.0))) for k, pair in enumerate(map(make_pair, range(8)))]
+    found = [replace(r, noise_mm=(1 if k < 4 else 2) / 3) for k, r in enumerate(found)]
+    x, y = curve(plots.recall_against(found, ["m"], "noise_mm", "noise"), "m")
+    assert x == pytest.approx([1 / 3, 2 / 3]) and y.tolist() == [1.0, 0.0]
+
+
 def test_many_values_are_put_in_at_most_six_bins():
     found = [record(pair, ok(shifted(pair, 1.0))) for pair in map(make_pair, range(40))]
     x, y = curve(plots.recall_against(found, ["m"], "overlap", "overlap"), "m")

@@ -52,6 +52,15 @@ def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_famil
     assert all(row["covered"] > 0.93 for row in rows.values())
 
 
+def test_no_quarter_of_the_bounds_is_lost_where_two_read_alike():
+    answers = made_answers(400)
+    alike = 2.0 + 0.001 * np.arange(400) / 400 + 30.0 * (np.arange(400) >= 300)
+    scale = alike / answers.tre95_mm
+    rows = conformal.coverage(answers, scale, 1.0)
+    counts = {name: row["accepted"] for name, row in rows.items() if name.startswith("tre95")}
+    assert sum(counts.values()) == 400 and counts["tre95 2.0 to 2.0 mm"] == 200
+
+
 def test_the_table_holds_medians_of_true_errors_over_scaled_ones_for_each_family():
     answers = made_answers(400, error_scale=2.0)
     scale = np.random.default_rng(1).uniform(0.9, 3.0, 400)

@@ -182,13 +182,14 @@ def test_folders_in_the_folder_are_bones_and_no_person_is_in_two_splits(tmp_path
     assert min(map(len, people.values())) >= 1
 
 
-def test_meshes_in_centimetres_give_the_pairs_of_the_same_meshes_in_millimetres(tmp_path):
+@pytest.mark.parametrize(("other", "size"), [("cm", 0.1), ("m", 0.001)])
+def test_meshes_in_other_units_give_the_pairs_of_the_same_meshes_in_millimetres(tmp_path, other, size):
     write_meshes(tmp_path / "mm" / "humerus", 1)
-    (tmp_path / "cm" / "humerus").mkdir(parents=True)
-    mesh = o3d.io.read_triangle_mesh(str(tmp_path / "mm" / "humerus" / "person0.stl")).scale(0.1, np.zeros(3))
-    o3d.io.write_triangle_mesh(str(tmp_path / "cm" / "humerus" / "person0.stl"), mesh.compute_triangle_normals())
+    (tmp_path / other / "humerus").mkdir(parents=True)
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / "mm" / "humerus" / "person0.stl")).scale(size, np.zeros(3))
+    o3d.io.write_triangle_mesh(str(tmp_path / other / "humerus" / "person0.stl"), mesh.compute_triangle_normals())
     pairs = {}
-    for unit in ("mm", "cm"):
+    for unit in ("mm", other):
         words = ["make-pairs", "--split", "all", "--protocol", "L1", "--count", "1", "--units", unit]
         assert main([*words, "--meshes", str(tmp_path / unit), "--out", str(tmp_path / f"pairs_{unit}")]) == 0
         pairs[unit] = load_pair(next((tmp_path / f"pairs_{unit}").glob("*.npz")))

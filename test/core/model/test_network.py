@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from safetensors.torch import save_file
 
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.geometry import se3
@@ -251,6 +252,16 @@ def test_missing_damaged_and_foreign_weights_are_refused(toy, tmp_path):
         weights.load(path)
     path.write_bytes(raw[:100])
     with pytest.raises(WeightsError):
+        weights.load(path)
+
+
+@pytest.mark.parametrize("entry", ["config", "card"])
+def test_weights_with_a_damaged_header_are_refused_as_weights(toy, tmp_path, entry):
+    path = tmp_path / "w.safetensors"
+    weights.save(network(toy.small_config()), path)
+    header, tensors = weights._read(path)
+    save_file(tensors, str(path), metadata=header | {entry: "{no json"})
+    with pytest.raises(WeightsError, match="fit their configuration"):
         weights.load(path)
 
 

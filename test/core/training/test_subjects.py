@@ -74,6 +74,15 @@ def test_the_record_goes_on_where_an_earlier_call_stopped(tmp_path):
     assert json.loads(path.read_text()) == {"parametric_0": 4, "parametric_1": 2}
 
 
+def test_subjects_of_all_processes_count_once(tmp_path):
+    first, second = (Drawn.of(None, tmp_path / f"subjects_{rank}.json") for rank in range(2))
+    first.add(["parametric_0", "parametric_1"])
+    second.add(["parametric_1", "parametric_2", "parametric_5"])
+    assert first.count() == 2
+    second.write()
+    assert (first.count(), second.count()) == (4, 3)  # the first has written nothing yet
+
+
 def test_a_pair_of_a_drawn_bone_names_everybody_whom_the_bone_was_drawn_from(settings, anatomy):
     pairs = dataset.TrainingPairs(replace(settings, synthetic=1.0), settings.network(), anatomy)
     assert set(pairs.pair(0).subjects) == TRAIN and len(pairs[0].subjects) == settings.micro_batch * len(TRAIN)

@@ -411,6 +411,7 @@ def test_two_processes_under_torchrun_learn_what_one_learns(settings, anatomy, t
     of_one = json.loads((tmp_path / "one" / "subjects_0.json").read_text())
     of_two = [json.loads((tmp_path / "two" / f"subjects_{rank}.json").read_text()) for rank in range(2)]
     assert Counter(of_one) == Counter(of_two[0]) + Counter(of_two[1]) and all(of_two)
+    assert weights.load(tmp_path / "two" / "weights.safetensors")[1]["subjects"] == len(of_one)
 
 
 def test_a_batch_that_the_processes_cannot_share_is_refused():

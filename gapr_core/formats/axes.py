@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import columns
 from gapr_core.formats.limits import FileLimits
-from gapr_core.formats.meshes import vtp
+from gapr_core.formats.meshes import vtk, vtp
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 LPS_RAS = np.array([-1.0, -1.0, 1.0])  # the same both ways
 FACTORS = {"lps": np.ones(3), "as_is": np.ones(3), "ras": LPS_RAS, "lps_to_ras": LPS_RAS}
 CHOICES = ("auto", *FACTORS)
-COMMENT = re.compile(rb"SPACE(?:[ \t]*=[ \t]*| 1 1 string\r?\n\xc3?)(LPS|RAS)\b")  # the second is a VTK field
+COMMENT = re.compile(rb"SPACE[ \t]*=[ \t]*(LPS|RAS)\b")
 COMMENT_BYTES = 8192
+IN_FIELDS = {".vtk": vtk.space, ".vtp": vtp.space}  # wherever in the file the field is
 OPTIONS = "--axes, --source-axes or model_axes"
 
 
@@ -112,8 +113,8 @@ def _in_comment(path: Path) -> str | None:
         head = file.read(COMMENT_BYTES)
     if found := COMMENT.search(head):
         return found[1].decode().lower()
-    if path.suffix.lower() == ".vtp":
-        text = vtp.space(path, FileLimits.from_environment()).lower()
+    if space_of := IN_FIELDS.get(path.suffix.lower()):
+        text = space_of(path, FileLimits.from_environment()).lower()
         return text if text in ("lps", "ras") else None
     return None
 

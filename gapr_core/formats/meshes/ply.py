@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -32,7 +33,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
     """A mesh, or a cloud with its normals."""
     data = options.limits.read(path)
     _check_header(data, options.limits)
-    ply = _parse(data)
+    ply = _parse(_with_ascii_header(data))
     columns = ply["vertex"].data
     points = _columns(columns, "xyz")
     if "face" in ply and ply["face"].count:
@@ -52,6 +53,12 @@ def _parse(data: bytes) -> Any:
             return PlyData.read(file, known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
         except (PlyParseError, ValueError):  # other polygons, row by row; old NumPy maps nothing after the last page
             return PlyData.read(io.BytesIO(data))
+
+
+def _with_ascii_header(data: bytes) -> bytes:
+    """The same, with a question mark for each byte of another alphabet in a comment, which plyfile refuses."""
+    header, end, body = data.partition(b"end_header")
+    return data if header.isascii() else re.sub(rb"[\x80-\xff]", b"?", header) + end + body
 
 
 def _columns(table: Any, names: Any) -> Array:

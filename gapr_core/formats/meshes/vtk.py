@@ -52,11 +52,24 @@ def read(path: Path, options: ReadOptions) -> Surface:
     return Surface(points, triangles if len(triangles) else None)
 
 
+def space(path: Path, limits: FileLimits) -> str:
+    """The text of the field array SPACE, in which 3D Slicer writes the axes, before the points; empty without one.
+
+    Raises:
+        ValueError: a damaged file.
+    """
+    file = _File(limits.read(path), limits)
+    while (words := file.words()) and words[0] in ("FIELD", "METADATA"):
+        file.skip(words)
+    return file.space
+
+
 class _File:
     """Reads on from one place; every number is checked to be there before it is taken."""
 
     def __init__(self, data: bytes, limits: FileLimits) -> None:
         self._data, self._limits, self._at = data, limits, 0
+        self.space = ""  # what a field array of this name said, as far as it was read
         if not self.line().startswith("# vtk DataFile"):
             raise ValueError("no VTK header")
         self.line()  # the title
@@ -121,7 +134,11 @@ class _File:
                 pass
         elif words[0] == "FIELD":
             for _ in range(*_counts(words, 3, 2)):
-                self._skip_array(self.words())
+                words = self.words()
+                if words == ["METADATA"]:  # of the array before
+                    self.skip(words)
+                    words = self.words()
+                self._skip_array(words)
         else:
             raise ValueError(f"a section {words[0][:30]!r}")
 
@@ -131,19 +148,20 @@ class _File:
         if words[3] != "string":
             self.numbers(count, words[3])
         for _ in range(min(count, len(self._data)) if words[3] == "string" else 0):
-            if self._is_text:
-                self.line()
-            else:
-                self._skip_string()
+            found = self.line() if self._is_text else self._string()
+            if words[0] == "SPACE":
+                self.space = found.strip()
 
-    def _skip_string(self) -> None:
+    def _string(self) -> str:
         """Its length comes first, in as many bytes as the upper two bits of the first one say."""
         kind = self._data[self._at] >> 6 if self._at < len(self._data) else 3
         size = {3: 1, 2: 2, 1: 4, 0: 8}[kind]
         length = int.from_bytes(self._data[self._at : self._at + size], "big") & ((1 << (8 * size - 2)) - 1)
-        self._at += size + length
+        begin = self._at + size
+        self._at = begin + length
         if self._at > len(self._data):
             raise ValueError("a text that ends beyond the file")
+        return self._data[begin : self._at].decode("ascii", "replace")
 
 
 def _counts(words: list[str], length: int, *places: int) -> list[int]:

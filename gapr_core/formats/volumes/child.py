@@ -70,7 +70,11 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
         raise
     size = int(np.prod(reader.GetSize(), dtype=np.float64)) * reader.GetNumberOfComponents()
     limits.check_unpacked(size * 8)
-    image = reader.Execute()
+    try:
+        image = reader.Execute()
+    except RuntimeError as error:  # ITK says why not, and where in its source, or that a file that is here is not
+        given = "a header without all of them, as of a file that is cut"
+        raise InvalidPointCloudError("the voxels that the header announces", given, "export it again") from error
     if image.GetDimension() != 3:
         raise InvalidPointCloudError("a volume", f"{image.GetDimension()} dimensions", "export one time step")
     _check_axes(path, {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()})

@@ -42,10 +42,21 @@ def read(path: Path, options: ReadOptions) -> Surface:
     if path.stat().st_size > options.limits.file_mb * (1 << 20):
         options.limits.read(path)
     with tempfile.TemporaryDirectory() as folder:
-        mask, affine, notes = _in_a_child(path, options, Path(folder) / "mask.npz")
+        asked = _with_small_ending(path, Path(folder))
+        mask, affine, notes = _in_a_child(asked, options, Path(folder) / "mask.npz")
     for note in notes:
         log.warning("%s: %s", path.name, note)
     return contour.surface_of(mask, affine)
+
+
+def _with_small_ending(path: Path, folder: Path) -> Path:
+    """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers."""
+    ending = "".join(path.suffixes[-2:]) if path.suffix.lower() == ".gz" else path.suffix
+    if ending == ending.lower():
+        return path
+    link = folder / f"file{ending.lower()}"
+    link.symlink_to(path.resolve())
+    return link
 
 
 def _in_a_child(path: Path, options: ReadOptions, out: Path) -> tuple[Mask, NDArray[np.float64], list[str]]:

@@ -71,13 +71,13 @@ def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tup
         return [_only(named, present)], []
     chosen, notes = [], []
     for label in wanted:
-        segment = _by_number(int(label), named, present) if label.isdecimal() else _by_name(label, named, present)
+        segment = _by_digits(label, named, present) if label.isdecimal() else _by_name(label, named, present)
         if segment.value not in present.get(segment.layer, ()):
             there = _present(named, present)
             how = "choose one of these" if there else "check the segmentation"
             raise InvalidPointCloudError(f"voxels of {label}", f"none, but {there or 'zeros only'}", how)
         chosen.append(segment)
-        if label.isdecimal():
+        if label.isdecimal() and _key(segment.name) != _key(label):
             notes.append(f"label {label} {_meaning(segment, present)}")
     return chosen, notes
 
@@ -108,6 +108,23 @@ def _by_number(value: int, named: list[Segment], present: Present) -> Segment:
         raise InvalidPointCloudError("one segment", f"{value} in {len(layers)} layers", "choose it by its name")
     layer = layers[0] if layers else 0
     return next((s for s in named if (s.value, s.layer) == (value, layer)), Segment("", value, layer))
+
+
+def _by_digits(label: str, named: list[Segment], present: Present) -> Segment:
+    """The segment of a number, or the one that has these digits for a name.
+
+    Raises:
+        InvalidPointCloudError: these are two.
+    """
+    of_name = [segment for segment in named if _key(segment.name) == _key(label)]
+    if not of_name:
+        return _by_number(int(label), named, present)
+    others = [s for s in _segments(named, present) if s.value == int(label) and s not in of_name]
+    if others:
+        other = f'the segment "{others[0].name}"' if others[0].name else "one without a name"
+        given = f"the name of the segment of number {of_name[0].value}, and the number of {other}"
+        raise InvalidPointCloudError(f"one segment {label}", given, "rename the first in 3D Slicer")
+    return _by_name(label, named, present)
 
 
 def _by_name(label: str, named: list[Segment], present: Present) -> Segment:

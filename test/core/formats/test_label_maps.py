@@ -252,6 +252,29 @@ def test_names_that_share_their_voxels_are_no_choice(tmp_path):
     assert mean_z(path, "1") == pytest.approx(20.0, abs=0.3)
 
 
+def test_digits_that_are_the_name_of_one_segment_and_the_number_of_another_are_no_choice():
+    """The segment of that number was taken, another bone."""
+    two = [Segment("2", 1), Segment("1", 2)]
+    for label in "12":
+        with pytest.raises(InvalidPointCloudError, match=f"one segment {label}; got the name of the segment of number"):
+            names.choose([label], two, {0: {1, 2}})
+    overlapping = [Segment("2", 1, 0), Segment("1", 1, 1)]  # no voxel is of number 2
+    assert names.choose(["2"], overlapping, {0: {1}, 1: {1}}) == ([overlapping[0]], [])
+    with pytest.raises(InvalidPointCloudError, match="one segment 1"):
+        names.choose(["1"], overlapping, {0: {1}, 1: {1}})
+    assert names.choose(["1"], [Segment("1", 1), Segment("2", 2)], {0: {1, 2}}) == ([Segment("1", 1)], [])
+    assert names.choose(["3"], [Segment("1", 1), Segment("Femur", 3)], {0: {1, 3}})[0] == [Segment("Femur", 3)]
+
+
+@pytest.mark.parametrize("ending", ["MHA", "Nrrd", "nii.GZ", "NII.gz", "NII"])
+def test_endings_may_be_in_capitals(tmp_path, ending):
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    written = write(tmp_path / f"a.{ending.lower()}", voxels_of(affine, size), affine)
+    capital = written.rename(tmp_path / f"my scan v1.2.{ending}")
+    surface = clouds.load(capital)
+    np.testing.assert_allclose(surface.points.mean(axis=0), CENTRE, atol=0.5)
+
+
 def test_one_name_twice_is_no_choice():
     with pytest.raises(InvalidPointCloudError, match="2 of the name bone"):
         names.choose(["bone"], [Segment("bone", 1), Segment("Bone", 2)], {0: {1, 2}})

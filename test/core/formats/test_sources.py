@@ -448,6 +448,45 @@ def test_axes_of_a_legacy_vtk_file_come_from_its_field_space_as_well(tmp_path, v
     np.testing.assert_allclose(reading.read(tmp_path / "a.vtk").points, POINTS * factors)
 
 
+@pytest.mark.parametrize("is_binary", [False, True])
+@pytest.mark.parametrize("name", ["a.vtk", "a.VTK"])
+def test_axes_of_a_legacy_vtk_file_may_come_after_kilobytes_of_other_fields_with_their_own_information(
+    tmp_path, is_binary, name
+):
+    """Only the first 8192 bytes were searched: half a turn. Of two arrays with named components none was read."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    poly, fields = triangle_with("RAS"), triangle_with()
+    for number in range(2):
+        array = numpy_to_vtk(np.random.default_rng(0).random((700, 3)), deep=True)
+        array.SetName(f"parameters {number}")
+        for component in range(3):
+            array.SetComponentName(component, "xyz"[component])
+        fields.GetFieldData().AddArray(array)
+    fields.GetFieldData().AddArray(poly.GetFieldData().GetAbstractArray("SPACE"))
+    writer = vtkPolyDataWriter()
+    writer.SetFileName(str(tmp_path / name))
+    writer.SetFileType(2 if is_binary else 1)
+    writer.SetInputData(fields)
+    assert writer.Write()
+    assert (tmp_path / name).read_bytes().index(b"SPACE") > 8192
+    surface = reading.read(tmp_path / name)
+    np.testing.assert_allclose(surface.points, POINTS * LPS_RAS)
+    assert surface.faces.tolist() == [[0, 1, 2]]
+
+
+def test_comments_of_a_ply_file_may_be_in_any_language(tmp_path):
+    head = "ply\nformat {} 1.0\ncomment Oberschenkel, M\u00fcller \u9aa8\nelement vertex 3\n"
+    head += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    rows = "\n".join(" ".join(map(str, point)) for point in POINTS)
+    (tmp_path / "text.ply").write_text(head.format("ascii") + rows + "\n", encoding="utf-8")
+    binary = head.format("binary_little_endian").encode() + POINTS.astype("<f4").tobytes()
+    (tmp_path / "binary.ply").write_bytes(binary)
+    for name in ("text.ply", "binary.ply"):
+        np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
+
+
 def triangle_with(*texts):
     """Polygonal data with a field array SPACE, if there are texts for it."""
     from vtkmodules.util.numpy_support import numpy_to_vtk

@@ -258,6 +258,7 @@ class LimitsConfig(Settings):
         0.4, "rough misfit in a scene over the scale of its residuals from which on they do not", low=0, high=100
     )
     covered: float = setting(0.9, "least share of the covariance within 4 mm and 5 deg", low=0, high=1)
+    loose_mm: float = setting(5.0, "a larger tre95_mm does not say whose bone it is", low=0, high=1000, unit="mm")
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,11 @@ def is_uncertain(assessment: Assessment, config: RegistrarConfig) -> bool:
     return right_share(assessment.uncertainty.covariance) < config.limits.covered
 
 
+def is_loose(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where the bone may be so far off somewhere that as much of another subject's would fit as well."""
+    return assessment.tre95_mm > config.limits.loose_mm
+
+
 def is_inferred(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True where nobody said where the camera was: the cloud's surface says it to some 10 degrees only."""
     return assessment.inferred_viewpoint is not None
@@ -209,6 +214,12 @@ LIMITS = (
         "the distance from the bone changes along the source, as under tissue; bare the bone, or correct the sensor",
     ),
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
+    Limit(
+        "loose",
+        is_loose,
+        "so little of the bone, or so noisy, may as well be of another subject's; measure a larger part of it, or more "
+        "precisely",
+    ),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )
 

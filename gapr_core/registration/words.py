@@ -38,6 +38,7 @@ WORDS = {
     "beyond_bias": "limit: near points err alike by more than the smooth error of the sensor",
     "rough": "limit: near points of a camera's cloud err alike",
     "uncertain": "limit: the covariance leaves the pose loose",
+    "loose": "limit: so loose over the bone, the pose may as well be of another subject's",
     "doubled": "limit: points that do not fit lie on the bone in another pose",
     "strained": "limit: the source is longer, wider or slanted against the bone",
     "layered": "limit: the distance from the bone changes along the source",

@@ -15,7 +15,7 @@ from gapr_core.registration import limits
 from gapr_core.results import Refusal
 
 SURE = 0.97
-TIGHT = np.diag([0.25] * 3 + [np.radians(0.5) ** 2] * 3)
+TIGHT = np.diag([0.01] * 3 + [np.radians(0.1) ** 2] * 3)
 
 
 @pytest.fixture
@@ -163,7 +163,19 @@ def test_no_pose_is_surer_than_its_covariance(made):
     loose = made(covariance=np.diag([2.0**2] * 3 + [1e-6] * 3))
     assert list(limits.applied(loose, RegistrarConfig()).contributions)[-1] == "uncertain"
     assert limits.applied(loose, RegistrarConfig()).probability == 0.89
-    assert limits.applied(made(covariance=np.diag([1.5**2] * 3 + [1e-6] * 3)), RegistrarConfig()).probability == SURE
+    alone = RegistrarConfig(limits=LimitsConfig(loose_mm=1000.0))
+    assert limits.applied(made(covariance=np.diag([1.5**2] * 3 + [1e-6] * 3)), alone).probability == SURE
+
+
+def test_a_pose_that_leaves_the_bone_loose_may_be_of_another_bone(made):
+    """Of a small noisy patch: it is right within 4 mm and 5 deg there, and millimetres off elsewhere."""
+    turned = made(covariance=np.diag([1e-4] * 3 + [np.radians(0.6) ** 2] * 3))
+    assert limits.right_share(turned.uncertainty.covariance) > 0.99 and turned.tre95_mm > 5.0
+    found = limits.applied(turned, RegistrarConfig())
+    assert found.probability == 0.89 and list(found.contributions)[-1] == "loose"
+    for loose_mm, probability in ((1.01 * turned.tre95_mm, SURE), (0.99 * turned.tre95_mm, 0.89)):
+        config = RegistrarConfig(limits=LimitsConfig(loose_mm=loose_mm))
+        assert limits.applied(turned, config).probability == probability
 
 
 def test_the_share_of_a_covariance_that_is_right_is_that_of_its_normal_distribution():

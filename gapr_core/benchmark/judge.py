@@ -56,6 +56,8 @@ def why_unusable(result: Any) -> str:
         return f"the method answered {type(result).__name__}, no RegistrationResult"
     if not isinstance(result.confidence, Real) or not np.isfinite(result.confidence):
         return f"the method's confidence is {result.confidence}, no finite number"
+    if not 0.0 <= result.confidence <= 1.0:
+        return f"the method's confidence is {result.confidence}, not from 0 to 1"
     for name, shape in {"T_target_source": (4, 4), "best": (4, 4), "covariance": (6, 6), "centre_mm": (3,)}.items():
         array = getattr(result, name)
         if array is not None and not _is_finite(array, shape):

@@ -104,9 +104,9 @@ def run_task(task: Task) -> Record:
         why = why_unusable(result)
     except (ConfigError, MethodUnavailableError, WeightsError):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a method that ends its process, too
         log.warning("%s failed on %s", task.method, pair.name, exc_info=True)
-        return _failure(task, pair, f"{type(error).__name__}: {error}")
+        return _failure(task, pair, " ".join(f"{type(error).__name__}: {error}".split()))
     if why:
         log.warning("%s on %s: %s", task.method, pair.name, why)
         return _failure(task, pair, why)

@@ -132,7 +132,11 @@ def _begin(
 ) -> tuple[Plan, set[tuple[str, str]]]:
     """Write the plan; hand it back with what an earlier run has done. Its records do not stay in memory."""
     known = records.read(out / records.FILE)
-    all_methods = list(dict.fromkeys([*(record.method for record in records.sort(known, methods)), *methods]))
+    before = records.read_plan(out) if (out / records.PLAN).is_file() else None
+    there = [record.method for record in records.sort(known, before.methods if before else methods)]
+    first = [name for name in before.methods if name in there] if before else []
+    all_methods = list(dict.fromkeys([*first, *there, *methods]))
+    ours = ours or (before.ours if before and before.ours in all_methods else None)
     plan = _plan(pairs, inputs.pairs, all_methods, ours)
     done = records.done(known, inputs)
     records.write_plan(out, plan)

@@ -149,6 +149,9 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
     if not folder.is_dir():
         raise ConfigError("a folder with meshes", f"{folder}, which does not exist", "check the path")
     flat, nested = _mesh_files(folder), {d.name: _mesh_files(d) for d in sorted(folder.glob("*")) if d.is_dir()}
+    if flat and any(nested.values()):
+        names = ", ".join([flat[0].name, *(name for name, found in nested.items() if found)][:4])
+        raise ConfigError("meshes of one bone, or a folder for each bone", f"both ({names})", "move the files")
     of_bone = {bone or folder.resolve().name: flat} if flat else {b: f for b, f in nested.items() if bone in (None, b)}
     specimens = [Specimen(load(f, units), b, _stem(f), "meshes") for b, found in of_bone.items() for f in found]
     if not specimens:
@@ -169,6 +172,22 @@ def meshes_hash(folder: str | Path, bones: Sequence[str], split: str = "all") ->
     found = _mesh_files(folder) or [file for bone in sorted(bones) for file in _mesh_files(folder / bone)]
     if split != "all" and (folder / "splits.json").is_file():
         found = [*found, folder / "splits.json"]
+    return _hash_of(found, folder)
+
+
+def is_flat(folder: str | Path) -> bool:
+    """Whether `meshes` takes the files of a folder for one bone."""
+    return bool(_mesh_files(Path(folder)))
+
+
+def corresponded_hash(folder: str | Path) -> str:
+    """sha256 over names and contents of the files that `surfaces` reads by default, of all bones, and splits.json."""
+    folder = Path(folder)
+    found = [*sorted(folder.glob("*.npz")), *folder.glob("splits.json")]
+    return _hash_of(found, folder)
+
+
+def _hash_of(found: Sequence[Path], folder: Path) -> str:
     digest = sha256()
     for file in found:
         digest.update(f"{file.relative_to(folder).as_posix()} {sha256(file.read_bytes()).hexdigest()}\n".encode())

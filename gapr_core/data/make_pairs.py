@@ -27,7 +27,7 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that a list of pairs depends on but the bones of `anatomy`; a user's meshes stand in it by their hash.
+    """Everything that a list of pairs depends on; meshes stand in it by their hash.
 
     Raises:
         ConfigError: an unknown protocol, nothing to make, or a number out of range.
@@ -41,7 +41,7 @@ class Recipe:
     people: int = 20
     origin: str = "parametric"  # or "anatomy", "meshes"
     units: str = "mm"  # of meshes
-    meshes: str = ""  # hash of the files; empty for other origins
+    meshes: str = ""  # hash of the files; empty for parametric bones
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.protocols if name not in PROTOCOLS]
@@ -82,7 +82,11 @@ def run(args: Namespace) -> int:
     origin = "anatomy" if args.anatomy else "meshes" if args.meshes else "parametric"
     there = pool.bones_in(args.meshes, args.units) if args.meshes and not args.bones else anatomy.BONES
     named = names(args.bones) if args.bones else there
+    if args.meshes and len(named) > 1 and anatomy.is_flat(args.meshes):
+        how = "put the meshes of each bone into a folder of its name"
+        raise ConfigError("one bone for meshes in one folder", ", ".join(named), how)
     made_of = anatomy.meshes_hash(args.meshes, named, args.split) if args.meshes else ""
+    made_of = anatomy.corresponded_hash(args.anatomy) if args.anatomy else made_of
     recipe = Recipe(
         names(args.protocol), tuple(named), args.count, args.seed, args.split, args.people, origin,
         args.units if args.meshes else "mm", made_of,
@@ -137,9 +141,15 @@ def begin(recipe: Recipe, out: Path) -> None:
     there = read_manifest(out) if (out / MANIFEST).exists() else None
     if there is None or not (there["pairs"] or any(out.glob("*.npz"))):
         _write_manifest(out, recipe, [], "")
-    elif there["recipe"] != recipe.listed():
+    elif not _is_of(there["recipe"], recipe):
         wanted = "an empty folder or one with pairs of this recipe, of the same meshes and unit"
         raise ConfigError(wanted, f"other pairs in {out}", "choose another --out")
+
+
+def _is_of(listed: dict[str, Any], recipe: Recipe) -> bool:
+    """Whether a manifest lists this recipe; older ones do not say of which anatomy they are."""
+    unsaid = {"meshes": recipe.meshes, "units": recipe.units} if recipe.origin == "anatomy" and recipe.meshes else {}
+    return unsaid | listed == recipe.listed()
 
 
 def read_manifest(folder: str | Path) -> dict[str, Any]:

@@ -23,8 +23,9 @@ class Heard:
 
     A stamp that goes back is judged as those of clouds are: one is a straggler and is left out; several in a row that
     go forward among themselves are another round, and what was heard before is forgotten. Until it is clear which,
-    nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden. Frames
-    through which nothing was looked up yet may be out of order by a second: they are no reason to forget the others.
+    nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden, or goes to
+    and fro, as one that two nodes send. Frames through which nothing was looked up yet may be out of order by a second;
+    while there are others, theirs are left out then: they are no reason to forget the others.
 
     Args:
         buffer: of tf2.
@@ -56,12 +57,15 @@ class Heard:
         if self._is_future(stamp):
             self._warn(f"a transform of '{child}' is left out: its stamp is ahead of the clock; synchronise the clocks")
         elif self._is_of_now(child, stamp):
-            self._links.note(child, transform.header.frame_id, stamp)
+            self._links.note(transform, stamp)
             self._buffer.set_transform(transform, authority)
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf_static: it holds at all times."""
-        self._links.note_static(transform.child_frame_id, transform.header.frame_id)
+        if changed := self._links.note_static(transform):
+            frame = plain_frame(transform.child_frame_id)
+            what = f"'{frame}' came on /tf_static once more, and {changed}: this holds now"
+            self._node.get_logger().warning(f"{what}; if two nodes send it, end one")
         self._buffer.set_transform_static(transform, authority)
 
     def why_not(self, frame: str, other: str, stamp: int, most_gap_s: float) -> str:
@@ -75,6 +79,9 @@ class Heard:
         if turned := self.turned(frame, other):
             return f"the stamps of the transforms of '{turned}' went back, and whether time did is not clear yet"
         frames = self._links.between(frame, other)
+        for each in sorted(frames):
+            if how := self._links.to_and_fro(each, stamp):
+                return f"'{each}' is not to be believed, {how}: do two nodes send it on /tf?"
         gap_s, child = max(((self._links.gap_ns(each, stamp) * 1e-9, each) for each in frames), default=(0.0, ""))
         if stamp == 0 or not 0.0 < most_gap_s < gap_s:
             return ""
@@ -100,9 +107,10 @@ class Heard:
     def _is_of_now(self, child: str, stamp: int) -> bool:
         newest, any_older = self._links.newest_ns(child), child in self._any_older
         self._any_older.discard(child)
+        is_needed = any_older or not self._needed or child in self._needed
         row, most_ns = self._back_ns.get(child, []), OUT_OF_ORDER_NS if child in self._needed else BACK_NS
         if stamp < newest - (0 if any_older or row else most_ns) or len(row) > 1:
-            if not (any_older or self._is_another_round(child, stamp)):
+            if not (any_older or self._is_another_round(child, stamp)) or not is_needed:
                 return False
             self._warn(f"the stamps of the transforms of '{child}' went back: those of before are forgotten")
             self.start_over()
@@ -111,7 +119,7 @@ class Heard:
 
     def _is_another_round(self, child: str, stamp: int) -> bool:
         row = self._back_ns.get(child, [])
-        self._back_ns[child] = [*row, stamp] if row and stamp > row[-1] else [stamp]
+        self._back_ns[child] = [*row, stamp][-RESTART_AFTER:] if row and stamp > row[-1] else [stamp]
         return len(self._back_ns[child]) >= RESTART_AFTER
 
     def _warn(self, text: str) -> None:

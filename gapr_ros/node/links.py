@@ -1,69 +1,133 @@
-"""Which moving frames lie between two, and when each was heard: what tf2 does not say of what it interpolates."""
+"""Which moving frames lie between two, and what was heard of each: what tf2 does not say of what it interpolates."""
 
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gapr_ros.node.intake import plain_frame
 
+if TYPE_CHECKING:
+    from geometry_msgs.msg import TransformStamped
+
+Array = NDArray[np.float64]
+Place = tuple[float, ...]  # x y z of a frame in its parent, metres, and its quaternion, x y z w
+
 KEPT_NS = 10_000_000_000  # behind the newest stamp of a frame, as a tf2 buffer keeps transforms
+NEAR_NS = 1_000_000_000  # on either side of a stamp it is looked whether a frame goes to and fro,
+TO_AND_FRO = 2  # so often,
+LEAST_M, LEAST_RAD = 0.003, np.radians(2.0)  # by so much or more,
+LEAST_M_S, LEAST_RAD_S = 0.15, np.radians(50.0)  # so fast,
+BACK = 0.25  # and back but for so much of it: as nothing moves that one tracker follows
+
+
+@dataclass
+class Track:
+    """What was heard of one moving frame, by its stamps, ns, ascending."""
+
+    stamps: list[int] = field(default_factory=list)
+    places: list[Place] = field(default_factory=list)
+    parents: list[str] = field(default_factory=list)
+
+    def insert(self, stamp: int, place: Place, parent: str) -> None:
+        """One more; what is far behind the newest is forgotten."""
+        at = bisect_right(self.stamps, stamp)
+        self.stamps.insert(at, stamp)
+        self.places.insert(at, place)
+        self.parents.insert(at, parent)
+        if self.stamps[0] < self.stamps[-1] - 2 * KEPT_NS:
+            old = bisect_left(self.stamps, self.stamps[-1] - KEPT_NS)
+            del self.stamps[:old], self.places[:old], self.parents[:old]
+
+    def near(self, stamp: int) -> tuple[Array, Array, list[str]]:
+        """Seconds (N,), places (N, 7) and parents of those within a second of a stamp, ns; of 0 of the newest one."""
+        stamp = stamp or self.stamps[-1]
+        some = slice(bisect_left(self.stamps, stamp - NEAR_NS), bisect_right(self.stamps, stamp + NEAR_NS))
+        seconds = 1e-9 * (np.array(self.stamps[some], dtype=np.float64) - stamp)
+        return seconds, np.array(self.places[some]).reshape(-1, 7), self.parents[some]
 
 
 class Links:
-    """The parent of every frame, and the stamps of its transforms. May be asked from another thread."""
+    """The parent of every frame, and what was heard of it. May be asked from another thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._parents: dict[str, str] = {}
-        self._stamps: dict[str, list[int]] = {}  # ns, ascending; none of a static frame
+        self._tracks: dict[str, Track] = {}  # none of a static frame
+        self._static: dict[str, tuple[str, Place]] = {}
 
-    def note(self, child: str, parent: str, stamp: int) -> None:
+    def note(self, transform: TransformStamped, stamp: int) -> None:
         """A transform of /tf with this stamp, ns."""
+        child, parent = plain_frame(transform.child_frame_id), plain_frame(transform.header.frame_id)
         with self._lock:
-            self._parents[plain_frame(child)] = plain_frame(parent)
-            stamps = self._stamps.setdefault(plain_frame(child), [])
-            insort(stamps, stamp)
-            if stamps[0] < stamps[-1] - 2 * KEPT_NS:
-                del stamps[: bisect_left(stamps, stamps[-1] - KEPT_NS)]
+            self._parents[child] = parent
+            self._tracks.setdefault(child, Track()).insert(stamp, _place(transform), parent)
 
-    def note_static(self, child: str, parent: str) -> None:
-        """A transform of /tf_static."""
+    def note_static(self, transform: TransformStamped) -> str:
+        """A transform of /tf_static; what it says otherwise than the last one of this frame did, empty if nothing."""
+        child, parent = plain_frame(transform.child_frame_id), plain_frame(transform.header.frame_id)
+        now = parent, _place(transform)
         with self._lock:
-            self._parents[plain_frame(child)] = plain_frame(parent)
-            self._stamps.pop(plain_frame(child), None)
+            self._parents[child] = parent
+            self._tracks.pop(child, None)
+            before, self._static[child] = self._static.get(child, now), now
+        if before[0] != parent:
+            return f"'{parent}' is its parent, and no longer '{before[0]}'"
+        moved_m, turned_rad = _apart(np.array([before[1]]), np.array([now[1]]))
+        is_moved = moved_m[0] > LEAST_M or turned_rad[0] > LEAST_RAD
+        return f"it moved by {1e3 * moved_m[0]:.1f} mm, {np.degrees(turned_rad[0]):.1f} deg" if is_moved else ""
 
     def forget(self) -> None:
         """All that is not static."""
         with self._lock:
-            for child in self._stamps:
+            for child in self._tracks:
                 del self._parents[child]
-            self._stamps = {}
+            self._tracks = {}
 
     def newest_ns(self, child: str) -> int:
         """The newest stamp of a frame; 0 of one that was not heard."""
         with self._lock:
-            return self._stamps.get(child, [0])[-1]
+            return self._tracks[child].stamps[-1] if child in self._tracks else 0
 
     @property
     def moving(self) -> set[str]:
         """Every frame that was heard on /tf."""
         with self._lock:
-            return set(self._stamps)
+            return set(self._tracks)
 
     def between(self, frame: str, other: str) -> set[str]:
         """The moving frames whose transforms lead from one frame to the other."""
         with self._lock:
-            return (self._up_from(plain_frame(frame)) ^ self._up_from(plain_frame(other))) & self._stamps.keys()
+            return (self._up_from(plain_frame(frame)) ^ self._up_from(plain_frame(other))) & self._tracks.keys()
 
     def gap_ns(self, child: str, stamp: int) -> int:
         """How far apart the two transforms of a frame around a stamp, ns, are; 0 at one of them, and outside of all."""
         with self._lock:
-            stamps = self._stamps.get(child, [])
+            stamps = self._tracks[child].stamps if child in self._tracks else []
             after = bisect_left(stamps, stamp)
             if after in (0, len(stamps)) or stamps[after] == stamp:
                 return 0
             return stamps[after] - stamps[after - 1]
+
+    def to_and_fro(self, child: str, stamp: int) -> str:
+        """How a frame goes to and fro around a stamp, ns, as where two nodes send it; empty where it does not.
+
+        A tracked thing that turns back does so more slowly, or not again within the same second.
+        """
+        with self._lock:
+            if child not in self._tracks:
+                return ""
+            seconds, places, parents = self._tracks[child].near(stamp)
+        changes = sum(a != b for a, b in zip(parents, parents[1:], strict=False))
+        if changes >= TO_AND_FRO:
+            return f"its parent is {' and '.join(repr(name) for name in sorted(set(parents)))} by turns"
+        times, by_m = _spikes(seconds, places)
+        return f"it goes to and fro by {1e3 * by_m:.1f} mm" if times >= TO_AND_FRO else ""
 
     def _up_from(self, frame: str) -> set[str]:
         """It and all above it."""
@@ -72,3 +136,28 @@ class Links:
             found.add(frame)
             frame = self._parents.get(frame, "")
         return found
+
+
+def _place(transform: TransformStamped) -> Place:
+    p, q = transform.transform.translation, transform.transform.rotation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def _spikes(seconds: Array, places: Array) -> tuple[int, float]:
+    """How many of the places (N, 7) are left at once for the one before, and the largest way there, m."""
+    if len(places) < 3:
+        return 0, 0.0
+    took_s = np.maximum(seconds[1:-1] - seconds[:-2], seconds[2:] - seconds[1:-1])
+    there, away = _apart(places[:-2], places[1:-1]), _apart(places[1:-1], places[2:])
+    back = _apart(places[:-2], places[2:])
+    is_spike = np.zeros(len(took_s), dtype=bool)
+    for kind, (least, least_per_s) in enumerate(((LEAST_M, LEAST_M_S), (LEAST_RAD, LEAST_RAD_S))):
+        way = np.minimum(there[kind], away[kind])
+        is_spike |= (way >= least) & (way >= least_per_s * took_s) & (back[kind] <= BACK * way)
+    return int(is_spike.sum()), float(there[0][is_spike].max(initial=0.0))
+
+
+def _apart(first: Array, second: Array) -> tuple[Array, Array]:
+    """(N,) metres and radians between places (N, 7)."""
+    cos_half = np.abs(np.einsum("ni,ni->n", first[:, 3:], second[:, 3:]))
+    return np.linalg.norm(first[:, :3] - second[:, :3], axis=1), 2.0 * np.arccos(np.minimum(cos_half, 1.0))

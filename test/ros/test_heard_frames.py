@@ -350,10 +350,91 @@ def test_what_is_known_of_a_frame_stays_small_and_is_forgotten_with_its_round(bu
     heard, hear, _ = hears(buffer)
     for i in range(5000):
         hear(1000.0 + 0.01 * i, 1.0)
-    assert 1000 <= len(heard._links._stamps["camera"]) <= 2001
+    assert 1000 <= len(heard._links._tracks["camera"].stamps) <= 2001
     assert why_not(heard, 1049.985, most_gap_s=0.005) != ""
     heard.start_over()
     assert why_not(heard, 1049.985, most_gap_s=0.005) == "" and not heard._links.between("world", "camera")
+
+
+@pytest.mark.parametrize("rate_hz", [50, 10, 3])
+@pytest.mark.parametrize("late_s", [0.0, 0.002, 0.01])
+@pytest.mark.parametrize("moves_m_s", [0.0, 0.2])
+def test_a_frame_that_two_nodes_send_is_not_believed_where_it_goes_to_and_fro(buffer, rate_hz, late_s, moves_m_s):
+    """A tracker, and what the description of the robot says: tf2 draws a line between the two, 60 mm apart."""
+    heard, hear, _ = hears(buffer)
+    sent, why = 0, ""
+    for i in range(250):
+        stamp_s, true_m = 1000.0 + 0.02 * i, 0.02 * i * moves_m_s
+        hear(stamp_s, true_m)
+        if i > 20 and i % (50 // rate_hz) == 0:
+            hear(stamp_s + late_s, true_m + 0.06)
+            sent += 1
+        for back_s in (0.001, 0.015, 0.03):
+            seen, at_s = seen_at(buffer, stamp_s - back_s), stamp_s - back_s
+            if sent < 3 or seen is None or abs(seen - (true_m - back_s * moves_m_s)) < 0.004:
+                continue  # one jump alone may be one
+            why = why_not(heard, at_s, most_gap_s=0.0)
+            assert why.startswith("'camera' is not to be believed, it goes to and fro by "), (i, back_s)
+            assert float(why.split(" by ")[1].split()[0]) == pytest.approx(60.0, abs=6.0)
+    assert why.endswith("mm: do two nodes send it on /tf?")
+
+
+@pytest.mark.parametrize("rate_hz", [4, 5, 20, 100])
+@pytest.mark.parametrize("swing_m", [0.03, 0.1, 0.3])
+def test_a_frame_that_one_tracker_follows_is_believed_however_it_turns_back(buffer, rate_hz, swing_m):
+    """A probe that is swept to and fro every two seconds, with half a millimetre and a third of a degree of noise."""
+    heard, hear, _ = hears(buffer)
+    rng = np.random.default_rng(rate_hz)
+    for i in range(20 * rate_hz):
+        stamp_s = 1000.0 + i / rate_hz
+        transform = _transform(swing_m * abs(1.0 - i / rate_hz % 2.0) + rng.normal(0.0, 5e-4), stamp_s)
+        turn = rng.normal(0.0, np.radians(0.3), 3) / 2.0
+        (q := transform.transform.rotation).x, q.y, q.z = turn
+        q.w = float(np.sqrt(1.0 - turn @ turn))
+        heard.set_transform(transform, "the tracker")
+        assert why_not(heard, stamp_s - 0.5 / rate_hz, most_gap_s=0.0) == ""
+
+
+def test_a_frame_that_is_turned_to_and_fro_or_has_two_parents_by_turns_is_not_believed(buffer):
+    heard, _, _ = hears(buffer)
+    for i in range(20):
+        turned = _transform(0.0, 1000.0 + 0.02 * i)
+        if i % 2:
+            turned.transform.rotation.z, turned.transform.rotation.w = np.sin(0.02), np.cos(0.02)
+        heard.set_transform(turned, "two nodes")
+        heard.set_transform(_transform(0.0, 1000.0 + 0.02 * i, "tip", "probe" if i % 2 else "stylus"), "two nodes")
+        heard.set_transform(_transform(0.0, 1000.0 + 0.02 * i, "arm", "world" if i < 10 else "base"), "once")
+    assert "'camera' is not to be believed, it goes to and fro by 0.0 mm" in why_not(heard, 1000.2)
+    at = round(1000.2 * NS)
+    text = heard.why_not("stylus", "tip", at, 0.25)
+    assert text.startswith("'tip' is not to be believed, its parent is 'probe' and 'stylus' by turns")
+    assert heard.why_not("base", "arm", at, 0.25) == "", "a frame may be mounted elsewhere"
+
+
+def test_a_place_on_tf_static_that_changes_is_said(buffer):
+    heard, _, said = hears(buffer)
+    for x, parent in ((0.1, "world"), (0.1, "/world"), (0.1 + 1e-6, "world"), (0.16, "world"), (0.16, "bed")):
+        heard.set_transform_static(_transform(x, parent=parent), "the mount")
+    assert len(said) == 2
+    assert "'camera' came on /tf_static once more, and it moved by 60.0 mm, 0.0 deg: this holds now" in said[0]
+    assert "'bed' is its parent, and no longer 'world'" in said[1]
+
+
+def test_a_frame_that_nobody_looks_through_makes_nobody_forget_the_others(buffer):
+    """A tool that two nodes send, 1.5 s apart, cleared the buffer again and again."""
+    heard, hear, said = hears(buffer)
+    for i in range(200):
+        stamp_s = 1000.0 + 0.02 * i
+        hear(stamp_s, 1.0)
+        assert why_not(heard, stamp_s) == ""
+        for late_s in (0.0, 1.5):
+            heard.set_transform(_transform(0.0, stamp_s - late_s, child="tool"), "two nodes")
+    assert seen_at(buffer, 1000.01) == pytest.approx(1.0) and not said
+    for i in range(100):  # a bag begins again, with all that it holds
+        hear(1000.0 + 0.02 * i, 3.0)
+        heard.set_transform(_transform(7.0, 1000.0 + 0.02 * i, child="tool"), "one node")
+    assert why_not(heard, 1001.0) == "" and seen_at(buffer, 1001.0) == pytest.approx(3.0) and len(said) == 1
+    assert heard.why_not("world", "tool", round(1001.5 * NS), 0.25) == ""
 
 
 @pytest.mark.parametrize(("max_tf_gap", "level"), [(0.25, 1), (0.0, 0), (2.0, 0)])

@@ -84,6 +84,7 @@ class Nothing(Fake):
 
 good = lambda: Fake("good")
 unsure = lambda: Odd("unsure", confidence=float("nan"))
+percent = lambda: Odd("percent", confidence=97.0)
 boundless = lambda: Odd("boundless", confidence=np.float32("inf"))
 wordy = lambda: Odd("wordy", confidence="high")
 astray = lambda: Odd("astray", T_target_source=np.full((4, 4), np.nan))

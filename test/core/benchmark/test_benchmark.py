@@ -17,8 +17,9 @@ from gapr_core.benchmark import records, runner
 from gapr_core.benchmark.table import TIMES
 from gapr_core.commands import benchmark
 from gapr_core.config import RegistrarConfig, SearchConfig
-from gapr_core.data.pair_files import load_pair, pair_hash, save_pair
+from gapr_core.data.pair_files import facts_hash, load_facts, load_pair, pair_hash, save_pair
 from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.geometry import se3
 
 
 def timeless(rows):
@@ -107,6 +108,22 @@ def test_a_process_that_dies_costs_its_own_pair_only(pairs, fakes, tmp_path, no_
     deadly = row_of(rows, "L1", "deadly")
     assert (deadly["pairs"], deadly["errors"], deadly["rr_4_5"]) == (4, 1, 0.75)
     assert row_of(rows, "L1", "good")["rr_4_5"] == 1.0
+
+
+def test_a_method_that_ends_its_process_or_says_several_lines_fails_on_that_pair(
+    pairs, fakes, tmp_path, in_process, monkeypatch
+):
+    method = known_methods.make(*fakes("good"))
+    monkeypatch.setattr(runner, "_methods", {(*fakes("good"), RegistrarConfig()): method})
+    errors = iter([SystemExit(4), ValueError("oops\nline | two")])
+
+    def register(source, target):
+        raise next(errors, RuntimeError("no luck"))
+
+    monkeypatch.setattr(method, "register", register)
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    found = {record.reason for record in records.read(tmp_path / "out" / records.FILE)}
+    assert found == {"SystemExit: 4", "ValueError: oops line | two", "RuntimeError: no luck"}
 
 
 def test_a_missing_library_stops_the_run_with_its_install_line(pairs, fakes, tmp_path, in_process):
@@ -252,6 +269,18 @@ def test_a_table_names_what_its_records_ran_on_whatever_asked_for_it_last(
     assert "> Results of different numbers of threads: 4, 8." in text
 
 
+def test_a_method_that_is_added_changes_neither_the_order_nor_what_the_others_are_compared_with(
+    pairs, fakes, tmp_path, in_process
+):
+    turned, good, shy = fakes("turned", "good", "shy")
+    benchmark.benchmark(pairs, [turned, good], tmp_path / "out", ours=good)
+    benchmark.benchmark(pairs, [shy], tmp_path / "out")
+    plan = records.read_plan(tmp_path / "out")
+    assert (plan.ours, plan.methods) == (good, [turned, good, shy])
+    benchmark.benchmark(pairs, [shy], tmp_path / "out", ours=turned)
+    assert records.read_plan(tmp_path / "out").ours == turned
+
+
 def test_records_of_a_method_that_has_changed_are_refused(pairs, fakes, tmp_path, in_process):
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
     module = tmp_path / "modules" / "fakes.py"
@@ -281,17 +310,24 @@ def test_what_a_method_is_made_of(tmp_path, fakes):
     assert {known_methods.made_of(name) for name in nothing} == {""}
 
 
-@pytest.mark.parametrize("change", [{"protocol": "L3"}, {"person": "another"}, {"metadata": {"noise_mm": 0.2}}, {
-    "metadata": {"noise_mm": 0.3, "overlap": 0.15, "viewpoint": np.array([0.0, 0.0, 500.0])}
-}, {"metadata": {"noise_mm": 0.3, "overlap": 0.15, "landmark_a": np.zeros(3)}}])  # fmt: skip
+@pytest.mark.parametrize("change", [
+    {"T_target_source": se3.exp([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])}, {"protocol": "L3"}, {"person": "another"},
+    {"metadata": {"noise_mm": 0.2}},
+    {"metadata": {"noise_mm": 0.3, "overlap": 0.15, "viewpoint": np.array([0.0, 0.0, 500.0])}},
+    {"metadata": {"noise_mm": 0.3, "overlap": 0.15, "landmark_a": np.zeros(3)}},
+])  # fmt: skip
 def test_records_of_a_pair_whose_file_says_something_else_now_are_refused(change, pairs, fakes, tmp_path, in_process):
     """The table named the old protocol, and answers without the camera's place counted as those with it."""
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
     path = pairs / "L1_femur_0001.npz"
     save_pair(path, load_pair(path))
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    before = facts_hash(load_facts(path))
+    assert before == facts_hash(load_pair(path))
     save_pair(path, replace(load_pair(path), **change))
-    with pytest.raises(ConfigError, match="L1_femur_0001, whose file said something else of it"):
+    assert facts_hash(load_facts(path)) != before
+    said = "other clouds named" if "T_target_source" in change else "whose file said something else of it"
+    with pytest.raises(ConfigError, match=f"L1_femur_0001, {said}|{said} L1_femur_0001"):
         benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
 
 

@@ -88,7 +88,8 @@ def test_a_run_over_a_wrong_pair_ends_in_one_line(pairs, fakes, tmp_path, capsys
     assert "z.npz" in said and "Traceback" not in said
 
 
-ODD = {"unsure": "confidence is nan", "boundless": "confidence is inf", "wordy": "high, no finite number",
+ODD = {"unsure": "confidence is nan", "percent": "confidence is 97.0, not from 0 to 1",
+       "boundless": "confidence is inf", "wordy": "high, no finite number",
        "astray": "T_target_source is no array", "reflecting": "T_target_source is not rigid",
        "vague": "covariance is no array", "dumb": "NoneType, no RegistrationResult"}  # fmt: skip
 

@@ -133,3 +133,32 @@ def test_a_ct_femur_is_of_the_same_person_as_the_fitted_one(anatomy_folder):
     for specimen in ct:
         twin = fitted[specimen.person].surface.points
         assert np.ptp(specimen.surface.points, axis=0)[2] == pytest.approx(np.ptp(twin, axis=0)[2], abs=12.0)
+
+
+def test_meshes_of_one_bone_lie_in_a_folder_and_those_of_several_in_folders_of_it(tmp_path):
+    """A femur next to a folder of tibiae was the only tibia, and one folder of femora all bones that were asked for."""
+    for name in ("tibia/a", "tibia/b", "femur"):
+        path = tmp_path / f"{name}.npz"
+        path.parent.mkdir(exist_ok=True)
+        surface = ball_specimen().surface
+        np.savez(path, points=surface.points, faces=surface.faces)
+    with pytest.raises(ConfigError, match=r"a folder for each bone; got both \(femur.npz, tibia\)"):
+        anatomy.meshes(tmp_path)
+    assert anatomy.is_flat(tmp_path) and not anatomy.is_flat(tmp_path.parent / "none")
+    (tmp_path / "femur.npz").unlink()
+    assert [s.person for s in anatomy.meshes(tmp_path, "tibia")] == ["a", "b"] and not anatomy.is_flat(tmp_path)
+
+
+def test_the_hash_of_an_anatomy_changes_with_any_bone_and_with_the_splits(tmp_path):
+    write_set(tmp_path, "femur", "one", ["a", "b"])
+    (tmp_path / "splits.json").write_text("{}")
+    found = [anatomy.corresponded_hash(tmp_path)]
+    (tmp_path / "README.md").write_text("words")
+    assert anatomy.corresponded_hash(tmp_path) == found[0]
+    write_splits(tmp_path)
+    found.append(anatomy.corresponded_hash(tmp_path))
+    write_set(tmp_path, "tibia", "one", ["a"])
+    found.append(anatomy.corresponded_hash(tmp_path))
+    (tmp_path / "tibia_one.npz").rename(tmp_path / "tibia_two.npz")
+    found.append(anatomy.corresponded_hash(tmp_path))
+    assert len(set(found)) == 4

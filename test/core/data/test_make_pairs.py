@@ -197,6 +197,32 @@ def test_meshes_in_other_units_give_the_pairs_of_the_same_meshes_in_millimetres(
     np.testing.assert_allclose(sizes[0], sizes[1], rtol=0.02)
 
 
+def test_meshes_in_one_folder_are_of_one_bone(tmp_path, capsys):
+    """They were femur and tibia by turns: source and target of a wrong pair were the same mesh."""
+    write_meshes(tmp_path / "bones", 2)
+    words = ["make-pairs", "--split", "all", "--protocol", "wrong", "--count", "1", "--meshes", str(tmp_path / "bones")]
+    assert main([*words, "--bones", "femur,tibia", "--out", str(tmp_path / "out")]) == 1
+    assert "one bone for meshes in one folder; got femur, tibia" in capsys.readouterr().err
+
+
+def test_pairs_of_an_anatomy_that_has_changed_are_not_taken_up(tmp_path, capsys):
+    specimen = ball_specimen()
+    points, faces = specimen.surface.points[None].astype(np.float32), specimen.surface.faces
+    (tmp_path / "anatomy").mkdir()
+    (tmp_path / "anatomy" / "splits.json").write_text(json.dumps({"train": ["a"], "val": [], "test": []}))
+    np.savez(tmp_path / "anatomy" / "femur_one.npz", points=points, faces=faces, person=np.array(["a"]))
+    words = ["make-pairs", "--split", "train", "--protocol", "L1", "--count", "1", "--bones", "femur"]
+    words += ["--anatomy", str(tmp_path / "anatomy"), "--out", str(tmp_path / "pairs")]
+    assert main(words) == 0 and main(words) == 0
+    manifest = read_manifest(tmp_path / "pairs")
+    older = manifest | {"recipe": {k: v for k, v in manifest["recipe"].items() if k not in ("meshes", "units")}}
+    np.savez(tmp_path / "anatomy" / "femur_one.npz", points=0.9 * points, faces=faces, person=np.array(["a"]))
+    capsys.readouterr()
+    assert main(words) == 1 and "same meshes and unit" in capsys.readouterr().err
+    (tmp_path / "pairs" / "manifest.json").write_text(json.dumps(older))
+    assert main(words) == 0, "it does not say of which anatomy its pairs are"
+
+
 def test_pairs_of_meshes_that_have_changed_are_not_taken_up(tmp_path, capsys):
     write_meshes(tmp_path / "bones" / "humerus", 3)
     write_meshes(tmp_path / "bones" / "ulna", 1)

@@ -1,6 +1,6 @@
 """Where the time goes: the steps of a registration, and how others do on the same clouds.
 
-    python benchmarks/profile.py [--anatomy DIR] [--split val] [--repeats 20] [--threads 2]
+    python benchmarks/time_profile.py [--anatomy DIR] [--split val] [--repeats 20] [--threads 2]
 
 All cases take turns within every repetition, so that a machine's moods hit them alike; read the ratios. Wall and CPU
 time are medians; memory is the largest that Python and NumPy allocated above what was there before (`tracemalloc`, in a

@@ -61,7 +61,7 @@ class SearchConfig(Settings):
     first_limit_mm: float = setting(
         7.0, "mean distance of these probes above which a pose is bad", low=0, high=100, unit="mm"
     )
-    keep: int = setting(1500, "poses that go to verification", low=1, high=100_000)
+    keep: int = setting(1500, "poses that go to verification", low=16, high=100_000)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class VerificationConfig(Settings):
     middle_points: int = setting(300, "points of the middle step", low=10)
     middle_poses: int = setting(200, "poses that reach the middle step", low=1)
     middle_limits_mm: tuple[float, float, int] = setting((6.0, 4.0, 10), TUKEY, low=0.1, unit="mm")
-    final_poses: int = setting(8, "distinct poses that are compared in the end", low=1, high=1000)
+    final_poses: int = setting(8, "distinct poses that are compared in the end", low=2, high=1000)
     final_limits_mm: tuple[float, float, int] = setting((5.0, 4.0, 8), TUKEY, low=0.1, unit="mm")
     same_pose_mm: float = setting(4.0, "poses nearer to each other (rms over the source) are one", low=0.1, unit="mm")
     markers: int = setting(16, "source points by which two poses are compared", low=3, high=1000)

@@ -121,7 +121,7 @@ class Record(PairFacts, Answer, Verdict):
         commit, machine, threads: what ran, on what, and how many cores it had.
         settings: those that were not the defaults, as `name=value` with commas; none of the baselines has any.
         made_of: changes with the weights or the module that the method is made of; empty for a baseline.
-        facts: changes with what the pair's file says of it besides the clouds and the transform.
+        facts: changes with what the pair's file says of it besides the clouds.
     """
 
     file: str

@@ -192,8 +192,8 @@ def pair_hash(pair: Pair) -> str:
 
 
 def facts_hash(pair: Pair) -> str:
-    """sha256 of what a file says of its pair besides the clouds and the transform, whether these were read or not."""
-    said = {**{name: getattr(pair, name) for name in NAMES}, **pair.metadata}
+    """sha256 of what a file says of its pair besides the clouds, whether these were read or not."""
+    said = {**{name: getattr(pair, name) for name in NAMES}, **pair.metadata, "transform": pair.T_target_source}
     facts = {name: np.asarray(value).tolist() for name, value in said.items() if _is_fact(name)}
     return sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 

@@ -130,6 +130,11 @@ def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterC
     return Pool(np.concatenate([given, *found]), label, np.zeros(len(label)))
 
 
+def has_proposed(pool: Pool) -> bool:
+    """Whether any of the hypotheses is a region's own: what was given alone has no rival."""
+    return bool((pool.region != GIVEN).any())
+
+
 def verify(
     pool: Pool,
     scene: Scene,

@@ -125,7 +125,8 @@ def _of_rivals(
     if not rivals:
         return 0.0, np.zeros(len(patches.centres)), np.ones(len(patches.centres))
     target, best = assessment.target, assessment.hypotheses[0]
-    in_source = se3.apply(se3.inverse(best.T_target_source), target.points)
+    seen_at = target.elements[:, :3]  # where a sensor with a stand-off sees the bone, as in `distances_mm`
+    in_source = se3.apply(se3.inverse(best.T_target_source), seen_at)
     distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
     weights = np.array([rival.probability for rival in rivals])
     variance = noise_mm**2 + bias_mm**2

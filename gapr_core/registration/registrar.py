@@ -56,6 +56,7 @@ Array = NDArray[np.float64]
 Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by itself needs no other proposer
 
 NO_POSES = np.empty((0, 4, 4))
+WITHIN_MM = 15.0  # root mean square over the source: refinement comes from there to the same pose
 
 
 def never(assessment: Assessment) -> bool:
@@ -303,7 +304,7 @@ class Registrar:
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough = never
     ) -> Assessment | None:
         """Ask one proposer after the other, each with the poses of all so far, until an answer is good enough."""
-        config, assessment = self.config, None
+        config, assessment, given = self.config, None, len(poses)
         for number, (proposer, calibration) in enumerate(zip(self.proposers, self.calibrations, strict=True), 1):
             rng = np.random.default_rng(config.seed)
             proposed = proposer.propose(source, target, rng).poses
@@ -319,9 +320,19 @@ class Registrar:
             assessment = assess_fit(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            if self._is_enough(assessment) or enough(assessment):
+            is_found = not given or self._is_near(assessment, poses[given:])
+            if enough(assessment) or (is_found and self._is_enough(assessment)):
                 break
         return assessment
+
+    @staticmethod
+    def _is_near(assessment: Assessment, proposed: Array) -> bool:
+        """Whether a proposer would have come to the best pose without one that was given.
+
+        Where none would, its poses are no rivals to the given one: what it missed may be the right one, too.
+        """
+        points, T = assessment.source.points, assessment.fit.T
+        return any(se3.rms_apart_mm(T, pose, points) < WITHIN_MM for pose in proposed)
 
     def _is_enough(self, assessment: Assessment) -> bool:
         """True where no further proposer need be asked: the pose is sure, or good enough and too doubtful to be sure.
@@ -349,9 +360,10 @@ class Registrar:
         for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
             pool = clutter.propose(scene, target, poses, settings, threads)
             clock.lap("propose")
-            if not len(pool.poses):
-                continue
-            candidates = clutter.verify(pool, scene, target, settings, threads, poses if number == 1 else None)
+            if not clutter.has_proposed(pool):
+                continue  # a pose that was given is not weighed against nothing
+            start = poses if assessment is None else None
+            candidates = clutter.verify(pool, scene, target, settings, threads, start)
             poses = candidates.poses
             clock.lap("verify")
             part = explained.refine(poses[0], scene, target, config)

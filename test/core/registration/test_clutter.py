@@ -276,3 +276,25 @@ def test_the_origin_comes_first_and_has_rounds_of_its_own(scene):
     source = prepare(in_the_frame_of_its_camera(scene), in_scene=True)
     places = clutter.inferred_places(source, RegistrarConfig(clutter=config))
     assert [rounds for _, rounds in places] == [3, 2, 1] and not places[0][0].any()
+
+
+def test_a_pose_that_was_given_is_not_weighed_against_nothing(method, target, scene, monkeypatch):
+    """Where no region proposed anything it was the only hypothesis: no rival, and no AMBIGUOUS."""
+    points, viewpoint, _ = scene
+    truth, alone = se3.inverse(T_SOURCE_TARGET), clutter.propose
+
+    def no_regions(scene, target, given, *more):
+        return clutter._given(given)
+
+    monkeypatch.setattr(clutter, "propose", no_regions)
+    found = method.register(points, target, initial=truth, viewpoint=viewpoint)
+    assert found.status is RegistrationStatus.LOW_CONFIDENCE and "no pose to begin with" in found.reason
+    calls = []
+
+    def later(scene, target, given, *more):
+        calls.append(len(given))
+        return (no_regions if len(calls) == 1 else alone)(scene, target, given, *more)
+
+    monkeypatch.setattr(clutter, "propose", later)
+    found = method.register(points, target, initial=truth, viewpoint=viewpoint)
+    assert found.ok and len(found.hypotheses) > 1 and calls[:2] == [1, 1], "it is still there in the next round"

@@ -107,6 +107,18 @@ def test_a_rival_that_slides_a_patch_along_the_bone_is_not_excluded_there():
     assert slid < 0.05 and lifted > 0.9
 
 
+def test_a_stand_off_excludes_no_rival_that_fits_as_well(distal):
+    """The patch is where the sensor sees the bone: from its bare surface every rival was one stand-off away."""
+    off = offset_surface(distal.target, SensorConfig(kind="pointer", standoff_mm=3.0))
+    same = Hypothesis(distal.fit.T, 0.3)
+    for target in (distal.target, off):
+        there = replace(distal, target=target)
+        members = [np.flatnonzero(np.linalg.norm(target.points - target.points[k], axis=1) < 15.0) for k in (0, 500)]
+        patches = guidance.Patches(np.array([0, 500]), members)
+        excluded = guidance._of_rivals(there, [same], patches, 0.8, 0.7)[2]
+        assert excluded.max() < 0.02
+
+
 def test_a_look_that_says_nothing_gains_nothing(distal):
     """What is known now is the bound over the same points as what would be known then."""
     found = guide(distal, replace(CONFIG, noise_mm=100.0, points=1))

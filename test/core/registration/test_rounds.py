@@ -191,3 +191,17 @@ def test_an_answer_and_a_refusal_name_their_method(pair, name):
     assert [result.method for result in results] == [name] * 2
     together = Accumulator(method, most=2).register(pair.source, target)
     assert together.method == "gapr_accumulator"
+
+
+@pytest.mark.parametrize(("proposed", "rounds"), [("far", 2), ("near", 1)])
+def test_a_given_pose_to_which_no_proposer_came_does_not_end_the_rounds(pair, proposed, rounds):
+    """It is weighed against the poses of one proposer, which missed it, and may have missed the right one."""
+    truth = pair.T_target_source
+    near = se3.exp([4.0, -3.0, 2.0, 0.02, 0.02, -0.02], pair.target.mean(axis=0)) @ truth
+    far = se3.exp([0.0, 0.0, 90.0, 0.0, 0.0, 1.5], pair.target.mean(axis=0)) @ truth
+    first, second = Fixed("network", (near if proposed == "near" else far)[None]), Fixed("search", near[None])
+    sure = [Calibration(each.name, Additive(9.0, ()), {}) for each in (first, second)]
+    registrar = Registrar(ONE_THREAD, [first, second], sure)
+    target = registrar.prepare(pair.target)
+    result = registrar.register(pair.source, target, initial=truth)
+    assert (result.rounds, second.asked) == (rounds, rounds - 1)

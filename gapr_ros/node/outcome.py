@@ -13,6 +13,7 @@ from gapr_ros.node.refusal import Reason
 from gapr_ros.node.worker import Job
 
 Array = NDArray[np.float64]
+OLD_S = 1.0  # age of a cloud from which on an answer says it: ~/register takes the newest there is, however old
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,5 +102,6 @@ class Outcome:
     def __str__(self) -> str:
         if self.ok:
             tre = "" if self.tre_mm is None else f"  TRE {self.tre_mm:.1f} mm"
-            return f"OK  confidence {self.confidence:.2f}{tre}  inliers {self.inlier_ratio:.2f}  {self.exec_ms:.0f} ms"
+            said = f"OK  confidence {self.confidence:.2f}{tre}  inliers {self.inlier_ratio:.2f}  {self.exec_ms:.0f} ms"
+            return said + (f"  the cloud is {self.age_s:.1f} s old" if (self.age_s or 0.0) > OLD_S else "")
         return f"refused: {self.reason}" + (f": {self.text}" if self.text else "")

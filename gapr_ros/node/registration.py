@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.time import Time
+from std_msgs.msg import Header
 
 from gapr_core.baselines.base import takes
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
@@ -110,10 +110,13 @@ class Registration:
 
     def _points_mm(self, outcome: Outcome, now: Situation) -> Array:
         """(N, 3) points of a cloud, mm, in the frame of the answer."""
+        header = intake.read_header(outcome.job.cloud)
+        if header is not None:  # whatever becomes of the cloud, what is said of it names it
+            _note_header(outcome, header, now)
         if outcome.job.epoch != now.epoch:
             raise RefusedError(Reason.SUPERSEDED_BY_RESET, f"the cloud is older than this: {now.why}")
         cloud = intake.read_message(outcome.job.cloud, now.parameters.cloud_type)
-        _note_header(outcome, cloud, now)
+        outcome.points_in = INPUTS[now.parameters.cloud_type].count(cloud)
         timeline.check_age(timeline.stamp_ns(cloud.header), now.now_ns, now.parameters.max_cloud_age)
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         crops = self._crops(T_frame_cloud, outcome, now)
@@ -211,11 +214,10 @@ def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
         raise
 
 
-def _note_header(outcome: Outcome, cloud: Any, now: Situation) -> None:
+def _note_header(outcome: Outcome, header: Header, now: Situation) -> None:
     """Frame and stamp of the answer; a cloud without a stamp gets the time at which it arrived."""
-    stamp_ns = timeline.stamp_ns(cloud.header)
-    outcome.points_in = INPUTS[now.parameters.cloud_type].count(cloud)
-    outcome.cloud_frame = intake.plain_frame(cloud.header.frame_id)
+    stamp_ns = timeline.stamp_ns(header)
+    outcome.cloud_frame = intake.plain_frame(header.frame_id)
     outcome.header.frame_id = now.parameters.output_frame or outcome.cloud_frame
     outcome.header.stamp = Time(nanoseconds=stamp_ns or outcome.job.received_ns).to_msg()
     outcome.age_s = (now.now_ns - stamp_ns) * 1e-9 if stamp_ns and now.now_ns else None

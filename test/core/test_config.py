@@ -26,9 +26,9 @@ def test_a_written_configuration_reads_back_the_same():
 def test_what_is_not_named_keeps_its_default_and_lists_become_tuples():
     config = from_dict(
         RegistrarConfig,
-        {"search": {"keep": 7}, "verification": {"coarse_limits_mm": [9.0, 4, 3]}, "min_confidence": 1},
+        {"search": {"keep": 70}, "verification": {"coarse_limits_mm": [9.0, 4, 3]}, "min_confidence": 1},
     )
-    assert config.search.keep == 7 and config.search.spins == RegistrarConfig().search.spins
+    assert config.search.keep == 70 and config.search.spins == RegistrarConfig().search.spins
     assert config.verification.coarse_limits_mm == (9.0, 4.0, 3)
     assert isinstance(config.min_confidence, float) and config.min_confidence == 1.0
 

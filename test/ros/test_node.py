@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import threading
 import time
 from contextlib import contextmanager
@@ -11,8 +12,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time as TimeMessage
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from harness import Client, Collecting, accepted, node_in_thread, pose_mm, wait_until
+from harness import NODE, Client, Collecting, accepted, node_in_thread, pose_mm, wait_until
 from lifecycle_msgs.msg import Transition
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
@@ -426,6 +428,40 @@ def test_register_processes_the_newest_cloud_and_answers_with_what_became_of_it(
         answer = client.call("register")
         assert not answer.success and answer.message.startswith("refused: empty_cloud")
         assert node.counters.dropped == 2
+
+
+def test_an_answer_on_request_says_how_old_its_cloud_is(blob_path, client, method):
+    """A camera that was dead for a quarter of a minute gave OK, and nothing said that the pose was of then."""
+    with node_in_thread(method, blob_path, continuous=False) as node:
+        client.wait_for_state("active")
+        client.send(GOOD, stamp_s=time.time() - 16.6)
+        wait_until(lambda: node.counters.received == 1)
+        answer = client.call("register")
+        assert answer.success and re.search(r"  the cloud is 1[67]\.\d s old$", answer.message)
+        client.send(GOOD)
+        wait_until(lambda: node.counters.received == 2)
+        assert "old" not in client.call("register").message
+
+
+def test_the_status_of_a_cloud_that_waited_when_a_reset_came_has_its_stamp_and_frame(blob_path, client, method):
+    heard = []
+    client.do(lambda: client.node.create_subscription(DiagnosticStatus, f"{NODE}/status", heard.append, 10))
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        wait_until(lambda: client.node.count_publishers(f"{NODE}/status"))
+        client.ask(GOOD)
+        method.gate.clear()
+        registered = len(method.calls)
+        client.send(GOOD)
+        wait_until(lambda: len(method.calls) > registered)
+        stamp = client.send(GOOD, frame="waiting")
+        wait_until(lambda: node.counters.received == 3)
+        assert client.call("reset").success
+        method.gate.set()
+        wait_until(lambda: len(heard) >= 3)
+    values = {pair.key: pair.value for pair in heard[2].values}
+    assert "superseded_by_reset" in heard[2].message
+    assert (values["stamp"], values["frame"]) == (stamp, "waiting")
 
 
 @contextmanager

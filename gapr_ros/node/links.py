@@ -19,11 +19,12 @@ Array = NDArray[np.float64]
 Place = tuple[float, ...]  # x y z of a frame in its parent, metres, and its quaternion, x y z w
 
 KEPT_NS = 10_000_000_000  # behind the newest stamp of a frame, as a tf2 buffer keeps transforms
-NEAR_NS = 1_000_000_000  # on either side of a stamp it is looked whether a frame goes to and fro,
-TO_AND_FRO = 2  # so often,
-LEAST_M, LEAST_RAD = 0.003, np.radians(2.0)  # by so much or more,
-LEAST_M_S, LEAST_RAD_S = 0.15, np.radians(50.0)  # so fast,
-BACK = 0.25  # and back but for so much of it: as nothing moves that one tracker follows
+# A frame goes to and fro as no tracker sees one thing move: ways there and back, one transform after the other
+NEAR_NS = 1_000_000_000  # looked for on either side of a stamp
+TO_AND_FRO = 2  # so many are not chance
+LEAST_M, LEAST_RAD = 0.003, np.radians(2.0)  # shortest way that counts
+LEAST_M_S, LEAST_RAD_S = 0.15, np.radians(50.0)  # slowest
+BACK = 0.25  # share of a way that may be left after it
 
 
 @dataclass

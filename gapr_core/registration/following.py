@@ -86,7 +86,7 @@ class Follower:
         if self.why_not(fit):
             return None
         self._T, self._since = fit.T, self._since + 1
-        return FollowedPose(fit.T, fit.inlier_ratio, fit.residual_mm, self._since)
+        return FollowedPose(fit.T.copy(), fit.inlier_ratio, fit.residual_mm, self._since)
 
     def motion(self) -> Array:
         """(4, 4) how the source has moved since it was assessed, inv(T_then) T_now, mm."""

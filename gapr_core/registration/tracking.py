@@ -194,7 +194,7 @@ class Tracker:
         found = follower.follow(source) if follower is not None and target is self._bone else None
         if follower is not None and found is not None:
             self._follower, self._memory.motion = follower, follower.motion()
-            self._last = self._last and self._last._replace(T_target_source=found.T_target_source)
+            self._last = self._last and self._last._replace(T_target_source=found.T_target_source.copy())
         return found
 
     def _assess(

@@ -367,3 +367,13 @@ def test_a_refused_source_leaves_the_track_where_it_was_followed_to(sure, frames
     assert sure.register(noise, prepared).status is not RegistrationStatus.OK
     np.testing.assert_array_equal(sure._memory.now, before)
     assert sure.register(frames[3].source, prepared).proposer == "track"
+
+
+def test_a_followed_pose_is_the_callers_own(sure, frames, prepared):
+    """In metres at once, it ended following: the tracker's own pose was in metres then."""
+    for pair in frames[1:4]:
+        found = sure.follow(pair.source, prepared)
+        assert found is not None and is_right(found.T_target_source, pair)
+        found.T_target_source[:3, 3] /= 1000.0
+    after = sure.register(frames[4].source, prepared)
+    assert after.ok and is_right(after.T_target_source, frames[4])

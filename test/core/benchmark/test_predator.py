@@ -20,6 +20,7 @@ from gapr_core.errors import InvalidPointCloudError, MethodUnavailableError, Wei
 from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.pyramid import build_cloud, target_frame
+from gapr_core.training import peer as training
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.peer import WithVoxel, train
 from gapr_core.training.predator import RECENT, Lessons, knows_features
@@ -247,8 +248,17 @@ def test_a_stand_in_of_a_checkout_learns_goes_on_after_a_stop_and_registers(monk
     before = Path.cwd(), set(sys.modules)
     made = Checkout.at(stand_in)
     config = replace(CONFIG, model_settings={"width": 16})
-    train(made, Lessons, replace(config, pairs=2), None, tmp_path)
     drawn, draw = [], WithVoxel.pair
+
+    def stopped(self, number):
+        if number == 2:
+            raise KeyboardInterrupt
+        return draw(self, number)
+
+    monkeypatch.setattr(training, "SAVE_S", -1.0)  # after every step
+    monkeypatch.setattr(WithVoxel, "pair", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        train(made, Lessons, config, None, tmp_path)
     monkeypatch.setattr(WithVoxel, "pair", lambda self, number: drawn.append(number) or draw(self, number))
     train(made, Lessons, config, None, tmp_path)
     assert drawn == [2, 3]

@@ -60,10 +60,9 @@ BENCHMARKS := one_sided clean scenes scene_stereo scene_noisy scene_joint scene_
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 TRACED     := traced traced-named
 FEW        := $(addprefix few-,pointer ultrasound femora)
-SCRIPTS    := strangers similar mirrored short_scans streams streams_strangers damage damage_camera damage_camera_described damage_layer \
+SCRIPTS    := strangers similar short_scans streams streams_strangers damage damage_camera damage_camera_described damage_layer \
               guidance hollow unknowable check_points flat_ends proposals proposals_clean viewpoint viewpoint_wrong
-made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --count 500 --mirrored 60 --sides 12 --out $(OUT)/strangers
-made_by_mirrored          = strangers.py --anatomy $(ANATOMY) --split test --count 4 --mirrored 300 --out $(OUT)/mirrored
+made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --out $(OUT)/strangers
 made_by_similar           = strangers.py --anatomy $(ANATOMY) --split test --bones femur,tibia,pelvis --count 0 --mirrored 0 --sides 0 --similar 270 --out $(OUT)/similar
 made_by_short_scans       = short_scans.py --anatomy $(ANATOMY) --split test --count 20
 made_by_streams           = tracking.py --anatomy $(ANATOMY) --split test --count 1

@@ -66,8 +66,10 @@ def test_of_the_images_that_lie_on_the_bone_the_best_one_is_taken(target, monkey
 
 
 def test_the_image_of_a_bone_is_a_reflection_and_found_once(registrar, target, monkeypatch):
+    target = replace(target, cache={})
     image = mirror._own_image(target, CONFIG.verification, 1)
     assert np.linalg.det(image[:3, :3]) == pytest.approx(-1.0)
+    mirror.is_symmetric(target, CONFIG)
     monkeypatch.setattr(mirror, "_own_image", None)  # is not called again
     np.testing.assert_array_equal(target.cache["own image", 0.0, CONFIG.verification], image)
     assert registrar.register(seen(make_bone("pelvis", 900_001)), target).ok

@@ -296,11 +296,8 @@ def _read(path: Path) -> list[Record]:
 
 def _made_of(folder: str) -> dict[bool, str]:
     """A short text that changes with the folder's bones, and the network (False) or, for streams, any model (True)."""
-    bones = sorted(path for path in Path(folder).glob("*") if path.suffix in (".npz", ".json"))
-    return {
-        False: origin.digest_of([*bones, SHIPPED]),
-        True: f"{origin.digest_of(bones)} {origin.shipped_weights()}",
-    }
+    bones = origin.digest_of(sorted(path for path in Path(folder).glob("*") if path.suffix in (".npz", ".json")))
+    return {False: f"{bones} {origin.digest_of([SHIPPED])}", True: f"{bones} {origin.shipped_weights()}"}
 
 
 def _is_stream(record: Record) -> bool:

@@ -74,7 +74,8 @@ def made_by(method: str, config: RegistrarConfig) -> dict[str, Any]:
     """What made an answer: the method, whether its confidence is calibrated, the version, settings and weights."""
     from gapr_core.benchmark import methods
 
-    return {"method": method, "calibrated": method in methods.OWN} | origin.of_answers(config)
+    by = {"method": method, "calibrated": method in methods.OWN, "weights": methods.made_of(method)}
+    return origin.of_answers(config) | by
 
 
 def guidance_json(result: RegistrationResult, spots: Sequence[Patch]) -> dict[str, Any] | None:

@@ -51,7 +51,7 @@ def run(args: Namespace) -> int:
     answers = _answers_so_far(args.out)
     config = options.registrar_config(args)
     method = methods.make(args.method, config)
-    by = made_by(args.method, config) | {"weights": methods.made_of(args.method)}
+    by = made_by(args.method, config)
     made_of = {path: by | {"sha256": _digest(path)} for path in paths}
     waiting = [path for path, made in made_of.items() if not made.items() <= answers.get(path.stem, {}).items()]
     for path in waiting[:1]:

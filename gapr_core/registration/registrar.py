@@ -44,7 +44,7 @@ from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.standoff import asking_the_standoff, unless_off_the_bone
 from gapr_core.registration.target import PreparedTarget
-from gapr_core.registration.verification import verify
+from gapr_core.registration.verification import support, verify
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
@@ -201,14 +201,25 @@ class Registrar:
         An answer that is `enough` ends the rounds, and a mirror image of its source is registered in full only where it
         has at most `rules.mirrored_points`.
         """
-        clock = clock or Clock()
         check_call(target, initial)
+        start = NO_POSES if initial is None else _rigid(initial)[None]
+        return self.assess_from(source, target, start, viewpoint, clock or Clock(), enough)
+
+    def assess_from(
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        start: Array,
+        viewpoint: ArrayLike | None,
+        clock: Clock,
+        enough: Enough = never,
+    ) -> Assessment | Refusal:
+        """`assess` with any number of poses to try as well: (K, 4, 4) T_target_source, mm, each rigid."""
         target = offset_surface(target, self.config.sensor)
         prepared = sources.prepare(source, self.config.source, self.config.num_threads, viewpoint is not None)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
-        start = NO_POSES if initial is None else _rigid(initial)[None]
         if viewpoint is None:
             assessment = self._as_bone(prepared, target, start, clock, enough)
             if assessment is None or not (assessment.reaches(self.config.min_confidence) or enough(assessment)):
@@ -320,19 +331,19 @@ class Registrar:
             assessment = assess_fit(fit, candidates, source, target, calibration, config)
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
-            is_found = not given or self._is_near(assessment, poses[given:])
-            if enough(assessment) or (is_found and self._is_enough(assessment)):
+            if enough(assessment) or (
+                self._is_enough(assessment) and (not given or self._is_near(assessment, poses[given:]))
+            ):
                 break
         return assessment
 
-    @staticmethod
-    def _is_near(assessment: Assessment, proposed: Array) -> bool:
+    def _is_near(self, assessment: Assessment, proposed: Array) -> bool:
         """Whether a proposer would have come to the best pose without one that was given.
 
         Where none would, its poses are no rivals to the given one: what it missed may be the right one, too.
         """
-        points, T = assessment.source.points, assessment.fit.T
-        return any(se3.rms_apart_mm(T, pose, points) < WITHIN_MM for pose in proposed)
+        count, T = self.config.verification.markers, assessment.fit.T[None]
+        return bool(support(T, proposed, assessment.source, count, WITHIN_MM)[0] > 0.0)
 
     def _is_enough(self, assessment: Assessment) -> bool:
         """True where no further proposer need be asked: the pose is sure, or good enough and too doubtful to be sure.

@@ -205,12 +205,12 @@ class Tracker:
         viewpoint: ArrayLike | None,
         clock: Clock,
     ) -> Assessment | Refusal:
-        """Where the last pose was, or in full; a camera's cloud in full, with the last pose among the hypotheses."""
+        """Where the last pose was, or in full; a re-check and a camera's cloud also try the last pose and its rivals."""
         if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if viewpoint is None and self._since_full + 1 < self.recheck:
             return self._tracking.assess(source, target, clock=clock, enough=self._stands)
-        return self.registrar.assess(source, target, self._memory.now[0], viewpoint, clock)
+        return self.registrar.assess_from(source, target, self._memory.now, viewpoint, clock)
 
     def _stands(self, assessment: Assessment) -> bool:
         """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""

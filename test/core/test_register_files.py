@@ -236,7 +236,8 @@ def test_json_says_what_made_the_answer(folder):
     assert register("--json x.json") == 0
     answer = json.loads(Path("x.json").read_text())
     assert answer["method"] == "known_method:make" and answer["calibrated"] is False
-    assert answer["version"].startswith("0.") and answer["settings"] and answer["weights"]
+    assert answer["version"].startswith("0.") and answer["settings"]
+    assert answer["weights"] == methods.made_of("known_method:make") != methods.made_of("gapr")
 
 
 def test_a_viewpoint_of_a_source_that_is_turned_is_in_lps(folder, caplog, hints):

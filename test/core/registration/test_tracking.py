@@ -171,6 +171,22 @@ def test_every_so_many_sources_one_is_registered_in_full(registrar, frames, prep
         Tracker(registrar, recheck=0)
 
 
+def test_a_full_registration_weighs_the_last_pose_and_its_rivals(registrar, frames, prepared, monkeypatch):
+    tracker, begun, assess_from = Tracker(registrar, recheck=2), [], Registrar.assess_from
+
+    def recorded(self, source, target, start, *rest):
+        begun.append(start)
+        return assess_from(self, source, target, start, *rest)
+
+    monkeypatch.setattr(Registrar, "assess_from", recorded)
+    for pair in frames[:2]:
+        tracker.register(pair.source, prepared)
+    remembered = tracker._memory.now
+    tracker.register(frames[2].source, prepared)
+    assert len(remembered) > 1 and not len(begun[0])
+    np.testing.assert_array_equal(begun[-1], remembered)
+
+
 def test_a_refused_source_does_not_end_the_track(tracker, frames, prepared):
     tracker.register(frames[0].source, prepared)
     noise = np.random.default_rng(0).uniform(-60.0, 60.0, (500, 3))

@@ -1,11 +1,12 @@
 """A consumer that acts on a pose only when it may: enough confidence, a bounded error, and the right time.
 
-python examples/ros/trusted_pose.py --ros-args -p min_confidence:=0.9 -p max_tre:=0.002
+python examples/ros/trusted_pose.py --ros-args -p min_confidence:=0.9 -p max_tre:=0.002 -p max_age:=1.0
 
 It hears ~/status, which comes with every cloud and carries the cloud's stamp, and takes the pose that ~/transform has
 for exactly that stamp. Neither the latest transform nor tf2's transform of the bone is used: they may be those of
 another cloud. For a pose in another frame (`frame`) tf2 gives where the cloud's frame was at that stamp, unless that
-was not heard for a while: tf2 draws a straight line over any gap.
+was not heard for a while: tf2 draws a straight line over any gap. `max_age` leaves the pose of an old cloud, such as one
+that ~/register answered once more after the camera stopped; a bag that is played without /clock needs 0, any age.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ class TrustedPose(Node):
         self.frame = declare("frame", "").value  # that of the pose when empty; another one needs tf2
         self.bone = declare("bone_frame", "").value  # the only bone that is acted on; empty: any
         self.max_tf_gap = declare("max_tf_gap", 0.25).value  # s, between the transforms around a pose; 0: any
+        self.max_age = declare("max_age", 0.0).value  # s, of the cloud when its pose is acted on; 0: any
         source = declare("register_node", "register_node").value
         self.waiting: dict[Stamp, dict[str, str]] = {}  # statuses without their transform
         self.transforms: dict[Stamp, TransformStamped] = {}  # and the other way round
@@ -120,7 +122,7 @@ class TrustedPose(Node):
                 return
             values, transform = self.waiting[key], self.transforms[key]
             self._forget(key)
-            why = why or self._not_mine(transform)
+            why = why or self._not_mine(transform) or self._too_old(transform)
             if why:
                 self.hold(why)
             else:
@@ -137,6 +139,11 @@ class TrustedPose(Node):
         """Why this is not the bone that was asked for; empty when it is."""
         bone = transform.child_frame_id
         return f"it is that of {bone}, bone_frame is {self.bone}" if self.bone and bone != self.bone else ""
+
+    def _too_old(self, transform: TransformStamped) -> str:
+        """Why the cloud is not one of now; empty when it is, or when any will do."""
+        age_s = (self.get_clock().now() - Time.from_msg(transform.header.stamp)).nanoseconds / 1e9
+        return f"its cloud is {age_s:.1f} s old, max_age is {self.max_age:g} s" if 0.0 < self.max_age < age_s else ""
 
     def _not_yet(self, transform: TransformStamped) -> str:
         """Why the pose cannot be had in the frame that was asked for; empty when it can."""

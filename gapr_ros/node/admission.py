@@ -6,7 +6,7 @@ from std_msgs.msg import Header
 
 from gapr_ros.node import intake, timeline
 from gapr_ros.node.cloud_frames import SHOWN_S, CloudFrames
-from gapr_ros.node.conflicts import Conflicts
+from gapr_ros.node.conflicts import Conflicts, names_of
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.timeline import Timeline
@@ -15,6 +15,7 @@ NO_CLOCK = "use_sim_time is true and no /clock has come: neither max_future nor 
 STAMPS_WENT_BACK = "the stamps of the clouds went back"
 CLOCK_WENT_BACK, CLOCK_CHANGED = "the clock jumped back", "the node's clock is another one now"
 OVER = "time starts over and the track is cleared"
+TWO_CLOCKS = "the clock jumped back, and has {} publishers on /clock ({}): each step back drops clouds; leave one"
 BEHIND = (
     "/tf waits for stamps 10 s newer than those it had before, or tf2 would mix the poses of both rounds: "
     "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
@@ -56,7 +57,11 @@ class Admission:
         """The clock jumped, which everybody knows who uses it: whatever comes next is the newest."""
         self.forget()
         self._frames.start_over()
-        self._host.ros.get_logger().warning(f"{why}: {OVER}")
+        clocks = self._host.ros.get_publishers_info_by_topic("/clock") if why == CLOCK_WENT_BACK else []
+        if len(clocks) > 1:
+            self._conflicts.note("clocks", TWO_CLOCKS.format(len(clocks), names_of(clocks)), SHOWN_S)
+        else:
+            self._host.ros.get_logger().warning(f"{why}: {OVER}")
 
     def forget(self) -> None:
         """Whatever comes next is the newest, on /tf too: its listeners are started again."""

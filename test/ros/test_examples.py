@@ -125,6 +125,17 @@ def test_the_consumer_never_pairs_a_status_with_the_transform_of_another(consume
     assert [each for each in done if isinstance(each, tuple)] == acted
 
 
+@pytest.mark.parametrize(("max_age", "acted"), [(0.0, [-1000, -2, 0]), (1.0, [0]), (3.0, [-2, 0])])
+def test_the_consumer_leaves_the_pose_of_a_cloud_that_is_too_old(consumer, max_age, acted):
+    node, done = consumer
+    node.max_age, now_s = max_age, node.get_clock().now().nanoseconds // 10**9
+    for ago in (-1000, -2, 0):
+        node._on_status(status(now_s + ago, SURE))
+        node._on_transform(transform_at(now_s + ago, 0.5))
+    assert [each[0] - now_s for each in done if isinstance(each, tuple)] == acted
+    assert all(f"max_age is {max_age:g} s" in each for each in done if isinstance(each, str))
+
+
 def test_the_pose_in_another_frame_is_that_of_the_status_whatever_tf2_has_of_the_bone(consumer):
     node, done = consumer
     asked = []
@@ -340,7 +351,7 @@ def test_topics_services_and_parameters_in_examples_and_deployment_are_those_of_
              if path.is_file() and path.suffix != ".png"}  # fmt: skip
     own = {name.split("/")[2] for names in graph.values() for name in names if name.startswith("/register_node/")}
     optional = {"detection", "get_type_description"}
-    consumers = {"frame", "bone_frame", "register_node"}  # parameters of the examples
+    consumers = {"frame", "bone_frame", "register_node", "max_age"}  # parameters of the examples
     others = {"use_sim_time", "NAME"}
     for path, text in texts.items():
         named = set(re.findall(r"(?:/register_node|\{source\}|[`\s>(]~)/([a-z_]+)\b(?!\.py|/)", text))

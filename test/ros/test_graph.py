@@ -195,6 +195,27 @@ def test_simulated_time_without_a_clock_is_a_conflict_until_the_clock_comes(blob
         wait_until(lambda: "/clock" not in client.values("input")["conflicts"])
 
 
+def test_two_clocks_that_differ_are_a_conflict_and_are_logged_once(blob_path, client, method, monkeypatch):
+    with node_in_thread(method, blob_path, use_sim_time=True) as node:
+        client.wait_for_state("active")
+        said = []
+        for logged_by, how in ((node.get_logger(), "warning"), (node.session.conflicts, "_write")):
+            monkeypatch.setattr(logged_by, how, lambda text, **_: said.append(text), raising=False)
+        other = client.do(lambda: client.node.create_publisher(Clock, "/clock", 10))
+        wait_until(lambda: node.count_publishers("/clock") == 2)
+        steps = iter(range(1000, 2000))
+
+        def both(seconds):
+            client.do(lambda: client.clock.publish(Clock(clock=node_time(seconds))))
+            client.do(lambda: other.publish(Clock(clock=node_time(seconds - 5))))
+
+        wait_until(lambda: both(next(steps)) or "2 publishers on /clock (/client" in client.values("input")["message"])
+        for _ in range(10):
+            both(next(steps))
+        assert sum("jumped back" in text for text in said) == 1
+        client.do(lambda: client.node.destroy_publisher(other))
+
+
 def node_time(seconds):
     return Time(nanoseconds=seconds * 1_000_000_000).to_msg()
 

@@ -13,7 +13,7 @@ from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import columns, reading
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry.extent import BEYOND
-from gapr_core.surface import Array, Surface, as_points
+from gapr_core.surface import Array, Surface, as_array, as_points
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def load(
         name, surface = str(source), reading.read(Path(source), options)
         is_in_mm, how = reading.format_of(Path(source)).is_in_mm(options or ReadOptions()), OF_FILE
     else:
-        name, surface = "array", source if isinstance(source, Surface) else Surface(as_points(source))
+        name, surface = "array", _checked(source) if isinstance(source, Surface) else Surface(as_points(source))
         is_in_mm, how = False, OF_ARRAY
     surface = _drop_non_finite(surface, name)
     if of_bone:
@@ -79,6 +79,14 @@ def load(
     if isinstance(source, str | Path):
         _warn_of_several_bones(surface, name)
     return surface
+
+
+def _checked(surface: Surface) -> Surface:
+    """A surface of the caller's own, with arrays where it has lists."""
+    faces = surface.faces
+    if faces is not None:
+        faces = as_array(faces, "triangles as (F, 3) integers", "triangulate the mesh")
+    return replace(surface, points=as_points(surface.points), faces=faces)
 
 
 def finite_points(array: ArrayLike) -> Array:

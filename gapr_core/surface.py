@@ -115,7 +115,7 @@ def as_points(array: ArrayLike) -> Array:
     if isinstance(array, str | PurePath):
         how = "load it first: gapr_core.load(path).points"
         raise InvalidPointCloudError("an array of shape (N, 3)", f"the path {str(array)!r}", how)
-    points = _as_array(array)
+    points = as_array(array, "an array of shape (N, 3)", "pass x y z in every row")
     if points.dtype.kind not in "fiu":
         raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")
     if points.ndim != 2 or points.shape[1] != 3:
@@ -123,8 +123,12 @@ def as_points(array: ArrayLike) -> Array:
     return points.astype(np.float64)
 
 
-def _as_array(array: Any) -> NDArray[Any]:
-    """A NumPy array; a tensor is taken without its gradient, from whatever device it is on."""
+def as_array(array: Any, expected: str, how: str) -> NDArray[Any]:
+    """A NumPy array; a tensor is taken without its gradient, from whatever device it is on.
+
+    Raises:
+        InvalidPointCloudError: what cannot be one, such as rows of several lengths; with these words.
+    """
     if hasattr(array, "detach"):
         array = array.detach().cpu()
     if np.ma.isMaskedArray(array) and array.dtype.kind in "fiu":
@@ -133,4 +137,4 @@ def _as_array(array: Any) -> NDArray[Any]:
         return np.asarray(array)
     except (ValueError, TypeError, RuntimeError) as error:
         given = f"{type(array).__name__} ({' '.join(str(error).split())})"
-        raise InvalidPointCloudError("an array of shape (N, 3)", given, "pass x y z in every row") from error
+        raise InvalidPointCloudError(expected, given, how) from error

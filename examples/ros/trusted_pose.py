@@ -5,8 +5,8 @@ python examples/ros/trusted_pose.py --ros-args -p min_confidence:=0.9 -p max_tre
 It hears ~/status, which comes with every cloud and carries the cloud's stamp, and takes the pose that ~/transform has
 for exactly that stamp. Neither the latest transform nor tf2's transform of the bone is used: they may be those of
 another cloud. For a pose in another frame (`frame`) tf2 gives where the cloud's frame was at that stamp, unless that
-was not heard for a while: tf2 draws a straight line over any gap. `max_age` leaves the pose of an old cloud, such as one
-that ~/register answered once more after the camera stopped; a bag that is played without /clock needs 0, any age.
+was not heard for a while: tf2 draws a straight line over any gap. `max_age` leaves the pose of an old cloud, such as
+one that ~/register answered once more after the camera stopped; a bag that is played without /clock needs 0, any age.
 """
 
 from __future__ import annotations

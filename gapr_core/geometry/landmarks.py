@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.geometry.extent import BEYOND
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ def paired_pose(source: ArrayLike, target: ArrayLike) -> LandmarkPose:
         target: (K, 3) the same landmarks, in the same order, in the target's frame, mm.
 
     Raises:
-        InvalidPointCloudError: another number or shape, values that are not finite, or points on a line.
+        InvalidPointCloudError: another number or shape, values that are not finite or beyond 1e12, or points on a line.
     """
     source, target = _checked(source, "source"), _checked(target, "target")
     if len(source) != len(target):
@@ -51,10 +52,10 @@ def paired_pose(source: ArrayLike, target: ArrayLike) -> LandmarkPose:
 def _checked(points: ArrayLike, name: str) -> Array:
     try:
         points = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # the last: a tensor with a gradient
         how = "pass one row of x, y, z for each"
         raise InvalidPointCloudError(f"{name} landmarks (K, 3), mm", str(error), how) from error
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST_PAIRS or not np.isfinite(points).all():
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST_PAIRS or not (np.abs(points) < BEYOND).all():
         expected = f"at least {FEWEST_PAIRS} finite {name} landmarks (K, 3), mm"
         raise InvalidPointCloudError(expected, f"an array of shape {points.shape}", "add or correct them")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)

@@ -18,5 +18,5 @@ Where to read on, in the order in which a source passes:
 A camera's cloud goes another way: `clutter` (with `proposals.regions`, `free_space`, `clutter_kernels`), `explained`.
 Streams: `tracking` (with `memory`, `evidence`, `repeats`, `stream_misfit` of `shared_misfit`), `following` between two
 of them, `accumulation`. `rigidity`: did a bone creep while its sources were collected, is a source strained or in two
-pieces? `doubles`: is the bone in it twice? `crop` cuts a cloud before.
+pieces? `doubles`: is the bone in it twice? `crop` cuts a cloud before, `inputs` takes poses and places.
 """

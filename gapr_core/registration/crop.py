@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.registration import inputs
 
 Array = NDArray[np.float64]
 
@@ -37,14 +39,14 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
         (K, 3) in the points' own frame; none of those that are not finite.
 
     Raises:
-        ConfigError: when a corner is not (3,) or `lowest` is not below `highest`.
-        InvalidPointCloudError: when the points are not (N, 3) numbers.
+        ConfigError: when a corner is not (3,) numbers or `lowest` is not below `highest`.
+        InvalidPointCloudError: when the points are not (N, 3) numbers, or the pose is not rigid.
     """
-    low, high = np.asarray(lowest, dtype=np.float64), np.asarray(highest, dtype=np.float64)
+    low, high = _corner(lowest), _corner(highest)
     if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
         raise ConfigError("two corners x y z, the lowest first", f"{low} and {high}", "correct the box")
     points = finite_points(points)
-    placed = se3.apply(T_box_points, points)
+    placed = se3.apply(inputs.rigid(T_box_points, "pose of the points' frame", "pass T_box_points in mm"), points)
     return np.asarray(points[((placed >= low) & (placed <= high)).all(axis=1)])
 
 
@@ -62,10 +64,18 @@ def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: Findable
 
     Raises:
         ConfigError: for a margin that is not positive.
-        InvalidPointCloudError: when the points are not (N, 3) numbers.
+        InvalidPointCloudError: when the points are not (N, 3) numbers, or the pose is not rigid.
     """
-    if not margin_mm > 0.0:
-        raise ConfigError("a positive margin in mm", f"{margin_mm:g}", "30 mm suits a bone that moves slowly")
+    if not isinstance(margin_mm, Real) or not margin_mm > 0.0:
+        raise ConfigError("a positive margin in mm", repr(margin_mm), "30 mm suits a bone that moves slowly")
     points = finite_points(points)
-    gaps = target.tree.query(se3.apply(T_target_source, points), distance_upper_bound=margin_mm)[0]
+    placed = se3.apply(inputs.rigid(T_target_source, "last pose"), points)
+    gaps = target.tree.query(placed, distance_upper_bound=margin_mm)[0]
     return np.asarray(points[np.isfinite(gaps)])
+
+
+def _corner(values: ArrayLike) -> Array:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError("a corner x y z in mm", repr(values), "correct the box") from error

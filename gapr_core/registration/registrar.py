@@ -27,8 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
-from gapr_core.geometry import se3
-from gapr_core.registration import checks, clutter, cortices, doubles, explained, limits, rules
+from gapr_core.registration import checks, clutter, cortices, doubles, explained, inputs, limits, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess_fit
@@ -162,8 +161,8 @@ class Registrar:
 
         Raises:
             InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; a target
-                that is not prepared; an `initial` that is no rigid pose; a `viewpoint` that is no point, or lies in the
-                cloud.
+                that is not prepared; an `initial` that is no rigid pose; a `viewpoint` that is no point, or that
+                sees nothing of the cloud.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
@@ -202,7 +201,7 @@ class Registrar:
         has at most `rules.mirrored_points`.
         """
         check_call(target, initial)
-        start = NO_POSES if initial is None else _rigid(initial)[None]
+        start = NO_POSES if initial is None else inputs.rigid(initial, "initial pose")[None]
         return self.assess_from(source, target, start, viewpoint, clock or Clock(), enough)
 
     def assess_from(
@@ -227,7 +226,7 @@ class Registrar:
                 if found is not None:
                     return found
         else:
-            eye = _finite(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
+            eye = inputs.numbers(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
             assessment = self._in_scene(prepared, target, start, eye, clock)
         if assessment is None:
             return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
@@ -420,32 +419,8 @@ def check_call(target: object, initial: ArrayLike | None) -> None:
         how = "pass what `prepare` returns for it"
         raise InvalidPointCloudError("a prepared target", type(target).__name__, how)
     if initial is not None:
-        _rigid(initial)
+        inputs.rigid(initial, "initial pose")
 
 
 def _search(config: RegistrarConfig) -> NormalAlignedSearch:
     return NormalAlignedSearch(config.search, config.num_threads)
-
-
-def _finite(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> Array:
-    """The values as an array of this shape.
-
-    Raises:
-        InvalidPointCloudError: another shape, or a value that is no finite number.
-    """
-    try:
-        array = np.asarray(values)
-    except ValueError as error:  # rows of several lengths
-        raise InvalidPointCloudError(f"a finite {shape} {what}", str(error), how) from error
-    if array.shape != shape or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        given = f"shape {array.shape}" if array.shape != shape else str(array.tolist())
-        raise InvalidPointCloudError(f"a finite {shape} {what}", given, how)
-    return array.astype(np.float64)
-
-
-def _rigid(pose: ArrayLike) -> Array:
-    T = _finite(pose, (4, 4), "initial pose", "pass T_target_source in mm")
-    if why := se3.why_not_rigid(T):
-        how = "no scale, no reflection, translation in the last column; lengths in mm"
-        raise InvalidPointCloudError("a rigid (4, 4) initial pose", f"a matrix whose {why}", how)
-    return se3.nearest_rigid(T)

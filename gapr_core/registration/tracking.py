@@ -205,7 +205,7 @@ class Tracker:
         viewpoint: ArrayLike | None,
         clock: Clock,
     ) -> Assessment | Refusal:
-        """Where the last pose was, or in full; a re-check and a camera's cloud also try the last pose and its rivals."""
+        """Where the last pose was, or in full; a re-check and a camera's cloud try the last pose and its rivals too."""
         if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if viewpoint is None and self._since_full + 1 < self.recheck:

@@ -337,6 +337,18 @@ def test_a_cloud_has_no_faces_to_draw_from():
         Surface(VERTICES).sample(5, np.random.default_rng(0))
 
 
+def test_lists_in_a_surface_are_taken_as_arrays():
+    loaded = clouds.load(Surface((30.0 * VERTICES).tolist(), FACES.tolist()))
+    np.testing.assert_array_equal(loaded.points, 30.0 * VERTICES)
+    np.testing.assert_array_equal(loaded.triangles, FACES)
+
+
+@pytest.mark.parametrize("points", [VERTICES.ravel(), VERTICES[:, :2], VERTICES.astype(object), VERTICES * 1j])
+def test_points_of_a_surface_that_are_none_are_refused(points):
+    with pytest.raises(InvalidPointCloudError, match=r"\(N, 3\)"):
+        clouds.load(Surface(points))
+
+
 @pytest.mark.parametrize(("faces", "text"), [
     (FACES.ravel(), "triangles"), (np.tile([[0, 1, 2, 3]], (2, 1)), "triangles"),
     (FACES + 100, "beyond"), (np.zeros((4, 3), dtype=np.int64), "area"),

@@ -48,8 +48,15 @@ def test_mirrored_landmarks_give_a_rotation_and_a_large_misfit():
         (POINTS[:, :2], POINTS[:, :2]),
         (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), POINTS),
         (np.full((4, 3), np.nan), POINTS),
+        (POINTS * 1e155, POINTS),  # their squares are infinite, and NumPy's decomposition does not return
     ],
 )
 def test_landmarks_that_fix_no_pose_are_refused(source, target):
     with pytest.raises(InvalidPointCloudError):
         paired_pose(source, target)
+
+
+def test_landmarks_with_a_gradient_are_refused():
+    torch = pytest.importorskip("torch", reason="tensors: pip install torch")
+    with pytest.raises(InvalidPointCloudError, match="grad"):
+        paired_pose(torch.tensor(POINTS, requires_grad=True), POINTS)

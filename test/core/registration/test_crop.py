@@ -28,6 +28,21 @@ def test_a_box_without_volume_is_refused(corners):
         crop_box(np.zeros((1, 3)), np.eye(4), *corners)
 
 
+def test_corners_that_are_no_numbers_are_refused():
+    with pytest.raises(ConfigError, match="a corner x y z"):
+        crop_box(np.zeros((1, 3)), np.eye(4), ["left", "low", "near"], [1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"), [(np.eye(3), "shape"), (np.full((4, 4), np.nan), "finite"), (np.diag([2, 2, 2, 1]), "rigid")]
+)
+def test_nothing_is_cropped_by_a_pose_that_is_not_rigid(pose, said, target):
+    with pytest.raises(InvalidPointCloudError, match=said):
+        crop_box(target.points, pose, np.zeros(3), np.ones(3))
+    with pytest.raises(InvalidPointCloudError, match=said):
+        crop_to_pose(target.points, pose, target, margin_mm=5.0)
+
+
 def test_what_is_far_from_the_bone_under_the_last_pose_is_dropped(target):
     T = se3.exp(np.array([20.0, -5.0, 60.0, 0.3, 0.2, -1.0]), np.zeros(3))
     on, off = target.points[:50], target.points[:50] + 25.0 * target.normals[:50]
@@ -36,9 +51,10 @@ def test_what_is_far_from_the_bone_under_the_last_pose_is_dropped(target):
     assert kept[:50] == pytest.approx(source[:50]) and len(kept) < 75
 
 
-def test_a_margin_that_is_not_positive_is_refused(target):
+@pytest.mark.parametrize("margin_mm", [0.0, float("nan"), "5"])
+def test_a_margin_that_is_not_positive_is_refused(margin_mm, target):
     with pytest.raises(ConfigError, match="margin"):
-        crop_to_pose(target.points, np.eye(4), target, margin_mm=0.0)
+        crop_to_pose(target.points, np.eye(4), target, margin_mm=margin_mm)
 
 
 @pytest.mark.parametrize("points", [np.zeros(3), np.zeros((5, 2)), np.zeros((2, 3, 3))])

@@ -12,7 +12,7 @@ from gapr_core.benchmark import methods
 from gapr_core.config import LimitsConfig
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
-from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.registration import checks, mirror
 from gapr_core.registration import registrar as registrars
@@ -191,6 +191,16 @@ def test_an_answer_and_a_refusal_name_their_method(pair, name):
     assert [result.method for result in results] == [name] * 2
     together = Accumulator(method, most=2).register(pair.source, target)
     assert together.method == "gapr_accumulator"
+
+
+def test_a_given_pose_may_be_a_tensor_with_a_gradient(pair):
+    torch = pytest.importorskip("torch", reason="tensors: pip install torch")
+    T, fixed = pair.T_target_source, Fixed("fixed", pair.T_target_source[None])
+    registrar = Registrar(ONE_THREAD, [fixed], [Calibration("fixed", Additive(9.0, ()), {})])
+    target = registrar.prepare(pair.target)
+    assert registrar.register(pair.source, target, initial=torch.tensor(T, requires_grad=True)).ok
+    with pytest.raises(InvalidPointCloudError, match="a finite .* initial pose"):
+        registrar.register(pair.source, target, initial=[[1.0, 2.0], [3.0]])
 
 
 @pytest.mark.parametrize(("proposed", "rounds"), [("far", 2), ("near", 1)])

@@ -340,6 +340,15 @@ def test_no_stream_makes_a_source_surer_than_it_may_be(scripted, frames, prepare
     assert [tracker.register(pair.source, prepared).confidence for pair in frames[:4]] == [0.85] * 4
 
 
+@pytest.mark.parametrize(("place", "said"), [(np.zeros(3), 0.89), (None, 0.97)])
+def test_a_pose_with_an_inferred_camera_says_no_more_of_the_bone_than_it_may(registrar, frames, prepared, place, said):
+    tracker, heard = Tracker(registrar), []
+    found = replace(registrar.assess(frames[0].source, prepared), probability=0.97, inferred_viewpoint=place)
+    tracker._evidence.add = lambda probability, *_: heard.append(probability) or probability
+    tracker._with_evidence(found, fingerprint(frames[0].source))
+    assert heard == [said]
+
+
 def test_a_call_that_cannot_be_answered_changes_nothing(registrar, frames, prepared):
     tracker = Tracker(registrar)
     tracker.register(frames[0].source, prepared)

@@ -242,7 +242,7 @@ class LimitsConfig(Settings):
 
     most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
     few_points: int = setting(
-        250, "fewer points that have a neighbour do not say whose bone it is", low=0, high=1_000_000
+        250, "fewer points that have a neighbour do not say whose bone it is, nor its size", low=0, high=1_000_000
     )
     noise_kept: float = setting(1.3, "residuals over a stated noise up to which they do say it", low=0, high=100)
     noise_exceeded: float = setting(

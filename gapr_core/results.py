@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -12,6 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
+
+
+def confidence_text(confidence: float) -> str:
+    """Two decimals, rounded down: no 1.00 for what is not certain, no 0.90 for what does not reach it."""
+    return f"{math.floor(100.0 * confidence + 1e-9) / 100.0:.2f}"
 
 
 class RegistrationStatus(str, Enum):
@@ -223,7 +229,7 @@ class RegistrationResult:
         return se3.apply(self.T_target_source, points)
 
     def __str__(self) -> str:
-        head = f"{self.status}  confidence {self.confidence:.2f}"
+        head = f"{self.status}  confidence {confidence_text(self.confidence)}"
         if self.ok and self.tre_mm is not None:
             head += f"  TRE {self.tre_mm:.1f} mm"
         if self.ok and self.tre95_mm is not None:

@@ -15,6 +15,7 @@ from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair
 from gapr_core.geometry import extent, se3
 from gapr_core.pages import palette
+from gapr_core.results import confidence_text
 
 Array = NDArray[np.float64]
 MOST_CASES = 10
@@ -36,12 +37,12 @@ def caption(record: Record) -> str:
     """One line on what went wrong."""
     head = f"{record.pair} ({record.protocol}, {record.bone}): "
     if not record.accepted:
-        return f"{head}refused, {record.status}, confidence {record.confidence:.2f}. {record.reason}"
+        return f"{head}refused, {record.status}, confidence {confidence_text(record.confidence)}. {record.reason}"
     if not record.has_truth:
-        return f"{head}FALSE ACCEPT of a wrong pair, confidence {record.confidence:.2f}"
+        return f"{head}FALSE ACCEPT of a wrong pair, confidence {confidence_text(record.confidence)}"
     kind = "FALSE ACCEPT" if record.false_accept else "right"
     errors = f"{record.rte_mm:.2f} mm, {record.rre_deg:.2f}°, whole bone {record.whole_bone_mm:.2f} mm"
-    return f"{head}{kind}, {errors}, confidence {record.confidence:.2f}"
+    return f"{head}{kind}, {errors}, confidence {confidence_text(record.confidence)}"
 
 
 def picture(record: Record, folder: Path) -> Figure:

@@ -21,7 +21,7 @@ from gapr_core.pages.guidance import GuidedStep, guidance_figure
 from gapr_core.pages.registration import Registration
 from gapr_core.pages.report import Report, Step, alignment_figure
 from gapr_core.registration.words import WORDS
-from gapr_core.results import Patch, RegistrationResult
+from gapr_core.results import Patch, RegistrationResult, confidence_text
 from gapr_core.runtime import origin
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def _lead(result: RegistrationResult) -> str:
 def _facts(result: RegistrationResult) -> dict[str, str]:
     return {
         "status": str(result.status).replace("_", " "),
-        "confidence": f"{result.confidence:.2f}",
+        "confidence": confidence_text(result.confidence),
         "expected error over the bone (TRE)": _mm(result.tre_mm),
         "its 95 % bound": _mm(result.tre95_mm),
         "points that fit": f"{100.0 * result.inlier_ratio:.0f} %",
@@ -159,9 +159,10 @@ def residual_figure(distance_mm: Array, inlier: NDArray[np.bool_]) -> Any:
 def _add_confidence(report: Report, result: RegistrationResult) -> None:
     report.heading("Confidence")
     report.paragraph(
-        f"{result.confidence:.2f} is the probability that the best hypothesis is within {se3.RIGHT_MM:g} mm and "
-        f"{se3.RIGHT_DEG:g} degrees of the truth. Each feature adds to its log odds: above 0 it speaks for the pose, "
-        "below 0 against it. Rules refuse what no probability can know; the reason of the refusal then names the rule."
+        f"{confidence_text(result.confidence)} is the probability that the best hypothesis is within "
+        f"{se3.RIGHT_MM:g} mm and {se3.RIGHT_DEG:g} degrees of the truth. Each feature adds to its log odds: "
+        "above 0 it speaks for the pose, below 0 against it. Rules refuse what no probability can know; "
+        "the reason of the refusal then names the rule."
     )
     if not result.contributions:
         report.paragraph("No features were measured here.")

@@ -45,7 +45,7 @@ class Accumulator:
         most: how many sources are kept, the newest among them.
 
     Raises:
-        ConfigError: `most` is no whole number, or less than 1.
+        ConfigError: `most` is no whole number, or less than 1; a method that cannot register.
     """
 
     name = "gapr_accumulator"
@@ -53,6 +53,8 @@ class Accumulator:
     def __init__(self, method: Registrar | Tracker, most: int) -> None:
         if not isinstance(most, int | np.integer) or most < 1:
             raise ConfigError("a whole number of sources to keep, at least 1", repr(most), "1 registers each by itself")
+        if not (hasattr(method, "register") and hasattr(method, "config")):
+            raise ConfigError("a Registrar or a Tracker", repr(method), "pass Registrar.from_pretrained()")
         self.method, self.most = _of_many_places(method), most
         self.config = self.method.config
         self._target: PreparedTarget | None = None

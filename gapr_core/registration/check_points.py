@@ -90,6 +90,8 @@ def _accepted(result: RegistrationResult) -> tuple[Array, Array, Array]:
 
     The covariance is widened as its bound was: 95 % of errors of known size stay below that.
     """
+    if not isinstance(result, RegistrationResult):
+        raise InvalidPointCloudError("a result", type(result).__name__, "pass what `register` returned")
     T, covariance, centre = result.T_target_source, result.covariance, result.centre_mm
     if T is None or covariance is None or centre is None:
         given = f"{result.status} by {result.method}"

@@ -17,6 +17,7 @@ from gapr_core.data.pool import parametric_specimen
 from gapr_core.geometry import se3
 from gapr_core.pages.guidance import GuidedStep, guidance_figure
 from gapr_core.pages.report import Report, timeline_figure
+from gapr_core.results import confidence_text
 from gapr_ros.demo.act import Act, write_bone
 from gapr_ros.demo.report import Row, add_frames, facts, judge
 from gapr_ros.demo.running import STARTING, Sender, running
@@ -96,7 +97,7 @@ def _line(number: int, look: Look) -> str:
     if answer.T_target_source is None:
         return shorten(f"look {number}, {points} points: refused: {answer.refusal}", 104, placeholder=" ...")
     bound = "" if answer.tre95_mm is None else f", error over the bone below {answer.tre95_mm:.1f} mm (95 %)"
-    return f"look {number}, {points} points: pose, confidence {answer.confidence:.2f}{bound}"
+    return f"look {number}, {points} points: pose, confidence {confidence_text(answer.confidence)}{bound}"
 
 
 def judged(probe: LookingProbe, looks: Sequence[Look]) -> list[Row]:

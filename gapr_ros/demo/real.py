@@ -10,6 +10,7 @@ from rich.table import Table
 from gapr_core import Registrar, RegistrationResult, metrics
 from gapr_core.data import real
 from gapr_core.data.real import RealPair
+from gapr_core.results import confidence_text
 
 COLUMNS = ("cloud", "points", "answer", "confidence", "TRE mm", "off mm", "off deg", "truth")
 
@@ -31,7 +32,7 @@ def run(folder: Path, console: Any) -> int:
 def judged(pair: RealPair, result: RegistrationResult) -> tuple[list[str], bool | None]:
     """A row of the table, and whether the pose is right; None for a refusal, or where no truth is known."""
     size = "" if result.tre_mm is None else f"{result.tre_mm:.1f}"
-    row = [pair.name, str(len(pair.source)), str(result.status), f"{result.confidence:.2f}", size]
+    row = [pair.name, str(len(pair.source)), str(result.status), confidence_text(result.confidence), size]
     if result.T_target_source is None or pair.T_target_source is None:
         return [*row, "", "", pair.truth], None
     error = metrics.pose_error(result.T_target_source, pair.T_target_source, pair.source)

@@ -17,6 +17,7 @@ from gapr_core.geometry import se3
 from gapr_core.pages.camera_pictures import KEY, CameraView, save_scene_poster, views_as_png
 from gapr_core.pages.poster import save_poster
 from gapr_core.pages.report import Image, Report, Step, alignment_figure, timeline_figure
+from gapr_core.results import confidence_text
 from gapr_ros.demo.act import Act
 from gapr_ros.demo.observer import Answer
 
@@ -79,7 +80,7 @@ class Row:
         ]
         errors = (f"{self.error_mm:.2f}", f"{self.error_deg:.2f}") if posed else ("", "")
         latency = f"{answer.latency_ms:.0f}" if np.isfinite(answer.latency_ms) else ""
-        return (*head, words, f"{answer.confidence:.2f}", *precision, *errors, latency)
+        return (*head, words, confidence_text(answer.confidence), *precision, *errors, latency)
 
 
 def columns(rows: Sequence[Row]) -> tuple[str, ...]:
@@ -205,7 +206,7 @@ def _step(row: Row, cloud: np.ndarray, bone: Specimen) -> Step:
         aligned[row.taken.is_taken], aligned[~row.taken.is_taken]
     )  # fmt: skip
     caption = (
-        f"frame {row.frame}, {row.points} points: confidence {row.answer.confidence:.2f}, "
+        f"frame {row.frame}, {row.points} points: confidence {confidence_text(row.answer.confidence)}, "
         f"error {row.error_mm:.2f} mm, {row.error_deg:.2f} deg"
     )
     return Step(str(row.frame), caption, on, bone.distance(on), aside)

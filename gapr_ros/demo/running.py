@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.results import confidence_text
 from gapr_ros.demo import interrupt
 from gapr_ros.demo.act import Act, DemoError
 from gapr_ros.demo.children import child, last_lines
@@ -202,4 +203,6 @@ def _last_answer(observer: Observer) -> str:
     if not observer.answers:
         return ""
     answer = observer.answers[max(observer.answers)]
-    return f"refused: {answer.refusal}"[:60] if answer.refusal else f"pose, confidence {answer.confidence:.2f}"
+    if answer.refusal:
+        return f"refused: {answer.refusal}"[:60]
+    return f"pose, confidence {confidence_text(answer.confidence)}"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from gapr_core.results import RegistrationResult
+from gapr_core.results import RegistrationResult, confidence_text
 from gapr_ros.node.refusal import Reason
 from gapr_ros.node.worker import Job
 
@@ -101,7 +101,8 @@ class Outcome:
 
     def __str__(self) -> str:
         if self.ok:
-            tre = "" if self.tre_mm is None else f"  TRE {self.tre_mm:.1f} mm"
-            said = f"OK  confidence {self.confidence:.2f}{tre}  inliers {self.inlier_ratio:.2f}  {self.exec_ms:.0f} ms"
+            said = f"OK  confidence {confidence_text(self.confidence)}"
+            said += "" if self.tre_mm is None else f"  TRE {self.tre_mm:.1f} mm"
+            said += f"  inliers {self.inlier_ratio:.2f}  {self.exec_ms:.0f} ms"
             return said + (f"  the cloud is {self.age_s:.1f} s old" if (self.age_s or 0.0) > OLD_S else "")
         return f"refused: {self.reason}" + (f": {self.text}" if self.text else "")

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 from gapr_core.baselines.base import takes
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.geometry import sampling, se3
-from gapr_core.results import RegistrationResult
+from gapr_core.results import RegistrationResult, confidence_text
 from gapr_ros.node import intake, region, timeline, wire
 from gapr_ros.node.collection import Late, forget
 from gapr_ros.node.following import Following
@@ -246,7 +246,7 @@ def check_limits(result: RegistrationResult, parameters: NodeParameters) -> None
         RefusedError: low_confidence or imprecise.
     """
     if not result.confidence >= parameters.min_confidence:
-        text = f"confidence {result.confidence:.2f}, min_confidence is {parameters.min_confidence:g}"
+        text = f"confidence {confidence_text(result.confidence)}, min_confidence is {parameters.min_confidence:g}"
         raise RefusedError(Reason.LOW_CONFIDENCE, text)
     _check_precision(result, parameters.max_tre)
 

@@ -3,8 +3,9 @@
 from dataclasses import fields
 
 import numpy as np
+import pytest
 
-from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus
+from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus, confidence_text
 
 
 def test_a_refusal_keeps_what_is_looked_at_and_nothing_that_goes_with_a_pose():
@@ -15,3 +16,12 @@ def test_a_refusal_keeps_what_is_looked_at_and_nothing_that_goes_with_a_pose():
     nothing = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="why", **looked_at)
     for each in fields(RegistrationResult):
         assert getattr(refused, each.name) == getattr(nothing, each.name), each.name
+
+
+@pytest.mark.parametrize(
+    ("confidence", "text"),
+    [(0.9964, "0.99"), (0.8999, "0.89"), (0.29, "0.29"), (0.57, "0.57"), (1.0, "1.00"), (0.0, "0.00")],
+)
+def test_no_confidence_is_shown_larger_than_it_is(confidence, text):
+    assert confidence_text(confidence) == text
+    assert f"confidence {text}" in str(RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, confidence=confidence))

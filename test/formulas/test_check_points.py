@@ -172,6 +172,8 @@ def test_more_points_than_are_touched_are_refused_before_the_work():
 def test_a_covariance_that_is_none_is_an_error():
     with pytest.raises(InvalidPointCloudError, match="a positive definite covariance"):
         check([[0.0, 0.0, 0.0]], plane(), answer(covariance=np.zeros((6, 6))), EXACT)
+    with pytest.raises(InvalidPointCloudError, match="a result; got NoneType"):
+        check([[0.0, 0.0, 0.0]], plane(), None, EXACT)
 
 
 def test_a_refusal_and_a_pose_without_covariance_cannot_be_checked():

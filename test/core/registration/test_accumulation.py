@@ -53,6 +53,8 @@ def test_only_the_newest_sources_are_kept(registrar, frames):
     np.testing.assert_array_equal(accumulator.collected, np.concatenate([pair.source for pair in frames[2:5]]))
     accumulator.reset()
     assert accumulator.collected.shape == (0, 3)
+    with pytest.raises(ConfigError, match="a Registrar or a Tracker; got 'gapr'"):
+        Accumulator("gapr", most=3)
     with pytest.raises(ConfigError, match="at least 1"):
         Accumulator(registrar, most=0)
 

@@ -37,6 +37,14 @@ class Group:
         dist.broadcast(flag, 0)
         return bool(flag.item())
 
+    def mean(self, values: dict[str, float]) -> dict[str, float]:
+        """The mean of each value over all processes; every process calls this, with the same names."""
+        if self.world == 1:
+            return values
+        sums = torch.tensor(list(values.values()), device=self.device)
+        dist.all_reduce(sums)
+        return dict(zip(values, (sums / self.world).tolist(), strict=True))
+
     def wait(self) -> None:
         """Until every process is here."""
         if self.world > 1:

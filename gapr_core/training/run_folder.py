@@ -53,18 +53,17 @@ def claim(
     return provenance.append(folder, config, anatomy, step, world)
 
 
-def log_row(
-    state: dict[str, Any], config: TrainConfig, rate: float, norm: float, parts: list[Losses]
-) -> dict[str, Any]:
-    """One line of log.csv."""
-    names = (
-        ("coarse", "fine", "early", "bone") if isinstance(parts[0].bone, torch.Tensor) else ("coarse", "fine", "early")
-    )
-    means = {n: sum(float(getattr(p, n).detach()) for p in parts) / len(parts) for n in names}
+def log_row(state: dict[str, Any], config: TrainConfig, values: dict[str, float]) -> dict[str, Any]:
+    """One line of log.csv: how far the run is, and five digits of each value."""
     row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
-    total = sum(float(p.total.detach()) for p in parts) / len(parts)
-    values = {"rate": rate, "norm": norm, "loss": total, **means}
     return row | {name: float(f"{value:.5g}") for name, value in values.items()}
+
+
+def mean_losses(parts: list[Losses]) -> dict[str, float]:
+    """The total and each loss, averaged over the micro-batches that one process had in a step."""
+    names = ["total", "coarse", "fine", "early", *(["bone"] if isinstance(parts[0].bone, torch.Tensor) else [])]
+    means = {name: sum(float(getattr(part, name).detach()) for part in parts) / len(parts) for name in names}
+    return {"loss": means.pop("total"), **means}
 
 
 def report(

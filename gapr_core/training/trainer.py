@@ -113,14 +113,16 @@ class Run:
             norm = self._move(step)
             spent = time.monotonic() - begun
             self.state = {"step": step + 1, "seconds": earlier + spent}
-            last = step + 1 == self.steps or spent > 60.0 * minutes
-            if self.leads and (last or (step + 1) % self.config.log_steps == 0):
-                row = run_folder.log_row(self.state, self.config, rate, norm, parts)
-                progress.set_postfix(loss=row["loss"], coarse=row["coarse"], fine=row["fine"])
-                run_folder.append(self.folder / "log.csv", row)
-                if last or to_validate.is_over():
-                    self._validate()
-            if ends := self.group.agree(last):
+            ends = self.group.agree(step + 1 == self.steps or spent > 60.0 * minutes)
+            if ends or (step + 1) % self.config.log_steps == 0:
+                losses = self.group.mean(run_folder.mean_losses(parts))
+                progress.set_postfix({name: losses[name] for name in ("loss", "coarse", "fine")})
+                if self.leads:
+                    row = run_folder.log_row(self.state, self.config, {"rate": rate, "norm": norm, **losses})
+                    run_folder.append(self.folder / "log.csv", row)
+                    if ends or to_validate.is_over():
+                        self._validate()
+            if ends:
                 self.drawn.write()
                 self.group.wait()  # the header of the weights counts the subjects of all processes
             if ends or to_save.is_over():

@@ -24,7 +24,7 @@ from gapr_core.model.config import ModelConfig
 from gapr_core.model.export import leaves
 from gapr_core.runtime.settings import load
 from gapr_core.surface import Surface
-from gapr_core.training import batches, distributed, export, provenance, start, trainer, validation
+from gapr_core.training import batches, curves, distributed, export, provenance, start, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
@@ -408,6 +408,9 @@ def test_two_processes_under_torchrun_learn_what_one_learns(settings, anatomy, t
     first, second = weights.load(one)[0], weights.load(tmp_path / "two" / "weights.safetensors")[0]
     for a, b in zip(first.parameters(), second.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-4)
+    losses = [curves.read_csv(tmp_path / run / "log.csv") for run in ("one", "two")]
+    for a, b in zip(*losses, strict=True):
+        assert b == pytest.approx(a | {"seconds": b["seconds"]}, rel=2e-3)
     of_one = json.loads((tmp_path / "one" / "subjects_0.json").read_text())
     of_two = [json.loads((tmp_path / "two" / f"subjects_{rank}.json").read_text()) for rank in range(2)]
     assert Counter(of_one) == Counter(of_two[0]) + Counter(of_two[1]) and all(of_two)

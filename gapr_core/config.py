@@ -38,7 +38,7 @@ class SourceConfig(Settings):
     fewest_points: int = setting(6, "fewer usable points are refused: as many as a pose has unknowns", low=6)
     most_points: int = setting(6000, "more points are thinned evenly", low=100, high=1_000_000)
     fitted_points: int = setting(
-        1500, "of these so many, drawn at random, are compared and assessed, unless most may not be bone", low=100
+        1500, "of those kept so many, drawn at random, are fitted and assessed; of a camera's cloud all are", low=100
     )
     normal_neighbours: int = setting(30, "points that give a normal", low=4, high=200)
     smallest_width_mm: float = setting(2.0, "a narrower cloud is refused: a line", low=0, high=1000, unit="mm")
@@ -129,7 +129,7 @@ class CovarianceConfig(Settings):
         0.3, "standard deviation of an error by which the bone's model is too thick or too thin; 0: it is exact",
         low=0, high=10, unit="mm",
     )  # fmt: skip
-    one_sided: float = setting(0.3, "mean normal from which on a view has a beam", low=0, high=1)
+    one_sided: float = setting(0.3, "length of the mean normal from which on a view has a beam", low=0, high=1)
     noise_points: float = setting(4.0, "points that the usual noise of the sensor is worth", low=0, high=1000)
     smooth_neighbours: int = setting(30, "points of an average that shows the smooth misfit", low=2, high=1000)
     short_neighbours: int = setting(12, "the same at short range, for the confidence alone", low=2, high=1000)
@@ -241,14 +241,12 @@ class LimitsConfig(Settings):
     """What no pose can be sure of (`gapr_core.registration.limits`)."""
 
     most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
-    few_points: int = setting(
-        250, "fewer points that have a neighbour do not say whose bone it is, nor its size", low=0, high=1_000_000
-    )
+    few_points: int = setting(250, "fewer near points show neither whose bone nor what size it is", low=0, high=10**6)
     noise_kept: float = setting(1.3, "residuals over a stated noise up to which they do say it", low=0, high=100)
     noise_exceeded: float = setting(
         2.5, "residuals over the noise of a named sensor and the model from which on they do not", low=0, high=100
     )
-    model_mm: float = setting(0.3, "standard deviation of the model of a bone", low=0, high=10, unit="mm")
+    model_mm: float = setting(0.3, "error of a bone's model from place to place", low=0, high=10, unit="mm")
     bias_exceeded: float = setting(
         1.25, "smooth misfit over that of a named sensor and the model from which on they do not", low=0, high=100
     )
@@ -319,7 +317,7 @@ class EvidenceConfig(Settings):
     memory: float = setting(10.0, "frames after which a frame's weight has fallen to about 1/e", low=1)
     agree_mm: float = setting(15.0, "largest motion between frames (rms) that continues a track", low=0, unit="mm")
     stands: float = setting(
-        0.8, "a tracked answer as sure as this stands after a frame that was sure; above 1 none does", low=0, high=2
+        0.8, "after a sure source a tracked answer of this confidence needs no search; above 1: it does", low=0, high=2
     )
 
 
@@ -473,8 +471,10 @@ class RegistrarConfig(Settings):
     guide: bool = setting(False, "say with every answer where another look would help most")
     min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
     max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
-    searched_below: float = setting(0.8, "below it, and above limits.most, the next proposer is asked", low=0, high=2)
-    sure: float = setting(0.95, "from here on it is not; nor is a tracked pose or a camera's", low=0, high=2)
+    searched_below: float = setting(
+        0.8, "a less confident answer goes to the next proposer; so does one from limits.most to sure", low=0, high=2
+    )
+    sure: float = setting(0.95, "nothing more is tried: no proposer, no regions, no search", low=0, high=2)
     num_threads: int = setting(0, "threads of a registration and its target; 0: all cores", low=0, high=1024)
     seed: int = setting(
         0, "seed of proposers that draw (ransac); other draws are always the same", low=0, high=2**31 - 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -17,7 +16,7 @@ Array = NDArray[np.float64]
 
 def confidence_text(confidence: float) -> str:
     """Two decimals, rounded down: no 1.00 for what is not certain, no 0.90 for what does not reach it."""
-    return f"{math.floor(100.0 * confidence + 1e-9) / 100.0:.2f}"
+    return f"{np.floor(100.0 * confidence + 1e-9) / 100.0:.2f}"
 
 
 class RegistrationStatus(str, Enum):
@@ -42,10 +41,12 @@ class Refusal:
     Attributes:
         status: every one but `OK`.
         reason: one sentence for users.
+        asks_standoff: the reason asks for the sensor's stand-off already.
     """
 
     status: RegistrationStatus
     reason: str
+    asks_standoff: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,7 +77,7 @@ class NodeParameters(Settings):
     min_points: int = setting(
         200, "fewer usable points are refused; counted over all clouds that are registered as one", low=3
     )
-    max_points: int = setting(200_000, "larger clouds are thinned to this, seeded; 0: never", low=0)
+    max_points: int = setting(200_000, "larger clouds are thinned to this; 0: never", low=0)
     range_min: float = setting(0.0, "nearer points are left out; 0: off", unit="m", low=0.0)
     range_max: float = setting(0.0, "farther points are left out; 0: off", unit="m", low=0.0)
     max_cloud_age: float = setting(0.0, "older clouds are refused; 0: off", unit="s", low=0.0)
@@ -115,11 +115,13 @@ class NodeParameters(Settings):
     publish_tf: bool = setting(True, "send accepted poses to /tf", live=False)
     publish_hypotheses: bool = setting(False, "send poses that are not believed to ~/hypotheses, to look at")
     guide: bool = setting(False, "work out where to look next, for ~/guidance and ~/next_view; takes time", live=False)
-    settings_file: str = setting("", "YAML file for `gapr register --config`; the node's parameters win",
+    settings_file: str = setting("", "YAML file as for `gapr register --config`; it must not contradict a parameter",
                                  live=False)  # fmt: skip
     device: str = setting("auto", "where a network runs", choices=("auto", "cpu", "cuda"), live=False)
     num_threads: int = setting(0, "threads of a registration; 0: all cores", low=0, high=1024, live=False)
-    seed: int = setting(0, "of every random choice", low=0, high=2**31 - 1, live=False)
+    seed: int = setting(
+        0, "seed of the thinning to max_points, and of a proposer that draws", low=0, high=2**31 - 1, live=False
+    )
     autostart: bool = setting(True, "configure and activate without a lifecycle manager; read when the node starts",
                               live=False)  # fmt: skip
     diagnostics_period: float = setting(1.0, "time between two diagnostics", unit="s", low=0.01, high=3600.0)

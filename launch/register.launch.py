@@ -25,7 +25,7 @@ FILE = Path(__file__).resolve()
 PATIENCE_S = "20"  # after Ctrl-C: the node ends with a second of work, which takes longer on a busy machine
 ARGUMENTS = {
     "points": ("points", "topic of the clouds"),
-    "initialpose": ("initialpose", "topic of optional seeds"),
+    "initialpose": ("initialpose", "topic of poses to start from"),
     "namespace": ("", "of the node, its topics and its services"),
     "use_sim_time": ("", "true: node and RViz take time from /clock; RViz does not read params_file"),
     "params_file": ("", "parameter file; what is given here as an argument, and not empty, wins"),

@@ -143,7 +143,7 @@ def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Femora and tibiae of subjects, every other one of another subject, three times as many as `count`; and rib cages.
+    """Three times `count` sources of subjects, half of them against another subject's bone: femora, tibiae, rib cages.
 
     So many are seen as at L3, where they are hardest to distinguish, so many by all other families in turn, half as
     many are thinned, since another subject's ridges look like noise where neighbours are far apart, and three of ten

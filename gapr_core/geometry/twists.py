@@ -59,7 +59,29 @@ def motion_jacobians(points: ArrayLike, centre: ArrayLike) -> Array:
     return jacobian
 
 
-def predicted_rmse_mm(covariance: ArrayLike, points: ArrayLike, centre: ArrayLike) -> float:
-    """Root-mean-square error that a pose covariance (6, 6) about `centre` predicts over points (N, 3), mm."""
-    jacobian = motion_jacobians(points, centre)
-    return float(np.sqrt(np.einsum("nij,jk,nik->n", jacobian, np.asarray(covariance), jacobian).mean()))
+def distance_jacobian(points: Array, normals: Array, centre: Array) -> Array:
+    """(N, 6) derivative of the signed distances of points (N, 3) by the twist about `centre`: [n, (p - c) x n].
+
+    Args:
+        points: in the target frame, mm.
+        normals: (N, 3) unit normals of the surface at their foot points.
+        centre: (3,) mm.
+    """
+    return np.hstack([normals, np.cross(points - centre, normals)])
+
+
+def mean_square(points: Array, centre: Array) -> Array:
+    """(6, 6) A with TRE^2 = e^T A e over points (M, 3): of their mean m and second moments S about the centre.
+
+    With [m]x the matrix of a cross product, A = [I, -[m]x; [m]x, tr(S) I - S].
+    """
+    offsets = points - centre
+    x, y, z = offsets.mean(axis=0)
+    S = offsets.T @ offsets / len(points)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[np.eye(3), -across], [across, np.trace(S) * np.eye(3) - S]])
+
+
+def predicted_rmse_mm(covariance: Array, points: Array, centre: Array) -> float:
+    """Root-mean-square error over points (M, 3), mm, under a pose covariance (6, 6) about `centre` (3,)."""
+    return float(np.sqrt(np.trace(mean_square(points, centre) @ covariance)))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.geometry.twists import distance_jacobian, predicted_rmse_mm
 
 Array = NDArray[np.float64]
 NEIGHBOURS = 12  # target points that give a normal
@@ -64,9 +64,10 @@ def local_normals(points: ArrayLike, queries: ArrayLike, tree: cKDTree | None = 
 
 def _bound(moved: Array, normals: Array, usable: NDArray[np.bool_], sigma_mm: float) -> PoseBound | None:
     centre = moved.mean(axis=0)
-    arms = moved[usable] - centre
-    size = np.sqrt((arms**2).sum(axis=1).mean())  # rotations in units that weigh like translations
-    rows = np.hstack([normals[usable], np.cross(arms, normals[usable]) / size])
+    size = np.sqrt(
+        ((moved[usable] - centre) ** 2).sum(axis=1).mean()
+    )  # rotations in units that weigh like translations
+    rows = distance_jacobian(moved[usable], normals[usable], centre) / np.repeat([1.0, size], 3)
     information = rows.T @ rows / sigma_mm**2
     if np.linalg.cond(information) > 1e10:
         return None

@@ -158,10 +158,10 @@ class Accumulator:
         """
         if result.T_target_source is None:  # it says nothing of any source, nor of a row of those off the bone
             for source in self._new:
-                self._with_small_ones(source)
+                self._join_small_ones(source)
             self._kept, self._new = self._last(), []
             return result
-        new, off = self._new, self._off_the_bone(result.T_target_source, target)
+        new, off = self._new, self._update_row_off_the_bone(result.T_target_source, target)
         self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
         self._new = []
         if len(self._off_in_a_row) >= self.config.accumulation.most_off:
@@ -191,7 +191,7 @@ class Accumulator:
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
 
-    def _off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
+    def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.
 
         What has too few points to be judged does neither.
@@ -199,7 +199,7 @@ class Accumulator:
         everything, seen = _together(self._last()), offset_surface(target, self.config.sensor)
         off: list[Array] = []
         for source in self._new:
-            judged = self._with_small_ones(source)
+            judged = self._join_small_ones(source)
             points = _together(judged)
             if not judged:
                 continue
@@ -211,8 +211,8 @@ class Accumulator:
                 self._off_in_a_row = [*self._off_in_a_row, points]
         return off
 
-    def _with_small_ones(self, source: Array) -> list[Array]:
-        """What is judged with a source (N, 3): itself, or of few points those just before it too; [] for too few."""
+    def _join_small_ones(self, source: Array) -> list[Array]:
+        """Take up a source (N, 3). Returns what is judged: it, or of few points those before it too; [] for too few."""
         fewest = self.config.accumulation.fewest_points
         if len(source) >= fewest:
             self._small = []

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig, RulesConfig
+from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration import covariance, kernels, precision, rules
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
@@ -90,7 +91,7 @@ class Assessment:
     @property
     def tre_mm(self) -> float:
         """Expected error, root mean square over the bone, mm."""
-        return precision.expected_mm(self.uncertainty.covariance, self.target.points, self.centre_mm)
+        return predicted_rmse_mm(self.uncertainty.covariance, self.target.points, self.centre_mm)
 
     @property
     def tre95_mm(self) -> float:

@@ -18,7 +18,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import motion_jacobians
+from gapr_core.geometry.twists import distance_jacobian, mean_square
 from gapr_core.registration import kernels, precision, sensor
 from gapr_core.registration.bias_field import smooth_correlation
 from gapr_core.registration.registrar import check_call
@@ -68,7 +68,7 @@ def check_points(
     surface = offset_surface(target, config.sensor)
     distance_mm, normals = _distances(T, points, surface)
     moved, near = se3.apply(T, points), ~np.isnan(distance_mm)
-    J = _jacobian(moved[near], normals[near], centre)
+    J = distance_jacobian(moved[near], normals[near], centre)
     R = _errors_of(moved[near], normals[near], sensor.errors(config.sensor, len(points)), config)
     S = J @ covariance @ J.T + R
     expected_mm = np.full(len(points), np.nan)
@@ -112,11 +112,6 @@ def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, 
     return np.where(signed < 0.0, -1.0, 1.0) * np.hypot(signed, aside), normals
 
 
-def _jacobian(moved: Array, normals: Array, centre: Array) -> Array:
-    """(n, 6) derivative of the signed distances by the pose's error about `centre`."""
-    return np.einsum("ni,nij->nj", normals, motion_jacobians(moved, centre))
-
-
 def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarConfig) -> Array:
     """(n, n) covariance of what the distances of points err by under the true pose, mm^2.
 
@@ -130,8 +125,8 @@ def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarCo
     shared_mm2 = errors.standoff_mm**2 + settings.model_mm**2
     R = own_mm2 * np.eye(len(moved)) + errors.bias_mm**2 * alike + shared_mm2 + errors.scale**2 * np.outer(grown, grown)
     if len(moved):
-        J = _jacobian(moved, normals, moved.mean(axis=0))
-        R += J @ np.diag(np.repeat(np.square([errors.tracking_mm, np.radians(errors.tracking_deg)]), 3)) @ J.T
+        J = distance_jacobian(moved, normals, moved.mean(axis=0))
+        R += J @ errors.place_covariance @ J.T
     return np.asarray(R)
 
 
@@ -162,8 +157,8 @@ def _next(covariance: Array, target: PreparedTarget, centre: Array, variance_mm2
     A distance with derivative j takes C j j^T C / (s^2 + j^T C j) off the covariance C of the pose (Kalman 1960).
     """
     chosen = np.arange(0, len(target.points), max(1, len(target.points) // CANDIDATES))
-    J = _jacobian(target.points[chosen], target.normals[chosen], centre)
+    J = distance_jacobian(target.points[chosen], target.normals[chosen], centre)
     CJ = J @ covariance
-    moved = precision.mean_square(target.points, centre)
+    moved = mean_square(target.points, centre)
     gain = np.einsum("ki,ij,kj->k", CJ, moved, CJ) / (variance_mm2 + np.einsum("ki,ki->k", CJ, J))
     return int(chosen[gain.argmax()])

@@ -3,13 +3,13 @@
 A least-squares pose reacts to errors e of the residuals by a gain, G e. With independent noise of variance s^2, a
 smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), a stand-off of variance o^2 that all points share and a
 relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
-Censi 2007 for the noise alone). A Hessian alone is over-confident. The size of the bias comes from the residuals
-(`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone hardly moves the
-pose, and one seen from one side does. What varies more slowly than the correlation is constant or linear in place: in
-proportion to the bias, all points share an offset and the source is strained. Of an image, depths are wrong: stand-off
-and scale act along the beam. Slices of a tracked probe share an error each: another K, of short reach. An error of the
-place of the whole cloud, a tracked scanner's, is one of the pose as it is. A weak prior keeps a motion of which nothing
-was observed uncertain, but finite.
+Censi 2007 for the noise alone); `sandwich` has all terms. A Hessian alone is over-confident. The size of the bias comes
+from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone
+hardly moves the pose, and one seen from one side does. What varies more slowly than the correlation is constant or
+linear in place: in proportion to the bias, all points share an offset and the source is strained. Of an image, depths
+are wrong: stand-off and scale act along the beam. Slices of a tracked probe share an error each: another K, of short
+reach. An error of the place of the whole cloud, a tracked scanner's, is one of the pose as it is. A weak prior keeps a
+motion of which nothing was observed uncertain, but finite.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
     return float(np.sqrt(max(root_mean_square(sizes_mm, log_posterior) ** 2 - config.no_bias_mm**2, 0.0)))
 
 
-def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
+def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
     """(6, 6) G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P.
 
     G is the gain of the fit, U = 1 1^T what all points share, s the noise, b the bias with fields F, of which all
@@ -150,11 +150,11 @@ def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) 
     of the whole cloud adds and P the prior.
     """
     inlier = fit.weights > 0.0
-    gain, prior = gain_of(fit, fields, errors.noise_mm)
+    gain, prior = gain_of(fit, bias_fields, errors.noise_mm)
     shift, growth = directions(fit, errors.along_beam, config.one_sided)
     moved = np.column_stack(
         [
-            errors.bias_mm * gain @ fields[inlier],
+            errors.bias_mm * gain @ bias_fields[inlier],
             config.long_share * errors.bias_mm * gain.sum(axis=1),
             config.linear_share * errors.bias_mm * gain @ strains(fit),
             errors.local_mm * gain @ _local_fields(fit, errors, config)[inlier],
@@ -163,8 +163,7 @@ def sandwich(fit: Fit, fields: Array, errors: Errors, config: CovarianceConfig) 
             errors.scale * gain @ growth,
         ]
     )
-    place = np.diag(np.repeat(np.square([errors.tracking_mm, np.radians(errors.tracking_deg)]), 3))
-    return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + place + prior)
+    return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + errors.place_covariance + prior)
 
 
 def directions(fit: Fit, along_beam: bool, one_sided: float) -> tuple[Array, Array]:
@@ -208,7 +207,7 @@ def _local_fields(fit: Fit, errors: Errors, config: CovarianceConfig) -> Array:
     return fields(fit, config.local_correlation_mm, config.local_centres)
 
 
-def gain_of(fit: Fit, fields: Array, noise_mm: float) -> tuple[Array, Array]:
+def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array]:
     """How the pose reacts to errors of the inliers: (6, n) twist per mm, and the prior's (6, 6) covariance.
 
     G = (J^T V^-1 J + P)^-1 J^T V^-1 up to its sign, with V = s^2 W^-1 + c^2 F F^T (Aitken 1935): c is the bias for
@@ -219,7 +218,7 @@ def gain_of(fit: Fit, fields: Array, noise_mm: float) -> tuple[Array, Array]:
     J, precision = fit.jacobian[inlier], fit.weights[inlier, None] / noise_mm**2
     VJ = precision * J
     if fit.bias_mm > 0.0:
-        F = fields[inlier]
+        F = bias_fields[inlier]
         R = np.sqrt(precision) * F
         VJ -= precision * (F @ np.linalg.solve(R.T @ R + np.eye(F.shape[1]) / fit.bias_mm**2, F.T @ VJ))
     P = POSE_PRIOR / noise_mm**2

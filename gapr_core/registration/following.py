@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import sampling, se3
-from gapr_core.registration import precision
+from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import POSE_PRIOR
 from gapr_core.registration.refinement import Fit, distances_mm, refine_fully, refine_many, tukey_limit
@@ -142,4 +142,4 @@ class Follower:
         """Expected error over the bone under s^2 (J^T W J + P)^-1, with the noise s of the assessed source."""
         a, J = self._assessment, fit.jacobian
         covariance = a.fit.sigma_mm**2 * np.linalg.inv((J * fit.weights[:, None]).T @ J + POSE_PRIOR)
-        return precision.expected_mm(covariance, a.target.points, fit.moved.mean(axis=0))
+        return predicted_rmse_mm(covariance, a.target.points, fit.moved.mean(axis=0))

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import GuidanceConfig
 from gapr_core.geometry import sampling, se3
+from gapr_core.geometry.twists import distance_jacobian
 from gapr_core.registration import precision
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.refinement import distances_mm
@@ -111,8 +112,7 @@ def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: 
     over_all = assessment.tre95_mm / assessment.bound_mm(anchors)  # a few points stand for the bone
     bounds = []
     for members in patches.members:
-        normals = target.normals[members]
-        J = np.hstack([normals, np.cross(target.points[members] - centre, normals)])
+        J = distance_jacobian(target.points[members], target.normals[members], centre)
         covariance = np.asarray(np.linalg.inv(known + information(J, points, noise_mm, bias_mm)), np.float64)
         bounds.append(over_all * assessment.factor95 * precision.bound_mm(covariance, anchors, centre))
     return np.array(bounds)

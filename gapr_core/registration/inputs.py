@@ -1,4 +1,4 @@
-"""What a caller gives beside clouds: poses, places, corners."""
+"""What a caller gives besides clouds: poses, places, corners."""
 
 from __future__ import annotations
 

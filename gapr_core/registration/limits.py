@@ -141,7 +141,7 @@ def is_uncertain(assessment: Assessment, config: RegistrarConfig) -> bool:
     return right_share(assessment.uncertainty.covariance) < config.limits.covered
 
 
-def is_loose(assessment: Assessment, config: RegistrarConfig) -> bool:
+def is_bound_large(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True where the bone may be so far off somewhere that as much of another subject's would fit as well."""
     return assessment.tre95_mm > config.limits.loose_mm
 
@@ -216,7 +216,7 @@ LIMITS = (
     Limit("uncertain", is_uncertain, "the points leave the pose too loose; measure a larger part of the bone"),
     Limit(
         "loose",
-        is_loose,
+        is_bound_large,
         "so little of the bone, or so noisy, may as well be of another subject's; measure a larger part of it, or more "
         "precisely",
     ),

@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from gapr_core.geometry.twists import mean_square
+
 Array = NDArray[np.float64]
 
 QUANTILE = 0.95
-
-
-def expected_mm(covariance: Array, points: Array, centre: Array) -> float:
-    """Root-mean-square error over points (M, 3), mm, under a pose covariance (6, 6) about `centre` (3,)."""
-    return float(np.sqrt(np.trace(mean_square(points, centre) @ covariance)))
 
 
 def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = QUANTILE) -> float:
@@ -35,15 +32,3 @@ def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = 
     mean, variance = np.trace(product), 2.0 * np.trace(product @ product)
     scale, freedom = variance / (2.0 * mean), 2.0 * mean**2 / variance
     return float(np.sqrt(scale * chi2.ppf(quantile, freedom)))
-
-
-def mean_square(points: Array, centre: Array) -> Array:
-    """(6, 6) A with TRE^2 = e^T A e over points (M, 3): of their mean m and second moments S about the centre.
-
-    With [m]x the matrix of a cross product, A = [I, -[m]x; [m]x, tr(S) I - S].
-    """
-    offsets = points - centre
-    x, y, z = offsets.mean(axis=0)
-    S = offsets.T @ offsets / len(points)
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.block([[np.eye(3), -across], [across, np.trace(S) * np.eye(3) - S]])

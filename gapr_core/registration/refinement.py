@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import RefinementConfig, SourceConfig
 from gapr_core.geometry import se3
+from gapr_core.geometry.twists import distance_jacobian
 from gapr_core.registration import fit_kernels, kernels
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
@@ -62,7 +63,7 @@ class Fit:
     @cached_property
     def jacobian(self) -> Array:
         """(N, 6) derivative of the residuals by x y z rx ry rz about the moved source's centroid."""
-        return np.hstack([self.gradients, np.cross(self.moved - self.moved.mean(axis=0), self.gradients)])
+        return distance_jacobian(self.moved, self.gradients, self.moved.mean(axis=0))
 
     @cached_property
     def feet(self) -> Array:

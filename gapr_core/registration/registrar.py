@@ -78,7 +78,8 @@ class Registrar:
         precision: what corrects the predicted errors; the shipped one when not given.
 
     Raises:
-        ConfigError: no proposer, or not one calibration for each, of that one, or of scenes.
+        ConfigError: no proposer; another number of calibrations than proposers; a calibration fitted for another
+            proposer, or a `scene_calibration` that is not for scenes.
         MethodUnavailableError: no confidence model ships for a proposer, and none was given.
     """
 

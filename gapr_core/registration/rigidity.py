@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.geometry import extent, sampling
-from gapr_core.geometry.twists import covariance_about
+from gapr_core.geometry.twists import covariance_about, distance_jacobian
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import smooth_correlation
 from gapr_core.registration.covariance import covariance_added_by, strains
@@ -145,7 +145,7 @@ def motions(fit: Fit) -> Array:
     """
     inlier = fit.weights > 0.0
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
-    return np.hstack([normals, np.cross(moved - moved.mean(axis=0), normals) / extent.radius_mm(moved)])
+    return distance_jacobian(moved, normals, moved.mean(axis=0)) / np.repeat([1.0, extent.radius_mm(moved)], 3)
 
 
 def halves(fit: Fit) -> list[Array]:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.clouds import EXTENT_LIMITS_MM, MM_PER_UNIT
-from gapr_core.config import RegistrarConfig, RulesConfig, VerificationConfig
-from gapr_core.geometry import se3
+from gapr_core.config import RegistrarConfig, RulesConfig
+from gapr_core.geometry import extent, se3
 from gapr_core.registration import words
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.other_size import HALFWAY
@@ -23,12 +23,11 @@ from gapr_core.registration.refinement import Fit, refine_many
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
-from gapr_core.results import Refusal, RegistrationStatus
+from gapr_core.results import Refusal, RegistrationStatus, confidence_text
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
-DEFAULT = RulesConfig()
 OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # that are taken for mm by mistake
 HALF_TURN_DEG = 180.0
 PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
@@ -47,12 +46,12 @@ def by_geometry(
 
     The costly rule, which pushes the pose, is asked for only where the pose may be accepted otherwise.
     """
-    if is_loose(uncertainty, config.rules):
-        return Refusal(RegistrationStatus.DEGENERATE, _what_is_loose(uncertainty))
-    if is_matched(candidates, config.rules):
+    if has_unobserved_motion(uncertainty, config.rules):
+        return Refusal(RegistrationStatus.DEGENERATE, _what_is_not_observed(uncertainty))
+    if has_equal_rival(candidates, config.rules):
         return Refusal(RegistrationStatus.AMBIGUOUS, _which_rival(candidates, source))
     is_worth_it = probability >= config.worth_checking
-    if is_worth_it and can_be_pushed(fit, source, target, config.verification, config.num_threads, config.rules):
+    if is_worth_it and can_be_pushed(fit, source, target, config):
         return Refusal(
             RegistrationStatus.DEGENERATE,
             "a pose a few mm away fits as well: the observed surface is flat or straight",
@@ -81,7 +80,7 @@ def asking_the_unit(refusal: Refusal, source: Array, target: Array) -> Refusal:
     return Refusal(refusal.status, f"{refusal.reason}; {sizes}: is the cloud in {unit}?")
 
 
-def by_size(features: Mapping[str, float], rules: RulesConfig = DEFAULT) -> Refusal | None:
+def by_size(features: Mapping[str, float], rules: RulesConfig) -> Refusal | None:
     """Why the source is not of this bone but of a larger or smaller one; None when its size agrees.
 
     Args:
@@ -94,7 +93,7 @@ def by_size(features: Mapping[str, float], rules: RulesConfig = DEFAULT) -> Refu
     return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: is it of this bone, and is its scale right?")
 
 
-def by_growth(log_ratio: float, rules: RulesConfig = DEFAULT) -> Refusal | None:
+def by_growth(log_ratio: float, rules: RulesConfig) -> Refusal | None:
     """Why the source is larger or smaller than this bone's; None where it fits no better grown or shrunk.
 
     Args:
@@ -107,7 +106,7 @@ def by_growth(log_ratio: float, rules: RulesConfig = DEFAULT) -> Refusal | None:
     return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: is it of this bone, and is its scale right?")
 
 
-def by_mirror(log_ratio: float, rules: RulesConfig = DEFAULT) -> Refusal | None:
+def by_mirror(log_ratio: float, rules: RulesConfig) -> Refusal | None:
     """Why the source is of the other side of the body, or flipped; None where its mirror image fits no better.
 
     Args:
@@ -134,8 +133,7 @@ def by_threshold(
     """
     if not probability >= config.min_confidence:
         worst, asked = words.against(contributions or {}), f"{config.min_confidence:g} is asked for"
-        digits = 6 if round(probability, 2) >= config.min_confidence else 2  # enough to be less than what is asked for
-        reason = f"the best pose is right with a probability of only {probability:.{digits}f}, {asked}"
+        reason = f"the best pose is right with a probability of only {confidence_text(probability)}, {asked}"
         return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}; against it: {worst}" if worst else reason)
     if config.max_tre_mm > 0.0 and not tre95_mm <= config.max_tre_mm:
         reason = f"the error over the bone is below {tre95_mm:.1f} mm (95 %), allowed are {config.max_tre_mm:g} mm"
@@ -143,7 +141,7 @@ def by_threshold(
     return None
 
 
-def is_matched(candidates: Candidates, rules: RulesConfig = DEFAULT) -> bool:
+def has_equal_rival(candidates: Candidates, rules: RulesConfig) -> bool:
     """True when a distinct pose explains the source as well as the best one.
 
     The limits are those of mean squares in mm^2; the scores of a camera's cloud, which are none, are held to them too.
@@ -152,7 +150,7 @@ def is_matched(candidates: Candidates, rules: RulesConfig = DEFAULT) -> bool:
     return len(scores) > 1 and bool(scores[1] < _as_good(scores[0], rules))
 
 
-def is_loose(uncertainty: PoseUncertainty, rules: RulesConfig = DEFAULT) -> bool:
+def has_unobserved_motion(uncertainty: PoseUncertainty, rules: RulesConfig) -> bool:
     """True when a direction of motion is not observed: a spin about a shaft, a slide along it."""
     turn_deg, shift_mm = uncertainty.largest_turn_deg, uncertainty.largest_shift_mm
     return turn_deg > rules.largest_turn_deg or shift_mm > rules.largest_shift_mm
@@ -162,22 +160,22 @@ def can_be_pushed(
     fit: Fit,
     source: PreparedSource,
     target: PreparedTarget,
-    config: VerificationConfig,
-    num_threads: int = 0,
-    rules: RulesConfig = DEFAULT,
+    config: RegistrarConfig,
 ) -> bool:
     """True when the pose, pushed along its least certain motions, rests elsewhere and explains the source as well.
 
     A hypothesis in a flat valley stays where it began, so none of the others shows that the valley is there; and what
     the surface elements of a plane seem to say about a slide is the noise of their normals.
     """
-    some = source.subset(config.middle_points)
-    pushes = _weakest_motions(fit, rules.pushed_motions) * rules.push * config.same_pose_mm
+    rules, verification = config.rules, config.verification
+    some = source.subset(verification.middle_points)
+    pushes = _weakest_motions(fit, rules.pushed_motions) * rules.push * verification.same_pose_mm
     centre = fit.moved.mean(axis=0)
     poses = np.array([fit.T, *(se3.exp(sign * push, centre) @ fit.T for push in pushes for sign in (1.0, -1.0))])
-    rested, scores = refine_many(poses, some, target, np.linspace(*config.final_limits_mm), num_threads)
+    limits_mm = np.linspace(*verification.final_limits_mm)
+    rested, scores = refine_many(poses, some, target, limits_mm, config.num_threads)
     apart = np.array([se3.rms_apart_mm(T, rested[0], some) for T in rested])
-    elsewhere = apart >= config.same_pose_mm
+    elsewhere = apart >= verification.same_pose_mm
     return bool((scores[elsewhere] < _as_good(scores[0], rules)).any())
 
 
@@ -192,19 +190,14 @@ def _as_good(score: float, rules: RulesConfig) -> float:
 
 def _weakest_motions(fit: Fit, count: int) -> Array:
     """(count, 6) twists about the moved source's centroid, of 1 mm over it, that the residuals say least about."""
-    J = fit.jacobian
-    arm_mm = max(_rms_mm(fit.moved - fit.moved.mean(axis=0)), 1.0)
-    scale = np.array([1.0] * 3 + [1.0 / arm_mm] * 3)
+    J, offsets = fit.jacobian, fit.moved - fit.moved.mean(axis=0)
+    scale = np.repeat([1.0, 1.0 / extent.radius_mm(fit.moved)], 3)
     motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:count] * scale
-    offsets = fit.moved - fit.moved.mean(axis=0)
-    return motions / np.array([[max(_rms_mm(each[:3] + np.cross(each[3:], offsets)), 1e-6)] for each in motions])
+    sizes_mm = [np.linalg.norm(each[:3] + np.cross(each[3:], offsets)) / np.sqrt(len(offsets)) for each in motions]
+    return motions / np.maximum(sizes_mm, 1e-6)[:, None]
 
 
-def _rms_mm(vectors: Array) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
-
-
-def _what_is_loose(uncertainty: PoseUncertainty) -> str:
+def _what_is_not_observed(uncertainty: PoseUncertainty) -> str:
     turn = _known(uncertainty.largest_turn_deg, HALF_TURN_DEG, "deg")
     shift = _known(uncertainty.largest_shift_mm, EXTENT_LIMITS_MM[1], "mm")
     return (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.config import SensorConfig
 from gapr_core.registration.target import PreparedTarget
@@ -35,6 +36,11 @@ class Errors:
     along_beam: bool = False
     tracking_mm: float = 0.0
     tracking_deg: float = 0.0
+
+    @property
+    def place_covariance(self) -> NDArray[np.float64]:
+        """(6, 6) covariance of the whole cloud's place, x y z (mm) rx ry rz (rad), about its centroid."""
+        return np.diag(np.repeat(np.square([self.tracking_mm, np.radians(self.tracking_deg)]), 3))
 
 
 LEAST_STANDOFF_MM = 0.1  # standard deviation: that of the surest kind

@@ -20,7 +20,6 @@ from gapr_core.registration.refinement import refine_many
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 
-LIES_OFF = "fits best on a surface"
 BETTER = 0.15  # log of mean squares: refused sources without a stand-off hardly fit better by more
 MUCH_BETTER = 0.3  # the same, of a pose that is refused for it: answers to sources on the bone reach 0.23
 FIRST_MM = (-3.0, 3.0)  # unless one of these is better than none, no other is tried
@@ -36,7 +35,8 @@ def asking_the_standoff(
     A cloud that a camera saw is not asked: most of it may not be bone. Nor is one that `unless_off_the_bone` refused.
     """
     a = assessment
-    if result.status is not RegistrationStatus.LOW_CONFIDENCE or a.seen is not None or LIES_OFF in result.reason:
+    is_asked = a.refusal is not None and a.refusal.asks_standoff
+    if result.status is not RegistrationStatus.LOW_CONFIDENCE or a.seen is not None or is_asked:
         return result
     found_mm = better_mm(assessment, config)
     if found_mm is None:
@@ -67,9 +67,11 @@ def unless_off_the_bone(assessment: Assessment, config: RegistrarConfig) -> Asse
     if best_mm not in FAR_MM or log_ratio >= -MUCH_BETTER:
         return a
     off_mm = a.target.offset_mm + best_mm
-    reason = f"the source {LIES_OFF} about {abs(off_mm):g} mm {'outside' if off_mm > 0.0 else 'inside'} of the bone"
+    side = "outside" if off_mm > 0.0 else "inside"
+    reason = f"the source fits best on a surface about {abs(off_mm):g} mm {side} of the bone"
     how = "is it tissue, is the radius of the tip subtracted, or is there a standoff_mm to state?"
-    return a.with_refusal(Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {how}"), config.rules)
+    refusal = Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {how}", asks_standoff=True)
+    return a.with_refusal(refusal, config.rules)
 
 
 def _misfits_mm2(assessment: Assessment, tried_mm: Sequence[float], config: RegistrarConfig) -> dict[float, float]:

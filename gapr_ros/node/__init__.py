@@ -11,7 +11,7 @@ The way of one cloud, from bytes to messages:
     course         decides whether the pose goes out: resets, limits, order of time, jumps (track)
     publishers     sends what became of it (messages), and to /tf (frames)
 
-`touches` are the other way in: points that a pointer touched, which check the pose that stands.
+`check_points` are the other way in: points that a pointer touched, which check the pose that stands.
 `lifecycle` is the node itself: states, parameters, clock. `loader` reads bones in another thread (model, method).
 `reporter` sends /diagnostics (diagnostics). Files do not call the node, but the six members of `host`.
 `parameter_files` finds those of the command line that are for other nodes.

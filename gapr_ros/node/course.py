@@ -13,7 +13,7 @@ from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.region import Place
 from gapr_ros.node.registration import check_limits
-from gapr_ros.node.situation import Seed
+from gapr_ros.node.situation import InitialPose
 from gapr_ros.node.timeline import Timeline
 from gapr_ros.node.track import Track
 from gapr_ros.parameters import NodeParameters
@@ -28,14 +28,14 @@ class Course:
         timeline: admits clouds.
         epoch: the clouds of earlier ones are refused.
         oldest: first epoch of the clouds that may be registered together with new ones.
-        seed: a pose from outside, where registrations start until one is accepted.
+        initial_pose: a pose from outside, where registrations start until one is accepted.
         why: the last epoch ended.
     """
 
     def __init__(self) -> None:
         self.timeline = Timeline()
         self.epoch, self.oldest = 0, 0
-        self.seed: Seed | None = None
+        self.initial_pose: InitialPose | None = None
         self.why = ""
         self._track = Track()
 
@@ -44,15 +44,15 @@ class Course:
         """Where the bone was with the last cloud; None where that says nothing of the next one."""
         return self._track.place
 
-    def begin_again(self, why: str, seed: Seed | None = None) -> None:
+    def begin_again(self, why: str, initial_pose: InitialPose | None = None) -> None:
         """Forget the track; clouds on their way will be refused, and none before is registered with new ones.
 
-        With a seed, whose frame may never come, jumps are still measured against the poses before it until a good pose
-        was found from there.
+        With an initial pose, whose frame may never come, jumps are still measured against the poses before it until a
+        good pose was found from there.
         """
         self.refuse_all(why)
-        self.oldest, self.seed = self.epoch, seed
-        if seed is None:
+        self.oldest, self.initial_pose = self.epoch, initial_pose
+        if initial_pose is None:
             self._track.clear()
 
     def refuse_all(self, why: str) -> None:
@@ -100,8 +100,8 @@ class Course:
         header, points_m = outcome.header, wire.to_metres(model.points_mm)
         self.timeline.check_answer(T_frame_model, header, points_m)
         cloud = timeline.stamp_ns(header) or hash(outcome.job.cloud)  # while no clock runs
-        if outcome.seeded:
+        if outcome.has_initial_pose:
             self._track.forget_accepted()
         self._track.judge(T_frame_model, header.frame_id, points_m.mean(axis=0), cloud, parameters)
         self.timeline.note_answer(T_frame_model, header)
-        self.seed = None
+        self.initial_pose = None

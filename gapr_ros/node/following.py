@@ -35,7 +35,7 @@ class Following:
     def _may_follow(self, now: Situation) -> bool:
         """Whether it is the turn of a cloud that is followed, and the last one that was assessed is known."""
         its_turn = self._row + 1 < now.parameters.assess_every
-        return its_turn and now.seed is None and now.place is not None and not why_all_assessed(now.parameters)
+        return its_turn and now.initial_pose is None and now.place is not None and not why_all_assessed(now.parameters)
 
 
 def continues(place: Place | None, T_frame_model: Array, frame: str, model: Model, parameters: NodeParameters) -> bool:

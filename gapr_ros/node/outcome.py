@@ -47,7 +47,7 @@ class Outcome:
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
         tre_mm, tre95_mm, inlier_ratio: of the registration.
         result: its whole answer; None where it was not asked.
-        seeded: the registration began at a pose from outside.
+        has_initial_pose: the registration began at a pose from outside.
         found_by: how far the registration had to look: track, network, search, or scene with a viewpoint.
         tf_wait_s: of it, how long transforms were waited for.
         exec_ms: wall time of the whole way.
@@ -69,7 +69,7 @@ class Outcome:
     tre95_mm: float | None = None
     result: RegistrationResult | None = None
     inlier_ratio: float = 0.0
-    seeded: bool = False
+    has_initial_pose: bool = False
     found_by: str = ""
     tf_wait_s: float = 0.0
     exec_ms: float = 0.0

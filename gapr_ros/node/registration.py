@@ -21,11 +21,11 @@ from gapr_ros.node.collection import Late, forget
 from gapr_ros.node.following import Following
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.guard import describe
+from gapr_ros.node.initial_pose import InitialPoses
 from gapr_ros.node.outcome import Found, Outcome
 from gapr_ros.node.refusal import OF_STATUS, Reason, RefusedError
 from gapr_ros.node.region import Crop
-from gapr_ros.node.seeding import Seeding
-from gapr_ros.node.situation import Seed, Situation
+from gapr_ros.node.situation import InitialPose, Situation
 from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NO_FRAME, NodeParameters
 from msg_adapters import INPUTS
@@ -41,14 +41,14 @@ class Registration:
     Args:
         frames: look-up of transforms.
         situation: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
-            when there is a seed, and with `accumulate` there are `collect` and `collected` as `Accumulator` has them.
+            when there is such a pose, and with `accumulate` it has `collect` and `collected` as an `Accumulator`.
         left: is called for every cloud of `collect`, now or later: whether it was collected, and why not.
     """
 
     def __init__(self, frames: Frames, situation: Callable[[], Situation], left: Callable[[bool, str], None]) -> None:
         self._frames, self._situation = frames, situation
         self._late = Late(self._collect, left)
-        self._following, self._seeding = Following(), Seeding()
+        self._following, self._initial_poses = Following(), InitialPoses()
         self._pushed_out: Job | None = None
         self._frame = ""  # of the last answer; what the method remembers holds there only
 
@@ -141,9 +141,9 @@ class Registration:
         self._frame = frame
 
     def _register(self, points_mm: Array, outcome: Outcome, now: Situation) -> RegistrationResult:
-        initial = self._seeding.start(now.seed, partial(self._initial, outcome=outcome, now=now))
-        outcome.seeded = initial is not None
-        options = {"initial": initial} if outcome.seeded else {}
+        initial = self._initial_poses.start(now.initial_pose, partial(self._initial, outcome=outcome, now=now))
+        outcome.has_initial_pose = initial is not None
+        options = {"initial": initial} if outcome.has_initial_pose else {}
         viewpoint_mm = self._viewpoint_mm(outcome, now)
         if viewpoint_mm is not None:
             options["viewpoint"] = viewpoint_mm
@@ -153,11 +153,11 @@ class Registration:
         outcome.tre_mm, outcome.tre95_mm = result.tre_mm, result.tre95_mm
         return result
 
-    def _initial(self, seed: Seed, outcome: Outcome, now: Situation) -> Array:
-        """The seed as T_target_source, mm, the source being in the frame of the answer."""
-        T_seed_cloud = self._lookup(seed.frame, outcome, now)
+    def _initial(self, given: InitialPose, outcome: Outcome, now: Situation) -> Array:
+        """The pose as T_target_source, mm, the source being in the frame of the answer."""
+        T_given_cloud = self._lookup(given.frame, outcome, now)
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
-        return wire.core_pose(T_frame_cloud @ se3.inverse(T_seed_cloud) @ seed.T_frame_model)
+        return wire.core_pose(T_frame_cloud @ se3.inverse(T_given_cloud) @ given.T_frame_model)
 
     def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:
         """(3,) where the camera was, in the frame of the answer; None where it is not known, or not one place."""

@@ -117,7 +117,7 @@ class Services:
 
     @answering
     async def reset(self, _: Trigger.Request) -> tuple[bool, str]:
-        """Forget the track, the seed, all clouds so far and the latched pose."""
+        """Forget the track, the initial pose, all clouds so far and the latched pose."""
         self._session().reset()
         self._host.ros.get_logger().info("reset: the track is forgotten")
         return True, "the track is forgotten; clouds on their way will be refused"

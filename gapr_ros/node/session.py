@@ -2,7 +2,7 @@
 
 What an interruption forgets; all but the last two refuse the clouds that are on their way:
 
-| event | collection | row of good poses | limits on jumps | seed | last cloud, for `~/register` | latched pose |
+| event | collection | row of good poses | limits on jumps | initial pose | last cloud (`~/register`) | latched pose |
 |---|---|---|---|---|---|---|
 | reset, another clock or bone | forgotten | ends | off until a pose | none | outdated | withdrawn |
 | `initialpose` | forgotten | ends | stay until a good pose | the new one | stays | stays |
@@ -24,7 +24,7 @@ from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 
 from gapr_core.results import PointCheck
-from gapr_ros.node import intake, timeline, touches
+from gapr_ros.node import check_points, intake, timeline
 from gapr_ros.node.admission import CLOCK_CHANGED, CLOCK_WENT_BACK, STAMPS_WENT_BACK, Admission
 from gapr_ros.node.changes import Changes
 from gapr_ros.node.collection import forget
@@ -40,7 +40,7 @@ from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.registration import Registration, needs_frames
 from gapr_ros.node.shared_frame import SharedFrame
 from gapr_ros.node.shared_name import SharedName
-from gapr_ros.node.situation import Seed, Situation
+from gapr_ros.node.situation import InitialPose, Situation
 from gapr_ros.node.worker import Job, Worker
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
@@ -129,7 +129,7 @@ class Session:
     def _accumulates(self) -> bool:
         return self._host.parameters.accumulate > 1
 
-    def take_seed(self, message: PoseWithCovarianceStamped) -> None:
+    def take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
         try:
             T_frame_model = pose_to_matrix(message)
@@ -143,20 +143,20 @@ class Session:
         self._guesses += 1
         often = f", {self._guesses} came since the last answer: send one guess, not a stream of them"
         why = "an initialpose" + (often if self._guesses >= STREAM_AFTER else "")
-        self._begin_again(why, Seed(T_frame_model, frame))
+        self._begin_again(why, InitialPose(T_frame_model, frame))
         if frame:
             self._frames.listen()
 
-    def take_touches(self, message: PoseArray) -> None:
+    def take_check_points(self, message: PoseArray) -> None:
         """Touched points, which check the last accepted pose: what they say goes out, and the pose stays."""
         found: PointCheck | str
         try:
-            found = touches.check(message, self._standing, self._ready, self._host.parameters)
-        except touches.NothingToCheckError as error:
+            found = check_points.check(message, self._standing, self._ready, self._host.parameters)
+        except check_points.NothingToCheckError as error:
             found = str(error)
             self._host.ros.get_logger().warning(f"nothing was checked: {found}")
         name = self._host.ros.get_fully_qualified_name()
-        self._publishers.send_check(touches.status(message, found, name, self.model.file))
+        self._publishers.send_check(check_points.status(message, found, name, self.model.file))
 
     def _is_future(self, stamp_ns: int) -> bool:
         """Of a transform."""
@@ -180,10 +180,8 @@ class Session:
 
     def _situation(self) -> Situation:
         host, ready, course = self._host, self._ready, self.course
-        since = course.epoch, course.oldest
-        return Situation(
-            ready.method, ready.model, host.parameters, *since, course.why, course.seed, course.place, host.now_ns()
-        )
+        since = course.epoch, course.oldest, course.why, course.initial_pose, course.place
+        return Situation(ready.method, ready.model, host.parameters, *since, host.now_ns())
 
     def _renew_method(self) -> None:
         """Before the next cloud, which may wait already: it is not registered by the limits of before."""
@@ -244,7 +242,7 @@ class Session:
     # --- state ---
 
     def reset(self) -> None:
-        """Forget track, seed, all clouds so far, their stamps on /tf too, and the pose that late listeners get."""
+        """Forget track, initial pose, all clouds so far, their stamps on /tf, and the pose that late listeners get."""
         self._admission.forget()
         self._clear("a reset")
 
@@ -327,8 +325,8 @@ class Session:
         self._host.counters.dropped += waiting is not None
         self._forget_clouds(why)
 
-    def _begin_again(self, why: str, seed: Seed | None = None) -> None:
-        self.course.begin_again(why, seed)
+    def _begin_again(self, why: str, initial_pose: InitialPose | None = None) -> None:
+        self.course.begin_again(why, initial_pose)
         self._forget_clouds(why)
 
     def _forget_clouds(self, why: str) -> None:

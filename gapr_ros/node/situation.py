@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Seed:
+class InitialPose:
     """A pose that somebody gave: T_frame_model (4, 4), metres, in `frame` (empty: that of the cloud)."""
 
     T_frame_model: Array
@@ -36,6 +36,6 @@ class Situation:
     epoch: int
     oldest: int
     why: str
-    seed: Seed | None
+    initial_pose: InitialPose | None
     place: Place | None
     now_ns: int

@@ -19,7 +19,7 @@ from gapr_ros.node.host import Host
 from gapr_ros.node.session import Session
 from msg_adapters import INPUTS
 
-CLOUDS, SEEDS, TOUCHES = "points", "initialpose", "check_points"
+CLOUDS, INITIAL_POSES, CHECK_POINTS = "points", "initialpose", "check_points"
 LOOK_S = 1.0  # between two looks at who publishes
 GRACE_S = 3.0  # the graph may know of a publisher later than the event of its QoS
 MOST_QUEUED = 100  # clouds in the middleware's queue
@@ -42,8 +42,10 @@ class Subscriptions:
         self._needed_at = 0.0
         first = ReliabilityPolicy.BEST_EFFORT if self._asked == "best_effort" else ReliabilityPolicy.RELIABLE
         self._clouds, self._second = self._subscribe(first), None
-        self._seeds = host.ros.create_subscription(PoseWithCovarianceStamped, SEEDS, self._on_seed, 1)
-        self._touches = host.ros.create_subscription(PoseArray, TOUCHES, self._on_touches, 10)
+        self._initial_poses = host.ros.create_subscription(
+            PoseWithCovarianceStamped, INITIAL_POSES, self._on_initial_pose, 1
+        )
+        self._check_points = host.ros.create_subscription(PoseArray, CHECK_POINTS, self._on_check_points, 10)
         self._looking = host.ros.create_timer(LOOK_S, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def describe(self) -> Input:
@@ -59,7 +61,7 @@ class Subscriptions:
         for about in ("type", "publishers"):
             self._session.conflicts.note(about, "")
         self._host.ros.destroy_timer(self._looking)
-        for subscription in (self._clouds, self._second, self._seeds, self._touches):
+        for subscription in (self._clouds, self._second, self._initial_poses, self._check_points):
             if subscription is not None:
                 self._host.ros.destroy_subscription(subscription)
 
@@ -112,12 +114,12 @@ class Subscriptions:
         return False
 
     @guarded
-    def _on_seed(self, message: PoseWithCovarianceStamped) -> None:
-        self._session.take_seed(message)
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._session.take_initial_pose(message)
 
     @guarded
-    def _on_touches(self, message: PoseArray) -> None:
-        self._session.take_touches(message)
+    def _on_check_points(self, message: PoseArray) -> None:
+        self._session.take_check_points(message)
 
     @guarded
     def _on_mismatch(self, event: Any) -> None:

@@ -83,7 +83,7 @@ class Worker:
             if newest is None or newest.epoch < self._oldest:
                 return False
             if self._slot is None:
-                self._slot = Job(newest.cloud, epoch, newest.received_ns)
+                self._slot = Job(newest.cloud, epoch, newest.received_ns, arrived_s=newest.arrived_s)
             self._slot.epoch, self._slot.urgent = epoch, True
             self._slot.waiters.append(waiter)
             self._wake.notify()

@@ -53,7 +53,9 @@ def prose_of_code(path):
         )
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value.strip():
-            text = re.sub(r"`[^`\n]+`|^ *[\w, *]+: (?=\S)", "", node.value, flags=re.MULTILINE)  # names of arguments go
+            text = re.sub(
+                r"`[^`\n]+`|^ *\*{0,2}\w+(?:, \*{0,2}\w+)*: (?=\S)", "", node.value, flags=re.MULTILINE
+            )  # names of arguments go
             yield from enumerate(text.splitlines(), start=node.lineno)
 
 

@@ -20,7 +20,7 @@ def test_a_refusal_keeps_what_is_looked_at_and_nothing_that_goes_with_a_pose():
 
 @pytest.mark.parametrize(
     ("confidence", "text"),
-    [(0.9964, "0.99"), (0.8999, "0.89"), (0.29, "0.29"), (0.57, "0.57"), (1.0, "1.00"), (0.0, "0.00")],
+    [(0.9964, "0.99"), (0.8999, "0.89"), (0.29, "0.29"), (0.57, "0.57"), (1.0, "1.00"), (0.0, "0.00"), (np.nan, "nan")],
 )
 def test_no_confidence_is_shown_larger_than_it_is(confidence, text):
     assert confidence_text(confidence) == text

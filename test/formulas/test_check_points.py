@@ -12,6 +12,7 @@ from tiny import ellipsoid, on_ellipsoid, plane
 from gapr_core.config import CovarianceConfig, RegistrarConfig, SensorConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration import check_points as module
 from gapr_core.registration import precision
 from gapr_core.registration.check_points import check_points as check
@@ -130,7 +131,7 @@ def test_the_next_point_is_where_another_one_lowers_what_is_unseen_most():
     def left_mm(place, normal):
         J = np.vstack([before, np.hstack([normal, np.cross(place - result.centre_mm, normal)])])
         covariance = np.linalg.inv(loose + J.T @ J / 0.3**2)
-        return precision.expected_mm(covariance, target.points, result.centre_mm)
+        return predicted_rmse_mm(covariance, target.points, result.centre_mm)
 
     left = [left_mm(*each) for each in zip(target.points, target.normals, strict=True)]
     best = int(np.argmin(left))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration import precision
 
 
@@ -18,7 +19,7 @@ def test_the_expected_error_and_its_bound_are_those_of_drawn_poses():
     twists = rng.multivariate_normal(np.zeros(6), covariance, 10_000)
     moves = twists[:, None, :3] + np.cross(twists[:, None, 3:], (points - centre)[None])
     errors = np.sqrt((moves**2).sum(axis=2).mean(axis=1))
-    assert precision.expected_mm(covariance, points, centre) == pytest.approx(np.sqrt((errors**2).mean()), rel=0.03)
+    assert predicted_rmse_mm(covariance, points, centre) == pytest.approx(np.sqrt((errors**2).mean()), rel=0.03)
     assert precision.bound_mm(covariance, points, centre) == pytest.approx(np.quantile(errors, 0.95), rel=0.05)
 
 

@@ -19,7 +19,9 @@ from gapr_core.registration.verification import Candidates
 from gapr_core.results import RegistrationStatus
 
 CONFIG = RegistrarConfig(num_threads=1)
-PUSHED = VerificationConfig(middle_points=60, final_limits_mm=(5.0, 4.0, 5), same_pose_mm=2.0)
+PUSHED = replace(
+    CONFIG, verification=VerificationConfig(middle_points=60, final_limits_mm=(5.0, 4.0, 5), same_pose_mm=2.0)
+)
 
 
 def uncertainty(shift_mm=0.1, turn_deg=0.1):
@@ -81,7 +83,7 @@ def test_a_direction_that_is_not_observed_refuses_alone(egg, shift_mm, turn_deg,
 
 
 def test_a_motion_that_is_just_known_well_enough_does_not_refuse():
-    assert not rules.is_loose(SimpleNamespace(largest_turn_deg=6.0, largest_shift_mm=5.0))
+    assert not rules.has_unobserved_motion(SimpleNamespace(largest_turn_deg=6.0, largest_shift_mm=5.0), CONFIG.rules)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,7 @@ def test_a_motion_that_is_just_known_well_enough_does_not_refuse():
 )  # fmt: skip
 def test_a_rival_within_the_roughness_or_within_a_share_refuses_alone(egg, scores, matched):
     refusal = judged(egg, candidates(*scores), uncertainty())
-    assert rules.is_matched(candidates(*scores)) is matched
+    assert rules.has_equal_rival(candidates(*scores), CONFIG.rules) is matched
     assert (refusal is not None) is matched
     if refusal:
         assert refusal.status is RegistrationStatus.AMBIGUOUS and "30 mm and 0 deg away" in refusal.reason
@@ -99,7 +101,7 @@ def test_a_rival_within_the_roughness_or_within_a_share_refuses_alone(egg, score
 
 @pytest.mark.parametrize(("scale_z", "refused"), [(2.99, False), (3.0, False), (3.01, True)])
 def test_a_source_of_another_size_refuses_alone(scale_z, refused):
-    refusal = rules.by_size({"scale_z": scale_z})
+    refusal = rules.by_size({"scale_z": scale_z}, CONFIG.rules)
     assert (refusal is not None) is refused
     if refusal:
         assert refusal.status is RegistrationStatus.LOW_CONFIDENCE
@@ -108,7 +110,7 @@ def test_a_source_of_another_size_refuses_alone(scale_z, refused):
 
 @pytest.mark.parametrize(("log_ratio", "refused"), [(-0.011, True), (-0.01, False), (0.0, False), (1.0, False)])
 def test_a_source_whose_mirror_image_fits_better_refuses_alone(log_ratio, refused):
-    refusal = rules.by_mirror(log_ratio)
+    refusal = rules.by_mirror(log_ratio, CONFIG.rules)
     assert (refusal is not None) is refused
     if refusal:
         assert refusal.status is RegistrationStatus.LOW_CONFIDENCE
@@ -136,7 +138,7 @@ def test_a_pose_that_can_be_pushed_refuses_alone_where_it_would_be_accepted(egg,
     monkeypatch.setattr(rules, "can_be_pushed", lambda *args: asked.append(args) or True)
     refusal = judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.5)
     assert refusal.status is RegistrationStatus.DEGENERATE and "flat or straight" in refusal.reason
-    assert asked[0][3] is CONFIG.verification
+    assert asked[0][3] is CONFIG
     assert judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.24) is None and len(asked) == 1
     streamed = judged(egg, candidates(1.0, 2.0), uncertainty(), probability=0.26)  # a stream may raise it to 0.51
     assert streamed.status is RegistrationStatus.DEGENERATE
@@ -150,7 +152,7 @@ def test_a_pose_that_can_be_pushed_refuses_alone_where_it_would_be_accepted(egg,
 def test_a_pose_on_a_plane_stays_where_it_is_pushed_and_one_on_an_egg_comes_back(plate, egg):
     for case, pushed in ((plate, True), (egg, False)):
         fit, source, target = case
-        assert rules.can_be_pushed(fit, source, target, PUSHED, 1) is pushed
+        assert rules.can_be_pushed(fit, source, target, PUSHED) is pushed
 
 
 def test_a_push_goes_both_ways_along_the_weakest_motions_by_its_length(plate, monkeypatch):
@@ -162,12 +164,14 @@ def test_a_push_goes_both_ways_along_the_weakest_motions_by_its_length(plate, mo
         return poses, np.r_[1.0, np.full(len(poses) - 1, 5.0)]
 
     monkeypatch.setattr(rules, "refine_many", note)
-    assert not rules.can_be_pushed(fit, source, target, PUSHED, 1)  # all are worse
+    assert not rules.can_be_pushed(fit, source, target, PUSHED)  # all are worse
     ((poses, points, limits),) = seen
     assert len(poses) == 1 + 2 * 3 and tuple(limits) == (5.0, 4.75, 4.5, 4.25, 4.0)
-    assert len(points) == PUSHED.middle_points and np.array_equal(poses[0], fit.T)
+    assert len(points) == PUSHED.verification.middle_points and np.array_equal(poses[0], fit.T)
     moves = np.array([se3.apply(T, source.points) - fit.moved for T in poses[1:]])
-    assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(1.5 * PUSHED.same_pose_mm, rel=0.02)
+    assert np.sqrt((moves**2).sum(axis=2).mean(axis=1)) == pytest.approx(
+        1.5 * PUSHED.verification.same_pose_mm, rel=0.02
+    )
     assert moves[0] == pytest.approx(-moves[1], abs=0.4)
 
 
@@ -185,7 +189,7 @@ def test_only_a_pose_that_rests_elsewhere_and_fits_as_well_is_a_push(plate, monk
         return rested, scores
 
     monkeypatch.setattr(rules, "refine_many", rest)
-    assert rules.can_be_pushed(fit, source, target, PUSHED, 1) is pushed
+    assert rules.can_be_pushed(fit, source, target, PUSHED) is pushed
 
 
 def test_the_weakest_motions_of_a_plane_lie_in_it_and_move_the_source_by_1_mm(plate):

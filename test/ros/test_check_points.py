@@ -17,7 +17,7 @@ from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import touches
+from gapr_ros.node import check_points
 from gapr_ros.node.method import configured
 from gapr_ros.node.model import Ready, load_model
 from gapr_ros.parameters import NodeParameters
@@ -118,7 +118,7 @@ def test_touched_points_are_a_pointers_whatever_the_clouds_are_and_a_stand_off_i
     parameters = NodeParameters(sensor=sensor, standoff=standoff)
     of_method = Registrar(configured(RegistrarConfig(), parameters))
     for method in (of_method, SimpleNamespace()):  # the other one has no settings
-        config = touches._config(method, parameters)
+        config = check_points._config(method, parameters)
         assert (config.sensor.kind, config.sensor.standoff_mm) == ("pointer", usual_mm)
 
 
@@ -127,10 +127,10 @@ def test_touched_points_are_a_pointers_whatever_the_clouds_are_and_a_stand_off_i
 def test_touched_points_err_by_what_the_settings_file_says_of_the_pointer_and_of_the_bone(of):
     """A right pose with a pointer that is known to be noisy was called contradicted."""
     said = RegistrarConfig(sensor=SensorConfig(kind="pointer", noise_mm=2.0), covariance=CovarianceConfig(model_mm=1.5))
-    found = touches._config(of(said), NodeParameters(sensor="pointer"))
+    found = check_points._config(of(said), NodeParameters(sensor="pointer"))
     assert (found.sensor, found.covariance) == (said.sensor, said.covariance)
     lasers = replace(said, sensor=SensorConfig(kind="laser", noise_mm=0.1))
-    found = touches._config(of(lasers), NodeParameters(sensor="laser"))
+    found = check_points._config(of(lasers), NodeParameters(sensor="laser"))
     assert (found.sensor, found.covariance.model_mm) == (SensorConfig(kind="pointer"), 1.5)
 
 
@@ -147,5 +147,5 @@ def test_the_node_gives_check_points_the_settings_of_its_method(bone):
     for config in (noisy, usual):
         method = Registrar(config)
         ready = Ready(method, load_model(method, parameters), parameters)
-        verdicts.append(touches.check(message, stands, ready, parameters).verdict)
+        verdicts.append(check_points.check(message, stands, ready, parameters).verdict)
     assert verdicts == ["HOLDS", "CONTRADICTED"]

@@ -218,7 +218,7 @@ def test_nor_in_another_frame_nor_after_a_guess(watch):
     assert live.heard(2) == [11, 13]
     wait_until(live.client.seeds.get_subscription_count)
     live.client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="other")))
-    wait_until(lambda: live.node.session.course.seed)
+    wait_until(lambda: live.node.session.course.initial_pose)
     live.send(14, frame="other")
     live.send(15, frame="other")
     assert live.heard(3) == [11, 13, 15] and live.method.calls[-1]["initial"] is not None

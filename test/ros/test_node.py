@@ -551,7 +551,7 @@ def test_a_waiting_cloud_is_registered_with_a_seed_that_came_after_it(blob_path,
         wait_until(lambda: node.counters.received == 1 and client.seeds.get_subscription_count())
         seed = PoseWithCovarianceStamped(header=Header(frame_id="probe"))
         client.seeds.publish(seed)
-        wait_until(lambda: node.session.course.seed)
+        wait_until(lambda: node.session.course.initial_pose)
         assert client.call("register").success
         np.testing.assert_allclose(method.calls[-1]["initial"], np.eye(4), atol=1e-12)
 
@@ -690,7 +690,7 @@ def test_who_sends_a_stream_of_guesses_learns_why_no_pose_comes(live):
     )
     assert client.ask(GOOD)["level"] == 0
     client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="probe")))
-    wait_until(lambda: node.session.course.seed)
+    wait_until(lambda: node.session.course.initial_pose)
     assert node.session.course.why == "an initialpose", "after an answer they are counted from the start"
 
 

@@ -18,12 +18,12 @@ from std_srvs.srv import SetBool
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.surface import Surface
-from gapr_ros.node import diagnostics, seeding
+from gapr_ros.node import diagnostics, initial_pose
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.registration import Registration
-from gapr_ros.node.situation import Seed, Situation
+from gapr_ros.node.situation import InitialPose, Situation
 from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
@@ -325,7 +325,7 @@ def test_a_seed_in_a_frame_that_nobody_knows_is_named(live):
     seed = PoseWithCovarianceStamped(header=Header(frame_id="map"))
     wait_until(client.seeds.get_subscription_count)
     client.seeds.publish(seed)
-    wait_until(lambda: node.session.course.seed)
+    wait_until(lambda: node.session.course.initial_pose)
     expect_refusal(live, GOOD, Reason.TF_MISSING, "the initialpose is in map")
     client.call("reset")
     expect_good(live)
@@ -335,10 +335,10 @@ def test_a_seed_whose_frame_does_not_come_is_given_up_and_no_cloud_is_registered
     node, client, method = live
     wait_until(client.seeds.get_subscription_count)
     client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="map")))
-    wait_until(lambda: node.session.course.seed)
+    wait_until(lambda: node.session.course.initial_pose)
     registered = len(method.calls)
     expect_refusal(live, GOOD, Reason.TF_MISSING, "it is given up if that lasts 2 s")
-    time.sleep(seeding.PATIENCE_S)
+    time.sleep(initial_pose.PATIENCE_S)
     assert len(method.calls) == registered
     expect_good(live)
     assert [call["initial"] for call in method.calls[registered:]] == [None]
@@ -351,11 +351,11 @@ def test_a_jump_is_none_where_the_pose_was_found_from_a_seed_and_only_there(live
     expect_good(live)
     wait_until(client.seeds.get_subscription_count)
     client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id=frame)))
-    wait_until(lambda: node.session.course.seed)
+    wait_until(lambda: node.session.course.initial_pose)
     method.answer = accepted(pose_mm([0, 0, 0], [30.0, 0, 0]))
     if is_a_jump:
         assert client.ask(GOOD)["last_refusal"].startswith("tf_missing: the initialpose is in map")
-        time.sleep(seeding.PATIENCE_S)
+        time.sleep(initial_pose.PATIENCE_S)
         client.poses.clear()
         assert client.ask(GOOD)["last_refusal"].startswith("jump: moved 0.03 m") and not client.poses
     else:
@@ -369,29 +369,29 @@ def test_a_seed_in_the_bones_own_frame_changes_nothing(live):
     for frame in ("/bone_preop", ""):
         client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id=frame)))
         time.sleep(0.2)  # the node hears the newest one only
-    wait_until(lambda: node.session.course.seed)
+    wait_until(lambda: node.session.course.initial_pose)
     assert node.session.course.epoch == epoch + 1, "that of the second one"
 
 
 def test_a_seed_is_given_up_only_when_its_frame_is_missing_without_a_break(monkeypatch):
     now, there = [0.0], [False]
-    monkeypatch.setattr(seeding.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(initial_pose.time, "monotonic", lambda: now[0])
 
-    def find(seed):
+    def find(given):
         if there[0]:
-            return seed.T_frame_model
+            return given.T_frame_model
         raise RefusedError(Reason.TF_MISSING, "not there")
 
-    starts, seed = seeding.Seeding(), Seed(np.eye(4), "map")
+    starts, given = initial_pose.InitialPoses(), InitialPose(np.eye(4), "map")
     for seconds, comes in ((0.0, False), (1.9, False), (2.5, True), (2.6, False), (4.5, False), (5.0, True)):
         now[0], there[0] = seconds, comes
         if comes:
-            assert starts.start(seed, find) is seed.T_frame_model
+            assert starts.start(given, find) is given.T_frame_model
         else:
             with pytest.raises(RefusedError, match="the initialpose is in map: not there"):
-                starts.start(seed, find)
-    there[0], other = False, Seed(np.eye(4), "map")
-    for seconds, each in ((6.0, seed), (7.9, other)):  # another one has its own time
+                starts.start(given, find)
+    there[0], other = False, InitialPose(np.eye(4), "map")
+    for seconds, each in ((6.0, given), (7.9, other)):  # another one has its own time
         now[0] = seconds
         with pytest.raises(RefusedError):
             starts.start(each, find)
@@ -454,10 +454,10 @@ def test_neither_another_frame_nor_a_pause_takes_the_limit_of_jumps_away(live):
 def test_a_pause_does_not_forget_where_to_start(live):
     node, client, method = live
     client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="probe")))
-    wait_until(lambda: node.session.course.seed is not None)
+    wait_until(lambda: node.session.course.initial_pose is not None)
     for enabled in (False, True):
         assert client.call("set_enabled", SetBool.Request(data=enabled)).success
-    assert node.session.course.seed is not None
+    assert node.session.course.initial_pose is not None
 
 
 def test_a_pause_ends_the_row_of_good_poses(live):

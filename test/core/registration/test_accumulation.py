@@ -185,7 +185,7 @@ def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(re
     accumulator = Accumulator(registrar, most=9)
     accumulator._off_in_a_row, accumulator._new = [sources["x"]], [sources[name] for name in new]
     accumulator._lies_off = lambda points, *_: any(np.array_equal(points, sources[name]) for name in off)
-    found = accumulator._off_the_bone(np.eye(4), prepared)
+    found = accumulator._update_row_off_the_bone(np.eye(4), prepared)
     assert {source[0, 0] for source in found} == {sources[name][0, 0] for name in off}
     assert [source[0, 0] for source in accumulator._off_in_a_row] == [sources[name][0, 0] for name in row]
 
@@ -290,7 +290,7 @@ def test_a_source_of_few_points_is_judged_with_those_just_before_it(registrar, s
     collected = Accumulator(registrar, most=50)
     assert collected.config.accumulation.fewest_points == 20
     for size in sizes:
-        found = collected._with_small_ones(np.zeros((size, 3)))
+        found = collected._join_small_ones(np.zeros((size, 3)))
     assert sum(map(len, found)) == judged
 
 

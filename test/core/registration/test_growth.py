@@ -65,4 +65,4 @@ def test_residuals_that_grow_with_the_source_speak_for_no_size(registrar, target
 
 @pytest.mark.parametrize(("log_ratio", "refuses"), [(-0.49, False), (-0.51, True), (0.6, False), (np.nan, False)])
 def test_another_size_has_to_fit_clearly_better(log_ratio, refuses):
-    assert (rules.by_growth(log_ratio) is not None) == refuses
+    assert (rules.by_growth(log_ratio, RegistrarConfig().rules) is not None) == refuses

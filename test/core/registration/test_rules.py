@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.config import CovarianceConfig, RefinementConfig, VerificationConfig
+from gapr_core.config import CovarianceConfig, RefinementConfig
 from gapr_core.data import scans
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
@@ -22,6 +22,7 @@ from gapr_core.registration.verification import Candidates
 from gapr_core.results import RegistrationStatus
 from gapr_core.surface import Surface
 
+CONFIG = RegistrarConfig(num_threads=1)
 TURN = Rotation.from_euler("xyz", [20.0, 30.0, 40.0], degrees=True).as_matrix()
 SIDES_MM = np.array([120.0, 80.0, 50.0])
 
@@ -83,12 +84,12 @@ def fit_of_plane(**kwargs):
 
 def test_what_was_not_observed_is_uncertain_and_not_exact():
     uncertainty = estimate(fit_of_plane(), CovarianceConfig())
-    assert rules.is_loose(uncertainty)
+    assert rules.has_unobserved_motion(uncertainty, CONFIG.rules)
     assert uncertainty.largest_shift_mm > 100.0 and uncertainty.largest_turn_deg > 100.0
     np.linalg.cholesky(uncertainty.covariance)
     assert np.sqrt(uncertainty.covariance[2, 2]) < 0.6  # across the plane it is known, but for a pointer's stand-off
     nothing = estimate(fit_of_plane(weights=np.zeros(500)), CovarianceConfig())
-    assert rules.is_loose(nothing)
+    assert rules.has_unobserved_motion(nothing, CONFIG.rules)
 
 
 @pytest.mark.parametrize(("turn_deg", "shift_mm", "turn", "shift"), [
@@ -100,7 +101,7 @@ def test_a_deviation_that_no_turn_or_shift_can_have_is_not_said_in_numbers(turn_
     x, _, z = np.eye(3)
     loose = SimpleNamespace(largest_turn_deg=turn_deg, largest_shift_mm=shift_mm, weakest_turn=x, weakest_shift=z)
     said = f"the rotation about (1.00, 0.00, 0.00) is {turn}, the shift along (0.00, 0.00, 1.00) is {shift}"
-    assert rules._what_is_loose(loose) == said
+    assert rules._what_is_not_observed(loose) == said
 
 
 @pytest.fixture(scope="module")
@@ -111,13 +112,13 @@ def femur_fit():
 
 
 def test_a_pose_on_a_bone_comes_back_when_it_is_pushed(femur_fit):
-    assert not rules.can_be_pushed(*femur_fit, VerificationConfig(), 1)
+    assert not rules.can_be_pushed(*femur_fit, CONFIG)
 
 
 def test_a_pose_on_a_plane_stays_where_it_is_pushed(search):
     target, source = search.prepare(rough_box()), sources.prepare(edge(0.1))
     fit = refine_fully(np.eye(4), source.points, target, RefinementConfig())
-    assert rules.can_be_pushed(fit, source, target, VerificationConfig(), 1)
+    assert rules.can_be_pushed(fit, source, target, CONFIG)
 
 
 def test_the_motions_that_are_pushed_are_those_that_the_residuals_say_least_about():
@@ -135,4 +136,4 @@ def candidates(*scores):
                                                  ((0.01, 0.08), False), ((1.0,), False), ((16.0, 16.2), True),
                                                  ((16.0, 16.3), False)])  # fmt: skip
 def test_a_rival_is_as_good_within_a_share_or_within_the_roughness(scores, matched):
-    assert rules.is_matched(candidates(*scores)) is matched
+    assert rules.has_equal_rival(candidates(*scores), CONFIG.rules) is matched

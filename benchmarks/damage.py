@@ -20,20 +20,18 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.benchmark import records
-from gapr_core.benchmark.judge import answer_of, judge, pair_facts
+from gapr_core.benchmark.judge import record_of
 from gapr_core.benchmark.record import Record
 from gapr_core.calibration.pairs import without_twins
 from gapr_core.config import SensorConfig
 from gapr_core.data.damage import CHANGES, DAMAGES, Site
 from gapr_core.data.pair import Pair
-from gapr_core.data.pair_files import pair_hash
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.metrics.confidence import SURE
 from gapr_core.pages import markdown
 from gapr_core.runtime.console import say
-from gapr_core.runtime.origin import commit
 
 Case = tuple[str, str, int, bool]  # damage, bone, number, and whether the target is another subject's
 BONES, LEVELS = ("femur", "tibia", "pelvis"), ("L1", "L2")
@@ -115,11 +113,7 @@ def pair_of(damage: str, bone: str, number: int, is_other: bool, bones: dict[str
 
 def registered(registrar: Registrar, pair: Pair) -> Record:
     """The answer, judged."""
-    result = registrar.register(pair.source, registrar.prepare(pair.target))
-    facts = {**vars(pair_facts(pair)), **vars(answer_of(result)), **vars(judge(pair, result))}
-    return Record(
-        **facts, file="", sha256=pair_hash(pair), method="gapr", seconds=result.seconds, commit=commit() or ""
-    )
+    return record_of(pair, registrar.register(pair.source, registrar.prepare(pair.target)))
 
 
 def table(found: Sequence[Record], damages: Sequence[str]) -> str:

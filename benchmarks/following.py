@@ -37,7 +37,6 @@ KINDS = {
 }
 OTHER = "becomes another subject's bone"
 SUBJECTS = 20  # of a bone, at most
-FAR_MM, FAR_DEG = 4.0, 5.0  # a pose beyond is wrong
 
 
 @dataclass
@@ -125,7 +124,7 @@ def row(kind: str, tally: Tally) -> str:
     """One row of the table."""
     cells = [kind, tally.frames, len(tally.followed), tally.asked - len(tally.followed)]
     both = tally.followed, tally.assessed
-    cells += [sum(mm > FAR_MM or deg > FAR_DEG for mm, deg in errors) for errors in both]
+    cells += [sum(mm > se3.RIGHT_MM or deg > se3.RIGHT_DEG for mm, deg in errors) for errors in both]
     cells += ["{:.2f} mm, {:.2f} deg".format(*np.median(errors, axis=0)) if errors else "" for errors in both]
     cells.append(f"{np.percentile(tally.apart_mm, 95):.2f} mm" if tally.apart_mm else "")
     return markdown.row(cells)

@@ -27,13 +27,12 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
 from gapr_core.benchmark import records
-from gapr_core.benchmark.judge import answer_of, judge, pair_facts
+from gapr_core.benchmark.judge import record_of
 from gapr_core.benchmark.record import Record
 from gapr_core.calibration.other_side import on_own_side
 from gapr_core.calibration.pairs import without_twins
 from gapr_core.data import anatomy
 from gapr_core.data.pair import TARGET_POINTS, Pair
-from gapr_core.data.pair_files import pair_hash
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
@@ -167,7 +166,7 @@ def run(cases: Sequence[Case], bones: Bones, path: Path, jobs: int) -> list[Reco
     left = [case for case in cases if case.name not in done]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _start, (bones,)) as pool:
-        for record in tqdm(pool.map(record_of, left, chunksize=8), "pairs", len(left)):
+        for record in tqdm(pool.map(registered, left, chunksize=8), "pairs", len(left)):
             records.append(path, record)
             done[record.pair] = record
     return [done[case.name] for case in cases]
@@ -178,14 +177,10 @@ def _start(bones: Bones) -> None:
     _bones.update(bones)
 
 
-def record_of(case: Case) -> Record:
+def registered(case: Case) -> Record:
     """One pair registered and judged."""
     pair = pair_of(case, _bones)
-    result = registrar().register(pair.source, prepared(case.bone, case.target))
-    facts = {**vars(pair_facts(pair)), **vars(answer_of(result)), **vars(judge(pair, result))}
-    return Record(
-        **facts, file="", sha256=pair_hash(pair), method="gapr", seconds=result.seconds, commit=commit() or ""
-    )
+    return record_of(pair, registrar().register(pair.source, prepared(case.bone, case.target)))
 
 
 def pair_of(case: Case, bones: Bones) -> Pair:

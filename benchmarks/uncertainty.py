@@ -19,17 +19,17 @@ import numpy as np
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig
+from gapr_core.calibration.conformal import MEDIAN_NEES
 from gapr_core.config import SENSOR_KINDS, SensorConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import error_twist, nees
+from gapr_core.geometry.twists import error_twist, nees, predicted_rmse_mm
 from gapr_core.pages import markdown
 from gapr_core.registration import source as sources
 from gapr_core.registration.covariance import PoseUncertainty, estimate
-from gapr_core.registration.precision import expected_mm
 from gapr_core.registration.refinement import Fit, refine_fully
 from gapr_core.registration.smooth_bias import bias_corrected, corrected_fit
 from gapr_core.registration.target import PreparedTarget
@@ -37,7 +37,6 @@ from gapr_core.results import Refusal
 from gapr_core.runtime.console import say
 
 FAMILIES = "paper,L1,L2,L3,L2-wave,L2-gp,L3-gp,pointer,ultrasound,depth-camera,laser,sweep"
-CHI_SQUARE_MEDIAN = 5.348
 Measured = tuple[float, float, float, bool]
 
 
@@ -91,7 +90,7 @@ def line(family: str, found: Sequence[Measured | None]) -> str:
     if not len(rows):
         return markdown.row([*cells, "-", "-", "-"])
     surprise, true_mm, predicted_mm = np.median(rows, axis=0)
-    return markdown.row([*cells, f"{surprise / CHI_SQUARE_MEDIAN:.2f}", f"{true_mm:.2f}", f"{predicted_mm:.2f}"])
+    return markdown.row([*cells, f"{surprise / MEDIAN_NEES:.2f}", f"{true_mm:.2f}", f"{predicted_mm:.2f}"])
 
 
 def measure(registrar: Registrar, pair: Pair, full: bool) -> Measured | None:
@@ -105,7 +104,7 @@ def measure(registrar: Registrar, pair: Pair, full: bool) -> Measured | None:
     true_mm = float(np.sqrt((moved**2).sum(axis=1).mean()))
     twist = error_twist(fit.T, pair.T_target_source, points)
     centre = fit.moved.mean(axis=0)
-    predicted_mm = expected_mm(uncertainty.covariance, target.points, centre)
+    predicted_mm = predicted_rmse_mm(uncertainty.covariance, target.points, centre)
     is_right = se3.pose_error(fit.T, pair.T_target_source, pair.source).is_right
     return nees(twist, uncertainty.covariance), true_mm, predicted_mm, is_right
 
@@ -129,8 +128,7 @@ def assessed(
     if isinstance(assessment, Refusal):
         return None
     assessment = bias_corrected(assessment, registrar.config)
-    rte_mm, rre_deg = se3.pose_error(assessment.fit.T, pair.T_target_source, assessment.source.points)
-    if rte_mm >= 4.0 or rre_deg >= 5.0:
+    if not se3.pose_error(assessment.fit.T, pair.T_target_source, assessment.source.points).is_right:
         return None
     return assessment.fit, assessment.uncertainty, assessment.source.points
 

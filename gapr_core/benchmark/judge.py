@@ -9,16 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core import metrics
-from gapr_core.benchmark.record import ERROR, Answer, PairFacts, Verdict
+from gapr_core.benchmark.record import ERROR, Answer, PairFacts, Record, Verdict
 from gapr_core.data.pair import Pair
-from gapr_core.data.pair_files import LANDMARK, NUMBERS, TEXTS
+from gapr_core.data.pair_files import LANDMARK, NUMBERS, TEXTS, pair_hash
 from gapr_core.geometry import extent, se3
 from gapr_core.metrics.pose import STRICT_LIMITS
 from gapr_core.results import RegistrationResult
+from gapr_core.runtime import origin
 
 Array = NDArray[np.float64]
 
 FACTS = (*NUMBERS, *TEXTS)  # in the metadata of a pair
+
+
+def record_of(pair: Pair, result: RegistrationResult) -> Record:
+    """A pair that is in no file, and what GAPR answered, judged."""
+    facts = {**vars(pair_facts(pair)), **vars(answer_of(result)), **vars(judge(pair, result))}
+    seconds, code = result.seconds, origin.commit() or ""
+    return Record(**facts, file="", sha256=pair_hash(pair), method="gapr", seconds=seconds, commit=code)
 
 
 def pair_facts(pair: Pair) -> PairFacts:

@@ -11,13 +11,14 @@ from scipy.special import expit
 from gapr_core.calibration.additive import fit_log_odds
 from gapr_core.calibration.answers import Answers, of_models_that_saw_neither, of_models_that_saw_no_subject
 from gapr_core.calibration.pairs import HELD_OUT
+from gapr_core.config import RegistrarConfig
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS
 from gapr_core.registration.features import SIGNS
 
 Array = NDArray[np.float64]
-ACCEPTED = 0.5  # default of `min_confidence`
+ACCEPTED = RegistrarConfig.min_confidence
 
 
 def known_families(answers: Answers) -> NDArray[np.bool_]:

@@ -10,12 +10,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.clouds import MM_PER_UNIT
 from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 Length = TypeVar("Length", Array, float)
-MM_PER_M = 1000.0
-MM_PER_UNIT = {"m": MM_PER_M, "cm": 10.0, "mm": 1.0}
+MM_PER_M = MM_PER_UNIT["m"]
 
 
 def to_mm(points: Array, unit: str) -> Array:

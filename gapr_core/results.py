@@ -23,7 +23,7 @@ class RegistrationStatus(str, Enum):
     """What the data decided. Only `OK` carries a pose."""
 
     OK = "OK"
-    AMBIGUOUS = "AMBIGUOUS"  # a distinct pose explains the source as well
+    AMBIGUOUS = "AMBIGUOUS"  # a distinct pose explains the source as well, or the bone is in it twice
     DEGENERATE = "DEGENERATE"  # a direction of motion is not observed (spin about a shaft, slide along it)
     LOW_CONFIDENCE = "LOW_CONFIDENCE"  # the best pose found is probably not right
     TOO_FEW_POINTS = "TOO_FEW_POINTS"  # fewer usable source points than a pose needs

@@ -26,6 +26,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
 FEWEST_IN_TIME = 6  # sources in which a steady motion is looked for
 
 
@@ -156,12 +157,13 @@ class Accumulator:
 
         It is a refusal where the newest source lies off the bone, or so many in a row that the bone has moved.
         """
-        if result.T_target_source is None:  # it says nothing of any source, nor of a row of those off the bone
+        T = result.best if result.status in POSED else None
+        if T is None:  # it says nothing of any source, nor of a row of those off the bone
             for source in self._new:
                 self._join_small_ones(source)
             self._kept, self._new = self._last(), []
             return result
-        new, off = self._new, self._update_row_off_the_bone(result.T_target_source, target)
+        new, off = self._new, self._update_row_off_the_bone(T, target)
         self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
         self._new = []
         if len(self._off_in_a_row) >= self.config.accumulation.most_off:
@@ -170,15 +172,15 @@ class Accumulator:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
             why = f"the {newest} off the bone where the others found it: left out"
             return _refused(result, why)
-        return self._unless_it_moves(result, target)
+        return self._unless_it_moves(result, T, target)
 
-    def _unless_it_moves(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
+    def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
         """The answer; a refusal where the sources show that the bone moves.
 
         Those since a step are left; of a steady motion the last third.
         """
-        T, kept, limits = result.T_target_source, self._kept, self.config.rigidity
-        if T is None or len(kept) < FEWEST_IN_TIME:
+        kept, limits = self._kept, self.config.rigidity
+        if len(kept) < FEWEST_IN_TIME:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)

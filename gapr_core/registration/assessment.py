@@ -6,7 +6,7 @@ Who changes its probability, in this order:
 |---|---|---|
 | calibrated model of the features | sets it | `assess_fit` |
 | safety rules | refuse, and leave `rules.ruled_out` at most | `with_refusal`; `rules`, `checks` |
-| another copy of the bone | at most its share of the points of both | `doubles` |
+| another copy of the bone | refused where it lies elsewhere | `doubles` |
 | a source on both cortices, an inferred camera in a stream | at most so much | `capped` |
 | sources before it in a stream | up to its root, or down | `tracking`, `evidence`, `stream_misfit` |
 | limits | at most `limits.most` | `limits.applied` |
@@ -55,7 +55,8 @@ class Assessment:
         rounds: how many were asked.
         seen: the whole cloud, where `source` is only the part of it that the pose explains; else None.
         members: (N,) mask of that part in `seen`; None with it.
-        inferred_viewpoint: (3,) mm, source frame: where `seen` is taken to be seen from; None where it was given.
+        viewpoint: (3,) mm, source frame: where `seen` was seen from; None with it.
+        inferred_viewpoint: the same, where nobody gave it; else None.
         contributions: log odds that each feature adds to the probability's.
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
@@ -76,6 +77,7 @@ class Assessment:
     rounds: int = 0
     seen: PreparedSource | None = None
     members: NDArray[np.bool_] | None = None
+    viewpoint: Array | None = None
     inferred_viewpoint: Array | None = None
     contributions: Mapping[str, float] = field(default_factory=dict)
     factor95: float = 1.0

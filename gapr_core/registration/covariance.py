@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.config import CovarianceConfig, SensorConfig
-from gapr_core.geometry import extent
+from gapr_core.geometry import extent, se3
 from gapr_core.geometry.twists import covariance_about
 from gapr_core.registration import fit_kernels
 from gapr_core.registration import sensor as sensors
@@ -82,6 +82,7 @@ def estimate(
     sensor: SensorConfig | None = None,
     around: NDArray[np.int64] | None = None,
     misfits_mm: tuple[float, ...] | None = None,
+    eye: Array | None = None,
 ) -> PoseUncertainty:
     """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
 
@@ -91,6 +92,7 @@ def estimate(
         sensor: what is known of them before.
         around: (N, k) neighbours of each point, where they are known (see `smooth_misfits_mm`).
         misfits_mm: the smooth and the short misfit, where they are known; else they are measured.
+        eye: (3,) mm, target frame: where a camera with wrong ranges was (`eye_of`); None for an error of size alone.
     """
     rests = fit.rests_on
     count = int(np.count_nonzero(rests.weights))
@@ -101,11 +103,19 @@ def estimate(
     sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
     noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, config.noise_points)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
-    covariance = _about_middle(fit, sandwich(rests, spanned, expected, config))
+    covariance = _about_middle(fit, sandwich(rests, spanned, expected, config, eye))
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     counts = config.smooth_neighbours, config.short_neighbours
     smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm)
+
+
+def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | None:
+    """(3,) mm, target frame: the camera of a source under a pose (4, 4) whose scale was stated, else None.
+
+    What is usual for a kind is an error of the size alone: cameras differ by more in how wrong their distance is.
+    """
+    return None if viewpoint is None or sensor.scale is None else se3.apply(T, viewpoint[None])[0]
 
 
 def covariance_added_by(fit: Fit, errors: Array, config: CovarianceConfig) -> Array:
@@ -141,7 +151,7 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: Cova
     return float(np.sqrt(max(root_mean_square(sizes_mm, log_posterior) ** 2 - config.no_bias_mm**2, 0.0)))
 
 
-def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig) -> Array:
+def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig, eye: Array | None = None) -> Array:
     """(6, 6) G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P.
 
     G is the gain of the fit, U = 1 1^T what all points share, s the noise, b the bias with fields F, of which all
@@ -151,7 +161,7 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
     """
     inlier = fit.weights > 0.0
     gain, prior = gain_of(fit, bias_fields, errors.noise_mm)
-    shift, growth = directions(fit, errors.along_beam, config.one_sided)
+    shift, growth = directions(fit, errors.along_beam, config.one_sided, eye)
     moved = np.column_stack(
         [
             errors.bias_mm * gain @ bias_fields[inlier],
@@ -166,18 +176,20 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
     return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + errors.place_covariance + prior)
 
 
-def directions(fit: Fit, along_beam: bool, one_sided: float) -> tuple[Array, Array]:
+def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None = None) -> tuple[Array, Array]:
     """How the residuals (n,) of the inliers change by a stand-off of 1 mm, and by an error of the size of 1.
 
-    A stand-off moves every point along its normal, another size by its distance from the centroid. Where only depths
-    are wrong, both move a point along the beam d: by n . d, and by (n . d) times its depth. The beam is taken for the
-    mean normal; where that is shorter than `one_sided`, the bone was seen from several sides and no beam is common.
+    A stand-off moves every point along its normal, another size by its distance from the centroid; where the ranges of
+    a camera at `eye` (3,), mm, target frame, are wrong, by that from there: the whole cloud is nearer or farther. Where
+    only depths are wrong, both move a point along the beam d: by n . d, and by (n . d) times its depth. The beam is
+    taken for the mean normal; where that is shorter than `one_sided`, the bone was seen from several sides and no beam
+    is common.
     """
     inlier = fit.weights > 0.0
-    normals = fit.gradients[inlier]
+    moved, normals = fit.moved[inlier], fit.gradients[inlier]
     if not inlier.any():
         return np.zeros(0), np.zeros(0)
-    away, mean = fit.moved[inlier] - fit.moved[inlier].mean(axis=0), normals.mean(axis=0)
+    away, mean = moved - (moved.mean(axis=0) if eye is None else eye), normals.mean(axis=0)
     length = float(np.linalg.norm(mean))
     if not along_beam or length < one_sided:
         return np.ones(len(normals)), np.einsum("ni,ni->n", away, normals)

@@ -2,7 +2,7 @@
 
 The robust fit then takes one copy for the bone and the other one for outliers, and is sure of the first. So the points
 that it rejects are registered by themselves: outliers, tissue and instruments have no pose on the bone, a second copy
-has. Which of the two is right nobody knows: where they differ, the answer is as probable as its share of their points.
+has. Which of the two is right nobody knows: where they differ, the answer is refused.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gapr_core.registration import source as sources
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.refinement import evaluate, refine_many
 from gapr_core.registration.source import PreparedSource
-from gapr_core.results import Refusal
+from gapr_core.results import Refusal, RegistrationStatus
 
 Array = NDArray[np.float64]
 Register = Callable[[PreparedSource, Array], Assessment | None]  # of a source and poses (K, 4, 4) to begin with
@@ -34,10 +34,11 @@ ON_BONE = 0.6  # share of the rejected points that count for their pose
 
 
 def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, register: Register) -> Assessment:
-    """The same; where its rejected points are another copy of the bone, less probable, and with the way there.
+    """The same; where its rejected points are another copy of the bone, with the way there, refused if that is long.
 
     Near the answer a copy is looked for first, which costs little. Only where much is rejected it may lie anywhere, but
-    not in a camera's cloud, where tissue is rejected. The way goes into the covariance.
+    not in a camera's cloud, where tissue is rejected. The way goes into the covariance. A pose that is not right if the
+    copy is, more than 4 mm or 5 deg away, is refused: in which of the two the bone is now nobody knows.
 
     Args:
         assessment: an answer that may be accepted.
@@ -62,18 +63,31 @@ def allowing_for_a_copy(assessment: Assessment, config: RegistrarConfig, registe
         return a
     if T is None and (is_same or found.fit.sigma_mm > AS_PRECISE * a.fit.sigma_mm):
         return a
-    own, others = len(residuals.points) - len(rejected), on_bone * len(rejected)
-    return _with_copy(a, found, 1.0 if is_same else own / (own + others))
+    return _with_copy(a, found).with_refusal(None if is_same else _in_two_poses(a, found), config.rules)
 
 
-def _with_copy(assessment: Assessment, copy: Assessment, share: float) -> Assessment:
-    """The same with the way to a copy in its covariance, and no more probable than its share of both one's points."""
+def is_in_two_poses(assessment: Assessment) -> bool:
+    """True where a source was refused for a copy of the bone."""
+    refusal = assessment.refusal
+    return NAME in assessment.deformed and refusal is not None and refusal.status is RegistrationStatus.AMBIGUOUS
+
+
+def _in_two_poses(assessment: Assessment, copy: Assessment) -> Refusal:
+    shift_mm, turn_deg = se3.pose_error(copy.fit.T, assessment.fit.T, assessment.source.points)
+    reason = (
+        f"the points that do not fit lie on the bone in another pose, {shift_mm:.0f} mm and {turn_deg:.0f} deg away"
+    )
+    how = "did the bone, its reference or the sensor move while it was measured? Measure it again"
+    return Refusal(RegistrationStatus.AMBIGUOUS, f"{reason}: {how}")
+
+
+def _with_copy(assessment: Assessment, copy: Assessment) -> Assessment:
+    """The same with the way to a copy in its covariance."""
     a = assessment
     twist = error_twist(copy.fit.T, a.fit.T, a.source.points)
     covariance = a.uncertainty.covariance + np.outer(twist, twist)
     deformed = {NAME: se3.rms_apart_mm(copy.fit.T, a.fit.T, a.source.points), **a.deformed}
-    uncertainty = replace(a.uncertainty, covariance=covariance)
-    return replace(a.capped(share, NAME), uncertainty=uncertainty, deformed=deformed, most=min(a.most, share))
+    return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
 
 
 def _elsewhere(assessment: Assessment, rejected: Array, config: RegistrarConfig) -> Array | None:

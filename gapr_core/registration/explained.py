@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration import clutter, covariance, kernels
+from gapr_core.registration import clutter, covariance, doubles, kernels
 from gapr_core.registration import source as sources
 from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.clutter import Scene
@@ -88,21 +88,27 @@ def assess_part(
 ) -> Assessment:
     """As `assess_fit`, for a pose that explains a part of a scene."""
     fit, part = explained.fit, explained.source
-    uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around)
+    eye = covariance.eye_of(fit.T, scene.viewpoint, config.sensor)
+    uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around, eye=eye)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
-    return replace(judged, seen=scene.source, members=explained.members)
+    return replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """The same; a refusal says so where most of the cloud is not this bone.
 
     With a viewpoint, by what the pose explains; of another dense cloud, by what lies on the bone. This is no safety
-    rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed.
+    rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed. What lies on
+    the bone in another pose is no clutter.
     """
     source, least, in_scene = assessment.source, config.min_confidence, assessment.seen is not None
     believed = assessment.probability >= least if in_scene else assessment.reaches(least)
-    if believed or not (in_scene or len(source.points) >= config.source.dense_points):
+    if (
+        believed
+        or doubles.is_in_two_poses(assessment)
+        or not (in_scene or len(source.points) >= config.source.dense_points)
+    ):
         return assessment
     if in_scene:
         share, limit = assessment.features["inlier_ratio"], config.part.mostly_clutter

@@ -124,7 +124,7 @@ def judged(monkeypatch):
 
     monkeypatch.setattr(explained, "judge", judge)
     monkeypatch.setattr(explained, "measure", lambda part, *_: {"inlier_ratio": part.share})
-    monkeypatch.setattr(explained.covariance, "estimate", lambda *_: None)
+    monkeypatch.setattr(explained.covariance, "estimate", lambda *_, **__: None)
     return verdict
 
 
@@ -136,15 +136,23 @@ def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed
     judged, probability, share, refusal, status
 ):
     judged.probability, judged.refusal = probability, refusal
-    scene, part = SimpleNamespace(source=object()), part_of(share)
+    scene, part = SimpleNamespace(source=object(), viewpoint=np.ones(3)), part_of(share)
     assessed_part = explained.assess_part(part, None, scene, None, None, CONFIG)
     assert assessed_part.refusal is refusal  # a stream may still raise the probability
     found = explained.named_clutter(assessed_part, CONFIG)
     assert (found.refusal and found.refusal.status.value) == status
     assert found.seen is scene.source and found.members is part.members and found.probability == probability
+    assert found.viewpoint is scene.viewpoint
     if status == "CLUTTER":
         assert "in the best pose 40 % of the cloud" in found.refusal.reason
         assert (refusal.reason if refusal else "no pose of it is certain") in found.refusal.reason
+
+
+def test_the_bone_in_two_poses_is_no_clutter(judged):
+    scene, part = SimpleNamespace(source=object(), viewpoint=np.ones(3)), part_of(0.4)
+    judged.probability, judged.refusal = 0.3, REFUSED
+    found = replace(explained.assess_part(part, None, scene, None, None, CONFIG), deformed={"doubled": 30.0})
+    assert explained.named_clutter(found, CONFIG) is found
 
 
 def assessed(plane, probability=0.2, count=20, off=13, **more):

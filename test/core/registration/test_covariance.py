@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.geometry import se3
 from gapr_core.geometry.twists import covariance_about, error_twist, nees
 from gapr_core.registration import bias_field, covariance, refinement
 from gapr_core.registration.sensor import Errors
@@ -162,6 +163,27 @@ def test_depths_that_are_wrong_move_the_pose_along_the_beam_and_nowhere_else():
     beam = beam_of(fit)
     np.testing.assert_allclose(C[:3, :3], 0.36 * np.outer(beam, beam), atol=1e-4)
     np.testing.assert_allclose(C[3:, 3:], 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("far_mm", [200.0, 400.0])
+def test_ranges_that_are_wrong_move_the_whole_cloud_along_the_line_of_sight(far_mm):
+    """By 1 % of the distance, on top of what an error of the size alone does, which hardly moves its middle."""
+    fit, errors, fields = curved_fit(), replace(NOTHING, scale=0.01), np.zeros((300, 1))
+    middle, sight = fit.moved.mean(axis=0), np.array([0.6, 0.0, 0.8])
+    alone = covariance.sandwich(fit, fields, errors, CONFIG)
+    found = covariance.sandwich(fit, fields, errors, CONFIG, middle - far_mm * sight)
+    assert np.sqrt(np.trace(alone[:3, :3])) < 0.3
+    assert np.sqrt(sight @ found[:3, :3] @ sight) == pytest.approx(0.01 * far_mm, abs=0.3)
+    assert np.sqrt(np.trace(found[:3, :3]) - sight @ found[:3, :3] @ sight) < 0.3
+
+
+def test_only_a_stated_scale_is_one_of_the_ranges_from_where_a_camera_was():
+    """Under T the camera moves with its cloud."""
+    T, viewpoint = se3.exp([5.0, -3.0, 2.0, 0.1, 0.2, -0.3]), np.array([10.0, 20.0, -400.0])
+    stated = SensorConfig("depth_camera", scale=0.01)
+    np.testing.assert_allclose(covariance.eye_of(T, viewpoint, stated), se3.apply(T, viewpoint[None])[0])
+    assert covariance.eye_of(T, viewpoint, SensorConfig("depth_camera")) is None
+    assert covariance.eye_of(T, None, stated) is None
 
 
 def test_a_view_from_several_sides_has_no_beam():

@@ -278,7 +278,9 @@ class PointCheck:
 
     def __str__(self) -> str:
         sizes = np.abs(self.distance_mm)
-        largest = "no surface near" if np.isnan(sizes).any() else f"{sizes.max():.1f} mm off at most"
+        largest = "one with no surface near" if np.isnan(sizes).any() else f"{sizes.max():.1f} mm off at most"
+        if np.isnan(sizes).all():
+            largest = "none near the bone: are they in the frame and the unit of the source?"
         return (
             f"{self.verdict}  {len(self.points)} points, {largest}  probability {self.probability:.3f}  "
             f"unseen {self.unseen_mm:.1f} mm  TRE 95 %: {self.tre95_mm:.1f} mm"

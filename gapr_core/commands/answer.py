@@ -43,7 +43,7 @@ def read_json(path: Path) -> RegistrationResult:
         ConfigError: no such file, another one, or an answer without a pose.
     """
     how = "give a file that gapr register --json wrote"
-    found = files.read_json(path, "the answer of a registration")
+    found = files.read_json(path, "the answer of a registration", how)
     try:
         status = RegistrationStatus(found["status"])
         transform, covariance, centre = (found[key] for key in ("transform", "covariance", "centre_mm"))

@@ -91,7 +91,9 @@ def _show(found: PointCheck, within_mm: float) -> None:
             say(f"{number}. no surface is near")
         else:
             say(f"{number}. {distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)")
-    if found.verdict is Verdict.CONTRADICTED:
+    if np.isnan(found.distance_mm).all():
+        say("none is near the bone: are the points in the frame of the source, and in its unit (--points-units)?")
+    elif found.verdict is Verdict.CONTRADICTED:
         say("the pose does not hold there: touch the farthest point again; if it stays, register again")
     elif found.verdict is Verdict.SAYS_LITTLE:
         where = "({:.0f}, {:.0f}, {:.0f})".format(*found.next_point)

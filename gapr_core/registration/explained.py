@@ -123,8 +123,9 @@ def _clutter(share: float, other: Refusal | None, more: str) -> Refusal:
     why = "no pose of it is certain" if other is None else other.reason
     return Refusal(
         RegistrationStatus.CLUTTER,
-        f"in the best pose {100.0 * share:.0f} % of the cloud is this bone, and {why}: crop the cloud with a box "
-        f"around the wound or around the last pose (crop_to_track) or expose more of the bone{more}",
+        f"in the best pose {100.0 * share:.0f} % of the cloud is this bone, and {why}: is it the right bone? "
+        f"If so, crop the cloud with a box around the wound or around the last pose (crop_to_track), or expose more of "
+        f"the bone{more}",
     )
 
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import EXTENT_LIMITS_MM, MM_PER_UNIT
+from gapr_core.clouds import EXTENT_LIMITS_MM, MM_PER_UNIT, PLAUSIBLE
 from gapr_core.config import RegistrarConfig, RulesConfig
 from gapr_core.geometry import extent, se3
 from gapr_core.registration import words
@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 
 OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # that are taken for mm by mistake
 HALF_TURN_DEG = 180.0
-PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 
 
 def by_geometry(

@@ -110,12 +110,13 @@ def write_json(path: str | Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
-def read_json(path: str | Path, what: str) -> Any:
+def read_json(path: str | Path, what: str, how: str = "check the path, or make the file again") -> Any:
     """The content of a JSON file.
 
     Args:
         path: where it is.
         what: what the file should be, in words, for the error.
+        how: to get it, in words, for the error.
 
     Raises:
         ConfigError: it cannot be read, or is no JSON.
@@ -124,7 +125,7 @@ def read_json(path: str | Path, what: str) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
-        raise ConfigError(what, f"{path} ({why})", "check the path, or make the file again") from error
+        raise ConfigError(what, f"{path} ({why})", how) from error
 
 
 def _refuse_folder(path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
-from gapr_core.clouds import EXTENT_LIMITS_MM, finite_points
+from gapr_core.clouds import EXTENT_LIMITS_MM, PLAUSIBLE, finite_points
 from gapr_core.geometry import pinhole
 from gapr_core.surface import Surface
 from gapr_ros.node import wire
@@ -184,7 +184,9 @@ def _within_range(points_mm: Array, parameters: NodeParameters) -> Array:
 
 
 def _looks_like(extent_mm: float, model_extent_mm: float, unit: str) -> str:
-    """The names of the other units in which the cloud would fit the bone; empty where none is."""
+    """The other units in which the cloud would be a piece of the bone, else those in which it may be one; or ""."""
     per_mm = extent_mm / wire.MM_PER_UNIT[unit] / model_extent_mm
     shares = {name: per_mm * wire.MM_PER_UNIT[other] for other, name in UNIT_NAMES.items() if other != unit}
-    return " or ".join(name for name, share in shares.items() if LEAST_SHARE <= share <= MOST_SHARE)
+    low, high = PLAUSIBLE
+    fitting = [name for name, share in shares.items() if low <= share <= high]
+    return " or ".join(fitting or [name for name, share in shares.items() if LEAST_SHARE <= share <= MOST_SHARE])

@@ -82,6 +82,10 @@ def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, caps
     shown = capsys.readouterr().out
     assert shown.startswith("CONTRADICTED") and "31. no surface is near" in shown and "register again" in shown
     assert json.loads((folder / "found.json").read_text())["distance_mm"][30] is None
+    np.savetxt("elsewhere.txt", moved + 4000.0)
+    assert run(points="elsewhere.txt") == 2
+    shown = capsys.readouterr().out
+    assert "are the points in the frame of the source" in shown and "register again" not in shown
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,9 @@ def test_a_model_is_turned_once_at_most_whatever_its_file_says(tmp_path, said, a
 
 def test_a_file_in_ras_that_is_read_as_it_is_names_the_parameter_whose_default_that_is(tmp_path, caplog):
     loaded(bone(tmp_path / "bone.ply", "SPACE=RAS"))
-    assert "says SPACE=RAS and is read as AS_IS: --axes, --source-axes or model_axes says so" in caplog.text
+    assert (
+        "says SPACE=RAS and is read as it is (--axes, --source-axes or model_axes): auto turns it to LPS" in caplog.text
+    )
 
 
 def test_a_model_that_is_ras_already_is_not_turned_by_lps_to_ras(tmp_path):

@@ -15,6 +15,7 @@ from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason
 
 SILENCE_S = 2.0
+LARGE = "; by best effort clouds of more than 0.5 MB may never come: let their publisher be reliable"
 THROTTLE_S = 5.0
 LOST_FOR_S = 5.0  # after a cloud was lost the input is not well
 
@@ -211,7 +212,8 @@ def _level_of_input(now: Snapshot, silent_s: float) -> tuple[bytes, str]:
         how = "crop or thin clouds before they are sent, or send fewer"
         return DiagnosticStatus.WARN, f"{now.counters.lost} clouds were sent and never came: {how}"
     if silent_s > SILENCE_S:
-        return DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s"
+        may_be_lost = not now.counters.received and "best_effort" in now.source.qos
+        return DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s{LARGE if may_be_lost else ''}"
     return DiagnosticStatus.OK, f"{now.counters.received} clouds"
 
 

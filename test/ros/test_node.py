@@ -29,7 +29,7 @@ from std_srvs.srv import SetBool, Trigger
 from gapr_core import Accumulator
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import frames
+from gapr_ros.node import diagnostics, frames
 from gapr_ros.node.collection import MOST_LATE, Late
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.session import OUTLIVED_AFTER
@@ -189,6 +189,23 @@ def test_diagnostics_have_every_key_and_come_when_idle(live):
     wait_until(lambda: len(client.diagnostics) >= count + 2)
     wait_until(lambda: client.values("input")["message"].startswith("no cloud for"))
     assert client.values("input")["level"] == 1
+
+
+@pytest.mark.parametrize(
+    ("qos", "received", "may_be_lost"),
+    [
+        ("best_effort", 0, True),
+        ("reliable and best_effort", 0, True),
+        ("reliable", 0, False),
+        ("best_effort", 3, False),
+    ],
+)
+def test_where_none_of_a_best_effort_publisher_came_its_clouds_may_be_too_large(qos, received, may_be_lost):
+    counters = SimpleNamespace(received=received, lost=0, last_cloud_at=time.monotonic() - 9.0, last_lost_at=0.0)
+    now = SimpleNamespace(counters=counters, source=diagnostics.Input(qos, 1), listening=True, last=None, conflicts=(),
+                          name="node", hardware_id="")  # fmt: skip
+    said = diagnostics.input_status(now).message
+    assert said == "no cloud for 9 s" + (diagnostics.LARGE if may_be_lost else "")
 
 
 def test_the_newest_cloud_wins_and_every_other_is_counted(live):

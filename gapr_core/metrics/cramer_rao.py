@@ -64,9 +64,8 @@ def local_normals(points: ArrayLike, queries: ArrayLike, tree: cKDTree | None = 
 
 def _bound(moved: Array, normals: Array, usable: NDArray[np.bool_], sigma_mm: float) -> PoseBound | None:
     centre = moved.mean(axis=0)
-    size = np.sqrt(
-        ((moved[usable] - centre) ** 2).sum(axis=1).mean()
-    )  # rotations in units that weigh like translations
+    # rotations in units that weigh like translations
+    size = np.sqrt(((moved[usable] - centre) ** 2).sum(axis=1).mean())
     rows = distance_jacobian(moved[usable], normals[usable], centre) / np.repeat([1.0, size], 3)
     information = rows.T @ rows / sigma_mm**2
     if np.linalg.cond(information) > 1e10:

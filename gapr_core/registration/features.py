@@ -108,7 +108,8 @@ def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
     Neighbours do not lie in a plane since they are noisy, and since the bone is curved: of a thinned cloud's, which are
     centimetres apart, mostly that. Their foot points show the second alone, and variances add up. What is left is small
     compared with both there, and of few points little is known: the noise counts as the upper end of what it may be,
-    so that residuals exceed it only where that is seen. Its median has the error of one of independent patches.
+    so that residuals exceed it only where that is seen. Its median has the standard error of one of as many independent
+    patches.
     """
     curved_mm = fit_planes(fit.rests_on.feet, source.patches)[1]
     left_mm2 = flatness_mm**2 - curved_mm**2

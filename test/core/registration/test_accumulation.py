@@ -12,7 +12,7 @@ from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.registration import clutter, rigidity
-from gapr_core.results import RegistrationResult
+from gapr_core.results import Hypothesis, RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
 
@@ -176,6 +176,25 @@ def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registr
         assert not refused.ok
     assert "restarts" in refused.reason
     np.testing.assert_array_equal(accumulator.collected, np.concatenate(distant))
+
+
+def test_an_answer_that_fits_two_poses_leaves_out_what_lies_off_the_bone_too(registrar, frames, prepared, monkeypatch):
+    """As after a knock: else the collection would hold the bone twice until the old sources have gone."""
+    accumulator = Accumulator(registrar, most=20)
+    for pair in frames[:4]:
+        accumulator.collect(pair.source)
+    best = (Hypothesis(frames[0].T_target_source, 0.4),)
+    answers = {
+        status: RegistrationResult(status, hypotheses=best, reason="two poses")
+        for status in (RegistrationStatus.DEGENERATE, RegistrationStatus.AMBIGUOUS)
+    }
+    distant = [se3.apply(se3.exp([0.0, 25.0, 10.0 * n, 0.0, 0.0, 0.0]), frames[4].source) for n in (1, 2)]
+    for (status, answer), source in zip(answers.items(), distant, strict=True):
+        before = len(accumulator.collected)
+        monkeypatch.setattr(type(registrar), "register", lambda *_, answer=answer: answer)
+        found, is_kept = accumulator.register(source, prepared), status is RegistrationStatus.DEGENERATE
+        assert not found.ok and ("left out" in found.reason) is not is_kept
+        assert len(accumulator.collected) - before == (len(source) if is_kept else 0)
 
 
 @pytest.mark.parametrize(("new", "off", "row"), [("ab", "ab", "xab"), ("ab", "b", "b"), ("ab", "a", ""), ("", "", "x"),

@@ -13,15 +13,12 @@ from typing import IO
 
 DOMAINS = range(1, 102)  # beyond, the ports of DDS meet those that Linux gives to other programs
 FIRST_PORT, PORTS = 7400, 250  # of domain 0, and from one domain to the next
-PROFILE = Path(__file__).with_name("fastdds.xml")
 _held: list[IO[str]] = []
 
 
 @cache
 def claim() -> int:
     """A domain that nobody on this machine uses; its lock is held until this process ends.
-
-    Nodes of this process hear each other as those of other processes do (`PROFILE`).
 
     Raises:
         RuntimeError: all are taken.
@@ -34,7 +31,6 @@ def claim() -> int:
         if domain not in busy and _lock(folder / str(domain)):
             os.environ["ROS_DOMAIN_ID"] = str(domain)
             os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-            os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROFILE))
             return domain
     raise RuntimeError(f"expected a free ROS domain of {len(DOMAINS)}; got none: end the nodes that were left running")
 

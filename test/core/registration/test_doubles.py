@@ -149,7 +149,36 @@ def test_the_way_to_a_copy_of_the_source_is_added_to_the_covariance_in_full(regi
     way = se3.exp(STEP, seen.mean(axis=0))
     rejected = replace(alone.source, points=alone.source.points[:50] + 30.0)
     copy = replace(alone, fit=replace(alone.fit, T=way @ alone.fit.T), source=rejected)
-    added = doubles._with_copy(alone, copy).uncertainty.covariance - alone.uncertainty.covariance
+    added = doubles._with_copy(alone, copy, 0.6).uncertainty.covariance - alone.uncertainty.covariance
     middle = alone.centre_mm
     twist = np.r_[se3.apply(way, middle[None])[0] - middle, Rotation.from_matrix(way[:3, :3]).as_rotvec()]
     np.testing.assert_allclose(added, np.outer(twist, twist), atol=1e-9)
+
+
+@pytest.mark.parametrize(("probability", "is_refused"), [(0.79, False), (0.8, True)])
+def test_a_doubtful_copy_leaves_the_answer_its_share_of_the_points_of_both(
+    registrar, twice, target, probability, is_refused
+):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    rejected = (~alone.residuals.inlier).sum()
+
+    def register(source, poses):
+        fit = replace(alone.fit, T=poses[0], weights=np.ones(len(source.points)), whole=None)
+        return replace(alone, fit=fit, source=source, probability=probability)
+
+    found = doubles.allowing_for_a_copy(alone, registrar.config, register)
+    share = 1.0 - rejected / len(twice)
+    assert (found.refusal is not None) is is_refused and found.most == pytest.approx(share)
+    assert found.probability == (registrar.config.rules.ruled_out if is_refused else pytest.approx(share))
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.0, 0.6), (0.5, 0.5)])
+def test_a_copy_makes_no_answer_surer_than_it_may_be(registrar, twice, target, before, after):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    assert doubles._with_copy(replace(alone, most=before), alone, 0.6).most == after
+
+
+def test_an_answer_that_is_less_probable_than_its_share_stays_so_in_a_stream(registrar, twice, target):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    found = doubles._with_copy(replace(alone, probability=0.55), alone, 0.6)
+    assert (found.probability, found.most) == (0.55, 0.6) and doubles.NAME not in found.contributions

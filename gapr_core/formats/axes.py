@@ -54,8 +54,10 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
         raise ConfigError("a file in LPS for lps_to_ras", f"{path.name}, which {how}", "use as_is: it is RAS")
     if axes == "auto" and said == "ras":
         log.warning("%s %s: x and y are negated, to LPS", path.name, how)
-    elif said == "ras" and axes != "ras":
+    elif said == "ras" and axes == "as_is":
         log.warning("%s %s and is read as it is (%s): auto turns it to LPS", path.name, how, OPTIONS)
+    elif said == "ras" and axes != "ras":
+        log.warning("%s %s and is read as %s: %s says so", path.name, how, axes.upper(), OPTIONS)
     elif said == "lps" and axes == "ras":
         log.warning("%s %s and is read as RAS: %s says so", path.name, how, OPTIONS)
     return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapr_core.config import RegistrarConfig, SmoothBiasConfig
+from gapr_core.config import RegistrarConfig, SensorConfig, SmoothBiasConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import smooth_bias
 from gapr_core.registration.assessment import Assessment
@@ -133,7 +133,7 @@ def test_all_points_of_the_source_decide_where_only_some_are_fitted(steps, monke
 
 
 def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps, monkeypatch):
-    monkeypatch.setattr(smooth_bias, "estimate", lambda fit, *given: ("estimated", fit.bias_mm, given[-1]))
+    monkeypatch.setattr(smooth_bias, "estimate", lambda fit, *given: ("estimated", fit.bias_mm, *given[-2:]))
     config = RegistrarConfig(smooth_bias=CONFIG)
     known = SimpleNamespace(covariance=EXACT, smooth_mm=0.3, short_mm=0.4)
     assessment = Assessment(fit_of(np.eye(4)), None, known, {}, 0.9, None, SOURCE, None)
@@ -142,4 +142,8 @@ def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps,
     steps(9.0, 0.0)
     found = smooth_bias.bias_corrected(assessment, config)
     assert found.fit.T == pytest.approx(moved_by(1, np.eye(4)), abs=1e-12)
-    assert found.uncertainty == ("estimated", pytest.approx(0.5), (0.3, 0.4)) and found.probability == 0.9
+    assert found.uncertainty == ("estimated", pytest.approx(0.5), (0.3, 0.4), None) and found.probability == 0.9
+    steps(9.0, 0.0)
+    stated, eye = replace(config, sensor=SensorConfig(scale=0.01)), np.array([0.0, 0.0, -400.0])
+    seen = smooth_bias.bias_corrected(replace(assessment, viewpoint=eye), stated)
+    np.testing.assert_allclose(seen.uncertainty[-1], se3.apply(seen.fit.T, eye[None])[0])

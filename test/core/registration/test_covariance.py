@@ -172,9 +172,9 @@ def test_ranges_that_are_wrong_move_the_whole_cloud_along_the_line_of_sight(far_
     middle, sight = fit.moved.mean(axis=0), np.array([0.6, 0.0, 0.8])
     alone = covariance.sandwich(fit, fields, errors, CONFIG)
     found = covariance.sandwich(fit, fields, errors, CONFIG, middle - far_mm * sight)
-    assert np.sqrt(np.trace(alone[:3, :3])) < 0.3
-    assert np.sqrt(sight @ found[:3, :3] @ sight) == pytest.approx(0.01 * far_mm, abs=0.3)
-    assert np.sqrt(np.trace(found[:3, :3]) - sight @ found[:3, :3] @ sight) < 0.3
+    assert np.sqrt(np.trace(alone[:3, :3])) < 0.4
+    assert np.sqrt(sight @ found[:3, :3] @ sight) == pytest.approx(0.01 * far_mm, abs=0.4)
+    assert np.sqrt(np.trace(found[:3, :3]) - sight @ found[:3, :3] @ sight) < 0.4
 
 
 def test_only_a_stated_scale_is_one_of_the_ranges_from_where_a_camera_was():

@@ -169,9 +169,11 @@ def test_depths_that_are_wrong_move_the_pose_along_the_beam_and_nowhere_else():
 def test_ranges_that_are_wrong_move_the_whole_cloud_along_the_line_of_sight(far_mm):
     """By 1 % of the distance, on top of what an error of the size alone does, which hardly moves its middle."""
     fit, errors, fields = curved_fit(), replace(NOTHING, scale=0.01), np.zeros((300, 1))
-    middle, sight = fit.moved.mean(axis=0), np.array([0.6, 0.0, 0.8])
-    alone = covariance.sandwich(fit, fields, errors, CONFIG)
-    found = covariance.sandwich(fit, fields, errors, CONFIG, middle - far_mm * sight)
+    inlier, sight = fit.weights > 0.0, np.array([0.6, 0.0, 0.8])
+    eye = fit.moved[inlier].mean(axis=0) - far_mm * sight
+    of_size, of_ranges = (covariance.directions(fit, False, 0.3, *where)[1] for where in ((), (eye,)))
+    np.testing.assert_allclose(of_ranges - of_size, fit.gradients[inlier] @ (far_mm * sight), atol=1e-9)
+    alone, found = (covariance.sandwich(fit, fields, errors, CONFIG, *where) for where in ((), (eye,)))
     assert np.sqrt(np.trace(alone[:3, :3])) < 0.4
     assert np.sqrt(sight @ found[:3, :3] @ sight) == pytest.approx(0.01 * far_mm, abs=0.4)
     assert np.sqrt(np.trace(found[:3, :3]) - sight @ found[:3, :3] @ sight) < 0.4

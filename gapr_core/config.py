@@ -242,14 +242,12 @@ class LimitsConfig(Settings):
 
     most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
     few_points: int = setting(250, "fewer near points show neither whose bone nor what size it is", low=0, high=10**6)
-    noise_kept: float = setting(1.3, "residuals over a stated noise up to which they do say it", low=0, high=100)
-    noise_exceeded: float = setting(
-        2.5, "residuals over the noise of a named sensor and the model from which on they do not", low=0, high=100
+    noise_kept: tuple[float, float] = setting(
+        (0.6, 1.3), "residuals over a stated noise between which they do say it", low=0, high=100
     )
+    noise_exceeded: float = setting(2.5, "residuals over the known noise from which on they do not", low=0, high=100)
     model_mm: float = setting(0.3, "error of a bone's model from place to place", low=0, high=10, unit="mm")
-    bias_exceeded: float = setting(
-        1.25, "smooth misfit over that of a named sensor and the model from which on they do not", low=0, high=100
-    )
+    bias_exceeded: float = setting(1.25, "smooth misfit over what is known from which on they do not", low=0, high=100)
     shared_noise: float = setting(0.5, "share of a sensor's noise that near points may share", low=0, high=1)
     model_bias_mm: float = setting(0.1, "smooth error of the model of a bone", low=0, high=10, unit="mm")
     rough_exceeded: float = setting(
@@ -257,6 +255,7 @@ class LimitsConfig(Settings):
     )
     covered: float = setting(0.9, "least share of the covariance within 4 mm and 5 deg", low=0, high=1)
     loose_mm: float = setting(5.0, "a larger tre95_mm does not say whose bone it is", low=0, high=1000, unit="mm")
+    standoff_mm: float = setting(3.5, "no residual shows that a larger stated one is right", low=0, high=100, unit="mm")
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,8 @@ def is_sparse(assessment: Assessment, config: RegistrarConfig) -> bool:
 
     Bones of different subjects are alike to half a millimetre over a knee end. A dense source shows the difference as a
     misfit that near points share. Between sparse points it looks like noise, unless the noise is known
-    (`SensorConfig.noise_mm`) and the residuals are no larger.
+    (`SensorConfig.noise_mm`) and the residuals are as large. Far smaller ones show that it is not: more than the noise
+    could hide in what was stated.
     """
     return with_neighbours(assessment) < config.limits.few_points and not is_noise(assessment, config)
 
@@ -81,11 +82,12 @@ def with_neighbours(assessment: Assessment) -> int:
 
 
 def is_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True where the noise is stated, nearly all points count for the pose, and their residuals are no larger."""
+    """True where the noise is stated, nearly all points count for the pose, and their residuals are about as large."""
     noise_mm, counts = config.sensor.noise_mm, assessment.fit.weights > 0.0
     if noise_mm is None or counts.mean() < NEARLY_ALL:
         return False
-    return residual_mm(assessment) <= config.limits.noise_kept * noise_mm
+    least, most = config.limits.noise_kept
+    return least * noise_mm <= residual_mm(assessment) <= most * noise_mm
 
 
 def is_beyond_noise(assessment: Assessment, config: RegistrarConfig) -> bool:
@@ -144,6 +146,11 @@ def is_uncertain(assessment: Assessment, config: RegistrarConfig) -> bool:
 def is_bound_large(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True where the bone may be so far off somewhere that as much of another subject's would fit as well."""
     return assessment.tre95_mm > config.limits.loose_mm
+
+
+def is_far_out(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True where a stand-off is stated with which a source that lies on the bone would not have a right pose."""
+    return abs(config.sensor.standoff_mm or 0.0) > config.limits.standoff_mm
 
 
 def is_inferred(assessment: Assessment, config: RegistrarConfig) -> bool:
@@ -219,6 +226,12 @@ LIMITS = (
         is_bound_large,
         "so little of the bone, or so noisy, may as well be of another subject's; measure a larger part of it, or more "
         "precisely",
+    ),
+    Limit(
+        "far_out",
+        is_far_out,
+        "a stand-off so large is taken out of the pose, and no residual shows that it is right; check standoff_mm, or "
+        "measure on the bone",
     ),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )

@@ -43,6 +43,7 @@ WORDS = {
     "strained": "limit: the source is longer, wider or slanted against the bone",
     "layered": "limit: the distance from the bone changes along the source",
     "apart": "limit: two halves of the source lie in two poses",
+    "far_out": "limit: a stand-off is stated that is larger than a pose may be off",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits
 

@@ -89,6 +89,13 @@ def test_a_camera_that_nobody_named_may_have_been_elsewhere(made):
     assert asked.refusal.status is RegistrationStatus.LOW_CONFIDENCE and "(viewpoint)" in asked.refusal.reason
 
 
+@pytest.mark.parametrize(("standoff_mm", "probability"), [(3.4, SURE), (3.6, 0.89), (-3.6, 0.89), (None, SURE)])
+def test_a_standoff_that_is_larger_than_a_pose_may_be_off_cannot_be_sure(made, standoff_mm, probability):
+    found = limits.applied(made(), named(standoff_mm=standoff_mm))
+    assert found.probability == probability
+    assert (list(found.contributions)[-1:] == ["far_out"]) is (probability < SURE)
+
+
 def test_what_is_no_surer_than_that_stays(made):
     unsure = made(60, probability=0.89)
     assert limits.applied(unsure, RegistrarConfig()) is unsure
@@ -97,9 +104,11 @@ def test_what_is_no_surer_than_that_stays(made):
 
 
 def test_few_points_whose_noise_is_known_and_left_may_be_sure(made):
-    """0.4 mm, the pose's six unknowns counted, may be at most 1.3 times what is stated."""
-    assert limits.applied(made(40), named(noise_mm=0.4 / 1.29)).probability == SURE
-    assert limits.applied(made(40), named(noise_mm=0.4 / 1.31)).probability == 0.89
+    """0.4 mm, the pose's six unknowns counted, may be 0.6 to 1.3 times what is stated."""
+    for times, probability in ((1.29, SURE), (1.31, 0.89), (0.61, SURE), (0.59, 0.89)):
+        found = limits.applied(made(40), named(noise_mm=0.4 / times))
+        assert found.probability == probability
+    assert list(found.contributions)[-1] == "sparse"
     assert limits.applied(made(7, gross=1), named(noise_mm=1.0)).probability == 0.89  # none left to be measured
 
 

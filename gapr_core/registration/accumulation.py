@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
-from gapr_core.geometry import sampling
-from gapr_core.registration import rigidity
+from gapr_core.geometry import sampling, se3
+from gapr_core.registration import precision, rigidity
 from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import fingerprint
@@ -36,9 +36,9 @@ class Accumulator:
     Nothing helps more than seeing more of the bone: images of a probe that say nothing alone determine the pose
     together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
-    what lies off the bone is left out, and refused if it is the newest. After three of them in a row the bone or its
-    reference has moved, and only these three are kept. Where all show that the bone moves (see `rigidity`), the answer
-    is refused, and those since a step or the last third are kept.
+    what lies off the bone, or lay off it under the accepted pose before, is left out, and refused if it is the newest.
+    After three of them in a row the bone or its reference has moved, and only these three are kept. Where all show that
+    the bone moves (see `rigidity`), the answer is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -66,12 +66,17 @@ class Accumulator:
         """(N, 3) all points that are kept, mm."""
         return _together(self._kept + self._new)
 
+    def together_with(self, source: ArrayLike) -> Array:
+        """(N, 3) mm, what `register` would register with a source (n, 3): the last of those kept, and itself."""
+        return _together([*self._kept, *self._new, np.asarray(source, dtype=np.float64)][-self.most :])
+
     def reset(self) -> None:
         """Forget all sources, and the track of a `Tracker`."""
         self._kept: list[Array] = []  # on the bone under an accepted pose, or from before there was one
         self._new: list[Array] = []  # since the last registration; several, where `collect` is called in between
         self._small: list[Array] = []  # the newest of few points, which are looked at together
         self._off_in_a_row: list[Array] = []  # off the bone under an accepted pose, and left out
+        self._accepted: RegistrationResult | None = None  # the last answer that was
         self._far_in_a_row = 0  # how many sources were metres away from the others
         if isinstance(self.method, Tracker):
             self.method.reset()
@@ -146,7 +151,9 @@ class Accumulator:
         except Exception:
             self._new = before if self._kept is kept else []  # or the collection restarted with this source
             raise
-        return self._decide_on_new(replace(result, method=self.name), target)
+        found = self._decide_on_new(replace(result, method=self.name), target)
+        self._accepted = found if found.ok else self._accepted
+        return found
 
     def _last(self) -> list[Array]:
         """The sources that are registered together, the newest last."""
@@ -205,7 +212,7 @@ class Accumulator:
             points = _together(judged)
             if not judged:
                 continue
-            if not self._lies_off(points, everything, T, seen):
+            if not (self._lies_off(points, everything, T, seen) or self._contradicts(points, seen)):
                 self._off_in_a_row = []
                 continue
             off, self._small = off + judged, []
@@ -238,6 +245,19 @@ class Accumulator:
         some = np.ascontiguousarray(points[:: 1 + len(points) // limits.most_points])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
         return own > limits.off * max(of_all, refinement.smallest_sigma_mm)
+
+    def _contradicts(self, source: Array, target: PreparedTarget) -> bool:
+        """True when a source (N, 3) lies off the bone under the last accepted pose, farther than that may be off there.
+
+        A large source may pull the pose of all along, and lie on the bone then.
+        """
+        last = self._accepted
+        if last is None or last.T_target_source is None or last.covariance is None or last.centre_mm is None:
+            return False
+        T = last.T_target_source
+        most_mm = last.factor95 * precision.bound_mm(last.covariance, se3.apply(T, source), last.centre_mm)
+        is_off = self._lies_off(source, _together(self._kept), T, target)
+        return is_off and _typical_distance_mm(T, source, target) > most_mm
 
 
 def _of_many_places(method: Registrar | Tracker) -> Registrar | Tracker:

@@ -41,7 +41,7 @@ class Registration:
     Args:
         frames: look-up of transforms.
         situation: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
-            when there is such a pose, and with `accumulate` it has `collect` and `collected` as an `Accumulator`.
+            when there is such a pose, and with `accumulate` it has `collect` and `together_with` as an `Accumulator`.
         left: is called for every cloud of `collect`, now or later: whether it was collected, and why not.
     """
 
@@ -49,7 +49,7 @@ class Registration:
         self._frames, self._situation = frames, situation
         self._late = Late(self._collect, left)
         self._following, self._initial_poses = Following(), InitialPoses()
-        self._pushed_out: Job | None = None
+        self._newest_collected: Job | None = None  # since a cloud was registered; it alone may change the frame
         self._frame = ""  # of the last answer; what the method remembers holds there only
 
     def process(self, job: Job) -> Outcome:
@@ -71,7 +71,7 @@ class Registration:
     def collect(self, job: Job) -> None:
         """Keep a cloud to be registered with a newer one, once its transform is there; never raises, never waits."""
         self._late.add(job)
-        self._pushed_out = job
+        self._newest_collected = job
         self._late.take(self._situation().parameters.tf_timeout)
 
     def end(self, why: str) -> None:
@@ -83,10 +83,11 @@ class Registration:
         if job.epoch < now.oldest:
             raise RefusedError(Reason.SUPERSEDED_BY_RESET, f"the cloud is older than this: {now.why}")
         outcome = Outcome(job)
+        # one from before a refusal may be collected, back to `oldest`; `_points_mm` would leave it out
         now = replace(now, epoch=job.epoch, parameters=replace(now.parameters, tf_timeout=0.0))
         points_mm = self._points_mm(outcome, now)
         frame = outcome.header.frame_id
-        if job is self._pushed_out:  # for the first time, just now
+        if job is self._newest_collected:  # for the first time, just now
             self._watch_frame(frame, now)
         elif frame != self._frame:
             raise RefusedError(Reason.BAD_FRAME, f"it is in '{frame}', those that are collected are in '{self._frame}'")
@@ -95,7 +96,7 @@ class Registration:
     def _run(self, outcome: Outcome, now: Situation, start: float) -> None:
         points_mm = self._points_mm(outcome, now)
         self._watch_frame(outcome.header.frame_id, now)
-        outcome.points_used, self._pushed_out = len(points_mm), None
+        outcome.points_used, self._newest_collected = len(points_mm), None
         if now.parameters.accumulate > 1:
             self._late.take(now.parameters.tf_timeout)  # the transform of this cloud has come: so have those of before
             _check_together(points_mm, outcome, now)
@@ -200,7 +201,7 @@ def needs_frames(parameters: NodeParameters) -> bool:
 
 def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
     """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
-    together = np.vstack([now.method.collected, points_mm])
+    together = now.method.together_with(points_mm)
     if len(together) < SEARCHED_FOR_DOUBLES:
         together = sampling.distinct(together)  # a cloud that comes again makes no more of them
     if not intake.is_one_bone(together, now.model.extent_mm):

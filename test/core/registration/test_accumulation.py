@@ -51,6 +51,8 @@ def test_only_the_newest_sources_are_kept(registrar, frames):
     for pair in frames[:5]:
         accumulator.collect(pair.source)
     np.testing.assert_array_equal(accumulator.collected, np.concatenate([pair.source for pair in frames[2:5]]))
+    with_next = np.concatenate([pair.source for pair in frames[3:6]])
+    np.testing.assert_array_equal(accumulator.together_with(frames[5].source), with_next)
     accumulator.reset()
     assert accumulator.collected.shape == (0, 3)
     with pytest.raises(ConfigError, match="a Registrar or a Tracker; got 'gapr'"):
@@ -417,3 +419,47 @@ def test_a_tracker_grows_surer_of_a_collection_that_grows(registrar, frames, pre
     accumulator = Accumulator(Tracker(registrar), most=20)
     said = [accumulator.register(pair.source, prepared).confidence for pair in frames]
     assert said[-1] > said[2] + 0.05
+
+
+@pytest.mark.parametrize(
+    ("sigma_mm", "factor95", "is_refused"), [(1.0, 1.0, True), (1.0, 4.0, False), (8.0, 1.0, False)]
+)
+def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_along(
+    registrar, target, femur, sigma_mm, factor95, is_refused
+):
+    points, normals = femur.sample(4000, np.random.default_rng(0))
+    near = np.argsort(np.linalg.norm(points - points[0], axis=1))
+    facing = near[normals[near] @ normals[0] > 0.8]
+    own, moved, away = points[facing[:100]], points[facing[:400]], 5.0 * normals[0]
+    covariance = np.diag([sigma_mm**2] * 3 + [1e-8] * 3)
+    poses = iter([np.eye(4), se3.exp(np.r_[-away, 0.0, 0.0, 0.0], np.zeros(3))])
+
+    class Pulled:
+        config = registrar.config
+
+        def register(self, source, target, initial):
+            T = next(poses)
+            found = {"covariance": covariance, "centre_mm": points[0], "factor95": factor95, "confidence": 0.9}
+            return RegistrationResult(RegistrationStatus.OK, T, hypotheses=(Hypothesis(T, 0.9),), **found)
+
+    accumulator = Accumulator(Pulled(), most=5)
+    assert accumulator.register(own, target).ok
+    answer = accumulator.register(moved + away, target)
+    assert answer.ok is not is_refused and ("newest source lies off the bone" in answer.reason) is is_refused
+    assert len(accumulator.collected) == (100 if is_refused else 500)
+
+
+@pytest.mark.parametrize(("step_mm", "creeps"), [(0.1, True), (0.0, False)])
+def test_a_bone_that_creeps_is_noticed_by_where_a_pointer_with_a_stand_off_sees_it(femur, step_mm, creeps):
+    """Against the bone itself the 2 mm between them would hide so slow a motion."""
+    pointer = SensorConfig(kind="pointer", standoff_mm=2.0)
+    registrar = Registrar(RegistrarConfig(num_threads=1, sensor=pointer))
+    collected, target = Accumulator(registrar, most=20), registrar.prepare(femur)
+    for number in range(9):
+        rng = np.random.default_rng(number)
+        points, normals = femur.sample(150, rng)
+        source = points + 2.0 * normals + rng.normal(0.0, 0.3, points.shape) + [0.0, step_mm * number, 0.0]
+        collected.collect(source)
+    result = collected.register(source, target)
+    assert ("the bone moves against the frame of the sources" in result.reason) is creeps
+    assert result.ok is not creeps and len(collected.collected) == 150 * (3 if creeps else 9)

@@ -20,12 +20,16 @@ class Reliability(NamedTuple):
 
 
 def auroc(confidence: ArrayLike, correct: ArrayLike) -> float:
-    """Probability that a right pose has a higher confidence than a wrong one, ties half; NaN without both kinds."""
+    """Probability that a right pose has a higher confidence than a wrong one, ties half; NaN without both kinds.
+
+    A confidence that is NaN is the lowest of all.
+    """
     correct = np.asarray(correct, dtype=bool)
     right, wrong = int(correct.sum()), int((~correct).sum())
     if right == 0 or wrong == 0:
         return float("nan")
-    _, place, ties = np.unique(np.asarray(confidence, dtype=np.float64), return_inverse=True, return_counts=True)
+    known = np.nan_to_num(np.asarray(confidence, dtype=np.float64), nan=-np.inf, posinf=np.inf)
+    _, place, ties = np.unique(known, return_inverse=True, return_counts=True)
     ranks = (np.cumsum(ties) - (ties - 1) / 2)[place]  # equal scores share their mean rank
     return float((ranks[correct].sum() - right * (right + 1) / 2) / (right * wrong))
 

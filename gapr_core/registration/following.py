@@ -7,6 +7,7 @@ did, and the bone does not jump. In all other cases there is no pose, and the so
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +23,7 @@ from gapr_core.registration.bias_field import POSE_PRIOR
 from gapr_core.registration.refinement import Fit, distances_mm, refine_fully, refine_many, tukey_limit
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,8 @@ class Follower:
         if self._since >= self._config.following.most_sources or len(points) < self._config.source.fewest_points:
             return None
         fit = self._fit_part(points, self._T)
-        if self.why_not(fit):
+        if why := self.why_not(fit):
+            log.debug("a source has to be assessed: %s", why)
             return None
         self._T, self._since = fit.T, self._since + 1
         return FollowedPose(fit.T.copy(), fit.inlier_ratio, fit.residual_mm, self._since)

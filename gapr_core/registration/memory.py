@@ -77,11 +77,11 @@ class MemoryFirst(Registrar):
         super().__init__(full.config, proposers, calibrations, full._scene_calibration, full.precision)
         self._full, self._memory = full, memory
 
-    def _is_enough(self, assessment: Assessment) -> bool:
+    def _needs_no_other_proposer(self, assessment: Assessment) -> bool:
         """A remembered pose has to be sure: what misled the answer before may mislead this one."""
         if assessment.proposer == Memory.name:
             return assessment.reaches(self.config.sure_from)
-        return super()._is_enough(assessment)
+        return super()._needs_no_other_proposer(assessment)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         return self._full._of_image(flipped, target, clock)

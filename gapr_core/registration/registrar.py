@@ -7,7 +7,7 @@ The order in which an answer comes about, with the function of each step:
    `assess_fit` says how sure it is, until that is enough. `_on_both_cortices` once more where a bone is hollow.
 3. `_of_one_view`: what is not sure as bone alone may be what a camera saw. With a viewpoint `_in_scene` comes at once.
 4. `_checked_and_corrected`: sizes, the mirror image, then a stand-off may refuse; `bias_corrected` moves the pose;
-   the precision model, `allowing_for_deformation` and `allowing_for_a_copy` widen its covariance.
+   the precision model and `allowing_for_deformation` widen its covariance, `allowing_for_a_copy` may refuse it too.
 5. In a stream `Tracker` weighs it with the sources before.
 6. `conclude`: `limits` keep it from being sure, thresholds refuse, and the reason gets its words.
 """
@@ -158,7 +158,8 @@ class Registrar:
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
             viewpoint: (3,) mm, source frame: where the camera was, if there was one. Without it the cloud is registered
-                as bone; where that is refused, as what a camera saw (`ClutterConfig.infer_viewpoint`).
+                as bone; where the probability or the geometry of that pose is against it, as what a camera saw
+                (`ClutterConfig.infer_viewpoint`).
 
         Raises:
             InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; a target
@@ -332,7 +333,7 @@ class Registrar:
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
             if enough(assessment) or (
-                self._is_enough(assessment) and (not given or self._is_near(assessment, poses[given:]))
+                self._needs_no_other_proposer(assessment) and (not given or self._is_near(assessment, poses[given:]))
             ):
                 break
         return assessment
@@ -345,7 +346,7 @@ class Registrar:
         count, T = self.config.verification.markers, assessment.fit.T[None]
         return bool(support(T, proposed, assessment.source, count, WITHIN_MM)[0] > 0.0)
 
-    def _is_enough(self, assessment: Assessment) -> bool:
+    def _needs_no_other_proposer(self, assessment: Assessment) -> bool:
         """True where no further proposer need be asked: the pose is sure, or good enough and too doubtful to be sure.
 
         What may be sure is searched for once more: where both agree, fewer bones of other subjects are. A memory

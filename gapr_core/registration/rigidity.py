@@ -105,7 +105,8 @@ def of_motion(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Mot
     best = int(np.argmax(ratios))
     if best == 0:
         return Motion(found[0])
-    at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()  # the step may lie anywhere in the group
+    # a step before the middle of a group speaks most for the group's first edge
+    at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()
     rests_from = int(np.ceil(order.min() + at * (order.max() - order.min())))
     return Motion(Finding(ratios[best], found[best].size_mm), rests_from)
 

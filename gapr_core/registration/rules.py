@@ -3,7 +3,8 @@
 Six rules do not weigh the probability: a motion that is not observed, a pose that can be pushed aside, a rival that is
 as good, a source of another size by small changes and by larger ones, a source whose mirror image fits better. Pushing,
 growing and mirroring cost time: they are done only where the pose may still be accepted. A seventh, a source that fits
-better off the bone, is in `standoff`. Two rules are the user's thresholds: `min_confidence` and `max_tre_mm`.
+better off the bone, is in `standoff`; an eighth, a second copy of the bone among the points that do not fit, in
+`doubles`. Two rules are the user's thresholds: `min_confidence` and `max_tre_mm`.
 """
 
 from __future__ import annotations

@@ -83,7 +83,8 @@ def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarg
     """The target whose surface elements lie where the sensor sees them: farther out by the stand-off.
 
     The residual of a point becomes its signed distance to the bone less the stand-off. Everything else of the target
-    stays, and so does the target itself where the stand-off is 0.
+    stays, and so does the target itself where the stand-off is 0. That of a target that lies farther out already is
+    added to its own.
     """
     offset_mm = errors(sensor, 0).offset_mm
     if offset_mm == 0.0:
@@ -91,4 +92,6 @@ def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarg
     elements = target.elements.copy()
     elements[:, :3] += offset_mm * elements[:, 3:6]
     both = None if target.both_cortices is None else offset_surface(target.both_cortices, sensor)
-    return replace(target, elements=np.ascontiguousarray(elements), both_cortices=both, offset_mm=offset_mm)
+    return replace(
+        target, elements=np.ascontiguousarray(elements), both_cortices=both, offset_mm=target.offset_mm + offset_mm
+    )

@@ -3,7 +3,8 @@
 On a patch that faces one way this is a shift of the pose, and no residual shows it. On one that bends, the source looks
 grown and fits badly, so that a right pose is refused. Such a refusal asks for the stand-off that would explain it. On a
 pelvis or a rib cage a layer of 4 to 8 mm fits well enough to be believed, with a pose that is off by as much. But it
-fits the surface of a thicker or thinner bone better: where one more than 4 mm off does, the pose is refused.
+fits the surface of a thicker or thinner bone better: where one more than 4 mm outside does, or one 3 mm inside, the
+pose is refused.
 """
 
 from __future__ import annotations

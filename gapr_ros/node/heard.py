@@ -22,7 +22,9 @@ class Heard:
     """Stands between tf2's listener and its buffer, which takes everything and interpolates between any two stamps.
 
     A stamp that goes back is judged as those of clouds are: one is a straggler and is left out; several in a row that
-    go forward among themselves are another round, and what was heard before is forgotten. Until it is clear which,
+    go forward among themselves are another round, and what was heard before is forgotten. So are two that go back and a
+    third that is the newest of all: the step may have been a short one, and to forget is the safe side. Until it is
+    clear which,
     nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden, or goes to
     and fro, as one that two nodes send. Frames through which nothing was looked up yet may be out of order by a second;
     while there are others, theirs are left out then: they are no reason to forget the others.

@@ -48,7 +48,7 @@ class Outcome:
         tre_mm, tre95_mm, inlier_ratio: of the registration.
         result: its whole answer; None where it was not asked.
         has_initial_pose: the registration began at a pose from outside.
-        found_by: how far the registration had to look: track, network, search, or scene with a viewpoint.
+        found_by: how far the registration had to look: track, network, search, or scene, a camera's view.
         tf_wait_s: of it, how long transforms were waited for.
         exec_ms: wall time of the whole way.
     """

@@ -20,7 +20,12 @@ from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros import parameters as node_parameters
 from gapr_ros.node import frames, wire
+from gapr_ros.node.course import Course
+from gapr_ros.node.model import Model
+from gapr_ros.node.outcome import Found, Outcome
+from gapr_ros.node.refusal import Reason
 from gapr_ros.node.timeline import Timeline
+from gapr_ros.node.worker import Job
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import pose_to_matrix
 
@@ -295,6 +300,33 @@ def test_after_time_starts_over_an_older_stamp_is_the_next():
     assert timeline.is_next(np.eye(4), header(5), GOOD)
     unstamped = Timeline()
     assert [unstamped.is_next(np.eye(4), header(0), GOOD) for _ in range(2)] == [True, True], "no clock runs"
+
+
+def decided(course, stamp_s, reason=None, **parameters):
+    """Why a cloud gets no pose that was found, or refused for a reason, while it was on its way; empty if it does."""
+    header = Header(frame_id="probe", stamp=Time(seconds=stamp_s).to_msg())
+    outcome = Outcome(Job(b"", course.epoch, 0), "probe", header, result=accepted(tre95_mm=2.0))
+    outcome.found = Found(np.eye(4), np.eye(6))
+    if reason:
+        outcome.refuse(reason, "for the test")
+    course.decide(outcome, Model("bone.npy", None, GOOD * 1000.0, 100.0, None), NodeParameters(**parameters))
+    return outcome.text
+
+
+@pytest.mark.parametrize("limit", [{"min_confidence": 0.95}, {"max_tre": 0.001}])
+def test_a_limit_that_is_raised_while_a_cloud_is_on_its_way_ends_the_row_and_the_place(limit):
+    course = Course()
+    assert not decided(course, 1) and course.place
+    assert decided(course, 2, **limit) and not course.place
+    assert decided(course, 3, require_consecutive=2).startswith("1 of 2")
+
+
+@pytest.mark.parametrize(("reason", "stands"), [(Reason.STALE, True), (Reason.AMBIGUOUS, False)])
+def test_a_cloud_that_grew_old_in_the_mailbox_ends_neither_the_row_nor_the_place(reason, stands):
+    course = Course()
+    assert not decided(course, 1)
+    assert decided(course, 2, reason) == "for the test" and bool(course.place) is stands
+    assert bool(decided(course, 3, require_consecutive=2)) is not stands
 
 
 @pytest.mark.parametrize(

@@ -189,8 +189,8 @@ def test_what_the_method_refused_after_a_long_time_is_its_reason_and_not_the_tim
     _, client, method = live
     method.answer = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two poses fit")
     send_slowly(live)
-    wait_until(lambda: client.confidences)
-    assert client.values()["last_refusal"] == "ambiguous: two poses fit"
+    why = "ambiguous: two poses fit"
+    wait_until(lambda: client.values()["last_refusal"] == why and client.confidences, what=client.values)
 
 
 class Slow:

@@ -19,6 +19,7 @@ def test_auroc_of_a_perfect_an_inverted_and_an_uninformed_score():
     correct = [True, True, False]
     assert c.auroc([0.9, 0.8, 0.1], correct) == 1.0
     assert c.auroc([0.1, 0.2, 0.9], correct) == 0.0
+    assert c.auroc([np.nan, 0.5, 0.7], [True, False, True]) == 0.5  # no confidence is the lowest
     assert c.auroc([0.5, 0.5, 0.5], correct) == 0.5
     assert c.auroc([0.9, 0.8, 0.85], [True, False, False]) == 1.0
     with np.errstate(all="raise"):

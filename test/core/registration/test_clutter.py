@@ -164,6 +164,16 @@ def test_a_stream_takes_the_wound_for_one_and_never_more_than_that(target, scene
     assert tracker._evidence is not None and not tracker._is_sure
 
 
+def test_a_stream_with_a_viewpoint_is_seen_from_there_to_the_last_cloud(target, scene):
+    """A tracker that left it out would infer one of its own, and find the bone as well."""
+    rng = np.random.default_rng(3)
+    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    for _ in range(3):
+        points = scene[0] + rng.normal(0.0, 0.1, scene[0].shape)
+        result = tracker.register(points, target, viewpoint=scene[1])
+        assert result.ok and result.proposer == clutter.NAME and result.inferred_viewpoint is None
+
+
 def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target, scene, monkeypatch):
     memory, given = Memory(), []
     memory.keep([se3.inverse(T_SOURCE_TARGET), np.eye(4)])

@@ -182,3 +182,19 @@ def test_an_answer_that_is_less_probable_than_its_share_stays_so_in_a_stream(reg
     alone, _ = assessed(registrar, twice, target, doubled=2.0)
     found = doubles._with_copy(replace(alone, probability=0.55), alone, 0.6)
     assert (found.probability, found.most) == (0.55, 0.6) and doubles.NAME not in found.contributions
+
+
+@pytest.mark.parametrize(("away_mm", "is_copy"), [(0.0, False), (30.0, True)])
+def test_a_copy_that_was_looked_for_anywhere_changes_nothing_where_it_lies_as_the_answer_does(
+    registrar, twice, target, monkeypatch, away_mm, is_copy
+):
+    alone, _ = assessed(registrar, twice, target, doubled=2.0)
+    monkeypatch.setattr(doubles, "_elsewhere", lambda *_: None)
+    T = se3.exp([away_mm, 0.0, 0.0, 0.0, 0.0, 0.0]) @ alone.fit.T
+
+    def register(source, poses):
+        fit = replace(alone.fit, T=T, weights=np.ones(len(source.points)), whole=None)
+        return replace(alone, fit=fit, source=source, probability=0.9)
+
+    found = doubles.allowing_for_a_copy(alone, registrar.config, register)
+    assert (found is not alone) is (doubles.NAME in found.deformed) is is_copy

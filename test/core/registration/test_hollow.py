@@ -6,13 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapr_core import Registrar, RegistrarConfig
+from gapr_core import Registrar, RegistrarConfig, Tracker
 from gapr_core.config import CorticesConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import quadrics, se3, visibility
 from gapr_core.registration import cortices
+from gapr_core.registration.stream_misfit import NoMisfit
 
 WALL_MM = 4.0
 
@@ -71,6 +72,17 @@ def test_a_source_that_follows_both_cortices_is_registered_to_both(registrar, ho
     assert result.ok
     assert se3.pose_error(result.T_target_source, np.eye(4), source)[0] < 0.5
     assert result.confidence <= 0.85  # such sources were no part of the calibration
+
+
+def test_a_stream_makes_no_source_on_both_cortices_surer(registrar, hollow, hollow_cloud):
+    """The misfit that the frames share, which speaks against such sources, is left out: all agree."""
+    points, tracker, said = hollow_cloud[0], Tracker(registrar), []
+    tracker._misfit = NoMisfit()
+    end = points[points[:, 2] > np.quantile(points[:, 2], 0.5)]
+    for seed in range(3):
+        source = end + np.random.default_rng(seed).normal(0.0, 1.0, end.shape)
+        said.append(tracker.register(source, hollow).confidence)
+    assert said == [registrar.config.cortices.largest_confidence] * 3
 
 
 def test_the_bone_of_somebody_else_does_not_follow_both_cortices(registrar, hollow):

@@ -54,6 +54,13 @@ def test_without_a_standoff_the_target_is_the_same_object(egg):
     assert moved.points is egg.points  # where the bone is, and its targets are, does not change
 
 
+def test_a_standoff_is_added_to_that_of_a_target_that_lies_farther_out_already(egg):
+    twice = sensor.offset_surface(sensor.offset_surface(egg, SensorConfig(standoff_mm=2.0)), SensorConfig("pointer"))
+    assert twice.offset_mm == 2.0 + sensor.KINDS["pointer"].offset_mm == 2.5
+    moved_mm = np.einsum("ni,ni->n", twice.elements[:, :3] - egg.elements[:, :3], egg.elements[:, 3:6])
+    np.testing.assert_allclose(moved_mm, twice.offset_mm)
+
+
 @pytest.mark.parametrize("kind", SENSOR_KINDS)
 def test_what_is_stated_replaces_what_is_usual(kind):
     usual = sensor.errors(SensorConfig(kind), 100)

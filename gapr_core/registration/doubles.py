@@ -83,7 +83,7 @@ def _in_two_poses(assessment: Assessment, copy: Assessment) -> Refusal:
     reason = (
         f"the points that do not fit lie on the bone in another pose, {shift_mm:.0f} mm and {turn_deg:.0f} deg away"
     )
-    how = "did the bone, its reference or the sensor move while it was measured? Measure it again"
+    how = "did the bone, its reference or the sensor move meanwhile? Measure it again; if it stays, is it this bone?"
     return Refusal(RegistrationStatus.AMBIGUOUS, f"{reason}: {how}")
 
 

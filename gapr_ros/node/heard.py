@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.links import Links
 from gapr_ros.node.timeline import BACK_NS, RESTART_AFTER, stamp_ns
@@ -24,10 +26,9 @@ class Heard:
     A stamp that goes back is judged as those of clouds are: one is a straggler and is left out; several in a row that
     go forward among themselves are another round, and what was heard before is forgotten. So are two that go back and a
     third that is the newest of all: the step may have been a short one, and to forget is the safe side. Until it is
-    clear which,
-    nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was hidden, or goes to
-    and fro, as one that two nodes send. Frames through which nothing was looked up yet may be out of order by a second;
-    while there are others, theirs are left out then: they are no reason to forget the others.
+    clear which, nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was
+    hidden, jumps, or goes to and fro, as one that two nodes send. Frames through which nothing was looked up yet may be
+    out of order by a second; while there are others, theirs are left out then: they are no reason to forget the others.
 
     Args:
         buffer: of tf2.
@@ -84,6 +85,9 @@ class Heard:
         for each in sorted(frames):
             if how := self._links.to_and_fro(each, stamp):
                 return f"'{each}' is not to be believed, {how}: do two nodes send it on /tf?"
+            if jump := self._links.jump(each, stamp):
+                way = f"{1e3 * jump.metres:.1f} mm and {np.degrees(jump.radians):.1f} deg"
+                return f"'{each}' jumped by {way} around this stamp: tf2 would say a place at which it never was"
         gap_s, child = max(((self._links.gap_ns(each, stamp) * 1e-9, each) for each in frames), default=(0.0, ""))
         if stamp == 0 or not 0.0 < most_gap_s < gap_s:
             return ""
@@ -96,15 +100,21 @@ class Heard:
         return min((each for each in frames if each in self._back_ns), default="")
 
     def is_settled(self, frame: str, other: str, stamp: int, arrived_s: float) -> bool:
-        """False where a cloud that came late has to wait for another transform: that shows whether time went back.
+        """False where a cloud has to wait for another transform, which shows what the last one meant.
+
+        One that came late: whether time went back. One around whose stamp a frame jumped: whether it moves on.
 
         Args:
             frame, other: names.
             stamp: of the cloud, ns; 0 for none.
             arrived_s: when it came, `time.monotonic`.
         """
-        late = [each for each in self._links.between(frame, other) if self._links.newest_ns(each) > stamp + LATE_NS]
-        return stamp == 0 or all(self._came_s[each] > arrived_s for each in late)
+        frames = self._links.between(frame, other)
+        late = [each for each in frames if self._links.newest_ns(each) > stamp + LATE_NS]
+        if stamp == 0:
+            return True
+        jumps = (self._links.jump(each, stamp) for each in frames)
+        return all(self._came_s[each] > arrived_s for each in late) and not any(jump and jump.is_open for jump in jumps)
 
     def _is_of_now(self, child: str, stamp: int) -> bool:
         newest, any_older = self._links.newest_ns(child), child in self._any_older

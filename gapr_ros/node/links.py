@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left, bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,24 @@ KEPT_NS = 10_000_000_000  # behind the newest stamp of a frame, as a tf2 buffer 
 # A frame goes to and fro as no tracker sees one thing move: ways there and back, one transform after the other
 NEAR_NS = 1_000_000_000  # looked for on either side of a stamp
 TO_AND_FRO = 2  # so many are not chance
-LEAST_M, LEAST_RAD = 0.003, np.radians(2.0)  # shortest way that counts
-LEAST_M_S, LEAST_RAD_S = 0.15, np.radians(50.0)  # slowest
+LEAST = LEAST_M, LEAST_RAD = 0.003, np.radians(2.0)  # shortest way that counts
+LEAST_PER_S = 0.15, np.radians(50.0)  # slowest, m/s and rad/s
 BACK = 0.25  # share of a way that may be left after it
+CALM = 0.25  # share of a jump that a frame moves by before and after it where it rests there
+REST_NS = 50_000_000  # looked at before and after, at least: over less the noise of a tracker looks like a motion
+
+
+class Jump(NamedTuple):
+    """A step from rest to rest, from one transform to the next: nothing that is tracked moves so.
+
+    Attributes:
+        metres, radians: how far.
+        is_open: no transform after it was heard, so that it may yet be the beginning of a motion.
+    """
+
+    metres: float
+    radians: float
+    is_open: bool
 
 
 @dataclass
@@ -51,6 +67,37 @@ class Track:
         some = slice(bisect_left(self.stamps, stamp - NEAR_NS), bisect_right(self.stamps, stamp + NEAR_NS))
         seconds = 1e-9 * (np.array(self.stamps[some], dtype=np.float64) - stamp)
         return seconds, np.array(self.places[some]).reshape(-1, 7), self.parents[some]
+
+    def jump(self, stamp: int) -> Jump | None:
+        """Whether it jumped between the two transforms around a stamp, ns; None at one of them.
+
+        Before and after them it is looked at for half as long at least, so that stamps need not be even. Where nothing
+        was heard before them, nobody knows that it rested.
+        """
+        after = bisect_left(self.stamps, stamp)
+        if after in (0, len(self.stamps)) or self.stamps[after] == stamp:
+            return None
+        before = after - 1
+        rest_ns = max(REST_NS, (self.stamps[after] - self.stamps[before]) // 2)
+        first = bisect_right(self.stamps, self.stamps[before] - rest_ns) - 1
+        last = bisect_left(self.stamps, self.stamps[after] + rest_ns)
+        if first < 0 or self.parents[before] != self.parents[after]:
+            return None
+        is_open, took_ns = last == len(self.stamps), self.stamps[after] - self.stamps[before]
+        way = self._largest_way(before, [after])
+        rests = [self._largest_way(before, range(first, before)), self._largest_way(after, range(after, last + 1))]
+        is_jump = [
+            way[kind] >= max(LEAST[kind], LEAST_PER_S[kind] * 1e-9 * took_ns)
+            and all(rest[kind] <= CALM * way[kind] for rest in rests)
+            for kind in range(2)
+        ]
+        return Jump(*way, is_open) if any(is_jump) else None
+
+    def _largest_way(self, start: int, to: Iterable[int]) -> tuple[float, float]:
+        """From one place to the farthest of some others, metres and radians; numbers that are not there count not."""
+        others = np.array([self.places[i] for i in to if i < len(self.places)]).reshape(-1, 7)
+        metres, radians = _apart(np.broadcast_to(self.places[start], others.shape), others)
+        return float(metres.max(initial=0.0)), float(radians.max(initial=0.0))
 
 
 class Links:
@@ -115,6 +162,11 @@ class Links:
                 return 0
             return stamps[after] - stamps[after - 1]
 
+    def jump(self, child: str, stamp: int) -> Jump | None:
+        """Whether a frame jumped between the two transforms around a stamp, ns, or may have."""
+        with self._lock:
+            return self._tracks[child].jump(stamp) if child in self._tracks else None
+
     def to_and_fro(self, child: str, stamp: int) -> str:
         """How a frame goes to and fro around a stamp, ns, as where two nodes send it; empty where it does not.
 
@@ -152,7 +204,7 @@ def _spikes(seconds: Array, places: Array) -> tuple[int, float]:
     there, away = _apart(places[:-2], places[1:-1]), _apart(places[1:-1], places[2:])
     back = _apart(places[:-2], places[2:])
     is_spike = np.zeros(len(took_s), dtype=bool)
-    for kind, (least, least_per_s) in enumerate(((LEAST_M, LEAST_M_S), (LEAST_RAD, LEAST_RAD_S))):
+    for kind, (least, least_per_s) in enumerate(zip(LEAST, LEAST_PER_S, strict=True)):
         way = np.minimum(there[kind], away[kind])
         is_spike |= (way >= least) & (way >= least_per_s * took_s) & (back[kind] <= BACK * way)
     return int(is_spike.sum()), float(there[0][is_spike].max(initial=0.0))

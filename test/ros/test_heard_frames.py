@@ -392,7 +392,84 @@ def test_a_frame_that_one_tracker_follows_is_believed_however_it_turns_back(buff
         (q := transform.transform.rotation).x, q.y, q.z = turn
         q.w = float(np.sqrt(1.0 - turn @ turn))
         heard.set_transform(transform, "the tracker")
-        assert why_not(heard, stamp_s - 0.5 / rate_hz, most_gap_s=0.0) == ""
+        assert "to and fro" not in why_not(heard, stamp_s - 0.5 / rate_hz, most_gap_s=0.0)
+        assert "jumped" not in why_not(heard, stamp_s - 6.5 / rate_hz, most_gap_s=0.0)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30, 60])
+@pytest.mark.parametrize("jump_mm", [20.0, 50.0])
+def test_between_the_two_places_of_a_frame_that_jumps_nothing_is_looked_up(buffer, rate_hz, jump_mm):
+    """As with a marker that is mounted elsewhere, or a tracker that changes its mind; the stamps are not quite even."""
+    heard, hear, _ = hears(buffer)
+    rng = np.random.default_rng(rate_hz)
+    stamps_s = 1000.0 + (np.arange(30) + rng.uniform(-0.2, 0.2, 30)) / rate_hz
+    places_m = np.where(np.arange(30) < 20, 0.0, 1e-3 * jump_mm) + rng.normal(0.0, 2e-4, 30)
+    rests_from_s = stamps_s[20] + max(0.05, 0.5 * (stamps_s[20] - stamps_s[19]))
+    for number, (stamp_s, place_m) in enumerate(zip(stamps_s, places_m, strict=True)):
+        hear(stamp_s, place_m)
+        between = round(0.5 * stamps_s[19:21].sum() * NS)
+        is_said = "'camera' jumped by" in heard.why_not("world", "camera", between, 0.0)
+        assert is_said is (number >= 20), number
+        is_settled = bool(number < 20 or stamp_s > rests_from_s)  # until then it may go on
+        assert heard.is_settled("world", "camera", between, -np.inf) is is_settled, number
+    text = why_not(heard, 0.5 * stamps_s[19:21].sum(), most_gap_s=0.0)
+    assert text.endswith("mm and 0.0 deg around this stamp: tf2 would say a place at which it never was")
+    assert float(text.split(" by ")[1].split()[0]) == pytest.approx(jump_mm, abs=1.5)
+    elsewhere = [*stamps_s, *(0.5 * (stamps_s[i] + stamps_s[i + 1]) for i in range(29) if i != 19)]
+    assert [why_not(heard, stamp_s, most_gap_s=0.0) for stamp_s in elsewhere] == [""] * len(elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "swing_m", "times_a_s"),
+    [(10, 0.1, 1.5), (20, 0.03, 2.5), (20, 0.1, 1.5), (60, 0.03, 2.5), (60, 0.1, 0.3)],
+)
+def test_a_frame_that_moves_however_fast_does_not_jump(buffer, rate_hz, swing_m, times_a_s):
+    """It is heard six times and more while it swings once: less, and a straight line says nothing of where it was."""
+    heard, hear, _ = hears(buffer)
+    rng = np.random.default_rng(rate_hz)
+    stamps_s = 1000.0 + (np.arange(5 * rate_hz) + rng.uniform(-0.2, 0.2, 5 * rate_hz)) / rate_hz
+    for stamp_s in stamps_s:
+        hear(stamp_s, swing_m * np.sin(2.0 * np.pi * times_a_s * stamp_s) + rng.normal(0.0, 2e-4))
+    for between_s in 0.5 * (stamps_s[:-3] + stamps_s[1:-2]):
+        assert "jumped" not in why_not(heard, between_s, most_gap_s=0.0)
+
+
+def test_a_frame_that_sets_off_at_once_is_believed_as_soon_as_it_is_seen_to_go_on(buffer):
+    heard, hear, _ = hears(buffer)
+    for number, x in enumerate((0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.03)):
+        hear(1000.0 + 0.02 * number, x)
+        assert heard.is_settled("world", "camera", round(1000.09 * NS), -np.inf) is (number != 5)
+        assert bool(why_not(heard, 1000.09)) is (number == 5)
+
+
+@pytest.mark.parametrize(("turn_deg", "took_s", "is_jump"), [(3.0, 0.02, True), (1.9, 0.02, False), (3.0, 0.1, False)])
+def test_a_frame_that_turns_at_once_jumps_too(buffer, turn_deg, took_s, is_jump):
+    heard, _, _ = hears(buffer)
+    for number in range(10):
+        turned = _transform(0.0, 1000.0 + took_s * number)
+        half = np.radians(turn_deg if number > 4 else 0.0) / 2.0
+        turned.transform.rotation.z, turned.transform.rotation.w = np.sin(half), np.cos(half)
+        heard.set_transform(turned, "the tracker")
+    assert ("jumped by 0.0 mm and 3.0 deg" in why_not(heard, 1000.0 + 4.5 * took_s, 0.0)) is is_jump
+
+
+@pytest.mark.parametrize(("moved_mm", "took_s", "is_jump"), [(3.1, 0.02, True), (2.9, 0.01, False), (14.0, 0.1, False)])
+def test_a_short_or_a_slow_way_is_no_jump(buffer, moved_mm, took_s, is_jump):
+    heard, hear, _ = hears(buffer)
+    for number in range(10):
+        hear(1000.0 + took_s * number, 1e-3 * moved_mm * (number > 4))
+    assert ("jumped" in why_not(heard, 1000.0 + 4.5 * took_s, 0.0)) is is_jump
+
+
+@pytest.mark.parametrize(("before_mm", "after_mm", "is_jump"), [(2.0, 2.0, True), (6.0, 0.0, False), (0.0, 6.0, False)])
+def test_a_frame_rests_on_both_sides_of_a_jump(buffer, before_mm, after_mm, is_jump):
+    """20 mm; a quarter of it is rest, and to and fro within 50 ms is none."""
+    heard, hear, _ = hears(buffer)
+    for number, x_mm in enumerate((before_mm, 0.0, before_mm, before_mm, 20.0 + before_mm)):
+        hear(1000.0 + 0.02 * number, 1e-3 * x_mm)
+    for number in range(5, 8):
+        hear(1000.0 + 0.02 * number, 1e-3 * (20.0 + before_mm + after_mm * (number == 5)))
+    assert ("jumped" in why_not(heard, 1000.07)) is is_jump
 
 
 def test_a_frame_that_is_turned_to_and_fro_or_has_two_parents_by_turns_is_not_believed(buffer):

@@ -35,7 +35,7 @@ class Jump(NamedTuple):
 
     Attributes:
         metres, radians: how far.
-        is_open: no transform after it was heard, so that it may yet be the beginning of a motion.
+        is_open: not enough was heard after it, so that it may yet be the beginning of a motion.
     """
 
     metres: float
@@ -71,8 +71,8 @@ class Track:
     def jump(self, stamp: int) -> Jump | None:
         """Whether it jumped between the two transforms around a stamp, ns; None at one of them.
 
-        Before and after them it is looked at for half as long at least, so that stamps need not be even. Where nothing
-        was heard before them, nobody knows that it rested.
+        It rests where it stays within a quarter of the way: for half as long as the step took, before it and after, and
+        50 ms at least. Where nothing was heard before them, nobody knows that it rested.
         """
         after = bisect_left(self.stamps, stamp)
         if after in (0, len(self.stamps)) or self.stamps[after] == stamp:
@@ -94,7 +94,7 @@ class Track:
         return Jump(*way, is_open) if any(is_jump) else None
 
     def _largest_way(self, start: int, to: Iterable[int]) -> tuple[float, float]:
-        """From one place to the farthest of some others, metres and radians; numbers that are not there count not."""
+        """From one place to the farthest of some others, metres and radians; those not heard yet are left out."""
         others = np.array([self.places[i] for i in to if i < len(self.places)]).reshape(-1, 7)
         metres, radians = _apart(np.broadcast_to(self.places[start], others.shape), others)
         return float(metres.max(initial=0.0)), float(radians.max(initial=0.0))

@@ -277,10 +277,14 @@ class PointCheck:
     next_normal: Array
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, none_near: str = "none near the bone: are they in the frame and the unit of the source?") -> str:
+        """The answer in one line; `none_near` is what it says where no point has a surface near."""
         sizes = np.abs(self.distance_mm)
         largest = "one with no surface near" if np.isnan(sizes).any() else f"{sizes.max():.1f} mm off at most"
         if np.isnan(sizes).all():
-            largest = "none near the bone: are they in the frame and the unit of the source?"
+            largest = none_near
         return (
             f"{self.verdict}  {len(self.points)} points, {largest}  probability {self.probability:.3f}  "
             f"unseen {self.unseen_mm:.1f} mm  TRE 95 %: {self.tre95_mm:.1f} mm"

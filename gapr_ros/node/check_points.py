@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.errors import GaprError
 from gapr_core.results import PointCheck, Verdict
-from gapr_ros.node import wire
+from gapr_ros.node import timeline, wire
 from gapr_ros.node.diagnostics import status_message
 from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.method import configured
@@ -22,6 +23,9 @@ from gapr_ros.node.outcome import Outcome
 from gapr_ros.parameters import NodeParameters
 
 Array = NDArray[np.float64]
+OLD_S = 5.0  # age of a pose from which on the text says it: the bone may have moved since
+NO_POINTS = "no check points that are finite: touch the bone, and publish the tip's positions (PoseArray, metres)"
+NONE_NEAR = "none near the bone: are they in metres, and of the tip of a calibrated pointer?"
 LEVELS = {
     Verdict.HOLDS: DiagnosticStatus.OK,
     Verdict.SAYS_LITTLE: DiagnosticStatus.WARN,
@@ -31,6 +35,28 @@ LEVELS = {
 
 class NothingToCheckError(Exception):
     """There is no verdict; the text says why."""
+
+
+@dataclass(frozen=True)
+class CheckedPose:
+    """Which pose was checked.
+
+    Attributes:
+        stamp: of its cloud, as text; empty where no pose stands.
+        age_s: since then; None where no pose stands and while no clock runs.
+    """
+
+    stamp: str = ""
+    age_s: float | None = None
+
+    @classmethod
+    def of(cls, accepted: Outcome | None, now_ns: int) -> CheckedPose:
+        """That of an outcome."""
+        if accepted is None:
+            return cls()
+        stamp_ns = timeline.stamp_ns(accepted.header)
+        age_s = (now_ns - stamp_ns) * 1e-9 if stamp_ns and now_ns else None
+        return cls(_text(accepted.header.stamp), age_s)
 
 
 def check(message: PoseArray, accepted: Outcome | None, ready: Ready, parameters: NodeParameters) -> PointCheck:
@@ -55,19 +81,24 @@ def check(message: PoseArray, accepted: Outcome | None, ready: Ready, parameters
         raise NothingToCheckError(f"check points in '{frame}', the pose is in '{wanted}': publish them there")
     positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses]
     points_mm = wire.to_mm(np.array(positions, dtype=np.float64).reshape(-1, 3), "m")
+    if not np.isfinite(points_mm).all(axis=1).any():
+        raise NothingToCheckError(NO_POINTS)
     try:
         return check_points(points_mm, ready.model.target, accepted.result, _config(ready.method, parameters))
     except GaprError as error:
         raise NothingToCheckError(str(error)) from error
 
 
-def status(message: PoseArray, found: PointCheck | str, name: str, hardware_id: str) -> DiagnosticStatus:
+def status(
+    message: PoseArray, found: PointCheck | str, pose: CheckedPose, name: str, hardware_id: str
+) -> DiagnosticStatus:
     """The verdict with its numbers, lengths in metres; or why there is none."""
-    stamp = message.header.stamp
     values: dict[str, object] = {
-        "stamp": f"{stamp.sec}.{stamp.nanosec:09d}",
+        "stamp": _text(message.header.stamp),
         "frame": plain_frame(message.header.frame_id),
-        "points": len(message.poses),
+        "points": 0 if isinstance(found, str) else len(found.points),
+        "pose_stamp": pose.stamp,
+        "pose_age": pose.age_s,
     }
     if isinstance(found, str):
         return status_message(
@@ -82,7 +113,19 @@ def status(message: PoseArray, found: PointCheck | str, name: str, hardware_id: 
         "next_point": " ".join(f"{value:.4f}" for value in wire.to_metres(found.next_point)),
     }
     values = {"verdict": str(found.verdict)} | values
-    return status_message(LEVELS[found.verdict], f"{name}: check points", hardware_id, str(found), values)
+    said = _said(message, found, pose)
+    return status_message(LEVELS[found.verdict], f"{name}: check points", hardware_id, said, values)
+
+
+def _said(message: PoseArray, found: PointCheck, pose: CheckedPose) -> str:
+    """The verdict as text, with what a user should know before acting on it."""
+    said, left_out = found.text(NONE_NEAR), len(message.poses) - len(found.points)
+    said += f"  not finite and left out: {left_out}" if left_out else ""
+    return said + (f"  the pose is {pose.age_s:.0f} s old" if (pose.age_s or 0.0) > OLD_S else "")
+
+
+def _text(stamp: Time) -> str:
+    return f"{stamp.sec}.{stamp.nanosec:09d}"
 
 
 def _config(method: Any, parameters: NodeParameters) -> RegistrarConfig:

@@ -208,12 +208,12 @@ def _level_of_input(now: Snapshot, silent_s: float) -> tuple[bytes, str]:
         return DiagnosticStatus.WARN, "; ".join(now.conflicts)
     if not now.source.publishers:
         return DiagnosticStatus.WARN, "nobody publishes clouds"
+    may_be_large = LARGE if "best_effort" in now.source.qos else ""
     if time.monotonic() - now.counters.last_lost_at < LOST_FOR_S:
-        how = "crop or thin clouds before they are sent, or send fewer"
+        how = f"crop or thin clouds before they are sent, or send fewer{may_be_large}"
         return DiagnosticStatus.WARN, f"{now.counters.lost} clouds were sent and never came: {how}"
     if silent_s > SILENCE_S:
-        may_be_lost = not now.counters.received and "best_effort" in now.source.qos
-        return DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s{LARGE if may_be_lost else ''}"
+        return DiagnosticStatus.WARN, f"no cloud for {silent_s:.0f} s{may_be_large}"
     return DiagnosticStatus.OK, f"{now.counters.received} clouds"
 
 

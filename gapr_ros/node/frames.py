@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError
+from gapr_ros.node import missing
 from gapr_ros.node.heard import Heard
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.timeline import BACK_NS
@@ -51,6 +52,7 @@ class Frames:
         is_future: Callable[[int], bool] = lambda stamp: False,
     ) -> None:
         self._node, self._note_sent, self._is_future = node, note_sent, is_future
+        self._ahead_ns = 0  # stamp of the last transform that was left out as too far ahead of the clock
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
         self._newest_ns, self._any_older = -1, False  # stamp of the clouds of this round of time
         self._tf2 = _import_tf2() if publish or listen else None
@@ -70,7 +72,7 @@ class Frames:
         if self._tf2 is not None and self._buffer is None:
             self._buffer = self._tf2.Buffer(node=self._node)
             self._buffer.jump_handle.unregister()  # `start_over` clears it; that of Jazzy's first tf2_ros_py raises
-            self._heard = Heard(self._buffer, self._is_future, self._node)
+            self._heard = Heard(self._buffer, self._is_ahead, self._node)
             self._listener = self._tf2.TransformListener(self._heard, self._node)
 
     def lookup(
@@ -99,27 +101,35 @@ class Frames:
         buffer, heard = self._buffer, self._heard  # `close` may take them away meanwhile
         if self._tf2 is None or buffer is None or heard is None:
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {MISSING}")
-        deadline = time.monotonic() + timeout_s  # tf2's own wait never ends while simulated time stands still
+        start = time.monotonic()  # tf2's own wait never ends while simulated time stands still
 
         def is_ready() -> bool:
             is_known = buffer.can_transform(parent, child, stamp) and not heard.turned(parent, child)
             return is_known and heard.is_settled(parent, child, stamp.nanoseconds, arrived_s)
 
-        while not is_ready() and time.monotonic() < deadline:
+        while not is_ready() and time.monotonic() - start < timeout_s:
             time.sleep(POLL_S)
         try:
             found = transform_to_matrix(buffer.lookup_transform(parent, child, stamp))
         except (self._tf2.TransformException, InvalidMessageError) as error:
-            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {str(error).strip()}") from error
+            waited_s = time.monotonic() - start
+            why = missing.explained(error, parent, child, stamp.nanoseconds, waited_s, self._ahead_ns)
+            raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {why}") from error
         if why := heard.why_not(parent, child, stamp.nanoseconds, most_gap_s):
             raise RefusedError(Reason.TF_MISSING, f"{parent} <- {child}: {why}")
         return found
 
     def start_over(self) -> None:
         """What was heard so far is of another round of time: between that and what comes tf2 would interpolate."""
-        self._newest_ns = -1
+        self._newest_ns, self._ahead_ns = -1, 0
         if self._heard is not None:
             self._heard.start_over()
+
+    def _is_ahead(self, stamp_ns: int) -> bool:
+        """Of a transform that was heard; one that is left out for it may be the one that is missed."""
+        is_ahead = self._is_future(stamp_ns)
+        self._ahead_ns = stamp_ns if is_ahead else self._ahead_ns
+        return is_ahead
 
     def note_cloud(self, stamp_ns: int) -> None:
         """A cloud was let in; one that is older than those of a round can be begins another one, as after a reset."""

@@ -12,6 +12,7 @@ from gapr_ros.node.refusal import RefusedError
 from gapr_ros.node.situation import InitialPose
 
 log = logging.getLogger(__name__)
+REMAP = "remap it if it is of another node"
 PATIENCE_S = 2.0  # the listener of transforms may have started with the pose
 
 
@@ -48,7 +49,7 @@ class InitialPoses:
         if given is not self._missing:
             self._missing, self._since = given, now
         if now - self._since < PATIENCE_S:
-            how = f"it is given up if that lasts {PATIENCE_S:g} s"
+            how = f"it is given up if that lasts {PATIENCE_S:g} s; {REMAP}"
             raise RefusedError(refusal.reason, f"{text}; {how}") from refusal
         self._given_up = given
-        log.warning("%s; it is given up, and clouds are registered without it", text)
+        log.warning("%s; it is given up, and clouds are registered without it; %s", text, REMAP)

@@ -38,6 +38,7 @@ from gapr_ros.node.session import Session
 from gapr_ros.node.subscription import CLOUDS, Subscriptions
 from gapr_ros.parameters import NodeParameters
 
+NEXT = "ros2 lifecycle set {} configure, then activate"
 LIBRARIES = ("gapr_core", "gapr_ros")  # whose logs go to the node's log
 
 
@@ -73,6 +74,9 @@ class RegisterNode(LifecycleNode):
         self._diagnosing = self.create_timer(self.parameters.diagnostics_period, self.report, clock=_steady_clock())
         if self.parameters.autostart:
             self.call_soon(self._autostart)
+        else:
+            how = NEXT.format(self.get_fully_qualified_name())
+            self.get_logger().info(f"unconfigured (autostart is false): configure and activate it, e.g. {how}")
 
     @property
     def ros(self) -> RegisterNode:
@@ -103,6 +107,9 @@ class RegisterNode(LifecycleNode):
 
     def report_failure(self, text: str) -> None:
         """A transition failed: keep its reason for log and diagnostics."""
+        if self.state == "configuring":
+            how = NEXT.format(self.get_fully_qualified_name())
+            text = f"{text}; it stays unconfigured: correct it, then {how}, or start again"
         self.failure = text
         self.get_logger().error(text)
         self.call_soon(self.report)

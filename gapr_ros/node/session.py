@@ -134,16 +134,21 @@ class Session:
         try:
             T_frame_model = pose_to_matrix(message)
         except InvalidMessageError as error:
-            self._host.ros.get_logger().warning(f"initialpose is ignored: {error}")
+            text = f"initialpose is ignored: {error}"
+            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
             return
         frame = intake.plain_frame(message.header.frame_id)
         if frame == self._host.parameters.model_frame:
-            self._host.ros.get_logger().warning(f"initialpose is ignored: it is in '{frame}', the bone's own frame")
+            text = f"initialpose is ignored: it is in '{frame}', the bone's own frame"
+            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
             return
         self._guesses += 1
         often = f", {self._guesses} came since the last answer: send one guess, not a stream of them"
         why = "an initialpose" + (often if self._guesses >= STREAM_AFTER else "")
         self._begin_again(why, InitialPose(T_frame_model, frame))
+        where = f"in '{frame}'" if frame else "in the frame of the clouds"
+        text = f"initialpose {where} is taken: the track is forgotten"
+        self._host.ros.get_logger().info(text, throttle_duration_sec=THROTTLE_S)
         if frame:
             self._frames.listen()
 
@@ -154,9 +159,11 @@ class Session:
             found = check_points.check(message, self._standing, self._ready, self._host.parameters)
         except check_points.NothingToCheckError as error:
             found = str(error)
-            self._host.ros.get_logger().warning(f"nothing was checked: {found}")
+            text = f"nothing was checked: {found}"
+            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
+        pose = check_points.CheckedPose.of(self._standing, self._host.now_ns())
         name = self._host.ros.get_fully_qualified_name()
-        self._publishers.send_check(check_points.status(message, found, name, self.model.file))
+        self._publishers.send_check(check_points.status(message, found, pose, name, self.model.file))
 
     def _is_future(self, stamp_ns: int) -> bool:
         """Of a transform."""

@@ -21,6 +21,7 @@ from msg_adapters import INPUTS
 
 CLOUDS, INITIAL_POSES, CHECK_POINTS = "points", "initialpose", "check_points"
 LOOK_S = 1.0  # between two looks at who publishes
+ALONE_S = 5.0  # without a publisher: not all start at once
 GRACE_S = 3.0  # the graph may know of a publisher later than the event of its QoS
 MOST_QUEUED = 100  # clouds in the middleware's queue
 REMEMBERED = 256  # clouds, to know the same one from the other subscription
@@ -39,7 +40,7 @@ class Subscriptions:
         self._asked = host.parameters.cloud_reliability
         self._mismatch, self._closed, self._gaps = "", False, Gaps()
         self._taken: deque[tuple[int, int | None]] = deque(maxlen=REMEMBERED)
-        self._needed_at = 0.0
+        self._needed_at, self._published_at = 0.0, time.monotonic()
         first = ReliabilityPolicy.BEST_EFFORT if self._asked == "best_effort" else ReliabilityPolicy.RELIABLE
         self._clouds, self._second = self._subscribe(first), None
         self._initial_poses = host.ros.create_subscription(
@@ -58,7 +59,7 @@ class Subscriptions:
     def close(self) -> None:
         """Listen no more; who publishes is no conflict then."""
         self._closed = True
-        for about in ("type", "publishers"):
+        for about in ("type", "publishers", "nobody"):
             self._session.conflicts.note(about, "")
         self._host.ros.destroy_timer(self._looking)
         for subscription in (self._clouds, self._second, self._initial_poses, self._check_points):
@@ -74,6 +75,7 @@ class Subscriptions:
         """See who publishes: how many, what, and whether somebody still needs best effort."""
         topic, kind = self._clouds.topic_name, self._host.parameters.cloud_type
         publishers = self._host.ros.get_publishers_info_by_topic(topic)
+        self._note_nobody(topic, any_publisher=bool(publishers))
         others = {p.topic_type for p in publishers} - {_type_name(kind)}
         text = f"a publisher of {topic} sends {', '.join(sorted(others))}, cloud_type is {kind}: nothing of it comes"
         self._session.conflicts.note("type", text if others else "")
@@ -85,6 +87,13 @@ class Subscriptions:
         elif time.monotonic() - self._needed_at > GRACE_S:
             self._mismatch = ""
             self._hear_reliable_only()
+
+    def _note_nobody(self, topic: str, any_publisher: bool) -> None:
+        """Say so where nobody publishes for a while, as where the topic is misspelt."""
+        now = time.monotonic()
+        self._published_at = now if any_publisher else self._published_at
+        text = f"nobody publishes on {topic}: start the driver, or remap points (-r points:=TOPIC)"
+        self._session.conflicts.note("nobody", text if now - self._published_at > ALONE_S else "")
 
     def _subscribe(self, reliability: ReliabilityPolicy) -> Any:
         depth = min(self._host.parameters.accumulate, MOST_QUEUED)  # every cloud counts where clouds are collected
@@ -138,7 +147,7 @@ class Subscriptions:
             return
         topic = self._clouds.topic_name
         text = f"a publisher of {topic} is best effort: it is heard as such; its clouds above 0.5 MB may be lost"
-        self.get_logger().warning(text)
+        self.get_logger().warning(f"{text}: let its publisher be reliable")
         self._second = self._subscribe(ReliabilityPolicy.BEST_EFFORT)
 
     def _hear_reliable_only(self) -> None:

@@ -410,6 +410,9 @@ class Collecting(StandIn):
     def collected(self):
         return np.concatenate([np.empty((0, 3)), *self.kept])
 
+    def together_with(self, source):
+        return np.concatenate([self.collected, source])
+
     def collect(self, source):
         self.kept.append(source)
 

@@ -11,12 +11,13 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseArray
 from harness import NODE, StandIn, accepted, node_in_thread, pose_mm, wait_until
+from rclpy.time import Time
 from std_msgs.msg import Header
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker
 from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.geometry import se3
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.results import PointCheck, RegistrationResult, RegistrationStatus, Verdict
 from gapr_ros.node import check_points
 from gapr_ros.node.method import configured
 from gapr_ros.node.model import Ready, load_model
@@ -77,10 +78,13 @@ def test_touched_points_check_the_pose_that_stands(client, bone):
         pointer = Pointer(client)
         level, text, values = pointer.touch(touched)
         assert (level, values["verdict"]) == (WARN, "") and "register first" in text
+        assert (values["points"], values["pose_stamp"], values["pose_age"]) == ("0", "", "")
 
-        client.ask(GOOD)
-        level, text, values = pointer.touch(touched)
+        answer = client.ask(GOOD)
+        level, text, values = pointer.touch(np.vstack([touched, [[np.nan, 0.0, 0.0]]]))
         assert (level, values["verdict"], values["points"]) == (OK, "HOLDS", "50")
+        assert text.endswith("not finite and left out: 1")
+        assert values["pose_stamp"] == answer["cloud_stamp"] and 0.0 < float(values["pose_age"]) < 60.0
         assert text.startswith("HOLDS  50 points") and 0.0 < float(values["unseen"]) < 0.004
         assert len(values["next_point"].split()) == 3
 
@@ -90,8 +94,9 @@ def test_touched_points_check_the_pose_that_stands(client, bone):
         assert (level, values["verdict"]) == (ERROR, "CONTRADICTED")
         level, text, values = pointer.touch(touched, frame="tracker")
         assert (level, values["verdict"]) == (WARN, "") and "in 'tracker', the pose is in 'probe'" in text
-        level, text, _ = pointer.touch(np.empty((0, 3)))
-        assert level == WARN and "check points; got none" in text
+        for none in (np.empty((0, 3)), np.full((2, 3), np.nan)):
+            level, text, _ = pointer.touch(none)
+            assert level == WARN and text == check_points.NO_POINTS and "mm" not in text
 
         method.answer = RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="for the test")
         client.ask(GOOD)
@@ -100,13 +105,35 @@ def test_touched_points_check_the_pose_that_stands(client, bone):
         assert "register first" in pointer.touch(touched)[1]
 
 
-def test_a_method_that_says_no_covariance_or_prepares_nothing_is_named(client, blob_path, method):
-    with node_in_thread(method, blob_path):
+@pytest.mark.parametrize(("age_s", "end"), [(3.0, "mm"), (55.2, "  the pose is 55 s old"), (None, "mm")])
+def test_the_verdict_says_which_pose_it_is_of_and_how_old_that_is(age_s, end):
+    header = Header(frame_id="probe", stamp=Time(nanoseconds=100_500_000_000).to_msg())
+    found = PointCheck(Verdict.HOLDS, 0.5, np.zeros((1, 3)), np.zeros(1), np.ones(1), 1.0, 1.0, *np.zeros((2, 3)))
+    now_ns = 0 if age_s is None else int((100.5 + age_s) * 1e9)
+    pose = check_points.CheckedPose.of(SimpleNamespace(header=header), now_ns)
+    said = check_points.status(PoseArray(poses=[Pose()]), found, pose, "node", "")
+    values = {pair.key: pair.value for pair in said.values}
+    assert said.message.endswith(end)
+    assert values["pose_stamp"] == "100.500000000" and values["pose_age"] == ("" if age_s is None else f"{age_s:.4g}")
+
+
+def test_points_far_from_the_bone_are_asked_about_in_the_words_of_the_topic():
+    nowhere = np.full(1, np.nan)
+    found = PointCheck(Verdict.CONTRADICTED, 0.0, np.zeros((1, 3)), nowhere, nowhere, 1.0, 1.0, *np.zeros((2, 3)))
+    said = check_points.status(PoseArray(poses=[Pose()]), found, check_points.CheckedPose(), "node", "").message
+    assert check_points.NONE_NEAR in said and "source" not in said and "the unit of the source?" in str(found)
+
+
+def test_a_method_that_says_no_covariance_or_prepares_nothing_is_named(client, blob_path, method, monkeypatch):
+    with node_in_thread(method, blob_path) as node:
         client.wait_for_state("active")
+        said = []
+        monkeypatch.setattr(node.get_logger(), "warning", lambda text, **options: said.append((text, options)))
         pointer = Pointer(client)
         client.ask(GOOD)
         level, text, _ = pointer.touch(GOOD[:5])
         assert level == WARN and "expected a prepared target; got" in text
+        assert said == [(f"nothing was checked: {text}", {"throttle_duration_sec": 5.0})], "a flood fills no log"
 
 
 @pytest.mark.parametrize(("sensor", "standoff", "usual_mm"), [("pointer", 0.002, 2.0), ("pointer", 0.0, None),

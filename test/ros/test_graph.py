@@ -185,6 +185,26 @@ def test_a_publisher_of_another_type_is_named_until_it_goes(blob_path, client, m
         apart.close()
 
 
+def test_a_topic_on_which_nobody_publishes_is_named_once_until_somebody_does(
+    blob_path, client, method, monkeypatch, capfd
+):
+    """As where it is misspelt: nothing else would say so in the log."""
+    for name, seconds in (("ALONE_S", 0.3), ("LOOK_S", 0.1)):
+        monkeypatch.setattr(subscription, name, seconds)
+    with node_in_thread(method, blob_path) as node:
+        client.wait_for_state("active")
+        time.sleep(0.5)
+        assert not node.session.conflicts.texts
+        client.forget(client.points)
+        text = "nobody publishes on /points: start the driver, or remap points"
+        wait_until(lambda: text in client.values("input")["message"])
+        assert client.values("input")["level"] == 1
+        time.sleep(0.5)
+        client.do(lambda: client.node.create_publisher(PointCloud2, "points", 1))
+        wait_until(lambda: text not in client.values("input")["conflicts"])
+    assert capfd.readouterr().err.count(text) == 1
+
+
 def test_simulated_time_without_a_clock_is_a_conflict_until_the_clock_comes(blob_path, client, method):
     with node_in_thread(method, blob_path, use_sim_time=True) as node:
         client.wait_for_state("active")

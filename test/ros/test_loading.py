@@ -211,6 +211,8 @@ def test_a_bone_that_cannot_be_prepared_fails_the_transition_with_its_reason(blo
         assert not configured.result().success
         wait_until(lambda: client.values()["level"] == 2)
         assert client.values()["message"].startswith("configure failed: RuntimeError: no such bone")
+        how = "it stays unconfigured: correct it, then ros2 lifecycle set /register_node configure, then activate"
+        assert f"; {how}, or start again" in client.values()["message"]
         slow.error = None
         configured = client.ask_for(Transition.TRANSITION_CONFIGURE)
         wait_until(configured.done)

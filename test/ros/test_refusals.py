@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -337,7 +338,7 @@ def test_a_seed_whose_frame_does_not_come_is_given_up_and_no_cloud_is_registered
     client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="map")))
     wait_until(lambda: node.session.course.initial_pose)
     registered = len(method.calls)
-    expect_refusal(live, GOOD, Reason.TF_MISSING, "it is given up if that lasts 2 s")
+    expect_refusal(live, GOOD, Reason.TF_MISSING, "given up if that lasts 2 s; remap it if it is of another node")
     time.sleep(initial_pose.PATIENCE_S)
     assert len(method.calls) == registered
     expect_good(live)
@@ -360,6 +361,21 @@ def test_a_jump_is_none_where_the_pose_was_found_from_a_seed_and_only_there(live
         assert client.ask(GOOD)["last_refusal"].startswith("jump: moved 0.03 m") and not client.poses
     else:
         expect_good(live)
+
+
+def test_seeds_are_logged_whether_they_are_taken_or_not_and_a_flood_of_them_is_not(live, monkeypatch):
+    node, client, method = live
+    said = []
+    for how in ("info", "warning"):
+        monkeypatch.setattr(node.get_logger(), how, lambda text, **options: said.append((text, options)), raising=False)
+    seeds = [PoseWithCovarianceStamped(header=Header(frame_id=name)) for name in ("probe", "bone_preop", "probe")]
+    seeds[0].pose.pose.position.x = np.nan
+    for seed in seeds:
+        node.call_soon(partial(node.session.take_initial_pose, seed))
+    wait_until(lambda: len(said) == 3, what=lambda: said)
+    assert [options for _, options in said] == [{"throttle_duration_sec": 5.0}] * 3
+    assert said[0][0].startswith("initialpose is ignored") and said[1][0].startswith("initialpose is ignored: it is in")
+    assert said[2][0] == "initialpose in 'probe' is taken: the track is forgotten"
 
 
 def test_a_seed_in_the_bones_own_frame_changes_nothing(live):

@@ -88,8 +88,16 @@ def test_the_image_is_found_where_a_sensor_with_a_stand_off_sees_the_bone(pelvis
 def test_what_is_kept_of_a_target_is_not_taken_for_that_of_other_settings(target):
     """A registrar that hardly refines took the pelvis for symmetric, and switched the rule off for all after it."""
     hasty = replace(CONFIG, verification=replace(CONFIG.verification, middle_limits_mm=(0.2, 0.1, 1)))
-    fresh = replace(target, cache={})
+    fresh = replace(target, cache={("symmetric", 0.0, hasty.verification): True})
     assert mirror.is_symmetric(fresh, hasty) and not mirror.is_symmetric(fresh, CONFIG)
+
+
+@pytest.mark.parametrize(("median_mm", "is_symmetric"), [(0.39, True), (0.41, False)])
+def test_a_model_is_symmetric_where_most_of_it_lies_on_its_image(target, monkeypatch, median_mm, is_symmetric):
+    """Models of an atlas do; what is not on it counts no more for being far off."""
+    off_mm = lambda T, points, _: np.where(np.arange(len(points)) % 2, median_mm, np.arange(len(points)) % 4 * 50.0)  # noqa: E731
+    monkeypatch.setattr(mirror, "distances_mm", off_mm)
+    assert mirror.is_symmetric(replace(target, cache={}), CONFIG) is is_symmetric
 
 
 def test_gross_points_that_lie_near_the_image_are_no_sign_of_a_flip(target, pelvis, monkeypatch):

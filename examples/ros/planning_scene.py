@@ -81,11 +81,15 @@ def main() -> None:
     import moveit_msgs.msg
 
     rclpy.init(args=sys.argv)
+    node = None
     try:
-        rclpy.spin(BoneInScene(given.bone, moveit_msgs.msg))
+        node = BoneInScene(given.bone, moveit_msgs.msg)
+        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     uninstall_signal_handlers()  # ends rclpy's thread for signals first: it shuts down too, and twice is an error
+    if node is not None:
+        node.destroy_node()  # not at the interpreter's end, in any order
     rclpy.try_shutdown()
 
 

@@ -196,8 +196,10 @@ def main() -> None:
     """Run until it is stopped."""
     parser(__doc__).parse_args(remove_ros_args(sys.argv)[1:])
     rclpy.init(args=sys.argv)
+    node = None
     try:
-        rclpy.spin(TrustedPose())
+        node = TrustedPose()
+        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except RuntimeError:  # of rclpy, where Ctrl-C comes while it takes a message
@@ -205,6 +207,8 @@ def main() -> None:
         if rclpy.ok():
             raise
     uninstall_signal_handlers()  # ends rclpy's thread for signals first: it shuts down too, and twice is an error
+    if node is not None:
+        node.destroy_node()  # not at the interpreter's end, in any order
     rclpy.try_shutdown()
 
 

@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import bones
 import numpy as np
@@ -231,7 +232,8 @@ def test_a_message_that_comes_with_ctrl_c_is_no_failure_of_the_consumer_and_othe
 
     monkeypatch.setattr(sys, "argv", ["trusted_pose.py"])
     monkeypatch.setattr(module, "SHUTDOWN_S", 0.0)
-    monkeypatch.setattr(module, "TrustedPose", lambda: None)
+    ended = []
+    monkeypatch.setattr(module, "TrustedPose", lambda: SimpleNamespace(destroy_node=lambda: ended.append(True)))
     monkeypatch.setattr(module, "uninstall_signal_handlers", lambda: None)
     monkeypatch.setattr(module.rclpy, "init", lambda args: None)
     monkeypatch.setattr(module.rclpy, "try_shutdown", lambda: None)
@@ -239,6 +241,7 @@ def test_a_message_that_comes_with_ctrl_c_is_no_failure_of_the_consumer_and_othe
     monkeypatch.setattr(module.rclpy, "ok", lambda: not stops)
     with nullcontext() if stops else pytest.raises(RuntimeError):
         module.main()
+    assert ended == [True] * stops
 
 
 @pytest.mark.parametrize("name", ["trusted_pose", "planning_scene"])

@@ -239,25 +239,29 @@ class Accumulator:
         reason = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"
         return _refused(result, reason)
 
-    def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget) -> bool:
-        """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3)."""
+    def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget, least_mm: float = 0.0) -> bool:
+        """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3).
+
+        And farther than `least_mm`.
+        """
         limits, refinement = self.config.accumulation, self.config.refinement
         some = np.ascontiguousarray(points[:: 1 + len(points) // limits.most_points])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
-        return own > limits.off * max(of_all, refinement.smallest_sigma_mm)
+        return own > max(least_mm, limits.off * max(of_all, refinement.smallest_sigma_mm))
 
     def _contradicts(self, source: Array, target: PreparedTarget) -> bool:
         """True when a source (N, 3) lies off the bone under the last accepted pose, farther than that may be off there.
 
-        A large source may pull the pose of all along, and lie on the bone then.
+        A large source may pull the pose that it shares with those before along, and lie on the bone then.
         """
-        last = self._accepted
-        if last is None or last.T_target_source is None or last.covariance is None or last.centre_mm is None:
+        before, last = self._last()[: -len(self._new)], self._accepted
+        if not before or last is None:
             return False
-        T = last.T_target_source
-        most_mm = last.factor95 * precision.bound_mm(last.covariance, se3.apply(T, source), last.centre_mm)
-        is_off = self._lies_off(source, _together(self._kept), T, target)
-        return is_off and _typical_distance_mm(T, source, target) > most_mm
+        T, covariance, centre_mm = last.T_target_source, last.covariance, last.centre_mm
+        if T is None or covariance is None or centre_mm is None:  # as of methods that predict no error
+            return False
+        least_mm = last.factor95 * precision.bound_mm(covariance, se3.apply(T, source), centre_mm)
+        return self._lies_off(source, _together(before), T, target, least_mm)
 
 
 def _of_many_places(method: Registrar | Tracker) -> Registrar | Tracker:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
@@ -35,28 +34,6 @@ LEVELS = {
 
 class NothingToCheckError(Exception):
     """There is no verdict; the text says why."""
-
-
-@dataclass(frozen=True)
-class CheckedPose:
-    """Which pose was checked.
-
-    Attributes:
-        stamp: of its cloud, as text; empty where no pose stands.
-        age_s: since then; None where no pose stands and while no clock runs.
-    """
-
-    stamp: str = ""
-    age_s: float | None = None
-
-    @classmethod
-    def of(cls, accepted: Outcome | None, now_ns: int) -> CheckedPose:
-        """That of an outcome."""
-        if accepted is None:
-            return cls()
-        stamp_ns = timeline.stamp_ns(accepted.header)
-        age_s = (now_ns - stamp_ns) * 1e-9 if stamp_ns and now_ns else None
-        return cls(_text(accepted.header.stamp), age_s)
 
 
 def check(message: PoseArray, accepted: Outcome | None, ready: Ready, parameters: NodeParameters) -> PointCheck:
@@ -90,15 +67,16 @@ def check(message: PoseArray, accepted: Outcome | None, ready: Ready, parameters
 
 
 def status(
-    message: PoseArray, found: PointCheck | str, pose: CheckedPose, name: str, hardware_id: str
+    message: PoseArray, found: PointCheck | str, accepted: Outcome | None, now_ns: int, name: str, hardware_id: str
 ) -> DiagnosticStatus:
-    """The verdict with its numbers, lengths in metres; or why there is none."""
+    """The verdict on an accepted pose with its numbers, lengths in metres; or why there is none."""
+    age_s = accepted and timeline.age_s(timeline.stamp_ns(accepted.header), now_ns)
     values: dict[str, object] = {
-        "stamp": _text(message.header.stamp),
+        "stamp": timeline.stamp_text(message.header),
         "frame": plain_frame(message.header.frame_id),
         "points": 0 if isinstance(found, str) else len(found.points),
-        "pose_stamp": pose.stamp,
-        "pose_age": pose.age_s,
+        "pose_stamp": timeline.stamp_text(accepted.header) if accepted else "",
+        "pose_age": age_s,
     }
     if isinstance(found, str):
         return status_message(
@@ -113,19 +91,15 @@ def status(
         "next_point": " ".join(f"{value:.4f}" for value in wire.to_metres(found.next_point)),
     }
     values = {"verdict": str(found.verdict)} | values
-    said = _said(message, found, pose)
+    said = _said(message, found, age_s or 0.0)
     return status_message(LEVELS[found.verdict], f"{name}: check points", hardware_id, said, values)
 
 
-def _said(message: PoseArray, found: PointCheck, pose: CheckedPose) -> str:
+def _said(message: PoseArray, found: PointCheck, age_s: float) -> str:
     """The verdict as text, with what a user should know before acting on it."""
     said, left_out = found.text(NONE_NEAR), len(message.poses) - len(found.points)
     said += f"  not finite and left out: {left_out}" if left_out else ""
-    return said + (f"  the pose is {pose.age_s:.0f} s old" if (pose.age_s or 0.0) > OLD_S else "")
-
-
-def _text(stamp: Time) -> str:
-    return f"{stamp.sec}.{stamp.nanosec:09d}"
+    return said + (f"  the pose is {age_s:.0f} s old" if age_s > OLD_S else "")
 
 
 def _config(method: Any, parameters: NodeParameters) -> RegistrarConfig:

@@ -109,10 +109,10 @@ class Heard:
             stamp: of the cloud, ns; 0 for none.
             arrived_s: when it came, `time.monotonic`.
         """
-        frames = self._links.between(frame, other)
-        late = [each for each in frames if self._links.newest_ns(each) > stamp + LATE_NS]
         if stamp == 0:
             return True
+        frames = self._links.between(frame, other)
+        late = [each for each in frames if self._links.newest_ns(each) > stamp + LATE_NS]
         jumps = (self._links.jump(each, stamp) for each in frames)
         return all(self._came_s[each] > arrived_s for each in late) and not any(jump and jump.is_open for jump in jumps)
 

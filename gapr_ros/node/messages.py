@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
 from gapr_core.results import Guidance, Residuals
-from gapr_ros.node import wire
+from gapr_ros.node import timeline, wire
 from gapr_ros.node.diagnostics import status_message
 from gapr_ros.node.outcome import Outcome
 from msg_adapters import matrix_to_pose, xyz_to_cloud
@@ -28,9 +28,8 @@ def status(outcome: Outcome, name: str, hardware_id: str) -> DiagnosticStatus:
     The confidence and the errors are those of the registration, whatever the node decided later.
     """
     result = outcome.result
-    stamp = outcome.header.stamp
     values = {
-        "stamp": f"{stamp.sec}.{stamp.nanosec:09d}",
+        "stamp": timeline.stamp_text(outcome.header),
         "frame": outcome.header.frame_id,
         "status": "" if result is None else str(result.status),
         "reason": "" if outcome.reason is None else str(outcome.reason),

@@ -221,7 +221,7 @@ def _note_header(outcome: Outcome, header: Header, now: Situation) -> None:
     outcome.cloud_frame = intake.plain_frame(header.frame_id)
     outcome.header.frame_id = now.parameters.output_frame or outcome.cloud_frame
     outcome.header.stamp = Time(nanoseconds=stamp_ns or outcome.job.received_ns).to_msg()
-    outcome.age_s = (now.now_ns - stamp_ns) * 1e-9 if stamp_ns and now.now_ns else None
+    outcome.age_s = timeline.age_s(stamp_ns, now.now_ns)
 
 
 def _check(result: RegistrationResult, seconds: float, parameters: NodeParameters) -> None:

@@ -134,13 +134,11 @@ class Session:
         try:
             T_frame_model = pose_to_matrix(message)
         except InvalidMessageError as error:
-            text = f"initialpose is ignored: {error}"
-            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
+            self._warn(f"initialpose is ignored: {error}")
             return
         frame = intake.plain_frame(message.header.frame_id)
         if frame == self._host.parameters.model_frame:
-            text = f"initialpose is ignored: it is in '{frame}', the bone's own frame"
-            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
+            self._warn(f"initialpose is ignored: it is in '{frame}', the bone's own frame")
             return
         self._guesses += 1
         often = f", {self._guesses} came since the last answer: send one guess, not a stream of them"
@@ -159,11 +157,12 @@ class Session:
             found = check_points.check(message, self._standing, self._ready, self._host.parameters)
         except check_points.NothingToCheckError as error:
             found = str(error)
-            text = f"nothing was checked: {found}"
-            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
-        pose = check_points.CheckedPose.of(self._standing, self._host.now_ns())
-        name = self._host.ros.get_fully_qualified_name()
-        self._publishers.send_check(check_points.status(message, found, pose, name, self.model.file))
+            self._warn(f"nothing was checked: {found}")
+        name, now_ns = self._host.ros.get_fully_qualified_name(), self._host.now_ns()
+        self._publishers.send_check(check_points.status(message, found, self._standing, now_ns, name, self.model.file))
+
+    def _warn(self, text: str) -> None:
+        self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
 
     def _is_future(self, stamp_ns: int) -> bool:
         """Of a transform."""
@@ -208,8 +207,7 @@ class Session:
     def _count_left(self, collected: bool, why: str) -> None:
         self._host.counters.leave(collected)
         if not collected:
-            text = f"a cloud is not registered with the newer ones: {why}"
-            self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
+            self._warn(f"a cloud is not registered with the newer ones: {why}")
 
     def _conclude(self, outcome: Outcome) -> None:
         """Decide on an outcome of the worker and answer."""

@@ -23,6 +23,16 @@ def stamp_ns(header: Header) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
+def stamp_text(header: Header) -> str:
+    """The stamp as seconds with nine decimals."""
+    return f"{header.stamp.sec}.{header.stamp.nanosec:09d}"
+
+
+def age_s(stamp: int, now_ns: int) -> float | None:
+    """How old a stamp, ns, is, s; None without one, and while no clock runs."""
+    return (now_ns - stamp) * 1e-9 if stamp and now_ns else None
+
+
 def normal(header: Header) -> Header:
     """The header with a stamp whose nanoseconds are less than a second; stamp 0 where it is no time."""
     stamp = stamp_ns(header)

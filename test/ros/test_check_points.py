@@ -110,8 +110,8 @@ def test_the_verdict_says_which_pose_it_is_of_and_how_old_that_is(age_s, end):
     header = Header(frame_id="probe", stamp=Time(nanoseconds=100_500_000_000).to_msg())
     found = PointCheck(Verdict.HOLDS, 0.5, np.zeros((1, 3)), np.zeros(1), np.ones(1), 1.0, 1.0, *np.zeros((2, 3)))
     now_ns = 0 if age_s is None else int((100.5 + age_s) * 1e9)
-    pose = check_points.CheckedPose.of(SimpleNamespace(header=header), now_ns)
-    said = check_points.status(PoseArray(poses=[Pose()]), found, pose, "node", "")
+    accepted = SimpleNamespace(header=header)
+    said = check_points.status(PoseArray(poses=[Pose()]), found, accepted, now_ns, "node", "")
     values = {pair.key: pair.value for pair in said.values}
     assert said.message.endswith(end)
     assert values["pose_stamp"] == "100.500000000" and values["pose_age"] == ("" if age_s is None else f"{age_s:.4g}")
@@ -120,7 +120,7 @@ def test_the_verdict_says_which_pose_it_is_of_and_how_old_that_is(age_s, end):
 def test_points_far_from_the_bone_are_asked_about_in_the_words_of_the_topic():
     nowhere = np.full(1, np.nan)
     found = PointCheck(Verdict.CONTRADICTED, 0.0, np.zeros((1, 3)), nowhere, nowhere, 1.0, 1.0, *np.zeros((2, 3)))
-    said = check_points.status(PoseArray(poses=[Pose()]), found, check_points.CheckedPose(), "node", "").message
+    said = check_points.status(PoseArray(poses=[Pose()]), found, None, 0, "node", "").message
     assert check_points.NONE_NEAR in said and "source" not in said and "the unit of the source?" in str(found)
 
 

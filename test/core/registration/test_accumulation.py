@@ -449,6 +449,13 @@ def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_
     assert len(accumulator.collected) == (100 if is_refused else 500)
 
 
+def test_where_each_source_is_registered_by_itself_the_pose_before_says_nothing_of_it(registrar, frames, prepared):
+    accumulator = Accumulator(registrar, most=1)
+    whole = np.concatenate([pair.source for pair in frames])
+    for source in (whole, whole + [0.0, 9.0, 0.0]):
+        assert accumulator.register(source, prepared).ok
+
+
 @pytest.mark.parametrize(("step_mm", "creeps"), [(0.1, True), (0.0, False)])
 def test_a_bone_that_creeps_is_noticed_by_where_a_pointer_with_a_stand_off_sees_it(femur, step_mm, creeps):
     """Against the bone itself the 2 mm between them would hide so slow a motion."""

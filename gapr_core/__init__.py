@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gapr_core.registration.check_points import check_points
     from gapr_core.registration.crop import crop_box, crop_to_pose
     from gapr_core.registration.following import FollowedPose
+    from gapr_core.registration.look_accumulation import LookAccumulator
     from gapr_core.registration.registrar import Registrar
     from gapr_core.registration.target import PreparedTarget
     from gapr_core.registration.tracking import Tracker
@@ -30,6 +31,7 @@ _HOMES = {
     "Registrar": "registration.registrar",
     "Tracker": "registration.tracking",
     "Accumulator": "registration.accumulation",
+    "LookAccumulator": "registration.look_accumulation",
     "FollowedPose": "registration.following",
     "RegistrarConfig": "config",
     "PreparedTarget": "registration.target",

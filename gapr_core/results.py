@@ -163,6 +163,8 @@ class RegistrationResult:
         residuals: of every used point under the best hypothesis; None where a method does not say.
         inferred_viewpoint: (3,) mm, source frame: where the camera is taken to be, as its cloud gave no pose as bone
             alone and nobody said it; None where it was given or is not needed.
+        looks_apart: (K, 3) mm, source frame: of a camera's places those from where it saw what does not fit the other
+            looks; None where all fit.
     """
 
     status: RegistrationStatus
@@ -185,6 +187,7 @@ class RegistrationResult:
     residuals: Residuals | None = None
     inferred_viewpoint: Array | None = None
     factor95: float = 1.0
+    looks_apart: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):

@@ -35,6 +35,7 @@ READ_BY_LAUNCH = (  # needs no declaration
     "sigkill_timeout",
     "ros_namespace",
 )
+MOST_LOOKS = 16  # of a camera that are registered as one, however many are asked for
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
 Triple = tuple[float, float, float]
 
@@ -130,6 +131,11 @@ class NodeParameters(Settings):
     )
     covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation", unit="rad", low=1e-9)
 
+    @property
+    def collects_looks(self) -> bool:
+        """Whether clouds that are registered as one are looks of a camera, each from a place of its own."""
+        return self.accumulate > 1 and self.viewpoint not in NO_FRAME and self.sensor not in TOGETHER
+
 
 FIELDS: Mapping[str, Field] = {f.name: f for f in fields(NodeParameters)}
 
@@ -176,8 +182,11 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
     if parameters.accumulate > 1 and not parameters.output_frame:
         sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
-    if parameters.viewpoint not in NO_FRAME and parameters.accumulate > 1:
-        sentences.append("viewpoint is not used: clouds that are registered as one were seen from several places")
+    if parameters.collects_looks:
+        count = min(parameters.accumulate, MOST_LOOKS)
+        sentences.append(f"the last {count} looks are registered as one, each from another direction")
+    elif parameters.viewpoint not in NO_FRAME and parameters.accumulate > 1:
+        sentences.append(f"viewpoint is not used: sensor {sensor} sees nothing from afar")
     if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
         sentences.append(f"assess_every is not used: {why}")
     if 0 < parameters.max_points < parameters.min_points:

@@ -25,7 +25,8 @@ class Pair:
         target: (M, 3) mm, centred on its mean: surface coordinates minus metadata["origin_mm"].
         T_target_source: (4, 4) truth; all NaN where no pose is right (protocol `wrong`).
         metadata: how the pair was made: region share, overlap, noise_mm, bias_mm, outlier_share, ...; of a camera's
-            view also `viewpoint` (3,) mm, where the camera is in the source's frame.
+            view also `viewpoint` (3,) mm, where the camera is in the source's frame; of several looks (N, 3), for each
+            point.
     """
 
     source: Array
@@ -44,7 +45,7 @@ class Pair:
 
     @property
     def viewpoint(self) -> Array | None:
-        """(3,) mm, source frame: the camera; None where there is none."""
+        """(3,) or (N, 3) mm, source frame: the camera; None where there is none."""
         given = self.metadata.get("viewpoint")
         return None if given is None else np.asarray(given, dtype=np.float64)
 
@@ -60,11 +61,14 @@ def place(
 ) -> Pair:
     """Centre both on the target's mean, then move the source by the rotation and +-150 mm along each axis.
 
-    A camera at `viewpoint` (3,) mm, in the bone's frame, moves with the source.
+    A camera at `viewpoint` mm, (3,) or for each point (N, 3), in the bone's frame, moves with the source.
     """
     origin = target.mean(axis=0)
     T_source_target = se3.from_rotation_translation(rotation, rng.uniform(-TRANSLATION_MM, TRANSLATION_MM, 3))
-    seen_from = {} if viewpoint is None else {"viewpoint": se3.apply(T_source_target, (viewpoint - origin)[None])[0]}
+    seen_from = {}
+    if viewpoint is not None:
+        places = se3.apply(T_source_target, np.atleast_2d(viewpoint - origin))
+        seen_from["viewpoint"] = places.reshape(viewpoint.shape)
     return Pair(
         source=se3.apply(T_source_target, source - origin),
         target=target - origin,

@@ -51,7 +51,8 @@ def pair_paths(folder: str | Path) -> list[Path]:
 
 
 def load_clouds(path: str | Path) -> tuple[Array, Array, Array | None]:
-    """Source (N, 3) and target (M, 3), mm, and where the camera was (3,) in the source's frame; None if not said.
+    """Source (N, 3) and target (M, 3), mm, and where the camera was in the source's frame, (3,) or (N, 3); None
+    if not said.
 
     Nothing else of the file is read, so that no truth can be looked at.
 
@@ -59,7 +60,8 @@ def load_clouds(path: str | Path) -> tuple[Array, Array, Array | None]:
         InvalidPointCloudError: not a readable .npz with these arrays.
     """
     arrays = _arrays(path, lambda name: name in (*CLOUDS, "viewpoint"))
-    return (*_clouds(arrays, path), _of_shape(arrays, "viewpoint", (3,), path))
+    source, target = _clouds(arrays, path)
+    return source, target, _viewpoint(arrays, path)
 
 
 def load_pair(path: str | Path) -> Pair:
@@ -122,7 +124,7 @@ def _pair(clouds: tuple[Array, Array], arrays: Mapping[str, NDArray[Any]], path:
 
 def _check_facts(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> None:
     """Everything that a judge computes with, or a record keeps."""
-    _of_shape(arrays, "viewpoint", (3,), path)
+    _viewpoint(arrays, path)
     for name in arrays:
         if name.startswith(LANDMARK):
             point = _of_shape(arrays, name, (3,), path)
@@ -172,6 +174,14 @@ def _of_shape(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, .
         given = f"shape {array.shape} and type {array.dtype}"
         raise _wrong(path, f"{name} as {shape} numbers", given, "write it again, or leave it out")
     return array.astype(np.float64)
+
+
+def _viewpoint(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> Array | None:
+    """(3,) or, of several looks, a place for each point (N, 3); any N where the clouds are not read."""
+    given = arrays.get("viewpoint")
+    if given is None or given.ndim != 2:
+        return _of_shape(arrays, "viewpoint", (3,), path)
+    return _of_shape(arrays, "viewpoint", (len(arrays.get("source", given)), 3), path)
 
 
 def _wrong(path: str | Path, expected: str, given: str, how: str) -> InvalidPointCloudError:

@@ -25,6 +25,7 @@ from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import derived
 from gapr_core.data.scenes.joint import IN_THEATRE, joint_scene
 from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
+from gapr_core.data.scenes.several_looks import LOOKED_AT, several_looks
 from gapr_core.data.scenes.table import table_scene
 from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
@@ -95,8 +96,12 @@ def make_pair(
     return replace(pair, name=name, protocol=protocol, metadata=metadata)
 
 
-def _derived(specimen: Specimen, rng: np.random.Generator, base: str, change: Change) -> Pair:
-    return change(PROTOCOLS[base](specimen, rng), rng)
+def _derived(
+    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen] = (), turn: int | None = None,
+    *, base: str, change: Change,
+) -> Pair:  # fmt: skip
+    make = PROTOCOLS[base]
+    return change(make(specimen, rng, others, turn) if base in WITH_OTHERS else make(specimen, rng), rng)
 
 
 def paper(specimen: Specimen, rng: np.random.Generator, share: tuple[float, float] = (0.40, 0.70)) -> Pair:
@@ -229,11 +234,6 @@ STRANGERS: dict[str, Callable[..., Pair]] = {  # no pose is right
     "scene-wrong": wrong_scene,
     "scene-wrong-stereo": partial(wrong_scene, levels=("scene-stereo", "scene-layers")),
 }
-WITH_OTHERS: dict[str, Callable[..., Pair]] = {  # made with other bones
-    **STRANGERS,
-    "scene-joint": joint_scene,
-    "scene-theatre": partial(joint_scene, level=IN_THEATRE),
-}
 DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same seed
     **{f"scene-{level}-bone": (f"scene-{level}", derived.bone_alone) for level in ("C1", "C2", "C3")},
     **{
@@ -242,6 +242,14 @@ DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same see
         for percent in (10, 30)
     },
     "scene-ultrasound": ("ultrasound", derived.echoes),
+    **{f"{name}-look": (f"{name}-looks", derived.first_look) for name in LOOKED_AT},
+}
+WITH_OTHERS: dict[str, Callable[..., Pair]] = {  # made with other bones
+    **STRANGERS,
+    "scene-joint": joint_scene,
+    "scene-theatre": partial(joint_scene, level=IN_THEATRE),
+    **{f"{name}-looks": partial(several_looks, kind=kind) for name, kind in LOOKED_AT.items()},
+    **{f"{name}-look": partial(_derived, base=f"{name}-looks", change=derived.first_look) for name in LOOKED_AT},
 }
 PROTOCOLS: dict[str, Callable[..., Pair]] = {
     "paper": paper,

@@ -15,8 +15,10 @@ Where to read on, in the order in which a source passes:
 - `guidance`: where to look next. `check_points`: does the pose hold where the source was not? `cortices`: bones whose
   model has an inner surface.
 
-A camera's cloud goes another way: `clutter` (with `proposals.regions`, `free_space`, `clutter_kernels`), `explained`.
+A camera's cloud goes another way: `looks` makes a scene of what it saw from one place or several, then `clutter` (with
+`proposals.regions`, `free_space`, `clutter_kernels`), `explained`; `apart`: do the looks show the bone in one place?
 Streams: `tracking` (with `memory`, `evidence`, `repeats`, `stream_misfit` of `shared_misfit`), `following` between two
-of them, `accumulation`. `rigidity`: did a bone creep while its sources were collected, is a source strained or in two
-pieces? `doubles`: is the bone in it twice? `crop` cuts a cloud before, `inputs` takes poses and places.
+of them, `accumulation`, for a camera `look_accumulation`. `rigidity`: did a bone creep while its sources were
+collected, is a source strained or in two pieces? `doubles`: is the bone in it twice? `crop` cuts a cloud before,
+`inputs` takes poses and places.
 """

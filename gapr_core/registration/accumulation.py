@@ -135,7 +135,7 @@ class Accumulator:
             InvalidPointCloudError: as `collect` and `Registrar.register`.
         """
         if viewpoint is not None:
-            how = "register the clouds of a camera one by one, or leave the viewpoint out"
+            how = "register a camera's clouds with a LookAccumulator, or leave the viewpoint out"
             raise ConfigError("collected sources without a viewpoint", "one viewpoint for all of them", how)
         if isinstance(self.method, Registrar | Tracker):  # others have targets of their own
             check_call(target, initial)

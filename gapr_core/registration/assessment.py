@@ -63,6 +63,7 @@ class Assessment:
         most: no surer than this, in a stream neither: no such source was calibrated.
         deformed: sizes, mm, of what the points show besides one rigid piece of bone (`rigidity`, `doubles`), the surest
             first.
+        looks_apart: (K, 3) mm, source frame: from where a camera saw what does not fit its other looks (`apart`).
     """
 
     fit: Fit
@@ -84,6 +85,7 @@ class Assessment:
     independent_points: float = RulesConfig.independent_points
     most: float = 1.0
     deformed: Mapping[str, float] = field(default_factory=dict)
+    looks_apart: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
     def centre_mm(self) -> Array:
@@ -224,6 +226,7 @@ def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResul
         contributions=a.contributions,
         residuals=a.residuals,
         inferred_viewpoint=a.inferred_viewpoint,
+        looks_apart=a.looks_apart if len(a.looks_apart) else None,
     )
     if refusal is not None:
         return replace(common, status=refusal.status, reason=refusal.reason)

@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, RegistrarConfig
 from gapr_core.geometry import one_view, sampling
-from gapr_core.registration import free_space
 from gapr_core.registration.clutter_kernels import refine_agreeing
-from gapr_core.registration.free_space import DepthImage, Visible
+from gapr_core.registration.free_space import Visible
 from gapr_core.registration.kernels import distinct
+from gapr_core.registration.looks import Scene
 from gapr_core.registration.proposals import regions
 from gapr_core.registration.proposals.regions import Region
 from gapr_core.registration.source import PreparedSource
@@ -35,23 +35,6 @@ NAME = "scene"
 AT_THE_BONE = ("pointer", "ultrasound")  # sensors without lines of sight
 GIVEN = -1  # in place of the index of a region
 SMALLEST_SCORE = 1e-4  # a score below, and so one below 0, counts as this
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What a camera saw.
-
-    Attributes:
-        source: the cloud, with normals towards the camera.
-        image: the same as its camera saw it.
-        viewpoint: (3,) mm, source frame: where the camera was.
-        regions: parts of it that may be bone alone.
-    """
-
-    source: PreparedSource
-    image: DepthImage
-    viewpoint: Array
-    regions: list[Region]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,15 +58,6 @@ class Pool:
     def __add__(self, other: Pool) -> Pool:
         poses = np.concatenate([self.poses, other.poses])
         return Pool(poses, np.append(self.region, other.region), np.append(self.scores, other.scores))
-
-
-def scene_from(source: PreparedSource, viewpoint: Array, config: ClutterConfig) -> Scene:
-    """The scene that a camera at `viewpoint` (3,), mm, source frame, saw; no regions yet."""
-    source = source.facing(viewpoint)
-    around = source.points[source.neighbours[:, : config.levelled_by]].mean(axis=1) - source.points
-    levelled = source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]
-    image = free_space.see(levelled, source.normals, viewpoint, config.free_space)
-    return Scene(source, image, viewpoint, [])
 
 
 def sees_from_afar(config: RegistrarConfig) -> bool:
@@ -119,7 +93,7 @@ def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:
 
 def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
     """Hypotheses of all regions, each refined on its own region; and those that are given (K, 4, 4)."""
-    steps = _steps(target, config.region_limits_mm, config)
+    steps = steps_on(target, config.region_limits_mm, config)
 
     def work(region: Region) -> Array:
         poses = regions.search(region, target, config).poses
@@ -173,7 +147,7 @@ def refine_around(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
     """Each refined on what lies around its region and hardly in front of the bone, and scored again."""
-    steps = _steps(target, config.middle_limits_mm, config, config.front_share)
+    steps = steps_on(target, config.middle_limits_mm, config, config.front_share)
     tree = cKDTree(scene.source.points[scene.source.order])
     poses = pool.poses.copy()
 
@@ -199,7 +173,7 @@ def refine_on_all(
     """
     some, refined = scene.source.order[: config.final_points], []
     for front_share in (1.0, config.front_share):
-        steps = _steps(target, config.final_limits_mm, config, front_share)
+        steps = steps_on(target, config.final_limits_mm, config, front_share)
         refined += in_pieces(partial(steps.refined, source=scene.source, some=some), pool.poses, num_threads)
     pool = replace(pool + pool, poses=np.concatenate(refined))
     pool = replace(pool, scores=seen_of(pool.poses, scene, target, config, num_threads).score)
@@ -209,7 +183,7 @@ def refine_on_all(
 def seen_of(poses: Array, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Visible:
     """What the camera saw of the target under poses (K, 4, 4), at the scale of the noise."""
     points, normals = spread(target, config.final_target_points)
-    return free_space.compare(poses, points, normals, scene.image, config.on_mm, config.front_mm, num_threads)
+    return scene.compare(poses, points, normals, config.on_mm, config.front_mm, num_threads)
 
 
 def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.int64]:
@@ -218,7 +192,7 @@ def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.i
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class Steps:
     """Gauss-Newton steps on a target: one per row of limits (I, 2), mm, on points whose normals agree up to a cosine.
 
     The limits are those of points inside and outside of the target.
@@ -235,19 +209,19 @@ class _Steps:
         return np.asarray(refine_agreeing(np.ascontiguousarray(poses), points, normals, *how))
 
 
-def _steps(
+def steps_on(
     target: PreparedTarget, limits_mm: tuple[float, float, int], config: ClutterConfig, front_share: float = 1.0
-) -> _Steps:
+) -> Steps:
     """Of falling limits (first, last, how many), mm, and a share of each for points in front of the bone."""
     both = np.outer(np.linspace(*limits_mm), [1.0, front_share])
-    return _Steps(target, both, config.free_space.same_surface_cos)
+    return Steps(target, both, config.free_space.same_surface_cos)
 
 
 def _scored(
     pool: Pool, scene: Scene, target: PreparedTarget, count: int, on_mm: float, front_mm: float, num_threads: int
 ) -> Pool:
     points, normals = spread(target, count)
-    seen = free_space.compare(pool.poses, points, normals, scene.image, on_mm, front_mm, num_threads)
+    seen = scene.compare(pool.poses, points, normals, on_mm, front_mm, num_threads)
     return replace(pool, scores=seen.score)
 
 

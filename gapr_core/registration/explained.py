@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration import clutter, covariance, doubles, kernels
-from gapr_core.registration import source as sources
+from gapr_core.registration.apart import looks_apart, refusal_of
 from gapr_core.registration.assessment import Assessment, judge
-from gapr_core.registration.clutter import Scene
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.features import SCENE_FEATURES, of_the_fit
 from gapr_core.registration.free_space import Visible
+from gapr_core.registration.looks import Scene
 from gapr_core.registration.refinement import Fit, refine_fully
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
@@ -59,7 +59,7 @@ def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConf
         members = _on_surface(T, scene.source, target, config)
         if members.sum() < config.part.fewest_points:
             members[:] = True
-        part = _described(scene, members, config)
+        part = scene.part(members, config)
         fit = refine_fully(T, part.points, target, config.refinement, part.neighbours)
         T = fit.T
     return Explained(part, members, fit)
@@ -72,10 +72,6 @@ def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, config
     same = np.einsum("ni,ni->n", source.normals @ T[:3, :3].T, gradients)
     near &= (same if source.oriented else np.abs(same)) > config.part.agreeing_cos
     return near & (near[source.neighbours[:, : config.part.crowd]].mean(axis=1) > config.part.most_alone)
-
-
-def _described(scene: Scene, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
-    return sources.describe(scene.source.points[members], config.source).facing(scene.viewpoint)
 
 
 def assess_part(
@@ -92,7 +88,11 @@ def assess_part(
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around, eye=eye)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
-    return replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
+    seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
+    if not seen.reaches(config.worth_checking):
+        return seen  # what lies elsewhere than a wrong pose may lie right
+    apart = scene.viewpoints[looks_apart(fit.T, scene, target, config)]
+    return replace(seen, looks_apart=apart).with_refusal(refusal_of(apart) if len(apart) else None, config.rules)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
@@ -100,13 +100,14 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
 
     With a viewpoint, by what the pose explains; of another dense cloud, by what lies on the bone. This is no safety
     rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed. What lies on
-    the bone in another pose is no clutter.
+    the bone in another pose is no clutter; where looks show it in several places, that is said.
     """
     source, least, in_scene = assessment.source, config.min_confidence, assessment.seen is not None
     believed = assessment.probability >= least if in_scene else assessment.reaches(least)
     if (
         believed
         or doubles.is_in_two_poses(assessment)
+        or len(assessment.looks_apart)
         or not (in_scene or len(source.points) >= config.source.dense_points)
     ):
         return assessment

@@ -7,6 +7,7 @@ target's surface is compared with what was measured on its own line of sight.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +71,13 @@ class Visible:
         return np.asarray(
             self.explained - self.config.misfit_costs * otherwise - self.config.violation_costs * self.violating
         )
+
+
+def average(seen: Sequence[Visible]) -> Visible:
+    """The mean of the shares of several images, each of which counts alike."""
+    names = ("explained", "violating", "compared")
+    explained, violating, compared = (np.mean([getattr(each, name) for each in seen], axis=0) for name in names)
+    return Visible(explained, violating, compared, seen[0].config)
 
 
 def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceConfig | None = None) -> DepthImage:

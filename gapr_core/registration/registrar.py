@@ -27,12 +27,13 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
-from gapr_core.registration import checks, clutter, cortices, doubles, explained, inputs, limits, rules
+from gapr_core.registration import checks, clutter, cortices, doubles, explained, inputs, limits, looks, rules
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess_fit
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.guidance import guide
+from gapr_core.registration.looks import Look, Scene
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
@@ -55,6 +56,7 @@ Array = NDArray[np.float64]
 Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by itself needs no other proposer
 
 NO_POSES = np.empty((0, 4, 4))
+NO_POSE = Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
 WITHIN_MM = 15.0  # root mean square over the source: refinement comes from there to the same pose
 
 
@@ -217,25 +219,34 @@ class Registrar:
     ) -> Assessment | Refusal:
         """`assess` with any number of poses to try as well: (K, 4, 4) T_target_source, mm, each rigid."""
         target = offset_surface(target, self.config.sensor)
-        prepared = sources.prepare(source, self.config.source, self.config.num_threads, viewpoint is not None)
+        if viewpoint is not None:
+            return self._as_scene(looks.split(source, viewpoint), target, start, clock, enough)
+        prepared = sources.prepare(source, self.config.source, self.config.num_threads)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
             return rules.asking_the_unit(prepared, finite_points(source), target.points)
-        if viewpoint is None:
-            assessment = self._as_bone(prepared, target, start, clock, enough)
-            if assessment is None or not (assessment.reaches(self.config.min_confidence) or enough(assessment)):
-                found = self._of_one_view(source, target, start, clock)
-                if found is not None:
-                    return found
-        else:
-            eye = inputs.numbers(viewpoint, (3,), "viewpoint", "pass x, y, z in mm")
-            assessment = self._in_scene(prepared, target, start, eye, clock)
+        assessment = self._as_bone(prepared, target, start, clock, enough)
+        if assessment is None or not (assessment.reaches(self.config.min_confidence) or enough(assessment)):
+            found = self._of_one_view(source, target, start, clock)
+            if found is not None:
+                return found
         if assessment is None:
-            return Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
+            return NO_POSE
         checked = self._checked_and_corrected(assessment, clock, enough)
-        if checked.refusal is None or checked.seen is not None:  # a part found in a scene has no size of its own
+        if checked.refusal is None:
             return checked
         return replace(checked, refusal=rules.asking_the_unit(checked.refusal, prepared.points, target.points))
+
+    def _as_scene(
+        self, seen: list[Look], target: PreparedTarget, start: Array, clock: Clock, enough: Enough
+    ) -> Assessment | Refusal:
+        """What a camera saw; the part that is bone has no size of its own, which the whole could be compared by."""
+        scene = looks.prepared(seen, self.config)
+        clock.lap("prepare")
+        if isinstance(scene, Refusal):
+            return rules.asking_the_unit(scene, np.concatenate([look.points for look in seen]), target.points)
+        assessment = self._in_scene(scene, target, start, clock)
+        return NO_POSE if assessment is None else self._checked_and_corrected(assessment, clock, enough)
 
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
@@ -289,7 +300,7 @@ class Registrar:
         places = clutter.inferred_places(scene, config)
         clock.lap("prepare")
         for viewpoint, rounds in places:
-            found = self._in_scene(scene, target, poses, viewpoint, clock, rounds)
+            found = self._in_scene(looks.scene_from([scene], viewpoint[None], config), target, poses, clock, rounds)
             if found is None or not found.reaches(config.accepted_if_inferred):
                 continue
             found = self._checked_and_corrected(replace(found, inferred_viewpoint=viewpoint), clock, never)
@@ -358,17 +369,16 @@ class Registrar:
 
     def _in_scene(
         self,
-        source: PreparedSource,
+        seen: Scene,
         target: PreparedTarget,
         poses: Array,
-        viewpoint: Array,
         clock: Clock,
         rounds: int | None = None,
     ) -> Assessment | None:
         """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
         config, threads = self.config, self.config.num_threads
         settings = replace(config.clutter, rounds=rounds or config.clutter.rounds)
-        seen, assessment = clutter.scene_from(source, viewpoint, settings), None
+        assessment = None
         for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
             pool = clutter.propose(scene, target, poses, settings, threads)
             clock.lap("propose")

@@ -79,7 +79,10 @@ class PreparedSource:
         return float(np.median(self.flatness_mm))
 
     def facing(self, viewpoint: Array) -> PreparedSource:
-        """The same with normals that point to the viewpoint (3,), mm: a sensor sees surfaces from outside."""
+        """The same with normals that point to the viewpoint, mm, (3,) or one for each point (N, 3).
+
+        A sensor sees surfaces from outside.
+        """
         away = np.einsum("ni,ni->n", self.normals, viewpoint - self.points) < 0.0
         return replace(self, normals=self.normals * np.where(away, -1.0, 1.0)[:, None], oriented=True)
 

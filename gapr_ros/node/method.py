@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 from gapr_core.errors import ConfigError
 from gapr_ros.node.wire import MM_PER_M
-from gapr_ros.parameters import NodeParameters
+from gapr_ros.parameters import MOST_LOOKS, NodeParameters
 
 if TYPE_CHECKING:
     from gapr_core import RegistrarConfig
 
 
 class ShippedMethod:
-    """GAPR as it ships: a `Tracker`, with `track: false` the `Registrar`; an `Accumulator` of either on demand.
+    """GAPR as it ships: a `Tracker`, with `track: false` the `Registrar`.
+
+    Several clouds are registered as one by an `Accumulator` of either, those of a camera by a `LookAccumulator`.
 
     `settings_file` is read once. A method with other limits, or for another bone, has the settings of before, whatever
     has become of the file.
@@ -36,7 +38,7 @@ class ShippedMethod:
         Raises:
             ConfigError: the file cannot be read, holds what no setting is, or what a parameter decides otherwise.
         """
-        from gapr_core import Accumulator, Registrar, Tracker
+        from gapr_core import Accumulator, LookAccumulator, Registrar, Tracker
 
         if self._settings is None:
             settings = read_settings(parameters.settings_file)
@@ -44,7 +46,11 @@ class ShippedMethod:
             self._settings = settings
         registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device)
         method = Tracker(registrar) if parameters.track else registrar
-        return Accumulator(method, parameters.accumulate) if parameters.accumulate > 1 else method
+        if parameters.accumulate <= 1:
+            return method
+        if parameters.collects_looks:
+            return LookAccumulator(method, min(parameters.accumulate, MOST_LOOKS))
+        return Accumulator(method, parameters.accumulate)
 
 
 def read_settings(path: str) -> RegistrarConfig:

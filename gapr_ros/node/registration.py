@@ -41,7 +41,8 @@ class Registration:
     Args:
         frames: look-up of transforms.
         situation: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
-            when there is such a pose, and with `accumulate` it has `collect` and `together_with` as an `Accumulator`.
+            when there is such a pose, and with `accumulate` it has `collect` and `together_with` as an `Accumulator`,
+            or where `viewpoint` names a place as a `LookAccumulator`.
         left: is called for every cloud of `collect`, now or later: whether it was collected, and why not.
     """
 
@@ -91,7 +92,7 @@ class Registration:
             self._watch_frame(frame, now)
         elif frame != self._frame:
             raise RefusedError(Reason.BAD_FRAME, f"it is in '{frame}', those that are collected are in '{self._frame}'")
-        now.method.collect(points_mm)
+        now.method.collect(points_mm, **self._seen_from(outcome, now))
 
     def _run(self, outcome: Outcome, now: Situation, start: float) -> None:
         points_mm = self._points_mm(outcome, now)
@@ -99,7 +100,7 @@ class Registration:
         outcome.points_used, self._newest_collected = len(points_mm), None
         if now.parameters.accumulate > 1:
             self._late.take(now.parameters.tf_timeout)  # the transform of this cloud has come: so have those of before
-            _check_together(points_mm, outcome, now)
+            self._check_together(points_mm, outcome, now)
         is_to_be_assessed = outcome.job.urgent or outcome.seen_from is not None
         outcome.followed = self._following.follow(points_mm, outcome.header.frame_id, is_to_be_assessed, now)
         if outcome.followed is not None:
@@ -145,9 +146,7 @@ class Registration:
         initial = self._initial_poses.start(now.initial_pose, partial(self._initial, outcome=outcome, now=now))
         outcome.has_initial_pose = initial is not None
         options = {"initial": initial} if outcome.has_initial_pose else {}
-        viewpoint_mm = self._viewpoint_mm(outcome, now)
-        if viewpoint_mm is not None:
-            options["viewpoint"] = viewpoint_mm
+        options |= self._seen_from(outcome, now)
         result = now.method.register(points_mm, now.model.target, **options)
         outcome.confidence, outcome.inlier_ratio = float(result.confidence), float(result.inlier_ratio)
         outcome.result, outcome.found_by = result, result.proposer
@@ -160,10 +159,30 @@ class Registration:
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         return wire.core_pose(T_frame_cloud @ se3.inverse(T_given_cloud) @ given.T_frame_model)
 
+    def _seen_from(self, outcome: Outcome, now: Situation) -> dict[str, Array]:
+        """`viewpoint` for the method, where there is one."""
+        viewpoint_mm = self._viewpoint_mm(outcome, now)
+        return {} if viewpoint_mm is None else {"viewpoint": viewpoint_mm}
+
+    def _check_together(self, points_mm: Array, outcome: Outcome, now: Situation) -> None:
+        """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
+        together = now.method.together_with(points_mm)
+        if len(together) < SEARCHED_FOR_DOUBLES:
+            together = sampling.distinct(together)  # a cloud that comes again makes no more of them
+        if not intake.is_one_bone(together, now.model.extent_mm):
+            together = points_mm  # the method leaves this cloud out, or starts again with it
+        outcome.points_used = len(together)
+        try:
+            intake.check_together(together, now.model.extent_mm, now.parameters)
+        except RefusedError as refusal:
+            if refusal.reason is Reason.TOO_FEW_POINTS:
+                now.method.collect(points_mm, **self._seen_from(outcome, now))
+            raise
+
     def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:
         """(3,) where the camera was, in the frame of the answer; None where it is not known, or not one place."""
-        frame = now.parameters.viewpoint
-        if now.parameters.accumulate > 1 or (frame in NO_FRAME and outcome.seen_from is None):
+        frame, together = now.parameters.viewpoint, now.parameters.accumulate > 1
+        if (frame in NO_FRAME and outcome.seen_from is None) or (together and not now.parameters.collects_looks):
             return None
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         if outcome.seen_from is not None:
@@ -197,22 +216,6 @@ def needs_frames(parameters: NodeParameters) -> bool:
     """Whether clouds cannot be read without tf2."""
     has_frame = parameters.viewpoint not in (*NO_FRAME, "origin")
     return bool(parameters.output_frame or parameters.crop_frame or has_frame)
-
-
-def _check_together(points_mm: Array, outcome: Outcome, now: Situation) -> None:
-    """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
-    together = now.method.together_with(points_mm)
-    if len(together) < SEARCHED_FOR_DOUBLES:
-        together = sampling.distinct(together)  # a cloud that comes again makes no more of them
-    if not intake.is_one_bone(together, now.model.extent_mm):
-        together = points_mm  # the method leaves this cloud out, or starts again with it
-    outcome.points_used = len(together)
-    try:
-        intake.check_together(together, now.model.extent_mm, now.parameters)
-    except RefusedError as refusal:
-        if refusal.reason is Reason.TOO_FEW_POINTS:
-            now.method.collect(points_mm)
-        raise
 
 
 def _note_header(outcome: Outcome, header: Header, now: Situation) -> None:

@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, SourceConfig
 from gapr_core.geometry import sampling, se3
-from gapr_core.registration import clutter
+from gapr_core.registration import clutter, free_space
 from gapr_core.registration import source as sources
-from gapr_core.registration.clutter import Pool, Scene
+from gapr_core.registration.clutter import Pool
+from gapr_core.registration.looks import Scene
 
 CONFIG = ClutterConfig(
     same_pose_mm=2.0, markers=5, middle_poses=3, final_poses=2, kept_poses=2, levelled_by=4, region_points=12,
@@ -34,7 +35,7 @@ def target():
 @pytest.fixture
 def scene(source):
     regions = [SimpleNamespace(source=source, centre=source.points[k]) for k in (0, 50)]
-    return Scene(source, None, np.array([0.0, 0.0, 300.0]), regions)
+    return Scene(source, (None,), np.array([[0.0, 0.0, 300.0]]), np.zeros(len(source.points), dtype=np.int64), regions)
 
 
 def shifts(*x_mm):
@@ -60,7 +61,8 @@ def scored(monkeypatch):
         asked.append((len(points), on_mm, front_mm))
         return SimpleNamespace(score=0.5 - 0.01 * np.abs(poses[:, 0, 3] - 10.0))
 
-    monkeypatch.setattr(clutter.free_space, "compare", compare)
+    monkeypatch.setattr(free_space, "compare", compare)
+    monkeypatch.setattr(free_space, "average", lambda seen: seen[0])
     return asked
 
 
@@ -207,17 +209,3 @@ def test_the_points_of_a_target_lie_where_its_sensor_sees_them(target):
     points, normals = clutter.spread(target, 37)
     farther_out, same = clutter.spread(replace(target, offset_mm=0.5), 37)
     assert farther_out == pytest.approx(points + 0.5 * normals) and np.array_equal(same, normals)
-
-
-def test_a_camera_sees_the_cloud_levelled_over_its_neighbours_along_the_normals(source, monkeypatch):
-    seen = []
-    monkeypatch.setattr(clutter.free_space, "see", lambda *words: seen.append(words))
-    eye = np.array([0.0, 0.0, 300.0])
-    scene = clutter.scene_from(source, eye, CONFIG)
-    ((levelled, normals, viewpoint, config),) = seen
-    assert scene.source.oriented and viewpoint is eye and config is CONFIG.free_space and scene.regions == []
-    for k in (0, 17, 60):
-        mean = source.points[source.neighbours[k][:4]].mean(axis=0)
-        along = source.normals[k] * (source.normals[k] @ (mean - source.points[k]))
-        assert levelled[k] == pytest.approx(source.points[k] + along)
-    assert (((eye - source.points) * normals).sum(axis=1) >= 0.0).all()

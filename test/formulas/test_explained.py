@@ -81,18 +81,23 @@ def described(monkeypatch):
         zeros = np.zeros(len(points))
         return Fit(T, 0.5, zeros, (points[:, 2] < 2.6).astype(float), None, zeros, se3.apply(T, points))
 
-    def described(scene, members, config):
-        return SimpleNamespace(points=scene.source.points[members], neighbours=None)
-
     monkeypatch.setattr(explained, "refine_fully", refine_fully)
-    monkeypatch.setattr(explained, "_described", described)
     return seen
+
+
+def scene_of(points):
+    """Its parts are described by their points alone."""
+    source = source_of(points)
+    part = SimpleNamespace
+    return SimpleNamespace(
+        source=source, part=lambda members, config: part(points=source.points[members], neighbours=None)
+    )
 
 
 def test_the_part_is_chosen_again_after_each_refinement(plane, described):
     """40 points at 0, 35 at 3 mm: at first only the first lie within 2 mm; moved down by 1.5 mm, all do."""
     points = [[0.1 * k, 0.0, 0.0] for k in range(40)] + [[0.1 * k, 1.0, 3.0] for k in range(35)]
-    scene = SimpleNamespace(source=source_of(points))
+    scene = scene_of(points)
     found = explained.refine(np.eye(4), scene, plane, CONFIG)
     assert described == [(40, -1.5), (75, -3.0)]
     assert found.members.sum() == 75 and found.share == pytest.approx(40 / 75)
@@ -103,7 +108,7 @@ def test_the_part_is_chosen_again_after_each_refinement(plane, described):
 @pytest.mark.parametrize(("count", "all_of_it"), [(29, True), (30, False)])
 def test_the_whole_cloud_is_refined_on_where_the_part_is_next_to_nothing(plane, described, count, all_of_it):
     points = [[0.1 * k, 0.0, 0.0] for k in range(count)] + [[0.1 * k, 1.0, 50.0] for k in range(20)]
-    explained.refine(np.eye(4), SimpleNamespace(source=source_of(points)), plane, CONFIG)
+    explained.refine(np.eye(4), scene_of(points), plane, CONFIG)
     assert described[0][0] == (count + 20 if all_of_it else count)
 
 
@@ -112,6 +117,11 @@ def part_of(share, count=10):
     weights = (np.arange(count) < round(share * count)).astype(float)
     fit = Fit(np.eye(4), 0.5, zeros, weights, None, zeros, np.zeros((count, 3)))
     return Explained(SimpleNamespace(points=np.zeros((count, 3)), around=None), np.ones(count, dtype=bool), fit)
+
+
+def camera_s():
+    """A scene seen from one place."""
+    return SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,))
 
 
 @pytest.fixture
@@ -136,7 +146,10 @@ def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed
     judged, probability, share, refusal, status
 ):
     judged.probability, judged.refusal = probability, refusal
-    scene, part = SimpleNamespace(source=object(), viewpoint=np.ones(3)), part_of(share)
+    scene, part = (
+        SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,)),
+        part_of(share),
+    )
     assessed_part = explained.assess_part(part, None, scene, None, None, CONFIG)
     assert assessed_part.refusal is refusal  # a stream may still raise the probability
     found = explained.named_clutter(assessed_part, CONFIG)
@@ -149,7 +162,10 @@ def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed
 
 
 def test_the_bone_in_two_poses_is_no_clutter(judged):
-    scene, part = SimpleNamespace(source=object(), viewpoint=np.ones(3)), part_of(0.4)
+    scene, part = (
+        SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,)),
+        part_of(0.4),
+    )
     judged.probability, judged.refusal = 0.3, REFUSED
     found = replace(explained.assess_part(part, None, scene, None, None, CONFIG), deformed={"doubled": 30.0})
     assert explained.named_clutter(found, CONFIG) is found

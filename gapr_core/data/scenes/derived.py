@@ -1,4 +1,4 @@
-"""Pairs made of other pairs: the bone's points alone, far clutter added, echoes of an ultrasound image."""
+"""Pairs made of other pairs: the bone's points alone, one look of several, far clutter, echoes of ultrasound."""
 
 from __future__ import annotations
 
@@ -26,6 +26,16 @@ def bone_alone(pair: Pair, rng: np.random.Generator) -> Pair:
     is_bone = np.asarray(pair.metadata["is_bone"])
     facts = {"is_bone": is_bone[is_bone], "bone_share": 1.0, "outlier_share": 0.0}
     return replace(pair, source=pair.source[is_bone], metadata={**pair.metadata, **facts})
+
+
+def first_look(pair: Pair, rng: np.random.Generator) -> Pair:
+    """The first of several looks alone."""
+    first = np.asarray(pair.metadata["look"]) == 0
+    is_bone = np.asarray(pair.metadata["is_bone"])[first]
+    share = float(is_bone.mean())
+    of_it = {"viewpoint": pair.metadata["viewpoint"][first][0], "look": np.zeros(len(is_bone), dtype=np.int64)}
+    facts = {**of_it, "is_bone": is_bone, "bone_share": share, "outlier_share": 1.0 - share}
+    return replace(pair, source=pair.source[first], metadata={**pair.metadata, **facts})
 
 
 def far_clutter(pair: Pair, rng: np.random.Generator, share: float) -> Pair:

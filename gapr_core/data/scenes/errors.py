@@ -6,6 +6,7 @@ between what is before and behind. Wet spots give nothing. Depth comes in steps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -58,21 +59,28 @@ def _in_stereo(view: View, rng: np.random.Generator, times: float, windows_mm: t
 
 def seen_on_layers(view: View, rng: np.random.Generator) -> View:
     """The bone under layers, with the errors of `camera.measured`."""
-    return seen_in_depth(_under_layers(view, rng), rng)
+    return seen_in_depth(under_layers([view], rng)[0], rng)
 
 
 def seen_in_theatre(view: View, rng: np.random.Generator) -> View:
     """The bone under layers as a stereo camera sees it whose range is about 1 % wrong."""
-    view = seen_in_stereo(_under_layers(view, rng), rng)
+    view = seen_in_stereo(under_layers([view], rng)[0], rng)
     seen = depth_maps.wrong_range(view.points, rng)
     return replace(view, points=seen.of(view.points), camera=seen.of(view.camera))
 
 
-def _under_layers(view: View, rng: np.random.Generator) -> View:
-    """One to three layers of up to 4 mm on the bone, towards the camera."""
-    bone, points = np.flatnonzero(view.part == 0), view.points.copy()
-    sight = points[bone] - view.camera
-    points[bone] -= layers(points[bone], rng)[:, None] * sight / np.linalg.norm(sight, axis=1, keepdims=True)
+def under_layers(views: Sequence[View], rng: np.random.Generator) -> list[View]:
+    """The same layers on the bone in all views of it: one to three of up to 4 mm, towards the camera."""
+    bone = [np.flatnonzero(view.part == 0) for view in views]
+    above_mm = layers(np.concatenate([view.points[of] for view, of in zip(views, bone, strict=True)]), rng)
+    of_each = np.split(above_mm, np.cumsum([len(of) for of in bone])[:-1])
+    return [_raised(view, of, mm) for view, of, mm in zip(views, bone, of_each, strict=True)]
+
+
+def _raised(view: View, some: NDArray[np.intp], above_mm: Array) -> View:
+    points = view.points.copy()
+    sight = points[some] - view.camera
+    points[some] -= above_mm[:, None] * sight / np.linalg.norm(sight, axis=1, keepdims=True)
     return replace(view, points=points)
 
 

@@ -37,12 +37,12 @@ def joint_scene(
     Raises:
         ConfigError: no other bone of this subject is near, or no wound shows that share of bone.
     """
-    neighbour = _next_to(specimen, others)
-    pair = draw(specimen, rng, level, partial(_at_joint, specimen, neighbour))
+    neighbour = next_to(specimen, others)
+    pair = draw(specimen, rng, level, partial(at_joint, specimen, neighbour))
     return replace(pair, metadata=pair.metadata | {"neighbour": neighbour.bone})
 
 
-def _next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
+def next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
     """The nearest bone of the same scan."""
     same = () if specimen.cohort in MADE else (specimen.person, specimen.cohort)
     own = [other for other in others if (other.person, other.cohort) == same and other.bone != specimen.bone]
@@ -56,7 +56,8 @@ def _next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
     return own[int(np.argmin(apart))]
 
 
-def _at_joint(specimen: Specimen, neighbour: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:
+def at_joint(specimen: Specimen, neighbour: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:
+    """A wound where both bones are near."""
     setting = arrange(_together(specimen, neighbour), rng, level, partial(_between, specimen, neighbour))
     return setting._replace(parts=[specimen.surface, *setting.parts[1:], neighbour.surface])
 

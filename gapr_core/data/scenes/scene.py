@@ -29,6 +29,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 Thing = Callable[[Wound, float, np.random.Generator], Surface]  # of a wound and the thickness of its tissue, mm
+Errors = Callable[[View, np.random.Generator], View]  # of a camera
 DISTANCE_MM = (350.0, 550.0)
 FARTHEST_OFF_DEG = 25.0
 AIM_MM = 20.0  # farthest of what the camera aims at from the wound's centre
@@ -60,7 +61,7 @@ class SceneLevel:
     packed: bool = False
     things: tuple[Thing, ...] = ()
     whole_image: bool = False
-    errors: Callable[[View, np.random.Generator], View] = seen_in_depth
+    errors: Errors = seen_in_depth
 
 
 SCENE_LEVELS = {
@@ -109,7 +110,7 @@ def draw(
     target, _ = specimen.sample(TARGET_POINTS, rng)
     for _ in range(TRIES):
         setting = setting_of(rng, level)
-        view = see(setting.parts, _camera(setting.wound, rng))
+        view = see(setting.parts, camera_above(setting.wound, rng))
         chosen = shown(view, setting.wound.centre, level, rng)
         if chosen is not None:
             return _as_pair(specimen, target, view.of(chosen), setting, level, rng)
@@ -145,7 +146,7 @@ def arrange(
     return Setting(wound, [specimen.surface, tissue, *retractors, *others], facts)
 
 
-def _camera(wound: Wound, rng: np.random.Generator) -> Camera:
+def camera_above(wound: Wound, rng: np.random.Generator) -> Camera:
     """Somewhere in a cone about the wound's axis, its image's middle within 20 mm of the wound's."""
     off = np.arccos(rng.uniform(np.cos(np.radians(FARTHEST_OFF_DEG)), 1.0))
     around = rng.uniform(0.0, 2.0 * np.pi)

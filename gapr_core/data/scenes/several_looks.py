@@ -1,0 +1,155 @@
+"""The protocols `scene-*-looks`: a wound that a tracked camera sees from four places, in one frame in which it rests.
+
+The first look is one as `scene` takes it. The others come from places around it, 15 to 35 degrees off the wound's axis,
+and show the same region. Layers on the bone are the same in all looks; errors of the camera are drawn for each, and so
+are those of the tracker that says where it was. A range that is wrong is wrong in all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.data.pair import TARGET_POINTS, Pair, place
+from gapr_core.data.scenes import joint
+from gapr_core.data.scenes.camera import View, looking_at, see, seen_in_depth
+from gapr_core.data.scenes.errors import seen_by_a_poor_camera, seen_in_stereo, under_layers
+from gapr_core.data.scenes.scene import (
+    AIM_MM,
+    DISTANCE_MM,
+    MOST_POINTS,
+    TRIES,
+    Errors,
+    SceneLevel,
+    Setting,
+    arrange,
+    camera_above,
+    shown,
+)
+from gapr_core.data.scenes.wound import Wound
+from gapr_core.data.sensors.depth_maps import RANGE
+from gapr_core.data.specimen import Specimen
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+from gapr_core.geometry.sampling import random_directions
+
+Array = NDArray[np.float64]
+
+LOOKS = 4
+OFF_DEG = (15.0, 35.0)  # of the later looks from the wound's axis
+TRACKED_MM, TRACKED_DEG = 0.3, 0.05  # standard deviation of the camera's tracked place and turn, about each axis
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What the looks show.
+
+    Attributes:
+        bone_share: of the points of the first look.
+        errors: of the camera, drawn for each look.
+        under_layers: the bone lies under layers.
+        at_joint: the next bone of the same scan lies in the wound, too.
+        range_wrong: standard deviation of the relative error of the camera's range.
+    """
+
+    bone_share: tuple[float, float] = (0.10, 0.90)
+    errors: Errors = seen_in_depth
+    under_layers: bool = False
+    at_joint: bool = False
+    range_wrong: float = 0.0
+
+
+LOOKED_AT = {
+    "scene-C3": LookedAt((0.10, 0.30)),
+    "scene-stereo": LookedAt(errors=seen_in_stereo),
+    "scene-noisy": LookedAt(errors=seen_by_a_poor_camera),
+    "scene-layers": LookedAt(under_layers=True),
+    "scene-joint": LookedAt((0.10, 0.60), at_joint=True),
+    "scene-theatre": LookedAt((0.10, 0.60), seen_in_stereo, under_layers=True, at_joint=True, range_wrong=RANGE),
+}
+
+
+def several_looks(
+    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None,
+    kind: LookedAt | None = None,
+) -> Pair:  # fmt: skip
+    """One wound as a camera sees it from `LOOKS` places.
+
+    Its metadata hold `viewpoint` (N, 3) mm, where the camera was for each point, in the source's frame; `look` (N,);
+    `is_bone` (N,), `bone_share` and how it was made.
+
+    Raises:
+        ConfigError: a bone on which no wound shows that share of bone, or at a joint, no other bone near.
+    """
+    kind = kind or LookedAt()
+    target, _ = specimen.sample(TARGET_POINTS, rng)
+    setting, views = _first(specimen, rng, others, kind)
+    radius = np.linalg.norm(views[0].points - setting.wound.centre, axis=1).max()
+    views += [_from(setting, around, radius, rng) for around in _places_around(rng)]
+    views = under_layers(views, rng) if kind.under_layers else views
+    factor = 1.0 + rng.normal(0.0, kind.range_wrong) if kind.range_wrong else 1.0
+    views = [_of_range(kind.errors(view, rng), factor) for view in views]
+    views = [views[0], *(_tracked(view, rng) for view in views[1:])]
+    return _as_pair(specimen, target, views, setting, rng)
+
+
+def _first(
+    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], kind: LookedAt
+) -> tuple[Setting, list[View]]:
+    """A wound and the first look, without errors."""
+    level, setting_of = SceneLevel(kind.bone_share), partial(arrange, specimen)
+    if kind.at_joint:
+        setting_of = partial(joint.at_joint, specimen, joint.next_to(specimen, others))
+    for _ in range(TRIES):
+        setting = setting_of(rng, level)
+        view = see(setting.parts, camera_above(setting.wound, rng))
+        chosen = shown(view, setting.wound.centre, level, rng)
+        if chosen is not None:
+            return setting, [view.of(chosen)]
+    low, high = kind.bone_share
+    given = f"{specimen.bone} of {specimen.person}: none in {TRIES} wounds"
+    raise ConfigError(f"a bone of which a wound shows {low:.0%} to {high:.0%}", given, "choose another bone or seed")
+
+
+def _places_around(rng: np.random.Generator) -> Array:
+    """Directions about the wound's axis, rad, evenly apart."""
+    return rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(LOOKS - 1) / (LOOKS - 1)
+
+
+def _from(setting: Setting, around: float, radius: float, rng: np.random.Generator) -> View:
+    """The same region from another place, at most `MOST_POINTS` of it."""
+    wound: Wound = setting.wound
+    off = np.radians(rng.uniform(*OFF_DEG))
+    direction = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])
+    position = wound.at(rng.uniform(*DISTANCE_MM) * direction)
+    aim = wound.centre + rng.uniform(0.0, AIM_MM) * random_directions(1, rng)[0]
+    view = see(setting.parts, looking_at(aim, position, rng.uniform(0.0, 2.0 * np.pi)))
+    inside = np.flatnonzero(np.linalg.norm(view.points - wound.centre, axis=1) <= radius)
+    return view.of(rng.permutation(inside)[:MOST_POINTS])
+
+
+def _of_range(view: View, factor: float) -> View:
+    """As a camera sees it whose range is wrong by a factor: the cloud is nearer or farther."""
+    return replace(view, points=view.camera + factor * (view.points - view.camera))
+
+
+def _tracked(view: View, rng: np.random.Generator) -> View:
+    """Moved as the tracker of the camera errs."""
+    twist = np.concatenate([rng.normal(0.0, TRACKED_MM, 3), np.radians(rng.normal(0.0, TRACKED_DEG, 3))])
+    T = se3.exp(twist, view.camera)
+    return replace(view, points=se3.apply(T, view.points), camera=se3.apply(T, view.camera[None])[0])
+
+
+def _as_pair(
+    specimen: Specimen, target: Array, views: Sequence[View], setting: Setting, rng: np.random.Generator
+) -> Pair:
+    look = np.repeat(np.arange(len(views)), [len(view.points) for view in views])
+    is_bone = np.concatenate([view.part == 0 for view in views])
+    share = float(is_bone.mean())
+    metadata = {**setting.facts, "look": look, "is_bone": is_bone, "bone_share": share, "outlier_share": 1.0 - share}
+    points, places = np.concatenate([view.points for view in views]), np.array([view.camera for view in views])
+    return place(specimen, points, target, se3.random_rotation(rng), metadata, rng, places[look])

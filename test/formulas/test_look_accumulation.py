@@ -1,0 +1,198 @@
+"""Which looks of a camera are kept, and what becomes of those that do not fit the others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+
+from gapr_core import ConfigError, InvalidPointCloudError, LookAccumulator, Registrar, Tracker
+from gapr_core.registration.look_accumulation import STUCK
+from gapr_core.results import RegistrationResult, RegistrationStatus
+
+OK = RegistrationResult(RegistrationStatus.OK, np.eye(4))
+REFUSED = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="too little bone")
+
+
+@pytest.fixture(scope="module")
+def target():
+    return tiny.ellipsoid()
+
+
+class Asked:
+    """Stands for `Registrar.register`: gives the answers in turn, the last one again and again; keeps what it gets."""
+
+    def __init__(self, *answers):
+        self.answers, self.sources, self.places = list(answers), [], []
+
+    def __call__(self, source, target, initial, viewpoint):
+        self.sources.append(source)
+        self.places.append(np.unique(viewpoint, axis=0))
+        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer(viewpoint) if callable(answer) else answer
+
+
+def looks_of(answer, *more, **how):
+    method = Registrar()
+    method.register = Asked(answer, *more)
+    return LookAccumulator(method, **how), method.register
+
+
+def points(name):
+    """Three points about the origin whose z says which look they are of."""
+    return np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 0.0]]) + [0.0, 0.0, 0.01 * name]
+
+
+def eye(deg):
+    return 400.0 * np.array([np.sin(np.radians(deg)), 0.0, np.cos(np.radians(deg))])
+
+
+def names(collected):
+    return [round(100.0 * z) for z in np.asarray(collected)[::3, 2]]
+
+
+def apart(*numbers):
+    """An answer in which the looks of these numbers, the oldest 0, do not fit the others."""
+
+    def said(viewpoint):
+        places = viewpoint[np.sort(np.unique(viewpoint, axis=0, return_index=True)[1])]
+        refused = replace(REFUSED, status=RegistrationStatus.AMBIGUOUS, reason="elsewhere")
+        return replace(refused, looks_apart=places[list(numbers)])
+
+    return said
+
+
+def test_each_look_is_registered_with_those_before_it_and_keeps_its_place(target):
+    looks, asked = looks_of(OK)
+    assert looks.register(points(1), target, viewpoint=eye(0.0)).method == "gapr_looks"
+    looks.register(points(2), target, viewpoint=eye(20.0))
+    assert names(asked.sources[0]) == [1] and names(asked.sources[1]) == [1, 2]
+    assert asked.places[1] == pytest.approx(np.array([eye(0.0), eye(20.0)]), abs=1e-5)
+
+
+def test_the_oldest_goes_beyond_most(target):
+    looks, asked = looks_of(OK, most=2)
+    for number in range(4):
+        looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert names(asked.sources[-1]) == [2, 3] == names(looks.collected)
+    assert names(looks.together_with(points(9))) == [3, 9]
+
+
+@pytest.mark.parametrize(("deg", "kept"), [(7.9, [2, 3]), (8.1, [1, 2, 3])])
+def test_a_look_takes_the_place_of_one_from_nearly_the_same_direction(target, deg, kept):
+    looks, asked = looks_of(OK)
+    for number, at in ((1, 0.0), (2, 40.0), (3, deg)):
+        looks.register(points(number), target, viewpoint=eye(at))
+    assert names(asked.sources[-1]) == kept
+
+
+def test_the_direction_is_seen_from_what_was_looked_at():
+    looks, _ = looks_of(OK)
+    looks.collect(points(1), eye(0.0))
+    looks.collect(points(2) + [100.0, 0.0, 0.0], eye(0.0) + [100.0, 0.0, 0.0])
+    assert len(looks.collected) == 3
+
+
+def test_two_looks_from_one_place_stay_two_where_all_are_kept(target):
+    looks, asked = looks_of(OK, apart_deg=0.0)
+    looks.register(points(1), target, viewpoint=eye(0.0))
+    looks.register(points(2), target, viewpoint=eye(0.0))
+    assert len(asked.places[-1]) == 2
+
+
+def test_the_newest_that_does_not_fit_is_left_out_and_three_in_a_row_are_all_that_is_kept(target):
+    looks, asked = looks_of(OK, OK, apart(-1), apart(-1), apart(-1), OK)
+    for number in range(2):
+        looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    for number, at in ((2, 40.0), (3, 1.0), (4, 60.0)):
+        result = looks.register(points(number), target, viewpoint=eye(at))
+        assert not result.ok and result.reason.startswith("elsewhere; ")
+        if number < 4:
+            assert "left out" in result.reason and names(looks.collected) == [0, 1]
+    assert "3 in a row" in result.reason and names(looks.collected) == [2, 3, 4]
+    looks.register(points(5), target, viewpoint=eye(80.0))
+    assert names(asked.sources[-1]) == [2, 3, 4, 5]
+
+
+def test_a_pose_ends_the_row(target):
+    looks, _ = looks_of(OK, OK, apart(-1), apart(-1), OK, apart(-1))
+    for number in range(6):
+        looks.register(points(number), target, viewpoint=eye(15.0 * number))
+    assert names(looks.collected) == [0, 1, 4]
+
+
+def test_older_looks_that_do_not_fit_are_left_out_from_then_on(target):
+    looks, _ = looks_of(OK, OK, apart(0, 1))
+    for number in range(3):
+        result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert not result.ok and result.reason == "elsewhere; left out from now on" and names(looks.collected) == [2]
+
+
+def test_after_ten_refusals_from_one_direction_the_last_look_alone_is_kept(target):
+    looks, _ = looks_of(REFUSED)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    for number in range(1, STUCK + 1):
+        result = looks.register(points(number), target, viewpoint=eye(30.0))
+        assert names(looks.collected) == ([0, number] if number < STUCK else [number])
+    assert "restarts with the last look" in result.reason
+
+
+def test_a_new_direction_gives_the_looks_another_chance(target):
+    looks, _ = looks_of(REFUSED)
+    for number in range(STUCK + 2):
+        looks.register(points(number), target, viewpoint=eye(0.0 if number < STUCK else 30.0))
+    assert names(looks.collected) == [STUCK - 1, STUCK + 1]
+
+
+def test_a_look_that_cannot_be_registered_is_not_kept(target):
+    looks, _ = looks_of(OK, InvalidPointCloudError("a", "b", "c"), OK)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    with pytest.raises(InvalidPointCloudError):
+        looks.register(points(1), target, viewpoint=eye(20.0))
+    assert names(looks.collected) == [0]
+
+
+def test_another_target_begins_a_new_collection(target):
+    looks, asked = looks_of(OK)
+    looks.register(points(1), target, viewpoint=eye(0.0))
+    looks.register(points(2), replace(target), viewpoint=eye(20.0))
+    assert names(asked.sources[-1]) == [2]
+
+
+def test_an_empty_look_is_refused_and_changes_nothing(target):
+    looks, asked = looks_of(OK)
+    looks.register(points(1), target, viewpoint=eye(0.0))
+    result = looks.register(np.full((3, 3), np.nan), target, viewpoint=eye(20.0))
+    assert result.status is RegistrationStatus.TOO_FEW_POINTS and len(asked.sources) == 1
+    looks.collect(np.empty((0, 3)), eye(20.0))
+    assert names(looks.collected) == [1]
+
+
+def test_a_look_needs_its_place(target):
+    looks, _ = looks_of(OK)
+    with pytest.raises(ConfigError, match="where the camera was"):
+        looks.register(points(1), target)
+    with pytest.raises(InvalidPointCloudError, match="viewpoint"):
+        looks.collect(points(1), np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("how", [{"most": 0}, {"most": 17}, {"most": 2.5}, {"apart_deg": -1.0}, {"apart_deg": np.nan}])
+def test_settings_that_are_none_are_refused(how):
+    with pytest.raises(ConfigError):
+        LookAccumulator(Registrar(), **how)
+
+
+def test_a_method_that_takes_no_viewpoint_is_refused():
+    with pytest.raises(ConfigError, match="a Registrar or a Tracker"):
+        LookAccumulator(object())
+
+
+def test_a_tracker_is_one_of_its_own_whose_sources_count_as_one():
+    tracker = Tracker(Registrar())
+    looks = LookAccumulator(tracker)
+    assert looks.method is not tracker and looks.method._evidence.config.correlation == 1.0
+    looks.method._has_track = True
+    looks.reset()
+    assert not looks.method._has_track

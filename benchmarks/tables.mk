@@ -20,12 +20,17 @@ export OPENBLAS_NUM_THREADS := 1
 export NUMBA_NUM_THREADS := 1
 
 # How pairs are made: list = options of `gapr make-pairs`
+comma := ,
+looks = $(subst $(eval) ,$(comma),$(foreach kind,$(1),scene-$(kind)-look scene-$(kind)-looks))
 of_one_sided      = --protocol L2,L3,wrong --count 40 --seed 0 $(FOUR)
 of_clean          = --protocol paper,incomplete,L1,sweep --count 20 --seed 0 $(FOUR)
 of_scenes         = --protocol scene-C1,scene-C2,scene-C3 --count 19 --seed 0 $(THREE)
 of_scene_stereo   = --protocol scene-stereo,scene-layers --count 19 --seed 0 $(THREE)
 of_scene_noisy    = --protocol scene-noisy --count 19 --seed 0 $(THREE)
 of_scene_joint    = --protocol scene-joint,scene-theatre --count 28 --seed 0 $(TWO)
+of_looks          = --protocol $(call looks,C3 stereo noisy layers) --count 13 --seed 0 $(THREE)
+of_looks_joint    = --protocol $(call looks,joint theatre) --count 20 --seed 0 $(TWO)
+of_looks_wrong    = --protocol scene-wrong-looks --count 40 --seed 0 $(THREE)
 of_scene_table    = --protocol scene-table --count 14 --seed 0 $(FOUR)
 of_scene_variants = --protocol scene-slit,scene-windows,scene-packed,scene-hand,scene-drape --count 6 --seed 0 $(THREE)
 of_scene_wrong        = --protocol scene-wrong --count 19 --seed 0 $(THREE)
@@ -56,7 +61,8 @@ sensor_few-pointer = pointer
 sensor_few-ultrasound = ultrasound
 
 # Tables that `gapr benchmark` writes, that benchmarks/trust.py makes of its records, and of scripts
-BENCHMARKS := one_sided clean scenes scene_stereo scene_noisy scene_joint scene_table scene_variants scene_wrong scene_wrong_stereo scene_image
+BENCHMARKS := one_sided clean scenes scene_stereo scene_noisy scene_joint scene_table scene_variants scene_wrong scene_wrong_stereo scene_image \
+              looks looks_joint looks_wrong
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 TRACED     := traced traced-named
 FEW        := $(addprefix few-,pointer ultrasound femora)

@@ -132,9 +132,14 @@ class NodeParameters(Settings):
     covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation", unit="rad", low=1e-9)
 
     @property
+    def names_a_place(self) -> bool:
+        """Whether every cloud is registered as what a camera saw from a place that is known."""
+        return self.viewpoint not in NO_FRAME and (self.accumulate <= 1 or self.sensor not in TOGETHER)
+
+    @property
     def collects_looks(self) -> bool:
         """Whether clouds that are registered as one are looks of a camera, each from a place of its own."""
-        return self.accumulate > 1 and self.viewpoint not in NO_FRAME and self.sensor not in TOGETHER
+        return self.accumulate > 1 and self.names_a_place
 
 
 FIELDS: Mapping[str, Field] = {f.name: f for f in fields(NodeParameters)}

@@ -5,7 +5,8 @@ L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gi
 the same of about half the size; L2-wave and so on have another smooth bias; sweep is the band that a probe covers on
 its way; pointer, tracing, ultrasound, depth-camera, laser, structured-light, stereo, photogrammetry, covered and moving
 are simulated sensors (see `sensors`), pointer-50 and ultrasound-4 the same with 50 dots and four slices; scene-C1 and
-so on are what a camera sees of a bone in a wound (see `scenes`); wrong and scene-wrong ones have no pose.
+so on are what a camera sees of a bone in a wound (see `scenes`), scene-C3-looks and so on from four places, and
+scene-C3-look from the first of these; wrong and scene-wrong ones have no pose.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import derived
 from gapr_core.data.scenes.joint import IN_THEATRE, joint_scene
 from gapr_core.data.scenes.scene import SCENE_LEVELS, scene
-from gapr_core.data.scenes.several_looks import LOOKED_AT, several_looks
+from gapr_core.data.scenes.several_looks import ALONE, LOOKED_AT, several_looks
 from gapr_core.data.scenes.table import table_scene
 from gapr_core.data.sensors import SENSORS, SPARSE
 from gapr_core.data.specimen import Specimen
@@ -233,6 +234,7 @@ STRANGERS: dict[str, Callable[..., Pair]] = {  # no pose is right
     "wrong": wrong,
     "scene-wrong": wrong_scene,
     "scene-wrong-stereo": partial(wrong_scene, levels=("scene-stereo", "scene-layers")),
+    "scene-wrong-looks": partial(wrong_scene, levels=[f"{name}-looks" for name in ALONE]),
 }
 DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same seed
     **{f"scene-{level}-bone": (f"scene-{level}", derived.bone_alone) for level in ("C1", "C2", "C3")},

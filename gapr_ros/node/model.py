@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core import clouds
+from gapr_core.baselines.base import takes
 from gapr_core.errors import ConfigError
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface
@@ -97,13 +98,19 @@ def make_ready(method_factory: Callable[[NodeParameters], Any], parameters: Node
     """
     method = method_factory(parameters)
     model = load_model(method, parameters)
-    warm_up(method, model)
+    warm_up(method, model, has_place=parameters.names_a_place)
     return Ready(method, model, parameters)
 
 
-def warm_up(method: Any, model: Model) -> None:
-    """Register the bone to itself once, so that no cloud waits for code that is compiled on first use."""
-    method.register(model.points_mm, model.target)
+def warm_up(method: Any, model: Model, has_place: bool = False) -> None:
+    """Register the bone to itself once, so that no cloud waits for code that is compiled on first use.
+
+    As a camera sees it from three times its extent away, where the place of one is named: that is other code.
+    """
+    points, options = model.points_mm, {}
+    if has_place and takes(method, "viewpoint"):
+        options["viewpoint"] = points.mean(axis=0) + [0.0, 0.0, 3.0 * model.extent_mm]
+    method.register(points, model.target, **options)
     if hasattr(method, "reset"):
         method.reset()
 

@@ -404,7 +404,7 @@ class Collecting(StandIn):
 
     def __init__(self):
         super().__init__()
-        self.kept = []
+        self.kept, self.places = [], []
 
     @property
     def collected(self):
@@ -413,12 +413,13 @@ class Collecting(StandIn):
     def together_with(self, source):
         return np.concatenate([self.collected, source])
 
-    def collect(self, source):
+    def collect(self, source, viewpoint=None):
         self.kept.append(source)
+        self.places.append(viewpoint)
 
     def register(self, source, target, initial=None, viewpoint=None):
         result = super().register(source, target, initial, viewpoint)
-        self.collect(source)
+        self.collect(source, viewpoint)
         return result
 
     def reset(self):

@@ -16,6 +16,7 @@ from lifecycle_msgs.srv import GetState
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from gapr_core import Accumulator, LookAccumulator
 from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, SensorConfig
 from gapr_core.errors import ConfigError
 from gapr_core.runtime.settings import changes
@@ -380,3 +381,17 @@ def test_a_signal_ends_the_node_within_two_seconds_while_it_registers(client, tm
     assert client.values()["frames_accepted"] == before["frames_accepted"] == "0", "it was ready before the signal"
     assert node.stop_cpu_s(number) < LIMIT_S
     assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "most"),
+    [
+        ({"viewpoint": "origin"}, LookAccumulator, 5),
+        ({"viewpoint": "origin", "accumulate": 40}, LookAccumulator, 16),
+        ({"viewpoint": "auto"}, Accumulator, 5),
+        ({"viewpoint": "origin", "sensor": "pointer"}, Accumulator, 5),
+    ],
+)
+def test_clouds_of_a_camera_with_a_place_are_collected_as_looks(given, kind, most):
+    method = ShippedMethod()(NodeParameters(**{"accumulate": 5, **given}))
+    assert type(method) is kind and method.most == most

@@ -225,3 +225,21 @@ def test_limits_that_refuse_every_cloud_are_warned_of_and_a_remark_is_not(blob_p
     lines = capfd.readouterr().err.splitlines()
     levels = {text: line for line in lines for text in ("crop_min (0.0, 0.0, 1.0)", "max_tre is 0") if text in line}
     assert "[WARN]" in levels["crop_min (0.0, 0.0, 1.0)"] and "[INFO]" in levels["max_tre is 0"]
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"viewpoint": "origin"}, "the last 5 looks are registered as one, each from another direction"),
+        ({"viewpoint": "camera", "accumulate": 40}, "the last 16 looks are registered as one"),
+        ({"viewpoint": "origin", "sensor": "ultrasound"}, "viewpoint is not used: sensor ultrasound sees nothing"),
+        ({"viewpoint": "auto"}, ""),
+        ({"viewpoint": "origin", "accumulate": 1}, ""),
+    ],
+)
+def test_the_node_says_what_becomes_of_the_looks_of_a_camera(given, sentence):
+    values = {"accumulate": 5, "output_frame": "reference", **given}
+    said = [
+        each for each in parameters.remarks(parameters.NodeParameters(**values)) if "look" in each or "view" in each
+    ]
+    assert len(said) == bool(sentence) and sentence in " ".join(said)

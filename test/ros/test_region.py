@@ -172,6 +172,33 @@ def test_the_origin_of_the_cloud_is_given_in_the_frame_of_the_answer(blob_path, 
 
 
 @pytest.mark.parametrize(
+    ("given", "is_given"),
+    [
+        ({"viewpoint": "origin"}, True),
+        ({"viewpoint": "origin", "sensor": "depth_camera"}, True),
+        ({"viewpoint": "origin", "sensor": "pointer"}, False),
+        ({"viewpoint": "auto"}, False),
+        ({"viewpoint": "none"}, False),
+    ],
+)
+def test_looks_that_are_registered_as_one_each_keep_their_place(blob_path, client, monkeypatch, given, is_given):
+    """The first has too few points to be registered alone: it is collected, with its place too."""
+    monkeypatch.setattr(frames, "_import_tf2", Tf2)
+    method = Collecting()
+    with node_in_thread(method, blob_path, output_frame="table", accumulate=4, **given):
+        client.wait_for_state("active")
+        assert client.ask(GOOD[:150], frame="probe")["last_refusal"].startswith("too_few_points")
+        assert client.ask(GOOD, frame="probe")["level"] == 0
+    of_model, *places = method.places
+    assert len(places) == 2 and (of_model is None) is not is_given
+    for place in places:
+        if is_given:
+            np.testing.assert_allclose(place, T_BOX_PROBE[:3, 3] * 1000.0, atol=1e-9)
+        else:
+            assert place is None
+
+
+@pytest.mark.parametrize(
     ("given", "expected_mm"),
     [
         ({}, [100.0, 50.0, -400.0]),

@@ -71,10 +71,11 @@ LOOKED_AT = {
     "scene-joint": LookedAt((0.10, 0.60), at_joint=True),
     "scene-theatre": LookedAt((0.10, 0.60), seen_in_stereo, under_layers=True, at_joint=True, range_wrong=RANGE),
 }
+ALONE = tuple(name for name, kind in LOOKED_AT.items() if not kind.at_joint)  # of one bone
 
 
 def several_looks(
-    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None,
+    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen] = (), turn: int | None = None,
     kind: LookedAt | None = None,
 ) -> Pair:  # fmt: skip
     """One wound as a camera sees it from `LOOKS` places.

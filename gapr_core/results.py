@@ -163,8 +163,8 @@ class RegistrationResult:
         residuals: of every used point under the best hypothesis; None where a method does not say.
         inferred_viewpoint: (3,) mm, source frame: where the camera is taken to be, as its cloud gave no pose as bone
             alone and nobody said it; None where it was given or is not needed.
-        looks_apart: (K, 3) mm, source frame: of a camera's places those from where it saw what does not fit the other
-            looks; None where all fit.
+        looks_apart: (K, 3) mm, source frame: from where a camera saw the bone elsewhere than in its other looks, or
+            nothing of it; None where all fit. A pose stands where a few saw nothing.
     """
 
     status: RegistrationStatus

@@ -1,8 +1,8 @@
 """Do the looks of a camera show the bone in one place? It or its reference may move between two of them.
 
 Then the pose that all looks have in common is that of some of them, or lies between. So each look is laid on the bone
-by itself, from that pose. Where it explains far more of the surface elsewhere, or hardly any of it here, or could not
-have shown it here at all, it does not fit the others.
+by itself, from that pose. Where it explains far more of the surface elsewhere, or hardly any of it here, it does not
+fit the others. A look that could not have shown the bone here is blind: something was in the way, or the bone is far.
 """
 
 from __future__ import annotations
@@ -55,26 +55,47 @@ class Own(NamedTuple):
         return (self.own_explained - self.explained) / max(self.compared, self.own_compared, 1e-6)
 
 
-def looks_apart(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> NDArray[np.bool_]:
-    """(K,) which of the looks of a scene do not fit the pose (4, 4) that all have in common; none of a single one."""
+class Fits(NamedTuple):
+    """Which of K looks do not fit the pose that all have in common.
+
+    Attributes:
+        apart: (K,) that show the bone elsewhere.
+        blind: (K,) that show hardly anything where the bone is.
+    """
+
+    apart: NDArray[np.bool_]
+    blind: NDArray[np.bool_]
+
+    @property
+    def is_refused(self) -> bool:
+        """True where one look is apart, or half of them are blind."""
+        return bool(self.apart.any() or 2 * self.blind.sum() >= len(self.blind))
+
+
+def fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> Fits:
+    """How the looks of a scene fit the pose (4, 4) that they have in common; a single one does."""
     if len(scene.images) == 1:
-        return np.zeros(1, dtype=bool)
+        return Fits(np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
     found = [_own(T, number, scene, target, config.clutter) for number in range(len(scene.images))]
     widest, best = max(each.compared for each in found), max(each.agrees for each in found)
-    return np.array([is_apart(each, widest, best) for each in found])
+    blind = np.array([each.compared < LEAST_COMPARED * widest and not _moved(each) for each in found])
+    return Fits(~blind & [is_apart(each, best) for each in found], blind)
 
 
-def is_apart(look: Own, widest: float, best: float) -> bool:
-    """True where a look fits far better elsewhere, agrees far less than the best one, or could show hardly anything."""
-    moved = look.gained > GAINED and look.away_mm > AWAY_MM
-    return moved or look.agrees < LEAST_SHARE * best or look.compared < LEAST_COMPARED * widest
+def is_apart(look: Own, best: float) -> bool:
+    """True where a look fits far better elsewhere, or agrees far less than the best one."""
+    return _moved(look) or look.agrees < LEAST_SHARE * best
+
+
+def _moved(look: Own) -> bool:
+    return look.gained > GAINED and look.away_mm > AWAY_MM
 
 
 def refusal_of(places: Array) -> Refusal:
     """The refusal for looks from these places (K, 3), mm, that do not fit the others."""
     said = " and ".join(f"({x:.0f}, {y:.0f}, {z:.0f})" for x, y, z in places)
     why = f"what was seen from {said} mm shows the bone elsewhere than the other looks, or not at all"
-    how = "the bone moved, or its reference, or something was in the way: register the last look alone"
+    how = "the bone moved, or its reference, or something was in the way"
     return Refusal(RegistrationStatus.AMBIGUOUS, f"{why}: {how}")
 
 

@@ -63,7 +63,8 @@ class Assessment:
         most: no surer than this, in a stream neither: no such source was calibrated.
         deformed: sizes, mm, of what the points show besides one rigid piece of bone (`rigidity`, `doubles`), the surest
             first.
-        looks_apart: (K, 3) mm, source frame: from where a camera saw what does not fit its other looks (`apart`).
+        looks_apart: (K, 3) mm, source frame: from where a camera saw what does not fit its other looks, or nothing of
+            the bone (`apart`).
     """
 
     fit: Fit

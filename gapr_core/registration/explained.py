@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration import clutter, covariance, doubles, kernels
-from gapr_core.registration.apart import looks_apart, refusal_of
+from gapr_core.registration.apart import fits, refusal_of
 from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
@@ -91,8 +91,10 @@ def assess_part(
     seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
     if not seen.reaches(config.worth_checking):
         return seen  # what lies elsewhere than a wrong pose may lie right
-    apart = scene.viewpoints[looks_apart(fit.T, scene, target, config)]
-    return replace(seen, looks_apart=apart).with_refusal(refusal_of(apart) if len(apart) else None, config.rules)
+    found = fits(fit.T, scene, target, config)
+    places = scene.viewpoints[found.apart | found.blind]
+    refusal = refusal_of(places) if found.is_refused else None
+    return replace(seen, looks_apart=places).with_refusal(refusal, config.rules)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
@@ -107,7 +109,7 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
     if (
         believed
         or doubles.is_in_two_poses(assessment)
-        or len(assessment.looks_apart)
+        or (len(assessment.looks_apart) and assessment.refusal is not None)
         or not (in_scene or len(source.points) >= config.source.dense_points)
     ):
         return assessment

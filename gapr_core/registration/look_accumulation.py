@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 STUCK = 10  # refusals in a row from one direction; what the looks before show may be gone
+NOT_SEEN = "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
 APART_MM = 1e-6  # between the places of two looks, so that those of a camera at rest stay two
 
 
@@ -141,8 +142,13 @@ class LookAccumulator:
             return replace(result, reason=result.reason + self._count_refusals(result.ok))
         apart = (places[:, None] == result.looks_apart).all(axis=2).any(axis=1)
         if apart[-1]:
-            return replace(result, reason=result.reason + self._leave_out_newest(before))
-        self._looks, self._apart_in_a_row = [look for look, off in zip(self._looks, apart, strict=True) if not off], []
+            refused = result.refused(RegistrationStatus.AMBIGUOUS, NOT_SEEN) if result.ok else result
+            return replace(refused, reason=refused.reason + self._leave_out_newest(before))
+        self._apart_in_a_row = []
+        if result.ok:  # something was in the way of the others
+            self._refused_in_a_row = 0
+            return result
+        self._looks = [look for look, off in zip(self._looks, apart, strict=True) if not off]
         return replace(result, reason=f"{result.reason}; left out from now on")
 
     def _places(self) -> Array:

@@ -123,6 +123,31 @@ def test_a_pose_ends_the_row(target):
     assert names(looks.collected) == [0, 1, 4]
 
 
+def blind(*numbers):
+    """A pose that stands although the looks of these numbers show nothing of the bone."""
+
+    def said(viewpoint):
+        return replace(OK, looks_apart=apart(*numbers)(viewpoint).looks_apart)
+
+    return said
+
+
+def test_a_pose_stands_where_an_older_look_shows_nothing_and_that_one_stays(target):
+    looks, _ = looks_of(OK, OK, blind(0))
+    for number in range(3):
+        result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert result.ok and names(looks.collected) == [0, 1, 2]
+
+
+def test_a_newest_look_that_shows_nothing_of_the_bone_is_refused_and_left_out(target):
+    looks, _ = looks_of(OK, OK, blind(2))
+    for number in range(3):
+        result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert result.status is RegistrationStatus.AMBIGUOUS and result.T_target_source is None
+    assert "newest look shows nothing" in result.reason and result.reason.endswith("; left out")
+    assert names(looks.collected) == [0, 1]
+
+
 def test_older_looks_that_do_not_fit_are_left_out_from_then_on(target):
     looks, _ = looks_of(OK, OK, apart(0, 1))
     for number in range(3):

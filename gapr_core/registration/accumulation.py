@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import logit
 
 from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling, se3
 from gapr_core.registration import precision, rigidity
+from gapr_core.registration.limits import why_no_surer
 from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import fingerprint
@@ -27,7 +29,9 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
-FEWEST_IN_TIME = 6  # sources in which a steady motion is looked for
+FEWEST_IN_TIME = 6  # sources that show a motion, as it is refused
+FEWEST_THAT_MAY, MAY_MOVE = 3, 1.0 / 6.0  # sources in which, and share of `rigidity.creeps` from which on it may be one
+MOVING = "moving"  # among the contributions and `limits.LIMITS`
 
 
 class Accumulator:
@@ -182,23 +186,36 @@ class Accumulator:
         return self._unless_it_moves(result, T, target)
 
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
-        """The answer; a refusal where the sources show that the bone moves.
+        """The answer; a refusal where the sources show that the bone moves, not sure where they hardly exclude it.
 
         Those since a step are left; of a steady motion the last third.
         """
         kept, limits = self._kept, self.config.rigidity
-        if len(kept) < FEWEST_IN_TIME:
+        if len(kept) < FEWEST_THAT_MAY:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
         found = rigidity.of_motion(refine_fully(T, points, seen, self.config.refinement), order[some], limits)
-        if found.finding.log_ratio <= limits.creeps:
-            return result
+        ratio = found.finding.log_ratio
+        if ratio <= limits.creeps or len(kept) < FEWEST_IN_TIME:
+            return self._no_surer(result) if ratio > MAY_MOVE * limits.creeps else result
         self.reset()
         self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
+
+    def _no_surer(self, result: RegistrationResult) -> RegistrationResult:
+        """The answer with `limits.most` as its confidence at most; refused where more is asked for."""
+        most = self.config.limits.most
+        if not result.ok or result.confidence <= most:
+            return result
+        takes = float(logit(most) - logit(result.confidence))
+        found = replace(result, confidence=most, contributions={**result.contributions, MOVING: takes})
+        if most >= self.config.min_confidence:
+            return found
+        reason = f"no surer than {most:g}: {why_no_surer(found.contributions)}"
+        return found.refused(RegistrationStatus.LOW_CONFIDENCE, reason)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.

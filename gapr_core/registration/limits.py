@@ -233,6 +233,12 @@ LIMITS = (
         "a stand-off so large is taken out of the pose, and no residual shows that it is right; check standoff_mm, or "
         "measure on the bone",
     ),
+    Limit(
+        "moving",
+        shows_most("moving"),  # an `Accumulator` asks
+        "the collected sources hardly exclude that the bone moves against their frame; check what is fixed to it, or "
+        "collect more",
+    ),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )
 

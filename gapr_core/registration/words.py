@@ -44,6 +44,7 @@ WORDS = {
     "layered": "limit: the distance from the bone changes along the source",
     "apart": "limit: two halves of the source lie in two poses",
     "far_out": "limit: a stand-off is stated that is larger than a pose may be off",
+    "moving": "limit: collected sources hardly exclude that the bone moves",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits
 

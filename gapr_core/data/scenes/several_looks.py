@@ -41,6 +41,7 @@ Array = NDArray[np.float64]
 
 LOOKS = 4
 OFF_DEG = (15.0, 35.0)  # of the later looks from the wound's axis
+FEWEST_POINTS = 200  # of a later look
 TRACKED_MM, TRACKED_DEG = 0.3, 0.05  # standard deviation of the camera's tracked place and turn, about each axis
 
 
@@ -122,7 +123,20 @@ def _places_around(rng: np.random.Generator) -> Array:
 
 
 def _from(setting: Setting, around: float, radius: float, rng: np.random.Generator) -> View:
-    """The same region from another place, at most `MOST_POINTS` of it."""
+    """The same region from another place, at most `MOST_POINTS` of it; from elsewhere where that shows hardly anything.
+
+    Raises:
+        ConfigError: no place shows some of it.
+    """
+    for _ in range(TRIES):
+        view = _seen_from(setting, around, radius, rng)
+        if len(view.points) >= FEWEST_POINTS:
+            return view
+        around = rng.uniform(0.0, 2.0 * np.pi)
+    raise ConfigError("a wound that a camera sees from several places", "one hidden from all", "choose another seed")
+
+
+def _seen_from(setting: Setting, around: float, radius: float, rng: np.random.Generator) -> View:
     wound: Wound = setting.wound
     off = np.radians(rng.uniform(*OFF_DEG))
     direction = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])

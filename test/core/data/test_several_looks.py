@@ -123,3 +123,20 @@ def test_a_file_with_other_places_than_points_is_refused(pair, tmp_path):
     np.savez(tmp_path / "pair.npz", source=pair.source, target=pair.target, viewpoint=pair.viewpoint[:-1])
     with pytest.raises(InvalidPointCloudError, match="viewpoint"):
         pair_files.load_clouds(tmp_path / "pair.npz")
+
+
+def test_a_look_that_shows_hardly_anything_is_taken_from_elsewhere(specimen, monkeypatch):
+    seen, asked = several_looks._seen_from, []
+
+    def hidden_at_first(setting, around, radius, rng):
+        view = seen(setting, around, radius, rng)
+        asked.append(around)
+        return view.of(np.arange(several_looks.FEWEST_POINTS - (len(asked) < 3)))
+
+    monkeypatch.setattr(several_looks, "_seen_from", hidden_at_first)
+    pair = several_looks.several_looks(specimen, np.random.default_rng(3), (), kind=NO_ERROR)
+    assert len(asked) == LOOKS + 1 and len(set(asked)) == LOOKS + 1
+    assert (np.bincount(pair.metadata["look"])[1:] == several_looks.FEWEST_POINTS).all()
+    monkeypatch.setattr(several_looks, "_seen_from", lambda setting, *_: View(np.empty((0, 3)), np.empty(0), None))
+    with pytest.raises(ConfigError, match="hidden from all"):
+        several_looks.several_looks(specimen, np.random.default_rng(3), (), kind=NO_ERROR)

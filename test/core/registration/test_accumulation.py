@@ -12,6 +12,7 @@ from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.registration import clutter, rigidity
+from gapr_core.registration.limits import why_no_surer
 from gapr_core.results import Hypothesis, RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)
@@ -402,6 +403,27 @@ def test_a_motion_is_believed_from_the_setting_on(registrar, target, femur, monk
     accumulator, result = creeping(registrar, target, femur, 0.0, 6.0)
     assert ("the bone moves against the frame" in result.reason) is is_refused and result.ok is not is_refused
     assert len(accumulator.collected) == (150 * 3 if is_refused else 150 * 9)
+
+
+@pytest.mark.parametrize(("log_ratio", "creeps", "count", "most"), [
+    (0.9, 6.0, 9, 1.0), (1.1, 6.0, 9, 0.89), (99.0, 6.0, 3, 0.89), (99.0, 6.0, 2, 0.9), (99.0, np.inf, 9, 1.0),
+])  # fmt: skip
+def test_where_a_motion_is_hardly_excluded_no_pose_is_sure(
+    registrar, target, femur, monkeypatch, log_ratio, creeps, count, most
+):
+    """Only this keeps it from being sure. Of two sources nobody knows; without the rule on motions nobody asks."""
+    monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(log_ratio, 1.0)))
+    _, result = creeping(registrar, target, femur, 0.0, creeps, count)
+    assert result.ok and result.confidence <= most and (count < 9 or (result.confidence > 0.9) is (most == 1.0))
+    assert ("hardly exclude that the bone moves" in why_no_surer(result.contributions)) is (most == 0.89)
+
+
+def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(registrar, target, femur, monkeypatch):
+    monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(1.1, 1.0)))
+    strict = Registrar(replace(registrar.config, min_confidence=0.9), registrar.proposers, registrar.calibrations)
+    _, result = creeping(strict, target, femur, 0.0, 6.0)
+    assert result.status is RegistrationStatus.LOW_CONFIDENCE and "no surer than 0.89" in result.reason
+    assert result.confidence == 0.89
 
 
 @pytest.mark.parametrize(("step_mm", "is_refused"), [(0.005, True), (0.0, False)])

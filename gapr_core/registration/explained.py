@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration import clutter, covariance, doubles, kernels
+from gapr_core.registration import clutter, covariance, doubles, kernels, rigidity
 from gapr_core.registration.apart import fits, refusal_of
 from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.confidence import Calibration
@@ -86,6 +86,8 @@ def assess_part(
     fit, part = explained.fit, explained.source
     eye = covariance.eye_of(fit.T, scene.viewpoint, config.sensor)
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around, eye=eye)
+    if len(scene.images) > 1:
+        uncertainty = _allowing_for_the_tracker(uncertainty, fit, scene.look[explained.members], config)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
     seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
@@ -95,6 +97,17 @@ def assess_part(
     places = scene.viewpoints[found.apart | found.blind]
     refusal = refusal_of(places) if found.is_refused else None
     return replace(seen, looks_apart=places).with_refusal(refusal, config.rules)
+
+
+def _allowing_for_the_tracker(
+    uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64], config: RegistrarConfig
+) -> PoseUncertainty:
+    """The same with what the looks' errors against each other add, each a motion of its own as large as it looks."""
+    found = rigidity.of_looks(fit, look, config.rigidity)
+    if not found.is_shown:
+        return uncertainty
+    added = covariance.covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance)
+    return replace(uncertainty, covariance=uncertainty.covariance + added)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:

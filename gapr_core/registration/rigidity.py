@@ -111,6 +111,24 @@ def of_motion(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Mot
     return Motion(Finding(ratios[best], found[best].size_mm), rests_from)
 
 
+def of_looks(fit: Fit, look: NDArray[np.int64], config: RigidityConfig) -> Deformation:
+    """Whether the looks of a camera err against each other, each by a motion of its own, as its tracker does.
+
+    Args:
+        fit: the pose that all have in common.
+        look: (N,) number of the look that each point is of.
+        config: of the blocks.
+    """
+    inlier = fit.weights > 0.0
+    if np.count_nonzero(inlier) < config.fewest_points or look[inlier].min() == look[inlier].max():
+        return Deformation(NOTHING, np.empty((np.count_nonzero(inlier), 0)), np.inf)
+    numbers, group = np.unique(look[inlier], return_inverse=True)
+    moved, group = motions(fit), group.reshape(-1)
+    changes = np.column_stack([np.where(group == k, 1.0, 0.0)[:, None] * moved for k in range(len(numbers))])
+    (found,) = findings(blocks(fit, fit.jacobian[inlier], [changes], group, config), config)
+    return Deformation(found, changes, 0.0)
+
+
 def step_times(groups: int) -> Array:
     """(groups,) shares of the time between groups: equal ones, the last of them halved, as the newest matter most."""
     return np.append(np.arange(1, groups), groups - 0.5) / groups

@@ -9,7 +9,8 @@ import tiny
 
 from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import explained, features
+from gapr_core.registration import explained, features, rigidity
+from gapr_core.registration.apart import Fits
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.explained import Explained
@@ -159,6 +160,26 @@ def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed
     if status == "CLUTTER":
         assert "in the best pose 40 % of the cloud" in found.refusal.reason
         assert (refusal.reason if refusal else "no pose of it is certain") in found.refusal.reason
+
+
+@pytest.mark.parametrize(("looks", "log_ratio", "is_added"), [(2, 5.0, True), (2, 0.0, False), (1, 5.0, False)])
+def test_the_covariance_holds_what_the_looks_err_by_against_each_other(judged, monkeypatch, looks, log_ratio, is_added):
+    known, changes, part = PoseUncertainty(np.eye(6), 0.1, 0.2, 0.3), np.ones((10, 12)), part_of(0.4)
+    asked = []
+
+    def of_looks(fit, look, config):
+        asked.append(look)
+        return rigidity.Deformation(rigidity.Finding(log_ratio, 0.7), changes, 0.0)
+
+    monkeypatch.setattr(explained.covariance, "estimate", lambda *_, **__: known)
+    monkeypatch.setattr(rigidity, "of_looks", of_looks)
+    monkeypatch.setattr(explained.covariance, "covariance_added_by", lambda fit, errors, config: errors[:6, :6] ** 2)
+    monkeypatch.setattr(explained, "fits", lambda *_: Fits(*np.zeros((2, looks), dtype=bool)))
+    scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=np.ones((looks, 3)), images=(None,) * looks)
+    scene.look = np.arange(10) % looks
+    found = explained.assess_part(part, None, scene, None, None, CONFIG).uncertainty
+    assert found.covariance == pytest.approx(np.eye(6) + (0.49 if is_added else 0.0))
+    assert len(asked) == (looks > 1) and all(np.array_equal(look, scene.look) for look in asked)
 
 
 def test_the_bone_in_two_poses_is_no_clutter(judged):

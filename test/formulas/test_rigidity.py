@@ -374,3 +374,39 @@ def test_a_step_is_found_and_what_was_measured_since_is_named(seen, first, rests
     assert found.rests_from == rests_from
     later = of_motion(fit_of(points, normals, noise(2400) + off), order + 7, CONFIG)
     assert later.rests_from == rests_from + 7
+
+
+def looks_that_err(seen, size_mm, count=2400):
+    """A fit of points of four looks, each shifted by itself along x, y and z; and which look each is of."""
+    points, normals = seen(count)
+    look = np.random.default_rng(9).integers(4, size=count)
+    shifts = size_mm * np.random.default_rng(2).normal(size=(4, 3))
+    return fit_of(points, normals, noise(count) + (shifts - shifts.mean(axis=0))[look]), look
+
+
+def test_looks_that_err_against_each_other_show_by_how_much(seen):
+    sizes = [rigidity.of_looks(*looks_that_err(seen, size_mm), CONFIG).finding for size_mm in (0.0, 0.5, 1.5)]
+    none, some, much = sizes
+    assert none.log_ratio < 2.0 < some.log_ratio < much.log_ratio
+    assert none.size_mm < 0.2 < 0.25 < some.size_mm < 0.8 < 0.9 < much.size_mm < 2.5
+
+
+def test_each_look_moves_by_itself(seen):
+    fit, look = looks_that_err(seen, 0.5)
+    look = np.where(look == 3, 7, look)  # a number that is missing is no look
+    found = rigidity.of_looks(fit, look, CONFIG)
+    moved = rigidity.motions(fit)
+    assert found.changes.shape == (len(look), 24)
+    for k, number in enumerate((0, 1, 2, 7)):
+        of_it = found.changes[:, 6 * k : 6 * k + 6]
+        assert np.array_equal(of_it, np.where(look == number, 1.0, 0.0)[:, None] * moved)
+    group = np.searchsorted([0, 1, 2, 7], look)
+    (same,) = findings(blocks(fit, fit.jacobian, [found.changes], group, CONFIG), CONFIG)
+    assert found.finding == same and found.is_shown
+
+
+def test_of_one_look_and_of_few_points_nothing_is_said(seen):
+    fit, look = looks_that_err(seen, 1.5, 199)
+    assert not rigidity.of_looks(fit, look, CONFIG).is_shown
+    fit, look = looks_that_err(seen, 1.5, 400)
+    assert not rigidity.of_looks(fit, np.zeros_like(look), CONFIG).is_shown

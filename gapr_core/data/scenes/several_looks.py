@@ -31,7 +31,6 @@ from gapr_core.data.scenes.scene import (
     shown,
 )
 from gapr_core.data.scenes.wound import Wound
-from gapr_core.data.sensors.depth_maps import RANGE
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -43,6 +42,7 @@ LOOKS = 4
 OFF_DEG = (15.0, 35.0)  # of the later looks from the wound's axis
 FEWEST_POINTS = 200  # of a later look
 TRACKED_MM, TRACKED_DEG = 0.3, 0.05  # standard deviation of the camera's tracked place and turn, about each axis
+RANGE = 0.003  # standard deviation of the relative error of a calibrated camera's range
 
 
 @dataclass(frozen=True)

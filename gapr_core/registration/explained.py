@@ -94,7 +94,7 @@ def assess_part(
     if not seen.reaches(config.worth_checking):
         return seen  # what lies elsewhere than a wrong pose may lie right
     found = fits(fit.T, scene, target, config)
-    places = scene.viewpoints[found.apart | found.blind]
+    places = np.concatenate([scene.viewpoints[found.apart | found.blind], scene.left_out])
     refusal = refusal_of(places) if found.is_refused else None
     return replace(seen, looks_apart=places).with_refusal(refusal, config.rules)
 

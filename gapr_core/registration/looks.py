@@ -7,7 +7,7 @@ it, and other errors. The images are one cloud in one frame in which the bone re
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +53,7 @@ class Scene:
         viewpoints: (K, 3) mm, source frame: the places.
         look: (N,) index of the place that each point of the source was seen from.
         regions: parts of it that may be bone alone.
+        left_out: (L, 3) mm, source frame: places from which too few points were seen for an image.
     """
 
     source: PreparedSource
@@ -60,6 +61,7 @@ class Scene:
     viewpoints: Array
     look: NDArray[np.int64]
     regions: Sequence[Region] = ()
+    left_out: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
     def viewpoint(self) -> Array:
@@ -110,7 +112,9 @@ def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
     seen = [(source, look.viewpoint) for source, look in found if isinstance(source, PreparedSource)]
     if not seen:
         return next(source for source, _ in found if isinstance(source, Refusal))
-    return scene_from([source for source, _ in seen], np.array([place for _, place in seen]), config)
+    scene = scene_from([source for source, _ in seen], np.array([place for _, place in seen]), config)
+    left_out = [look.viewpoint for source, look in found if isinstance(source, Refusal)]
+    return replace(scene, left_out=np.reshape(left_out, (-1, 3)))
 
 
 def scene_from(looks: Sequence[PreparedSource], viewpoints: Array, config: RegistrarConfig) -> Scene:

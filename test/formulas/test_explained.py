@@ -122,7 +122,9 @@ def part_of(share, count=10):
 
 def camera_s():
     """A scene seen from one place."""
-    return SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,))
+    return SimpleNamespace(
+        source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,), left_out=np.empty((0, 3))
+    )
 
 
 @pytest.fixture
@@ -147,10 +149,7 @@ def test_clutter_is_named_where_little_is_explained_and_the_pose_is_not_believed
     judged, probability, share, refusal, status
 ):
     judged.probability, judged.refusal = probability, refusal
-    scene, part = (
-        SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,)),
-        part_of(share),
-    )
+    scene, part = camera_s(), part_of(share)
     assessed_part = explained.assess_part(part, None, scene, None, None, CONFIG)
     assert assessed_part.refusal is refusal  # a stream may still raise the probability
     found = explained.named_clutter(assessed_part, CONFIG)
@@ -176,17 +175,14 @@ def test_the_covariance_holds_what_the_looks_err_by_against_each_other(judged, m
     monkeypatch.setattr(explained.covariance, "covariance_added_by", lambda fit, errors, config: errors[:6, :6] ** 2)
     monkeypatch.setattr(explained, "fits", lambda *_: Fits(*np.zeros((2, looks), dtype=bool)))
     scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=np.ones((looks, 3)), images=(None,) * looks)
-    scene.look = np.arange(10) % looks
+    scene.look, scene.left_out = np.arange(10) % looks, np.empty((0, 3))
     found = explained.assess_part(part, None, scene, None, None, CONFIG).uncertainty
     assert found.covariance == pytest.approx(np.eye(6) + (0.49 if is_added else 0.0))
     assert len(asked) == (looks > 1) and all(np.array_equal(look, scene.look) for look in asked)
 
 
 def test_the_bone_in_two_poses_is_no_clutter(judged):
-    scene, part = (
-        SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,)),
-        part_of(0.4),
-    )
+    scene, part = camera_s(), part_of(0.4)
     judged.probability, judged.refusal = 0.3, REFUSED
     found = replace(explained.assess_part(part, None, scene, None, None, CONFIG), deformed={"doubled": 30.0})
     assert explained.named_clutter(found, CONFIG) is found

@@ -70,6 +70,7 @@ def test_a_look_of_too_few_points_is_left_out_and_where_all_are_the_first_is_ref
     enough, few = Look(source.points, EYES[0]), Look(source.points[:2], EYES[1])
     scene = looks.prepared([few, enough], CONFIG)
     assert isinstance(scene, Scene) and scene.viewpoints.tolist() == EYES[:1].tolist() and len(scene.images) == 1
+    assert scene.left_out.tolist() == EYES[1:].tolist() and not len(looks.prepared([enough], CONFIG).left_out)
     refusal = looks.prepared([few, few], CONFIG)
     assert refusal.status.value == "TOO_FEW_POINTS" and "2 distinct" in refusal.reason
 

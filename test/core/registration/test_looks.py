@@ -91,6 +91,19 @@ def test_an_accumulator_of_looks_finds_the_bone_where_it_moved_to(registrar, pai
     assert last.ok and is_right(last.T_target_source @ se3.inverse(back), pair)
 
 
+def test_a_look_of_too_few_points_is_named_and_as_the_newest_refused(registrar, pair, target):
+    few = pair.source[:4] + 1.0
+    places = np.vstack([pair.viewpoint, np.tile([[0.0, 0.0, 900.0]], (4, 1))])
+    result = registrar.register(np.vstack([pair.source, few]), target, viewpoint=places)
+    assert result.ok and result.looks_apart.tolist() == [[0.0, 0.0, 900.0]]
+    looks = LookAccumulator(registrar)
+    for number in (0, 1):
+        looks.register(of_look(pair, number), target, viewpoint=of_look(pair, number, pair.viewpoint)[0])
+    result = looks.register(few, target, viewpoint=pair.viewpoint[pair.metadata["look"] == 2][0])
+    assert result.status is RegistrationStatus.AMBIGUOUS and "newest look shows nothing" in result.reason
+    assert len(looks.collected) == len(of_look(pair, 0)) + len(of_look(pair, 1))
+
+
 def test_a_viewpoint_for_each_point_has_as_many_rows(registrar, pair, target):
     with pytest.raises(InvalidPointCloudError, match=r"viewpoint"):
         registrar.register(pair.source, target, viewpoint=pair.viewpoint[:-1])

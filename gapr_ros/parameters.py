@@ -189,7 +189,8 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
     if parameters.collects_looks:
         count = min(parameters.accumulate, MOST_LOOKS)
-        sentences.append(f"the last {count} looks are registered as one, each from another direction")
+        most = f", {MOST_LOOKS} at most" if parameters.accumulate > MOST_LOOKS else ""
+        sentences.append(f"the last {count} looks are registered as one, each from another direction{most}")
     elif parameters.viewpoint not in NO_FRAME and parameters.accumulate > 1:
         sentences.append(f"viewpoint is not used: sensor {sensor} sees nothing from afar")
     if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration import clutter, covariance, doubles, kernels, rigidity
-from gapr_core.registration.apart import fits, refusal_of
+from gapr_core.registration.apart import look_fits, refusal_of
 from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
@@ -92,8 +92,8 @@ def assess_part(
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
     seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
     if not seen.reaches(config.worth_checking):
-        return seen  # what lies elsewhere than a wrong pose may lie right
-    found = fits(fit.T, scene, target, config)
+        return seen  # a pose that is refused anyway says nothing about the looks
+    found = look_fits(fit.T, scene, target, config)
     places = np.concatenate([scene.viewpoints[found.apart | found.blind], scene.left_out])
     refusal = refusal_of(places) if found.is_refused else None
     return replace(seen, looks_apart=places).with_refusal(refusal, config.rules)

@@ -10,6 +10,7 @@ from gapr_core.geometry import se3
 from gapr_core.surface import as_array
 
 Array = NDArray[np.float64]
+MOST_SHOWN = 16  # values of an array in a message
 
 
 def numbers(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> Array:
@@ -26,7 +27,9 @@ def numbers(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> A
     """
     array = as_array(values, f"a finite {shape} {what}", how)
     if array.shape != shape or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        given = f"shape {array.shape}" if array.shape != shape else str(array.tolist())
+        given = f"shape {array.shape}"
+        if array.shape == shape:
+            given = str(array.tolist()) if array.size <= MOST_SHOWN else f"{given} with values that are none"
         raise InvalidPointCloudError(f"a finite {shape} {what}", given, how)
     return array.astype(np.float64)
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.clouds import finite_points
-from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
 from gapr_core.registration import inputs
 from gapr_core.registration.looks import HOW, MOST_PLACES, Look
 from gapr_core.registration.registrar import Registrar, check_call
@@ -25,6 +26,8 @@ log = logging.getLogger(__name__)
 
 STUCK = 10  # refusals in a row from one direction; what the looks before show may be gone
 NOT_SEEN = "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
+DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
+AWAY_MM, TURNED_DEG = 4.0, 5.0  # beyond which a pose is not right where the other one is
 APART_MM = 1e-6  # between the places of two looks, so that those of a camera at rest stay two
 
 
@@ -35,8 +38,9 @@ class LookAccumulator:
     show more of it and of what hid it. All must be in one frame in which the bone rests, such as that of a reference
     fixed to it, and the camera's place must be known for each. A look takes the place of one from nearly the same
     direction, so that those of a video do not push out all others. A look that does not fit the others (`looks_apart`)
-    is left out, and refused if it is the newest. After three of them in a row the bone or its reference has moved, and
-    only these three are kept; after `STUCK` refusals without a look from elsewhere the last one alone.
+    is left out, and refused if it is the newest; so is a newest one that alone has another pose. After three of them in
+    a row the bone or its reference has moved, and only these three are kept, whatever their directions; after `STUCK`
+    refusals without a look from elsewhere, or looks that show nothing, the last one alone.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
@@ -116,7 +120,7 @@ class LookAccumulator:
         """As `Registrar.register`, of all looks that are kept, this one included.
 
         Another target than before starts a new collection. A look without a finite point is refused: those before say
-        nothing about it. So is one with which the others cannot be registered.
+        nothing about it. A look with which the others cannot be registered is not kept.
 
         Raises:
             ConfigError, InvalidPointCloudError: as `collect` and `Registrar.register`.
@@ -132,33 +136,61 @@ class LookAccumulator:
         places = self._places()
         of_points = np.repeat(places, [len(look.points) for look in self._looks], axis=0)
         try:
-            result = self.method.register(self.collected, target, initial, of_points)
-        except InvalidPointCloudError:
-            self._leave_out_newest(before)
+            result = replace(self.method.register(self.collected, target, initial, of_points), method=self.name)
+        except Exception:
+            self._looks = before
             raise
-        result = replace(result, method=self.name)
-        if result.looks_apart is None:
-            self._apart_in_a_row = []
-            return replace(result, reason=result.reason + self._count_refusals(result.ok))
-        apart = (places[:, None] == result.looks_apart).all(axis=2).any(axis=1)
+        apart = np.zeros(len(places), dtype=bool)
+        if result.looks_apart is not None:
+            apart = (places[:, None] == result.looks_apart).all(axis=2).any(axis=1)
+        if result.ok:
+            return self._unless_newest_differs(result, target, before, is_blind=bool(apart[-1]))
         if apart[-1]:
-            refused = result.refused(RegistrationStatus.AMBIGUOUS, NOT_SEEN) if result.ok else result
-            return replace(refused, reason=refused.reason + self._leave_out_newest(before))
+            return self._refused(result, result.reason + self._leave_out_newest(before))
         self._apart_in_a_row = []
-        if result.ok:  # something was in the way of the others
-            self._refused_in_a_row = 0
-            return result
-        self._looks = [look for look, off in zip(self._looks, apart, strict=True) if not off]
-        return replace(result, reason=f"{result.reason}; left out from now on")
+        if apart.any():
+            self._looks = [look for look, off in zip(self._looks, apart, strict=True) if not off]
+            return replace(result, reason=f"{result.reason}; left out from now on")
+        return replace(result, reason=result.reason + self._count_refusal())
+
+    def _unless_newest_differs(
+        self, result: RegistrationResult, target: PreparedTarget, before: list[Look], is_blind: bool
+    ) -> RegistrationResult:
+        """The pose of all looks; refused where the newest shows nothing of the bone there, or alone another pose."""
+        if is_blind:
+            reason = NOT_SEEN + self._count_refusal()
+            if self._refused_in_a_row:  # else it is the only one that is left
+                self._looks = before
+            return self._refused(result, reason)
+        if self._differs(self._looks[-1], result, target):
+            return self._refused(result, DIFFERS + self._leave_out_newest(before))
+        self._apart_in_a_row, self._refused_in_a_row = [], 0
+        return result
+
+    def _differs(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> bool:
+        """True where the newest look alone has a pose that is more than 4 mm or 5 deg from that of all."""
+        if len(self._looks) < 2:
+            return False
+        registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
+        alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
+        if alone.T_target_source is None or result.T_target_source is None:
+            return False
+        away_mm, turned_deg = se3.pose_error(alone.T_target_source, result.T_target_source, newest.points)
+        return away_mm > AWAY_MM or turned_deg > TURNED_DEG
+
+    def _refused(self, result: RegistrationResult, reason: str) -> RegistrationResult:
+        """Of a bone that is no longer where the looks have it in common, for all that is known."""
+        refused = result.refused(RegistrationStatus.AMBIGUOUS, reason)
+        return replace(refused, confidence=min(result.confidence, self.config.rules.ruled_out))
 
     def _places(self) -> Array:
         """(K, 3) mm, where the camera was for each look; no two are the same."""
         places = np.reshape([look.viewpoint for look in self._looks], (-1, 3))
         return places + APART_MM * np.outer(np.arange(len(places)), np.eye(3)[0])
 
-    def _count_refusals(self, is_ok: bool) -> str:
+    def _count_refusal(self) -> str:
         """Keep the last look alone where the camera rests and nothing is found. Returns what is said of it."""
-        self._refused_in_a_row = 0 if is_ok else self._refused_in_a_row + 1
+        self._refused_in_a_row += 1
         if self._refused_in_a_row < STUCK or len(self._looks) < 2:
             return ""
         last = self._looks[-1:]

@@ -98,11 +98,13 @@ def split(source: ArrayLike, viewpoint: ArrayLike) -> list[Look]:
     points = as_array(source, "an (N, 3) source", "pass x, y, z in mm")
     of_points = inputs.numbers(viewpoint, (len(points), 3), "viewpoint", HOW)
     finite_points(points)  # a source that is none is named here
-    places, look = np.unique(of_points, axis=0, return_inverse=True)
+    begins = np.append(True, (np.diff(of_points, axis=0) != 0.0).any(axis=1))[: len(points)]  # runs from one place
+    places, of_run = np.unique(of_points[begins], axis=0, return_inverse=True)
+    look = of_run.reshape(-1)[np.cumsum(begins) - 1]
     if len(places) > MOST_PLACES:
         how = "pass the last images, or those from places that differ most"
         raise InvalidPointCloudError(f"at most {MOST_PLACES} places of a camera", f"{len(places)}", how)
-    found = [Look(finite_points(points[look.reshape(-1) == i]), place) for i, place in enumerate(places)]
+    found = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
     return found or [Look(points, np.zeros(3))]  # of no point at all
 
 

@@ -10,7 +10,7 @@ import tiny
 from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import explained, features, rigidity
-from gapr_core.registration.apart import Fits
+from gapr_core.registration.apart import LookFits
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.explained import Explained
@@ -173,7 +173,7 @@ def test_the_covariance_holds_what_the_looks_err_by_against_each_other(judged, m
     monkeypatch.setattr(explained.covariance, "estimate", lambda *_, **__: known)
     monkeypatch.setattr(rigidity, "of_looks", of_looks)
     monkeypatch.setattr(explained.covariance, "covariance_added_by", lambda fit, errors, config: errors[:6, :6] ** 2)
-    monkeypatch.setattr(explained, "fits", lambda *_: Fits(*np.zeros((2, looks), dtype=bool)))
+    monkeypatch.setattr(explained, "look_fits", lambda *_: LookFits(*np.zeros((2, looks), dtype=bool)))
     scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=np.ones((looks, 3)), images=(None,) * looks)
     scene.look, scene.left_out = np.arange(10) % looks, np.empty((0, 3))
     found = explained.assess_part(part, None, scene, None, None, CONFIG).uncertainty

@@ -7,6 +7,7 @@ import pytest
 import tiny
 
 from gapr_core import ConfigError, InvalidPointCloudError, LookAccumulator, Registrar, Tracker
+from gapr_core.geometry import se3
 from gapr_core.registration.look_accumulation import STUCK
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
@@ -24,8 +25,12 @@ class Asked:
 
     def __init__(self, *answers):
         self.answers, self.sources, self.places = list(answers), [], []
+        self.initial, self.alone = [], OK  # `alone`: what a single look says
 
     def __call__(self, source, target, initial, viewpoint):
+        if np.ndim(viewpoint) == 1:
+            return self.alone
+        self.initial.append(initial)
         self.sources.append(source)
         self.places.append(np.unique(viewpoint, axis=0))
         answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
@@ -140,12 +145,39 @@ def test_a_pose_stands_where_an_older_look_shows_nothing_and_that_one_stays(targ
 
 
 def test_a_newest_look_that_shows_nothing_of_the_bone_is_refused_and_left_out(target):
-    looks, _ = looks_of(OK, OK, blind(2))
-    for number in range(3):
-        result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
-    assert result.status is RegistrationStatus.AMBIGUOUS and result.T_target_source is None
-    assert "newest look shows nothing" in result.reason and result.reason.endswith("; left out")
-    assert names(looks.collected) == [0, 1]
+    """However often: a hand before the camera says nothing of the bone. After ten in a row that one alone is kept."""
+    looks, asked = looks_of(OK, OK, blind(-1))
+    for number in range(2):
+        looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    for number in range(STUCK):
+        result = looks.register(points(2 + number), target, viewpoint=eye(1.0))
+        assert result.status is RegistrationStatus.AMBIGUOUS and result.T_target_source is None
+        assert "newest look shows nothing" in result.reason and result.confidence <= looks.config.rules.ruled_out
+        assert names(looks.collected) == ([0, 1] if number < STUCK - 1 else [2 + number])
+    assert "restarts with the last look" in result.reason
+
+
+@pytest.mark.parametrize(("x_mm", "deg", "is_refused"), [
+    (3.9, 0.0, False), (4.1, 0.0, True), (0.0, 4.9, False), (0.0, 5.1, True),
+])  # fmt: skip
+def test_a_newest_look_that_alone_has_another_pose_is_refused(target, x_mm, deg, is_refused):
+    looks, asked = looks_of(OK)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    centre = points(1).mean(axis=0)
+    asked.alone = replace(OK, T_target_source=se3.exp([x_mm, 0.0, 0.0, 0.0, 0.0, np.radians(deg)], centre))
+    result = looks.register(points(1), target, viewpoint=eye(20.0))
+    assert result.ok is not is_refused and names(looks.collected) == ([0] if is_refused else [0, 1])
+    if is_refused:
+        assert "newest look alone has another pose" in result.reason
+        assert result.confidence <= looks.config.rules.ruled_out
+    asked.alone = REFUSED
+    assert looks.register(points(2), target, viewpoint=eye(40.0)).ok, "one that alone is refused says nothing"
+
+
+def test_a_first_look_is_not_compared_with_itself(target):
+    looks, asked = looks_of(OK)
+    asked.alone = replace(OK, T_target_source=se3.exp([9.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert looks.register(points(0), target, viewpoint=eye(0.0)).ok
 
 
 def test_older_looks_that_do_not_fit_are_left_out_from_then_on(target):
@@ -164,6 +196,20 @@ def test_after_ten_refusals_from_one_direction_the_last_look_alone_is_kept(targe
     assert "restarts with the last look" in result.reason
 
 
+def test_poses_end_the_count_of_refusals(target):
+    looks, _ = looks_of(OK, *[REFUSED] * (STUCK - 1), OK, REFUSED, REFUSED)
+    for number in range(STUCK + 2):
+        looks.register(points(number), target, viewpoint=eye(30.0 * (number > 0)))
+        assert names(looks.collected) == ([0, number] if number else [0])
+
+
+def test_a_camera_that_rests_keeps_its_looks_while_there_are_poses(target):
+    looks, _ = looks_of(OK)
+    for number in range(STUCK + 5):
+        looks.register(points(number), target, viewpoint=eye(30.0 * (number > 0)))
+    assert names(looks.collected) == [0, STUCK + 4]
+
+
 def test_a_new_direction_gives_the_looks_another_chance(target):
     looks, _ = looks_of(REFUSED)
     for number in range(STUCK + 2):
@@ -171,12 +217,21 @@ def test_a_new_direction_gives_the_looks_another_chance(target):
     assert names(looks.collected) == [STUCK - 1, STUCK + 1]
 
 
-def test_a_look_that_cannot_be_registered_is_not_kept(target):
-    looks, _ = looks_of(OK, InvalidPointCloudError("a", "b", "c"), OK)
+@pytest.mark.parametrize("error", [InvalidPointCloudError("a", "b", "c"), RuntimeError("d")])
+def test_looks_that_cannot_be_registered_are_not_kept_however_many(target, error):
+    looks, _ = looks_of(OK, error, error, error, error, OK)
     looks.register(points(0), target, viewpoint=eye(0.0))
-    with pytest.raises(InvalidPointCloudError):
-        looks.register(points(1), target, viewpoint=eye(20.0))
-    assert names(looks.collected) == [0]
+    for number in range(1, 5):
+        with pytest.raises(type(error)):
+            looks.register(points(number), target, viewpoint=eye(20.0))
+        assert names(looks.collected) == [0]
+
+
+def test_a_first_guess_goes_to_the_method(target):
+    looks, asked = looks_of(OK)
+    guess = se3.exp([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    looks.register(points(0), target, guess, eye(0.0))
+    assert asked.initial == [guess]
 
 
 def test_another_target_begins_a_new_collection(target):

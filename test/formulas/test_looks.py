@@ -117,55 +117,57 @@ def test_every_place_counts_alike(monkeypatch):
     assert scene.of(1).compare(None, None, None, 0.6, 3.0).explained.tolist() == [0.4]
 
 
-HERE = Own(compared=0.2, explained=0.16, own_compared=0.2, own_explained=0.17, away_mm=0.5)
+HERE = Own(compared=0.2, on=0.12, near=0.18, seen_through=0.0, own_compared=0.2, own_on=0.13, away_mm=0.5)
+BLIND = Own(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("changes", "is_apart"), [
     ({}, False),
-    ({"own_explained": 0.235, "away_mm": 2.1}, True),  # of .2 that it could show, .375 more elsewhere
-    ({"own_explained": 0.225, "away_mm": 2.1}, False),  # .325 more
-    ({"own_explained": 0.235, "away_mm": 1.9}, False),  # as near as noise takes it
-    ({"own_explained": 0.235, "away_mm": 2.1, "own_compared": 0.25}, False),  # .3 of what it could show there
-    ({"explained": 0.089, "own_explained": 0.089}, True),  # half of the share of the best, .9, is .09 of .2
-    ({"explained": 0.091, "own_explained": 0.091}, False),
+    ({"own_on": 0.172, "away_mm": 2.1}, True),  # of .2 that it could show, .26 more elsewhere
+    ({"own_on": 0.168, "away_mm": 2.1}, False),  # .24 more
+    ({"own_on": 0.172, "away_mm": 1.9}, False),  # as near as noise takes it
+    ({"own_on": 0.172, "away_mm": 2.1, "own_compared": 0.25}, False),  # .21 of what it could show there
+    ({"seen_through": 0.032}, True), ({"seen_through": 0.028}, False),  # .15 of .2 is .03
+    ({"near": 0.089}, True), ({"near": 0.091}, False),  # half of the share of the best, .9, is .09 of .2
+    ({"on": 0.047}, True), ({"on": 0.049}, False),  # .3 of the share of the best, .8, is .048 of .2
 ])  # fmt: skip
-def test_a_look_is_apart_where_it_fits_better_elsewhere_or_hardly_here(changes, is_apart):
-    assert apart.is_apart(HERE._replace(**changes), best=0.9) is is_apart
-
-
-def test_shares_are_of_what_a_look_could_show():
-    own = Own(compared=0.2, explained=0.1, own_compared=0.4, own_explained=0.3, away_mm=0.0)
-    assert own.agrees == pytest.approx(0.5) and own.gained == pytest.approx(0.5)
-    assert Own(0.0, 0.0, 0.0, 0.0, 0.0).agrees == Own(0.0, 0.0, 0.0, 0.0, 0.0).gained == 0.0
+def test_a_look_is_apart_where_it_fits_elsewhere_looks_through_the_bone_or_hardly_agrees(changes, is_apart):
+    assert apart.is_apart(HERE._replace(**changes), near=0.9, on=0.8) is is_apart
 
 
 def fits(monkeypatch, *found):
     monkeypatch.setattr(apart, "_own", lambda T, number, *rest: found[number])
-    return apart.fits(np.eye(4), SimpleNamespace(images=found), None, CONFIG)
+    return apart.look_fits(np.eye(4), SimpleNamespace(images=found), None, CONFIG)
 
 
 def test_each_look_is_compared_with_the_widest_and_the_best(monkeypatch):
-    poor, small = HERE._replace(explained=0.07, own_explained=0.07), Own(0.019, 0.018, 0.019, 0.018, 0.0)
+    poor, small = HERE._replace(near=0.07), HERE._replace(compared=0.019, on=0.01, near=0.018, own_on=0.01)
     found = fits(monkeypatch, HERE, poor, HERE, small, small._replace(compared=0.021))
     assert found.apart.tolist() == [False, True, False, False, False] and found.is_refused
     assert found.blind.tolist() == [False, False, False, True, False]
     assert not fits(monkeypatch, poor, poor).is_refused
 
 
+def test_a_blind_look_is_the_measure_of_none(monkeypatch):
+    half = HERE._replace(near=0.09, on=0.05, own_on=0.05)
+    found = fits(monkeypatch, half, half, half, BLIND._replace(compared=0.001, near=0.001, on=0.001))
+    assert not found.apart.any() and found.blind.tolist() == [False, False, False, True]
+
+
 def test_what_a_look_shows_elsewhere_is_no_blindness(monkeypatch):
     """Where the bone is it could show hardly anything, and all of it a few millimetres on."""
-    found = fits(monkeypatch, HERE, HERE, HERE, HERE._replace(compared=0.01, explained=0.01, away_mm=6.0))
+    found = fits(monkeypatch, HERE, HERE, HERE, HERE._replace(compared=0.01, on=0.01, near=0.01, away_mm=6.0))
     assert found.apart.tolist() == [False, False, False, True] and not found.blind.any() and found.is_refused
 
 
 @pytest.mark.parametrize(("looks", "blind", "is_refused"), [(3, 1, False), (4, 2, True), (2, 1, True), (4, 1, False)])
 def test_a_pose_stands_where_less_than_half_of_the_looks_are_blind(monkeypatch, looks, blind, is_refused):
-    found = fits(monkeypatch, *[HERE] * (looks - blind), *[Own(0.0, 0.0, 0.0, 0.0, 0.0)] * blind)
+    found = fits(monkeypatch, *[HERE] * (looks - blind), *[BLIND] * blind)
     assert found.blind.sum() == blind and not found.apart.any() and found.is_refused is is_refused
 
 
 def test_one_look_has_nothing_to_fit(monkeypatch):
-    found = fits(monkeypatch, HERE._replace(own_explained=0.9, away_mm=9.0))
+    found = fits(monkeypatch, HERE._replace(own_on=0.9, away_mm=9.0))
     assert not found.is_refused and not found.apart.any() and not found.blind.any()
 
 
@@ -185,7 +187,7 @@ def test_each_look_is_laid_on_the_bone_by_its_own_points_near_it():
     scene = looks.scene_from(views, EYES[[0, 0]] + [[0.0] * 3, [1.0, 0.0, 0.0]], CONFIG)
     here, moved = (apart._own(np.eye(4), number, scene, target, CONFIG.clutter) for number in (0, 1))
     assert here.away_mm < 0.5 and moved.away_mm == pytest.approx(3.0, abs=0.5)
-    assert moved.own_explained > moved.explained + 0.02 and here.compared > 0.1
+    assert moved.own_on > moved.on + 0.02 and here.compared > 0.1 and here.near >= here.on
     aside = replace(scene, look=np.where(scene.look == 1, 5, scene.look))
     gone = apart._own(se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 1, aside, target, CONFIG.clutter)
-    assert gone.away_mm == 0.0 and gone.own_explained == gone.explained
+    assert gone.away_mm == 0.0 and gone.own_on == gone.on

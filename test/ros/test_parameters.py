@@ -231,7 +231,10 @@ def test_limits_that_refuse_every_cloud_are_warned_of_and_a_remark_is_not(blob_p
     ("given", "sentence"),
     [
         ({"viewpoint": "origin"}, "the last 5 looks are registered as one, each from another direction"),
-        ({"viewpoint": "camera", "accumulate": 40}, "the last 16 looks are registered as one"),
+        (
+            {"viewpoint": "camera", "accumulate": 40},
+            "the last 16 looks are registered as one, each from another direction, 16",
+        ),
         ({"viewpoint": "origin", "sensor": "ultrasound"}, "viewpoint is not used: sensor ultrasound sees nothing"),
         ({"viewpoint": "auto"}, ""),
         ({"viewpoint": "origin", "accumulate": 1}, ""),

@@ -273,3 +273,25 @@ def test_the_margin_has_ends(plane, scores, margin):
 def test_a_pose_without_a_rival_has_no_margin(plane):
     seen = Visible(*(np.array([x]) for x in (0.2, 3.0, 0.0)), CONFIG.clutter.free_space)
     assert explained._visible_features(seen, Candidates(None, np.array([2.0]), None), plane)["rival_margin"] == 0.0
+
+
+@pytest.mark.parametrize(("apart", "blind", "places", "is_refused"), [
+    ([0, 0, 1], [0, 0, 0], [2], True), ([0, 0, 0], [1, 0, 0], [0], False), ([0, 0, 0], [1, 0, 1], [0, 2], True),
+    ([0, 0, 0], [0, 0, 0], [], False),
+])  # fmt: skip
+def test_looks_that_do_not_fit_are_named_and_refused_where_they_are_apart_or_half(
+    judged, monkeypatch, apart, blind, places, is_refused
+):
+    viewpoints = np.arange(9.0).reshape(3, 3)
+    scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=viewpoints, images=(None,) * 3)
+    scene.look, scene.left_out = np.arange(10) % 3, np.full((1, 3), 7.0)
+    asked = []
+    found = LookFits(np.array(apart, dtype=bool), np.array(blind, dtype=bool))
+    monkeypatch.setattr(explained, "_allowing_for_the_tracker", lambda uncertainty, *_: uncertainty)
+    monkeypatch.setattr(explained, "look_fits", lambda *_: asked.append(1) or found)
+    seen = explained.assess_part(part_of(0.4), None, scene, None, None, CONFIG)
+    assert seen.looks_apart.tolist() == [*viewpoints[places].tolist(), [7.0] * 3]
+    assert (seen.refusal is not None) is is_refused and (seen.probability == 0.9) is not is_refused
+    judged.probability = 0.5 * CONFIG.worth_checking  # a pose that is refused anyway says nothing of the looks
+    seen = explained.assess_part(part_of(0.4), None, scene, None, None, CONFIG)
+    assert len(asked) == 1 and not len(seen.looks_apart) and seen.refusal is None

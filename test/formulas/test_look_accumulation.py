@@ -276,3 +276,17 @@ def test_a_tracker_is_one_of_its_own_whose_sources_count_as_one():
     looks.method._has_track = True
     looks.reset()
     assert not looks.method._has_track
+
+
+@pytest.mark.parametrize("answer", [apart(-1), REFUSED])
+def test_a_collection_that_restarts_forgets_the_track(target, answer, monkeypatch):
+    tracker = Tracker(Registrar())
+    looks = LookAccumulator(tracker)
+    monkeypatch.setattr(looks.method, "register", Asked(REFUSED, answer))
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    for number in range(1, STUCK + 1):
+        looks.method._has_track = True
+        result = looks.register(points(number), target, viewpoint=eye(30.0))
+        if "restarts" in result.reason:
+            break
+    assert "restarts" in result.reason and not looks.method._has_track

@@ -140,3 +140,25 @@ def test_a_look_that_shows_hardly_anything_is_taken_from_elsewhere(specimen, mon
     monkeypatch.setattr(several_looks, "_seen_from", lambda setting, *_: View(np.empty((0, 3)), np.empty(0), None))
     with pytest.raises(ConfigError, match="hidden from all"):
         several_looks.several_looks(specimen, np.random.default_rng(3), (), kind=NO_ERROR)
+
+
+def test_a_tracker_errs_about_the_camera_and_takes_it_along(monkeypatch):
+    view = View(np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]), np.zeros(2, dtype=np.int64), np.array([0.0, 0.0, 500.0]))
+    monkeypatch.setattr(several_looks, "TRACKED_MM", 0.0)
+    turned = several_looks._tracked(view, np.random.default_rng(1))
+    assert turned.camera == pytest.approx(view.camera) and 0.1 < np.linalg.norm(turned.points[0]) < 3.0
+    assert np.linalg.norm(turned.points - turned.camera, axis=1) == pytest.approx(
+        np.linalg.norm(view.points - view.camera, axis=1)
+    )
+    monkeypatch.setattr(several_looks, "TRACKED_MM", 0.3)
+    monkeypatch.setattr(several_looks, "TRACKED_DEG", 0.0)
+    shifted = several_looks._tracked(view, np.random.default_rng(1))
+    step = shifted.camera - view.camera
+    assert 0.05 < np.linalg.norm(step) < 1.5 and shifted.points == pytest.approx(view.points + step)
+
+
+def test_all_looks_lie_under_the_same_layers(specimen, monkeypatch):
+    asked = []
+    monkeypatch.setattr(several_looks, "under_layers", lambda views, rng: asked.append(len(views)) or views)
+    several_looks.several_looks(specimen, np.random.default_rng(3), (), kind=replace(NO_ERROR, under_layers=True))
+    assert asked == [LOOKS]

@@ -58,7 +58,9 @@ def test_both_ways_to_be_degenerate_are_asked(registrar, target):
 def test_a_part_found_in_a_scene_is_not_asked_for_its_unit(registrar, femur_cloud, target, monkeypatch, is_scene):
     answer = registrar.assess(femur_cloud, target)
     refused = replace(answer, refusal=LINE, seen=answer.source if is_scene else None)
-    monkeypatch.setattr(Registrar, "_in_scene", lambda *_: refused)
-    found = registrar.register(femur_cloud / 10.0, target, viewpoint=[0.0, -500.0, 0.0])
+    monkeypatch.setattr(Registrar, "_in_scene" if is_scene else "_as_bone", lambda *_: refused)
+    monkeypatch.setattr(Registrar, "_of_one_view", lambda *_: None)
+    viewpoint = [0.0, -500.0, 0.0] if is_scene else None
+    found = registrar.register(femur_cloud / 10.0, target, viewpoint=viewpoint)
     assert found.status is RegistrationStatus.DEGENERATE
     assert ("is the cloud in cm?" in found.reason) is not is_scene

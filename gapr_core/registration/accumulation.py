@@ -14,7 +14,7 @@ from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import sampling, se3
 from gapr_core.registration import precision, rigidity
-from gapr_core.registration.limits import why_no_surer
+from gapr_core.registration.limits import too_unsure, why_no_surer
 from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import fingerprint
@@ -214,8 +214,8 @@ class Accumulator:
         found = replace(result, confidence=most, contributions={**result.contributions, MOVING: takes})
         if most >= self.config.min_confidence:
             return found
-        reason = f"no surer than {most:g}: {why_no_surer(found.contributions)}"
-        return found.refused(RegistrationStatus.LOW_CONFIDENCE, reason)
+        why = why_no_surer(found.contributions)
+        return found.refused(RegistrationStatus.LOW_CONFIDENCE, too_unsure(why, self.config))
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.

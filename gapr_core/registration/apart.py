@@ -82,7 +82,9 @@ def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarC
     """How the looks of a scene fit the pose (4, 4) that they have in common; a single one does."""
     if len(scene.images) == 1:
         return LookFits(np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
-    found = [_own(T, number, scene, target, config.clutter) for number in range(len(scene.images))]
+    signed, _, aside, _ = kernels.residuals_at(T, scene.source.points, *target.kernel_view, 0.0)
+    close = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < REACH_MM
+    found = [_own(T, number, close, scene, target, config.clutter) for number in range(len(scene.images))]
     widest = max(each.compared for each in found)
     blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in found])
     seeing = [each for each, is_blind in zip(found, blind, strict=True) if not is_blind]
@@ -110,11 +112,11 @@ def refusal_of(places: Array) -> Refusal:
     return Refusal(RegistrationStatus.AMBIGUOUS, f"{why}: {how}")
 
 
-def _own(T: Array, number: int, scene: Scene, target: PreparedTarget, config: ClutterConfig) -> Own:
-    """Look `number` of a scene under the common pose (4, 4), and laid on the bone by itself."""
-    source = scene.source
-    signed, _, aside, _ = kernels.residuals_at(T, source.points, *target.kernel_view, 0.0)
-    close = np.flatnonzero((scene.look == number) & (np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < REACH_MM))
+def _own(
+    T: Array, number: int, is_close: NDArray[np.bool_], scene: Scene, target: PreparedTarget, config: ClutterConfig
+) -> Own:
+    """Look `number` of a scene under the common pose (4, 4), and laid on the bone by its points (N,) close to it."""
+    source, close = scene.source, np.flatnonzero((scene.look == number) & is_close)
     own = T
     if len(close) >= FEWEST_POINTS:
         some = close[:: -(-len(close) // MOST_POINTS)]

@@ -56,6 +56,7 @@ class Assessment:
         seen: the whole cloud, where `source` is only the part of it that the pose explains; else None.
         members: (N,) mask of that part in `seen`; None with it.
         viewpoint: (3,) mm, source frame: where `seen` was seen from; None with it.
+        look: (N,) of several looks, which one each point of `source` is of; else None.
         inferred_viewpoint: the same, where nobody gave it; else None.
         contributions: log odds that each feature adds to the probability's.
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
@@ -80,6 +81,7 @@ class Assessment:
     seen: PreparedSource | None = None
     members: NDArray[np.bool_] | None = None
     viewpoint: Array | None = None
+    look: NDArray[np.int64] | None = None
     inferred_viewpoint: Array | None = None
     contributions: Mapping[str, float] = field(default_factory=dict)
     factor95: float = 1.0

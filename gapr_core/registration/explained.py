@@ -86,28 +86,17 @@ def assess_part(
     fit, part = explained.fit, explained.source
     eye = covariance.eye_of(fit.T, scene.viewpoint, config.sensor)
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around, eye=eye)
-    if len(scene.images) > 1:
-        uncertainty = _allowing_for_the_tracker(uncertainty, fit, scene.look[explained.members], config)
+    look = scene.look[explained.members] if len(scene.images) > 1 else None
+    uncertainty = rigidity.allowing_for_looks(uncertainty, fit, look, config)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
-    seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint)
+    seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint, look=look)
     if not seen.reaches(config.worth_checking):
         return seen  # a pose that is refused anyway says nothing about the looks
     found = look_fits(fit.T, scene, target, config)
     places = np.concatenate([scene.viewpoints[found.apart | found.blind], scene.left_out])
     refusal = refusal_of(places) if found.is_refused else None
     return replace(seen, looks_apart=places).with_refusal(refusal, config.rules)
-
-
-def _allowing_for_the_tracker(
-    uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64], config: RegistrarConfig
-) -> PoseUncertainty:
-    """The same with what the looks' errors against each other add, each a motion of its own as large as it looks."""
-    found = rigidity.of_looks(fit, look, config.rigidity)
-    if not found.is_shown:
-        return uncertainty
-    added = covariance.covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance)
-    return replace(uncertainty, covariance=uncertainty.covariance + added)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:

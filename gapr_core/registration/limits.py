@@ -51,8 +51,13 @@ def applied(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     found = a.capped(most, limit.name)
     if a.refusal is not None or most >= config.min_confidence:
         return found
-    reason = f"the pose is right with a probability of {most:g} at most, {config.min_confidence:g} is asked for"
-    return replace(found, refusal=Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}: {limit.why}"))
+    return replace(found, refusal=Refusal(RegistrationStatus.LOW_CONFIDENCE, too_unsure(limit.why, config)))
+
+
+def too_unsure(why: str, config: RegistrarConfig) -> str:
+    """The reason of a refusal where more is asked for than a limit leaves."""
+    most, asked = config.limits.most, config.min_confidence
+    return f"the pose is right with a probability of {most:g} at most, {asked:g} is asked for: {why}"
 
 
 def is_sparse(assessment: Assessment, config: RegistrarConfig) -> bool:

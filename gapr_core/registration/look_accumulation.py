@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 STUCK = 10  # refusals in a row from one direction; what the looks before show may be gone
 NOT_SEEN = "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
 DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
-AWAY_MM, TURNED_DEG = 4.0, 5.0  # beyond which a pose is not right where the other one is
 APART_MM = 1e-6  # between the places of two looks, so that those of a camera at rest stay two
 
 
@@ -168,15 +167,14 @@ class LookAccumulator:
         return result
 
     def _differs(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> bool:
-        """True where the newest look alone has a pose that is more than 4 mm or 5 deg from that of all."""
+        """True where the newest look alone has a pose that is not right if that of all is."""
         if len(self._looks) < 2:
             return False
         registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
         alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
         if alone.T_target_source is None or result.T_target_source is None:
             return False
-        away_mm, turned_deg = se3.pose_error(alone.T_target_source, result.T_target_source, newest.points)
-        return away_mm > AWAY_MM or turned_deg > TURNED_DEG
+        return not se3.pose_error(alone.T_target_source, result.T_target_source, newest.points).is_right
 
     def _refused(self, result: RegistrationResult, reason: str) -> RegistrationResult:
         """Of a bone that is no longer where the looks have it in common, for all that is known."""

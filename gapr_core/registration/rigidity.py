@@ -23,7 +23,7 @@ from gapr_core.geometry import extent, sampling
 from gapr_core.geometry.twists import covariance_about, distance_jacobian
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import smooth_correlation
-from gapr_core.registration.covariance import covariance_added_by, strains
+from gapr_core.registration.covariance import PoseUncertainty, covariance_added_by, strains
 from gapr_core.registration.refinement import Fit
 
 Array = NDArray[np.float64]
@@ -203,6 +203,20 @@ def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) ->
     surest = sorted(found.items(), key=lambda item: -item[1].finding.log_ratio)
     deformed = {name: each.finding.size_mm for name, each in surest}
     return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
+
+
+def allowing_for_looks(
+    uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64] | None, config: RegistrarConfig
+) -> PoseUncertainty:
+    """The same with what the looks' errors against each other add, each a motion of its own; `look` as in `of_looks`.
+
+    None: of a single look nothing is added.
+    """
+    found = None if look is None else of_looks(fit, look, config.rigidity)
+    if found is None or not found.is_shown:
+        return uncertainty
+    added = covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance)
+    return replace(uncertainty, covariance=uncertainty.covariance + added)
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:

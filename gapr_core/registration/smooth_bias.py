@@ -21,6 +21,7 @@ from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import NormalEquations, equations_of, fields, root_mean_square
 from gapr_core.registration.covariance import estimate, eye_of
 from gapr_core.registration.refinement import Fit, evaluate_trusted, evaluate_with_patches, trust_of_whole
+from gapr_core.registration.rigidity import allowing_for_looks
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 
@@ -38,7 +39,8 @@ def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessmen
         return a
     misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # those that were assessed
     eye = eye_of(fit.T, a.viewpoint, config.sensor)
-    return replace(a, fit=fit, uncertainty=estimate(fit, config.covariance, config.sensor, None, misfits_mm, eye))
+    uncertainty = estimate(fit, config.covariance, config.sensor, None, misfits_mm, eye)
+    return replace(a, fit=fit, uncertainty=allowing_for_looks(uncertainty, fit, a.look, config))
 
 
 def corrected_fit(

@@ -172,7 +172,7 @@ def test_the_covariance_holds_what_the_looks_err_by_against_each_other(judged, m
 
     monkeypatch.setattr(explained.covariance, "estimate", lambda *_, **__: known)
     monkeypatch.setattr(rigidity, "of_looks", of_looks)
-    monkeypatch.setattr(explained.covariance, "covariance_added_by", lambda fit, errors, config: errors[:6, :6] ** 2)
+    monkeypatch.setattr(rigidity, "covariance_added_by", lambda fit, errors, config: errors[:6, :6] ** 2)
     monkeypatch.setattr(explained, "look_fits", lambda *_: LookFits(*np.zeros((2, looks), dtype=bool)))
     scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=np.ones((looks, 3)), images=(None,) * looks)
     scene.look, scene.left_out = np.arange(10) % looks, np.empty((0, 3))
@@ -287,7 +287,7 @@ def test_looks_that_do_not_fit_are_named_and_refused_where_they_are_apart_or_hal
     scene.look, scene.left_out = np.arange(10) % 3, np.full((1, 3), 7.0)
     asked = []
     found = LookFits(np.array(apart, dtype=bool), np.array(blind, dtype=bool))
-    monkeypatch.setattr(explained, "_allowing_for_the_tracker", lambda uncertainty, *_: uncertainty)
+    monkeypatch.setattr(rigidity, "allowing_for_looks", lambda uncertainty, *_: uncertainty)
     monkeypatch.setattr(explained, "look_fits", lambda *_: asked.append(1) or found)
     seen = explained.assess_part(part_of(0.4), None, scene, None, None, CONFIG)
     assert seen.looks_apart.tolist() == [*viewpoints[places].tolist(), [7.0] * 3]

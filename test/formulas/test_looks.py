@@ -9,7 +9,6 @@ import tiny
 
 from gapr_core.config import ClutterConfig, FreeSpaceConfig, RegistrarConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.geometry import se3
 from gapr_core.registration import apart, free_space, looks
 from gapr_core.registration import source as sources
 from gapr_core.registration.apart import Own
@@ -137,7 +136,8 @@ def test_a_look_is_apart_where_it_fits_elsewhere_looks_through_the_bone_or_hardl
 
 def fits(monkeypatch, *found):
     monkeypatch.setattr(apart, "_own", lambda T, number, *rest: found[number])
-    return apart.look_fits(np.eye(4), SimpleNamespace(images=found), None, CONFIG)
+    scene = SimpleNamespace(images=found, source=tiny.ellipsoid())
+    return apart.look_fits(np.eye(4), scene, tiny.ellipsoid(), CONFIG)
 
 
 def test_each_look_is_compared_with_the_widest_and_the_best(monkeypatch):
@@ -185,9 +185,12 @@ def test_each_look_is_laid_on_the_bone_by_its_own_points_near_it():
     first, second = points[::2], points[1::2] + shift
     views = [sources.prepare(each, CONFIG.source) for each in (first, second)]
     scene = looks.scene_from(views, EYES[[0, 0]] + [[0.0] * 3, [1.0, 0.0, 0.0]], CONFIG)
-    here, moved = (apart._own(np.eye(4), number, scene, target, CONFIG.clutter) for number in (0, 1))
+    close = np.ones(len(scene.look), dtype=bool)
+    here, moved = (apart._own(np.eye(4), number, close, scene, target, CONFIG.clutter) for number in (0, 1))
     assert here.away_mm < 0.5 and moved.away_mm == pytest.approx(3.0, abs=0.5)
     assert moved.own_on > moved.on + 0.02 and here.compared > 0.1 and here.near >= here.on
+    far = apart._own(np.eye(4), 1, ~close, scene, target, CONFIG.clutter)
+    assert far.away_mm == 0.0 and far.own_on == far.on
     aside = replace(scene, look=np.where(scene.look == 1, 5, scene.look))
-    gone = apart._own(se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 1, aside, target, CONFIG.clutter)
+    gone = apart._own(np.eye(4), 1, close, aside, target, CONFIG.clutter)
     assert gone.away_mm == 0.0 and gone.own_on == gone.on

@@ -147,3 +147,18 @@ def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps,
     stated, eye = replace(config, sensor=SensorConfig(scale=0.01)), np.array([0.0, 0.0, -400.0])
     seen = smooth_bias.bias_corrected(replace(assessment, viewpoint=eye), stated)
     np.testing.assert_allclose(seen.uncertainty[-1], se3.apply(seen.fit.T, eye[None])[0])
+
+
+def test_a_corrected_pose_keeps_what_its_looks_err_by(steps, monkeypatch):
+    look, asked = np.arange(COUNT) % 2, []
+    monkeypatch.setattr(smooth_bias, "estimate", lambda *_: "estimated")
+    monkeypatch.setattr(smooth_bias, "allowing_for_looks", lambda *given: asked.append(given) or "wider")
+    config = RegistrarConfig(smooth_bias=CONFIG)
+    known = SimpleNamespace(covariance=EXACT, smooth_mm=0.3, short_mm=0.4)
+    steps(9.0, 0.0)
+    found = smooth_bias.bias_corrected(
+        Assessment(fit_of(np.eye(4)), None, known, {}, 0.9, None, SOURCE, None, look=look), config
+    )
+    ((estimated, fit, of_points, settings),) = asked
+    assert found.uncertainty == "wider" and estimated == "estimated" and settings is config
+    assert fit is found.fit and of_points is look

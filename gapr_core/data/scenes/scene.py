@@ -108,12 +108,27 @@ def draw(
 ) -> Pair:
     """As `scene`, of wounds that are drawn by `setting_of` until one shows that share of bone."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
+    setting, view = first_view(specimen, rng, level, setting_of)
+    return _as_pair(specimen, target, view, setting, level, rng)
+
+
+def first_view(
+    specimen: Specimen,
+    rng: np.random.Generator,
+    level: SceneLevel,
+    setting_of: Callable[[np.random.Generator, SceneLevel], Setting],
+) -> tuple[Setting, View]:
+    """A wound that shows the level's share of bone, and what a camera above it sees, without errors.
+
+    Raises:
+        ConfigError: none does.
+    """
     for _ in range(TRIES):
         setting = setting_of(rng, level)
         view = see(setting.parts, camera_above(setting.wound, rng))
         chosen = shown(view, setting.wound.centre, level, rng)
         if chosen is not None:
-            return _as_pair(specimen, target, view.of(chosen), setting, level, rng)
+            return setting, view.of(chosen)
     raise ConfigError(
         f"a bone of which a wound shows {level.bone_share[0]:.0%} to {level.bone_share[1]:.0%}",
         f"{specimen.bone} of {specimen.person}: none in {TRIES} wounds",

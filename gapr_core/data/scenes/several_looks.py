@@ -27,8 +27,7 @@ from gapr_core.data.scenes.scene import (
     SceneLevel,
     Setting,
     arrange,
-    camera_above,
-    shown,
+    first_view,
 )
 from gapr_core.data.scenes.wound import Wound
 from gapr_core.data.specimen import Specimen
@@ -89,32 +88,17 @@ def several_looks(
     """
     kind = kind or LookedAt()
     target, _ = specimen.sample(TARGET_POINTS, rng)
-    setting, views = _first(specimen, rng, others, kind)
-    radius = np.linalg.norm(views[0].points - setting.wound.centre, axis=1).max()
-    views += [_from(setting, around, radius, rng) for around in _places_around(rng)]
+    setting_of = partial(arrange, specimen)
+    if kind.at_joint:
+        setting_of = partial(joint.at_joint, specimen, joint.next_to(specimen, others))
+    setting, first = first_view(specimen, rng, SceneLevel(kind.bone_share), setting_of)
+    radius = np.linalg.norm(first.points - setting.wound.centre, axis=1).max()
+    views = [first, *(_from(setting, around, radius, rng) for around in _places_around(rng))]
     views = under_layers(views, rng) if kind.under_layers else views
     factor = 1.0 + rng.normal(0.0, kind.range_wrong) if kind.range_wrong else 1.0
     views = [_of_range(kind.errors(view, rng), factor) for view in views]
     views = [views[0], *(_tracked(view, rng) for view in views[1:])]
     return _as_pair(specimen, target, views, setting, rng)
-
-
-def _first(
-    specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], kind: LookedAt
-) -> tuple[Setting, list[View]]:
-    """A wound and the first look, without errors."""
-    level, setting_of = SceneLevel(kind.bone_share), partial(arrange, specimen)
-    if kind.at_joint:
-        setting_of = partial(joint.at_joint, specimen, joint.next_to(specimen, others))
-    for _ in range(TRIES):
-        setting = setting_of(rng, level)
-        view = see(setting.parts, camera_above(setting.wound, rng))
-        chosen = shown(view, setting.wound.centre, level, rng)
-        if chosen is not None:
-            return setting, [view.of(chosen)]
-    low, high = kind.bone_share
-    given = f"{specimen.bone} of {specimen.person}: none in {TRIES} wounds"
-    raise ConfigError(f"a bone of which a wound shows {low:.0%} to {high:.0%}", given, "choose another bone or seed")
 
 
 def _places_around(rng: np.random.Generator) -> Array:

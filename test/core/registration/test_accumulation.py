@@ -422,7 +422,10 @@ def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(regis
     monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(1.1, 1.0)))
     strict = Registrar(replace(registrar.config, min_confidence=0.9), registrar.proposers, registrar.calibrations)
     _, result = creeping(strict, target, femur, 0.0, 6.0)
-    assert result.status is RegistrationStatus.LOW_CONFIDENCE and "no surer than 0.89" in result.reason
+    assert (
+        result.status is RegistrationStatus.LOW_CONFIDENCE
+        and "0.89 at most, 0.9 is asked for: the collected sources" in result.reason
+    )
     assert result.confidence == 0.89
 
 

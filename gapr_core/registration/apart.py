@@ -126,7 +126,6 @@ def _own(
     near, on = (
         alone.compare(poses, points, normals, mm, config.front_mm) for mm in (config.middle_on_mm, config.on_mm)
     )
-    away = se3.apply(own, source.points[close]) - se3.apply(T, source.points[close])
-    away_mm = float(np.sqrt((away**2).sum(axis=1).mean())) if len(close) else 0.0
+    away_mm = se3.rms_apart_mm(own, T, source.points[close]) if len(close) else 0.0
     (compared, own_compared), (on_it, own_on) = near.compared.tolist(), on.explained.tolist()
     return Own(compared, on_it, float(near.explained[0]), float(on.violating[0]), own_compared, own_on, away_mm)

@@ -164,7 +164,11 @@ def arrange(
 def camera_above(wound: Wound, rng: np.random.Generator) -> Camera:
     """Somewhere in a cone about the wound's axis, its image's middle within 20 mm of the wound's."""
     off = np.arccos(rng.uniform(np.cos(np.radians(FARTHEST_OFF_DEG)), 1.0))
-    around = rng.uniform(0.0, 2.0 * np.pi)
+    return camera_off(wound, off, rng.uniform(0.0, 2.0 * np.pi), rng)
+
+
+def camera_off(wound: Wound, off: float, around: float, rng: np.random.Generator) -> Camera:
+    """The same, `off` radians off the wound's axis and `around` radians about it."""
     direction = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])
     position = wound.at(rng.uniform(*DISTANCE_MM) * direction)
     aim = wound.centre + rng.uniform(0.0, AIM_MM) * random_directions(1, rng)[0]

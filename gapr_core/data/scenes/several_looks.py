@@ -16,24 +16,21 @@ from numpy.typing import NDArray
 
 from gapr_core.data.pair import TARGET_POINTS, Pair, place
 from gapr_core.data.scenes import joint
-from gapr_core.data.scenes.camera import View, looking_at, see, seen_in_depth
+from gapr_core.data.scenes.camera import View, see, seen_in_depth
 from gapr_core.data.scenes.errors import seen_by_a_poor_camera, seen_in_stereo, under_layers
 from gapr_core.data.scenes.scene import (
-    AIM_MM,
-    DISTANCE_MM,
     MOST_POINTS,
     TRIES,
     Errors,
     SceneLevel,
     Setting,
     arrange,
+    camera_off,
     first_view,
 )
-from gapr_core.data.scenes.wound import Wound
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.geometry.sampling import random_directions
 
 Array = NDArray[np.float64]
 
@@ -121,13 +118,8 @@ def _from(setting: Setting, around: float, radius: float, rng: np.random.Generat
 
 
 def _seen_from(setting: Setting, around: float, radius: float, rng: np.random.Generator) -> View:
-    wound: Wound = setting.wound
-    off = np.radians(rng.uniform(*OFF_DEG))
-    direction = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])
-    position = wound.at(rng.uniform(*DISTANCE_MM) * direction)
-    aim = wound.centre + rng.uniform(0.0, AIM_MM) * random_directions(1, rng)[0]
-    view = see(setting.parts, looking_at(aim, position, rng.uniform(0.0, 2.0 * np.pi)))
-    inside = np.flatnonzero(np.linalg.norm(view.points - wound.centre, axis=1) <= radius)
+    view = see(setting.parts, camera_off(setting.wound, np.radians(rng.uniform(*OFF_DEG)), around, rng))
+    inside = np.flatnonzero(np.linalg.norm(view.points - setting.wound.centre, axis=1) <= radius)
     return view.of(rng.permutation(inside)[:MOST_POINTS])
 
 

@@ -226,10 +226,12 @@ def looking(
 
     thread = Thread(target=look, daemon=True)
     thread.start()
-    yield clients
-    time.sleep(2 * LOOK_S)
-    ended.set()
-    thread.join()
+    try:
+        yield clients
+        time.sleep(2 * LOOK_S)
+    finally:
+        ended.set()
+        thread.join()
 
 
 def new_lines(path: Path, place: int) -> tuple[int, int]:

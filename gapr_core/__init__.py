@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gapr_core.registration.registrar import Registrar
     from gapr_core.registration.target import PreparedTarget
     from gapr_core.registration.tracking import Tracker
-    from gapr_core.results import RegistrationResult, RegistrationStatus
+    from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
     from gapr_core.surface import Surface
 
 __version__ = "0.2.0"
@@ -37,6 +37,7 @@ _HOMES = {
     "PreparedTarget": "registration.target",
     "RegistrationResult": "results",
     "RegistrationStatus": "results",
+    "LookFit": "results",
     "Surface": "surface",
     "load": "clouds",
     "check_points": "registration.check_points",

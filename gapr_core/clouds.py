@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import columns, reading
@@ -93,7 +93,12 @@ def _checked(surface: Surface) -> Surface:
 def finite_points(array: ArrayLike) -> Array:
     """The rows of an (N, 3) array that can be points: finite, and none beyond 1e12; may be empty."""
     points = as_points(array)
-    return points[(np.abs(points) < BEYOND).all(axis=1)]
+    return points[is_point(points)]
+
+
+def is_point(rows: Array) -> NDArray[np.bool_]:
+    """(N,) which rows of an (N, 3) array can be points: finite, and none beyond 1e12."""
+    return np.asarray((np.abs(rows) < BEYOND).all(axis=1))
 
 
 def check_extent(extent_mm: float, unit: str, name: str, how: str = CONVERT) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,6 +135,31 @@ class Guidance:
         )
 
 
+class LookFit(str, Enum):
+    """How one look of a camera fits the pose that all its looks have in common."""
+
+    FITS = "FITS"
+    APART = "APART"  # it shows the bone elsewhere, or looks through it where the others have it
+    BLIND = "BLIND"  # it could hardly show the bone there: something was in the way, or the bone is far
+    TOO_SMALL = "TOO_SMALL"  # too few points
+    NOT_ASKED = "NOT_ASKED"  # the pose was refused for another reason
+
+    def __str__(self) -> str:
+        return self.value
+
+
+class LookAnswer(NamedTuple):
+    """What a registration says of one look.
+
+    Attributes:
+        viewpoint: (3,) mm, source frame: where the camera was.
+        fit: how the look fits the pose.
+    """
+
+    viewpoint: Array
+    fit: LookFit
+
+
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
     """The answer to one `register` call.
@@ -147,7 +173,7 @@ class RegistrationResult:
             refused pose.
         tre_mm: expected target registration error, root mean square over the target's points; None unless `OK`.
         tre95_mm: its 95 % bound, mm; None unless `OK`.
-        factor95: that the bound of `covariance` is taken times, since 95 % of errors of known size stay below it then.
+        factor95: the bound from `covariance` is multiplied by it, so that 95 % of errors of known size stay below.
         inlier_ratio: share of the source points that the best hypothesis explains, 0 to 1.
         hypotheses: distinct refined poses, best first; on refusals too, to look at, not to use.
         guidance: where on the target another look would help most; None unless `RegistrarConfig.guide` asks for it.
@@ -163,8 +189,8 @@ class RegistrationResult:
         residuals: of every used point under the best hypothesis; None where a method does not say.
         inferred_viewpoint: (3,) mm, source frame: where the camera is taken to be, as its cloud gave no pose as bone
             alone and nobody said it; None where it was given or is not needed.
-        looks_apart: (K, 3) mm, source frame: from where a camera saw the bone elsewhere than in its other looks, or
-            nothing of it; None where all fit. A pose stands where a few saw nothing.
+        looks: of a camera's several looks, how each fits the pose; () of one. A pose can be accepted although fewer
+            than half of them saw nothing of the bone.
     """
 
     status: RegistrationStatus
@@ -187,7 +213,7 @@ class RegistrationResult:
     residuals: Residuals | None = None
     inferred_viewpoint: Array | None = None
     factor95: float = 1.0
-    looks_apart: Array | None = None
+    looks: tuple[LookAnswer, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):

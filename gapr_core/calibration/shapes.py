@@ -12,6 +12,7 @@ from gapr_core.data.pair import Pair
 from gapr_core.data.scenes.things import BOX_FACES
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
+from gapr_core.geometry.sampling import log_uniform
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ def box_pair(seed: int) -> Pair:
     if rng.random() < 0.5:
         box = replace(box, surface=scans.drawn(rng)(box.surface))
     noise_mm, bias_mm, outliers = rng.uniform(0.05, 1.0), rng.uniform(0.0, 1.0) * (rng.random() < 0.5), 0.0
-    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.02, 0.4), (300.0, 4000.0)))
+    share, points = (log_uniform(limits, rng) for limits in ((0.02, 0.4), (300.0, 4000.0)))
     level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
     pair = protocols.one_sided(box, rng, level)
     return replace(pair, T_target_source=np.full((4, 4), np.nan), name=f"box-{seed}", protocol="box", bone="none")

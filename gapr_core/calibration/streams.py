@@ -17,6 +17,7 @@ from gapr_core.calibration.pairs import Task
 from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.stream import Motion, simulate
+from gapr_core.geometry.sampling import log_uniform
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
 from gapr_core.registration.features import STREAM, STREAM_FEATURES
@@ -68,7 +69,7 @@ def draw_stream(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
     motion = Motion(
         frames=FRAMES,
         share=rng.uniform(0.08, 0.35),
-        points=round(np.exp(rng.uniform(*np.log((400, 3000))))),
+        points=round(log_uniform((400, 3000), rng)),
         noise_mm=rng.uniform(0.3, 1.6),
         bias_mm=rng.uniform(0.0, BIASES[family][kind]),
         outlier_share=rng.uniform(0.0, 0.2),

@@ -12,6 +12,7 @@ from gapr_core.data import protocols
 from gapr_core.data.pair import TARGET_POINTS, Pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import sampling
+from gapr_core.geometry.sampling import log_uniform
 
 VOXELS_MM = (4.0, 12.0)  # edges of the grid that thins a cloud
 DENSE = 20000  # points before that
@@ -19,7 +20,7 @@ DENSE = 20000  # points before that
 
 def patch_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
     """A one-sided view of 1 to 12 % of the bone, of few points."""
-    share, points = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ((0.01, 0.12), (60.0, 1500.0)))
+    share, points = (log_uniform(limits, rng) for limits in ((0.01, 0.12), (60.0, 1500.0)))
     noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
     level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
     return protocols.one_sided(specimen, rng, level)

@@ -198,3 +198,8 @@ def random_directions(count: int, rng: np.random.Generator) -> Array:
     """(count, 3) unit vectors, uniform on the sphere."""
     vectors = rng.normal(size=(count, 3))
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def log_uniform(limits: tuple[float, float], rng: np.random.Generator) -> float:
+    """A number between two limits above 0 whose logarithm is uniform."""
+    return float(np.exp(rng.uniform(*np.log(limits))))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logit
 
-from gapr_core.clouds import EXTENT_LIMITS_MM, check_extent, finite_points
-from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.clouds import finite_points
+from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
 from gapr_core.registration import precision, rigidity
+from gapr_core.registration.far_away import FarInARow
 from gapr_core.registration.limits import too_unsure, why_no_surer
 from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
@@ -26,7 +26,6 @@ from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
 FEWEST_IN_TIME = 6  # sources that show a motion, as it is refused
@@ -63,6 +62,7 @@ class Accumulator:
         self.method, self.most = _of_many_places(method), most
         self.config = self.method.config
         self._target: PreparedTarget | None = None
+        self._far_away = FarInARow(self.config.accumulation.most_off, "source")
         self.reset()
 
     @property
@@ -81,7 +81,7 @@ class Accumulator:
         self._small: list[Array] = []  # the newest of few points, which are looked at together
         self._off_in_a_row: list[Array] = []  # off the bone under an accepted pose, and left out
         self._accepted: RegistrationResult | None = None  # the last answer that was
-        self._far_in_a_row = 0  # how many sources were metres away from the others
+        self._far_away.reset()
         if isinstance(self.method, Tracker):
             self.method.reset()
 
@@ -98,24 +98,10 @@ class Accumulator:
         points = points[sampling.thin(points, self.config.accumulation.most_points)]
         if not len(points):
             return
-        if (extent_mm := Surface(points).extent_mm) > EXTENT_LIMITS_MM[1]:
-            check_extent(extent_mm, "mm", "the source")
-        apart_mm = Surface(np.concatenate([self.collected, points])).extent_mm
-        if apart_mm > EXTENT_LIMITS_MM[1]:
-            self._leave_out(f"one that makes them {apart_mm:.0f} mm across")
-        self._far_in_a_row = 0
+        if self._far_away.restarts_with(points, self.collected):
+            self.reset()
         if not _was_sent(points, self._kept + self._new):
             self._new = [*self._new, points][-self.most :]
-
-    def _leave_out(self, given: str) -> None:
-        """Raise for a source metres away from the others; with the last of `most_off` in a row, forget the others."""
-        self._far_in_a_row += 1
-        most_off = self.config.accumulation.most_off
-        if self._far_in_a_row < most_off:
-            how = f"look at the transforms; {most_off} in a row restart the collection"
-            raise InvalidPointCloudError("a source near the others, in one frame", given, how)
-        log.warning("%d sources in a row are metres away from the others: the collection restarts", most_off)
-        self.reset()
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target; see `Registrar.prepare`."""
@@ -143,10 +129,11 @@ class Accumulator:
             raise ConfigError("collected sources without a viewpoint", "one viewpoint for all of them", how)
         if isinstance(self.method, Registrar | Tracker):  # others have targets of their own
             check_call(target, initial)
+        points = finite_points(source)
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target
-        if not len(finite_points(source)):
+        if not len(points):
             return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason="the source has no finite point")
         kept, before = self._kept, self._new
         self.collect(source)

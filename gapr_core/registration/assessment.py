@@ -34,7 +34,7 @@ from gapr_core.registration.refinement import Fit
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
-from gapr_core.results import Hypothesis, Refusal, RegistrationResult, RegistrationStatus, Residuals
+from gapr_core.results import Hypothesis, LookAnswer, Refusal, RegistrationResult, RegistrationStatus, Residuals
 
 Array = NDArray[np.float64]
 
@@ -55,17 +55,16 @@ class Assessment:
         rounds: how many were asked.
         seen: the whole cloud, where `source` is only the part of it that the pose explains; else None.
         members: (N,) mask of that part in `seen`; None with it.
-        viewpoint: (3,) mm, source frame: where `seen` was seen from; None with it.
+        viewpoint: (3,) mm, source frame: where `seen` was seen from, of several places their mean; None with it.
         look: (N,) of several looks, which one each point of `source` is of; else None.
-        inferred_viewpoint: the same, where nobody gave it; else None.
+        inferred_viewpoint: (3,) mm, source frame: `viewpoint`, where nobody gave it; else None.
         contributions: log odds that each feature adds to the probability's.
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
         most: no surer than this, in a stream neither: no such source was calibrated.
         deformed: sizes, mm, of what the points show besides one rigid piece of bone (`rigidity`, `doubles`), the surest
             first.
-        looks_apart: (K, 3) mm, source frame: from where a camera saw what does not fit its other looks, or nothing of
-            the bone (`apart`).
+        looks: of several looks, what the pose says of each (`look_agreement`); else ().
     """
 
     fit: Fit
@@ -88,7 +87,7 @@ class Assessment:
     independent_points: float = RulesConfig.independent_points
     most: float = 1.0
     deformed: Mapping[str, float] = field(default_factory=dict)
-    looks_apart: Array = field(default_factory=lambda: np.empty((0, 3)))
+    looks: tuple[LookAnswer, ...] = ()
 
     @property
     def centre_mm(self) -> Array:
@@ -229,7 +228,7 @@ def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResul
         contributions=a.contributions,
         residuals=a.residuals,
         inferred_viewpoint=a.inferred_viewpoint,
-        looks_apart=a.looks_apart if len(a.looks_apart) else None,
+        looks=a.looks,
     )
     if refusal is not None:
         return replace(common, status=refusal.status, reason=refusal.reason)

@@ -21,9 +21,9 @@ from gapr_core.geometry import one_view, sampling
 from gapr_core.registration.clutter_kernels import refine_agreeing
 from gapr_core.registration.free_space import Visible
 from gapr_core.registration.kernels import distinct
-from gapr_core.registration.looks import Scene
 from gapr_core.registration.proposals import regions
 from gapr_core.registration.proposals.regions import Region
+from gapr_core.registration.scene import Scene
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates, markers, support

@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration import clutter, covariance, doubles, kernels, rigidity
-from gapr_core.registration.apart import look_fits, refusal_of
+from gapr_core.registration import clutter, covariance, doubles, kernels, look_agreement, rigidity
 from gapr_core.registration.assessment import Assessment, judge
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.features import SCENE_FEATURES, of_the_fit
 from gapr_core.registration.free_space import Visible
-from gapr_core.registration.looks import Scene
 from gapr_core.registration.refinement import Fit, refine_fully
+from gapr_core.registration.scene import Scene
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.verification import Candidates
@@ -90,13 +89,7 @@ def assess_part(
     uncertainty = rigidity.allowing_for_looks(uncertainty, fit, look, config)
     features = measure(explained, candidates, uncertainty, scene, target, config)
     judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
-    seen = replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint, look=look)
-    if not seen.reaches(config.worth_checking):
-        return seen  # a pose that is refused anyway says nothing about the looks
-    found = look_fits(fit.T, scene, target, config)
-    places = np.concatenate([scene.viewpoints[found.apart | found.blind], scene.left_out])
-    refusal = refusal_of(places) if found.is_refused else None
-    return replace(seen, looks_apart=places).with_refusal(refusal, config.rules)
+    return replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint, look=look)
 
 
 def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
@@ -111,7 +104,7 @@ def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment
     if (
         believed
         or doubles.is_in_two_poses(assessment)
-        or (len(assessment.looks_apart) and assessment.refusal is not None)
+        or look_agreement.is_refused(assessment)
         or not (in_scene or len(source.points) >= config.source.dense_points)
     ):
         return assessment

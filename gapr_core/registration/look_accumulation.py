@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,13 @@ from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration import inputs
-from gapr_core.registration.looks import HOW, MOST_PLACES, Look
+from gapr_core.registration.far_away import FarInARow
 from gapr_core.registration.registrar import Registrar, check_call
+from gapr_core.registration.scene import HOW, MOST_PLACES, Look, Places
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
+from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
@@ -25,9 +29,18 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 STUCK = 10  # refusals in a row from one direction; what the looks before show may be gone
-NOT_SEEN = "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
-DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
-APART_MM = 1e-6  # between the places of two looks, so that those of a camera at rest stay two
+
+
+class Newest(Enum):
+    """What the newest look says of the pose of all."""
+
+    AGREES = ""
+    IS_REFUSED = "with the others it gives no pose"
+    SHOWS_NOTHING = (
+        "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
+    )
+    IS_APART = "it shows the bone elsewhere"
+    DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
 
 
 class LookAccumulator:
@@ -36,10 +49,12 @@ class LookAccumulator:
     A single image of a wound shows little of the bone, with one set of errors. A few from places some ten degrees apart
     show more of it and of what hid it. All must be in one frame in which the bone rests, such as that of a reference
     fixed to it, and the camera's place must be known for each. A look takes the place of one from nearly the same
-    direction, so that those of a video do not push out all others. A look that does not fit the others (`looks_apart`)
-    is left out, and refused if it is the newest; so is a newest one that alone has another pose. After three of them in
-    a row the bone or its reference has moved, and only these three are kept, whatever their directions; after `STUCK`
-    refusals without a look from elsewhere, or looks that show nothing, the last one alone.
+    direction, so that those of a video do not push out all others.
+
+    An older look that shows the bone elsewhere than the newest is left out, and the others are asked again. The newest
+    is refused where it does not fit the others, shows nothing of the bone there, or alone has another pose. After three
+    that show the bone elsewhere in a row it or its reference has moved, and only these three are kept, whatever their
+    directions. After ten refusals from one direction only the last look is kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
@@ -64,6 +79,7 @@ class LookAccumulator:
         self.method = method.sharing_points() if isinstance(method, Tracker) else method
         self.most, self.apart_deg, self.config = most, apart_deg, method.config
         self._target: PreparedTarget | None = None
+        self._far_away = FarInARow(self.config.accumulation.most_off, "look")
         self.reset()
 
     @property
@@ -71,38 +87,35 @@ class LookAccumulator:
         """(N, 3) all points that are kept, mm."""
         return _together(self._looks)
 
-    def together_with(self, source: ArrayLike) -> Array:
-        """(N, 3) mm, what `register` would register with a source (n, 3) from a new place: those kept, and itself."""
-        newest = Look(np.asarray(source, dtype=np.float64), np.zeros(3))
-        return _together([*self._looks, newest][-self.most :])
+    def together_with(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> Array:
+        """(N, 3) mm, what `register` would register with a look: those kept, and itself; as `collect`."""
+        newest = _look(source, viewpoint)
+        return _together(self._with(newest) if self._is_enough(newest) else self._looks)
 
     def reset(self) -> None:
         """Forget all looks, and the track of a `Tracker`."""
         self._looks: list[Look] = []
-        self._apart_in_a_row: list[Look] = []  # newest ones that did not fit those before
-        self._refused_in_a_row = 0  # since a pose, or a look from another direction
+        self._off_in_a_row: list[Look] = []  # newest ones that show the bone elsewhere than those before
+        self._refused_in_a_row = 0  # from nearly one direction, since a pose
+        self._first_refused: Look | None = None  # of that row
+        self._far_away.reset()
         if isinstance(self.method, Tracker):
             self.method.reset()
 
     def collect(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> None:
         """Keep a look (N, 3), mm, and where its camera was (3,), without registering.
 
-        It takes the place of those from nearly the same direction; beyond `most` the oldest goes. An empty look changes
-        nothing.
+        It takes the place of those from nearly the same direction; beyond `most` the oldest goes. A look of fewer
+        points than a pose needs changes nothing. One that is metres away from the others is left out, and the third in
+        a row restarts the collection.
 
         Raises:
             ConfigError: no viewpoint.
-            InvalidPointCloudError: wrong shape or type.
+            InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
         """
-        if viewpoint is None:
-            raise ConfigError("where the camera was for each look", "none", HOW)
-        look = Look(finite_points(source), inputs.numbers(viewpoint, (3,), "viewpoint", HOW))
-        if not len(look.points):
-            return
-        others = [each for each in self._looks if _apart_deg(each, look) >= self.apart_deg]
-        if len(others) == len(self._looks):
-            self._refused_in_a_row = 0
-        self._looks = [*others, look][-self.most :]
+        newest = _look(source, viewpoint)
+        if self._is_enough(newest):
+            self._add(newest)
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Everything static about a target; see `Registrar.prepare`."""
@@ -118,53 +131,61 @@ class LookAccumulator:
     ) -> RegistrationResult:
         """As `Registrar.register`, of all looks that are kept, this one included.
 
-        Another target than before starts a new collection. A look without a finite point is refused: those before say
-        nothing about it. A look with which the others cannot be registered is not kept.
+        Another target than before starts a new collection. A look of fewer points than a pose needs is refused: those
+        before say nothing about it. A look with which the others cannot be registered is not kept.
 
         Raises:
             ConfigError, InvalidPointCloudError: as `collect` and `Registrar.register`.
         """
         check_call(target, initial)
+        newest = _look(source, viewpoint)
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target
-        if not len(finite_points(source)):
-            return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason="the look has no finite point")
-        before = self._looks
-        self.collect(source, viewpoint)
-        places = self._places()
-        of_points = np.repeat(places, [len(look.points) for look in self._looks], axis=0)
+        if not self._is_enough(newest):
+            reason = f"the look has {len(newest.points)} finite points, a pose needs {self.config.source.fewest_points}"
+            return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=reason, method=self.name)
+        before = self._add(newest)
         try:
-            result = replace(self.method.register(self.collected, target, initial, of_points), method=self.name)
+            result = self._of_those_that_fit(target, initial)
         except Exception:
             self._looks = before
             raise
-        apart = np.zeros(len(places), dtype=bool)
-        if result.looks_apart is not None:
-            apart = (places[:, None] == result.looks_apart).all(axis=2).any(axis=1)
-        if result.ok:
-            return self._unless_newest_differs(result, target, before, is_blind=bool(apart[-1]))
-        if apart[-1]:
-            return self._refused(result, result.reason + self._leave_out_newest(before))
-        self._apart_in_a_row = []
-        if apart.any():
-            self._looks = [look for look, off in zip(self._looks, apart, strict=True) if not off]
-            return replace(result, reason=f"{result.reason}; left out from now on")
-        return replace(result, reason=result.reason + self._count_refusal())
+        clock = Clock()
+        said = self._of_newest(result, target)
+        clock.lap("compare")
+        found = replace(result, stage_ms=_added(result.stage_ms, clock.stages))
+        if said in (Newest.SHOWS_NOTHING, Newest.DIFFERS):
+            found = self._refused(found, said.value)
+        return found if found.ok else replace(found, reason=found.reason + self._after_refusal(said, newest, before))
 
-    def _unless_newest_differs(
-        self, result: RegistrationResult, target: PreparedTarget, before: list[Look], is_blind: bool
-    ) -> RegistrationResult:
-        """The pose of all looks; refused where the newest shows nothing of the bone there, or alone another pose."""
-        if is_blind:
-            reason = NOT_SEEN + self._count_refusal()
-            if self._refused_in_a_row:  # else it is the only one that is left
-                self._looks = before
-            return self._refused(result, reason)
+    def _of_those_that_fit(self, target: PreparedTarget, initial: ArrayLike | None) -> RegistrationResult:
+        """The answer to all looks; without older ones that show the bone elsewhere than the newest and the others."""
+        stage_ms: dict[str, float] = {}
+        while True:
+            result = self.method.register(self.collected, target, initial, Places.of(self._looks))
+            stage_ms = _added(stage_ms, result.stage_ms)
+            fits = [look.fit for look in result.looks] or [LookFit.FITS] * len(self._looks)
+            kept = [look for look, fit in zip(self._looks, fits, strict=True) if fit is not LookFit.APART]
+            if fits[-1] is LookFit.APART or len(kept) == len(self._looks):
+                return replace(result, method=self.name, stage_ms=stage_ms)
+            log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(kept))
+            self._looks = kept
+
+    def _of_newest(self, result: RegistrationResult, target: PreparedTarget) -> Newest:
+        """What the newest look says of the answer to all; a pose that it agrees with ends what is counted."""
+        fit = result.looks[-1].fit if result.looks else LookFit.FITS
+        may_be_there = result.status in (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)
+        if fit is LookFit.APART:
+            return Newest.IS_APART
+        if fit is LookFit.TOO_SMALL or (fit is LookFit.BLIND and may_be_there):
+            return Newest.SHOWS_NOTHING
+        if not result.ok:
+            return Newest.IS_REFUSED
         if self._differs(self._looks[-1], result, target):
-            return self._refused(result, DIFFERS + self._leave_out_newest(before))
-        self._apart_in_a_row, self._refused_in_a_row = [], 0
-        return result
+            return Newest.DIFFERS
+        self._off_in_a_row, self._refused_in_a_row = [], 0
+        return Newest.AGREES
 
     def _differs(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> bool:
         """True where the newest look alone has a pose that is not right if that of all is."""
@@ -181,32 +202,70 @@ class LookAccumulator:
         refused = result.refused(RegistrationStatus.AMBIGUOUS, reason)
         return replace(refused, confidence=min(result.confidence, self.config.rules.ruled_out))
 
-    def _places(self) -> Array:
-        """(K, 3) mm, where the camera was for each look; no two are the same."""
-        places = np.reshape([look.viewpoint for look in self._looks], (-1, 3))
-        return places + APART_MM * np.outer(np.arange(len(places)), np.eye(3)[0])
+    def _after_refusal(self, said: Newest, newest: Look, before: list[Look]) -> str:
+        """Decide which looks stay after a refusal. Returns how that is said, after the reason.
 
-    def _count_refusal(self) -> str:
-        """Keep the last look alone where the camera rests and nothing is found. Returns what is said of it."""
-        self._refused_in_a_row += 1
-        if self._refused_in_a_row < STUCK or len(self._looks) < 2:
-            return ""
-        last = self._looks[-1:]
-        self.reset()
-        self._looks = last
-        return f"; {STUCK} refusals in a row: the collection restarts with the last look"
-
-    def _leave_out_newest(self, before: list[Look]) -> str:
-        """Go back to the looks before; with the last of `most_off` in a row, to those. Returns what is said of it."""
-        self._apart_in_a_row = [*self._apart_in_a_row, self._looks[-1]]
-        if len(self._apart_in_a_row) < self.config.accumulation.most_off:
+        Args:
+            said: what the newest look says.
+            newest: the look; among those kept so far.
+            before: the looks before it.
+        """
+        if said in (Newest.IS_APART, Newest.DIFFERS):
+            self._off_in_a_row = [*self._off_in_a_row, newest]
+            if len(self._off_in_a_row) >= self.config.accumulation.most_off:
+                moved = self._off_in_a_row
+                self._restart_with(moved)
+                return f"; {len(moved)} in a row: the collection restarts with them"
             self._looks = before
             return "; left out"
-        moved = self._apart_in_a_row
-        log.warning("%d looks in a row do not fit those before: the collection restarts with them", len(moved))
+        if said is Newest.IS_REFUSED:
+            self._off_in_a_row = []
+        else:
+            self._looks = before
+        if self._is_stuck(newest) and self._looks and self._looks != [newest]:
+            self._restart_with([newest])
+            return f"; {STUCK} refusals in a row: the collection restarts with the last look"
+        return "; left out" if said is Newest.SHOWS_NOTHING else ""
+
+    def _is_stuck(self, newest: Look) -> bool:
+        """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""
+        first = self._first_refused
+        if first is None or not self._refused_in_a_row or _apart_deg(first, newest) >= self.apart_deg:
+            self._refused_in_a_row, self._first_refused = 0, newest
+        self._refused_in_a_row += 1
+        return self._refused_in_a_row >= STUCK
+
+    def _restart_with(self, looks: list[Look]) -> None:
+        log.warning("the collection of looks restarts with the last %d", len(looks))
         self.reset()
-        self._looks = moved[-self.most :]
-        return f"; {len(moved)} in a row: the collection restarts with them"
+        self._looks = looks[-self.most :]
+
+    def _is_enough(self, look: Look) -> bool:
+        """Whether a look may have a pose at all; fewer points say nothing of it."""
+        return len(look.points) >= self.config.source.fewest_points
+
+    def _add(self, newest: Look) -> list[Look]:
+        """Keep a look. Returns those before it; none where the collection restarts with it."""
+        if self._far_away.restarts_with(newest.points, self.collected):
+            self.reset()
+        before, self._looks = self._looks, self._with(newest)
+        return before
+
+    def _with(self, newest: Look) -> list[Look]:
+        """The looks that are kept, those from nearly the direction of the newest replaced by it."""
+        others = [each for each in self._looks if _apart_deg(each, newest) >= self.apart_deg]
+        return [*others, newest][-self.most :]
+
+
+def _look(source: ArrayLike, viewpoint: ArrayLike | None) -> Look:
+    if viewpoint is None:
+        raise ConfigError("where the camera was for each look", "none", HOW)
+    return Look(finite_points(source), inputs.numbers(viewpoint, (3,), "viewpoint", HOW))
+
+
+def _added(stage_ms: Mapping[str, float], more_ms: Mapping[str, float]) -> dict[str, float]:
+    """Times of stages, ms, and of those that came after them."""
+    return {stage: stage_ms.get(stage, 0.0) + more_ms.get(stage, 0.0) for stage in [*stage_ms, *more_ms]}
 
 
 def _together(looks: list[Look]) -> Array:
@@ -214,7 +273,17 @@ def _together(looks: list[Look]) -> Array:
 
 
 def _apart_deg(first: Look, second: Look) -> float:
-    """Angle between the directions in which the cameras of two looks are, each from the middle of what it saw."""
-    ahead = [look.viewpoint - look.points.mean(axis=0) for look in (first, second)]
-    a, b = (each / max(float(np.linalg.norm(each)), 1e-9) for each in ahead)
+    """How different two looks are: the larger of two angles.
+
+    That between their cameras, seen from the middle of what both show; and that between what they show, seen from the
+    middle of both cameras.
+    """
+    cameras = np.stack([first.viewpoint, second.viewpoint])
+    shown = np.stack([first.points.mean(axis=0), second.points.mean(axis=0)])
+    return max(_angle_deg(cameras - shown.mean(axis=0)), _angle_deg(shown - cameras.mean(axis=0)))
+
+
+def _angle_deg(pair: Array) -> float:
+    """Between two directions (2, 3) of any length."""
+    a, b = pair / np.maximum(np.linalg.norm(pair, axis=1, keepdims=True), 1e-9)
     return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))

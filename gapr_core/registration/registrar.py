@@ -27,18 +27,19 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
-from gapr_core.registration import checks, clutter, cortices, doubles, explained, inputs, limits, looks, rules
+from gapr_core.registration import checks, clutter, cortices, doubles, explained, inputs, limits, look_agreement, rules
+from gapr_core.registration import scene as scenes
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.assessment import Assessment, answer, assess_fit
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.guidance import guide
-from gapr_core.registration.looks import Look, Scene
 from gapr_core.registration.precision_model import Precision
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.refinement import refine_fully, rest_on_whole
 from gapr_core.registration.rigidity import allowing_for_deformation
+from gapr_core.registration.scene import Look, Scene, Viewpoint
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
@@ -151,7 +152,7 @@ class Registrar:
         source: ArrayLike,
         target: PreparedTarget,
         initial: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
+        viewpoint: Viewpoint | None = None,
     ) -> RegistrationResult:
         """The pose of a source on the target, or a refusal.
 
@@ -159,14 +160,15 @@ class Registrar:
             source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
-            viewpoint: (3,) mm, source frame: where the camera was, if there was one. Without it the cloud is registered
-                as bone; where the probability or the geometry of that pose is against it, as what a camera saw
+            viewpoint: (3,) mm, source frame: where the camera was, if there was one; (N, 3) where it was for each
+                point, of a camera that moved in a frame in which the bone rests. Without it the cloud is registered as
+                bone; where the probability or the geometry of that pose is against it, as what a camera saw
                 (`ClutterConfig.infer_viewpoint`).
 
         Raises:
             InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; a target
-                that is not prepared; an `initial` that is no rigid pose; a `viewpoint` that is no point, or that
-                sees nothing of the cloud.
+                that is not prepared; an `initial` that is no rigid pose; a `viewpoint` that is neither, or that sees
+                nothing of the cloud; more than 16 places.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
@@ -195,7 +197,7 @@ class Registrar:
         source: ArrayLike,
         target: PreparedTarget,
         initial: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
+        viewpoint: Viewpoint | None = None,
         clock: Clock | None = None,
         enough: Enough = never,
     ) -> Assessment | Refusal:
@@ -213,14 +215,14 @@ class Registrar:
         source: ArrayLike,
         target: PreparedTarget,
         start: Array,
-        viewpoint: ArrayLike | None,
+        viewpoint: Viewpoint | None,
         clock: Clock,
         enough: Enough = never,
     ) -> Assessment | Refusal:
         """`assess` with any number of poses to try as well: (K, 4, 4) T_target_source, mm, each rigid."""
         target = offset_surface(target, self.config.sensor)
         if viewpoint is not None:
-            return self._as_scene(looks.split(source, viewpoint), target, start, clock, enough)
+            return self._as_scene(scenes.split(source, viewpoint), target, start, clock, enough)
         prepared = sources.prepare(source, self.config.source, self.config.num_threads)
         clock.lap("prepare")
         if isinstance(prepared, Refusal):
@@ -241,12 +243,21 @@ class Registrar:
         self, seen: list[Look], target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | Refusal:
         """What a camera saw; the part that is bone has no size of its own, which the whole could be compared by."""
-        scene = looks.prepared(seen, self.config)
+        scene = scenes.prepared(seen, self.config)
         clock.lap("prepare")
         if isinstance(scene, Refusal):
             return rules.asking_the_unit(scene, np.concatenate([look.points for look in seen]), target.points)
         assessment = self._in_scene(scene, target, start, clock)
-        return NO_POSE if assessment is None else self._checked_and_corrected(assessment, clock, enough)
+        if assessment is None:
+            return NO_POSE
+
+        def alone(look: Scene) -> Assessment | None:
+            found = self._in_scene(look, target, NO_POSES, clock)
+            return None if found is None else self._checked_and_corrected(found, clock, never)
+
+        agreed = look_agreement.unless_apart(assessment, scene, target, alone, self.config)
+        clock.lap("assess")
+        return self._checked_and_corrected(agreed, clock, enough)
 
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
@@ -300,7 +311,7 @@ class Registrar:
         places = clutter.inferred_places(scene, config)
         clock.lap("prepare")
         for viewpoint, rounds in places:
-            found = self._in_scene(looks.scene_from([scene], viewpoint[None], config), target, poses, clock, rounds)
+            found = self._in_scene(scenes.scene_from(scene, viewpoint, config), target, poses, clock, rounds)
             if found is None or not found.reaches(config.accepted_if_inferred):
                 continue
             found = self._checked_and_corrected(replace(found, inferred_viewpoint=viewpoint), clock, never)

@@ -61,7 +61,7 @@ class Motion(NamedTuple):
 
 
 class Deformation(NamedTuple):
-    """What a source may have suffered against the bone.
+    """How a source may be deformed relative to the bone.
 
     Attributes:
         finding: what the residuals say of it.
@@ -105,7 +105,7 @@ def of_motion(fit: Fit, order: NDArray[np.int64], config: RigidityConfig) -> Mot
     best = int(np.argmax(ratios))
     if best == 0:
         return Motion(found[0])
-    # a step before the middle of a group speaks most for the group's first edge
+    # a step in the first half of a group is found at the edge before it
     at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()
     rests_from = int(np.ceil(order.min() + at * (order.max() - order.min())))
     return Motion(Finding(ratios[best], found[best].size_mm), rests_from)
@@ -126,7 +126,7 @@ def of_looks(fit: Fit, look: NDArray[np.int64], config: RigidityConfig) -> Defor
     moved, group = motions(fit), group.reshape(-1)
     changes = np.column_stack([np.where(group == k, 1.0, 0.0)[:, None] * moved for k in range(len(numbers))])
     (found,) = findings(blocks(fit, fit.jacobian[inlier], [changes], group, config), config)
-    return Deformation(found, changes, 0.0)
+    return Deformation(found, changes, 0.0)  # it refuses nothing and only widens the covariance: any sign of it counts
 
 
 def step_times(groups: int) -> Array:

@@ -19,7 +19,7 @@ Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neigh
 
 SPREAD_OUT = 512  # points that are spread evenly, before the others in any order
 TRUSTED_SHARE = 0.8  # of the points, those most in the middle of their neighbours: of them the spread-out ones are
-STRAY = 4.0  # a point so many times farther from the middle than most is looked at; at the end of a bar it is 2
+FAR_OUT = 4.0  # a point so many times farther from the middle than most is looked at; at the end of a bar it is 2
 CONTACT_MM = 1.0  # a pointer that is held still measures one contact again and again
 CROWD = 5, 5.0  # points that are kept of it: so many, or so many times those of a typical mm
 SMALLEST_MM = 1.0  # across: less is a cloud in metres, and not too short a piece
@@ -131,7 +131,7 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
 
     Not evenly spread: some stay so near to each other that what near residuals share is seen (`roughness`).
     """
-    is_clean = len(points) <= config.most_points and not _has_strays(points)
+    is_clean = len(points) <= config.most_points and not _has_outliers(points)
     whole = points if is_clean else without_isolated(points, config)
     if len(whole) > config.most_points:
         whole = whole[sampling.thin(whole, config.most_points)]
@@ -191,10 +191,10 @@ def without_isolated(points: Array, config: SourceConfig) -> Array:
     return points[_has_companions(cKDTree(some).query(points, k=config.companions + 1)[0][:, -1], config)]
 
 
-def _has_strays(points: Array) -> bool:
+def _has_outliers(points: Array) -> bool:
     """True where one of the points (N, 3) is so far from most that it would change the extent of the cloud."""
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    return bool(away.max() > STRAY * np.median(away))
+    return bool(away.max() > FAR_OUT * np.median(away))
 
 
 def _has_companions(gaps: Array, config: SourceConfig) -> NDArray[np.bool_]:

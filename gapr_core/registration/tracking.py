@@ -22,6 +22,7 @@ from gapr_core.registration.following import FollowedPose, Follower
 from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import Fingerprint, fingerprint
+from gapr_core.registration.scene import Viewpoint
 from gapr_core.registration.stream_misfit import NoMisfit, StreamMisfit
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import Refusal, RegistrationResult
@@ -148,7 +149,7 @@ class Tracker:
         source: ArrayLike,
         target: PreparedTarget,
         initial: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
+        viewpoint: Viewpoint | None = None,
     ) -> RegistrationResult:
         """As `Registrar.register`, for the next source in the same frame.
 
@@ -202,7 +203,7 @@ class Tracker:
         source: ArrayLike,
         target: PreparedTarget,
         initial: ArrayLike | None,
-        viewpoint: ArrayLike | None,
+        viewpoint: Viewpoint | None,
         clock: Clock,
     ) -> Assessment | Refusal:
         """Where the last pose was, or in full; a re-check and a camera's cloud try the last pose and its rivals too."""

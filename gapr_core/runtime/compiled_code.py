@@ -14,12 +14,12 @@ import tempfile
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
-BESIDE = Path(__file__).parent  # a folder with modules, as all of the package
+PACKAGE = Path(__file__).parent  # a folder with modules, as all of the package
 
 
 def find_a_place() -> None:
     """Give numba a temporary folder, for this process alone, where it has no other; say so once."""
-    if os.environ.get(VARIABLE) or _can_write(BESIDE / "__pycache__") or _can_write(_of_user()):
+    if os.environ.get(VARIABLE) or _can_write(PACKAGE / "__pycache__") or _can_write(_of_user()):
         return
     folder = tempfile.mkdtemp(prefix="gapr-compiled-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -28,7 +28,7 @@ def find_a_place() -> None:
         sys.modules["numba"].config.CACHE_DIR = folder
     logging.getLogger(__name__).warning(
         "compiled code can be kept neither in %s nor in %s: every start compiles for seconds; set %s to a folder that "
-        "can be written", BESIDE.parent, _of_user(), VARIABLE,
+        "can be written", PACKAGE.parent, _of_user(), VARIABLE,
     )  # fmt: skip
 
 

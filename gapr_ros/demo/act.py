@@ -138,7 +138,7 @@ def write_bag(act: Act, path: Path, storage: str) -> None:
         DemoError: something is there that no demo has written.
     """
     from gapr_ros.bags.writing import BagWriter
-    from gapr_ros.node import wire
+    from gapr_ros.node import units
 
     if path.exists():
         if not (path / OWN_BAG).is_file():
@@ -147,4 +147,4 @@ def write_bag(act: Act, path: Path, storage: str) -> None:
     with BagWriter(path, storage) as bag:
         (path / OWN_BAG).touch()
         for frame, cloud in enumerate(act.clouds):
-            bag.write_cloud("/points", wire.to_metres(cloud), act.frame_id, act.stamp_ms(frame) * 1_000_000)
+            bag.write_cloud("/points", units.to_metres(cloud), act.frame_id, act.stamp_ms(frame) * 1_000_000)

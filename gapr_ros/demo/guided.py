@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core import metrics
-from gapr_core.data.looks import LookingProbe
+from gapr_core.data.looking_probe import LookingProbe
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.geometry import se3
 from gapr_core.pages.guidance import GuidedStep, guidance_figure

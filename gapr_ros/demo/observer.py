@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from gapr_ros.node import timeline, wire
+from gapr_ros.node import timeline, units
 from msg_adapters import cloud_to_field, cloud_to_xyz, pose_to_matrix
 
 Array = NDArray[np.float64]
@@ -138,19 +138,19 @@ class Observer(Node):
             answer.T_target_source, answer.used = self._poses.get(stamp), self._used.get(stamp)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._poses[_ms(timeline.stamp_ns(message.header))] = wire.core_pose(pose_to_matrix(message))
+        self._poses[_ms(timeline.stamp_ns(message.header))] = units.core_pose(pose_to_matrix(message))
 
     def _on_residuals(self, message: PointCloud2) -> None:
-        points_mm = wire.to_mm(cloud_to_xyz(message, keep_nan=True), "m")
+        points_mm = units.to_mm(cloud_to_xyz(message, keep_nan=True), "m")
         used = Used(points_mm, cloud_to_field(message, "inlier").astype(bool))
         self._used[_ms(timeline.stamp_ns(message.header))] = used
 
     def _on_guidance(self, message: PointCloud2) -> None:
-        gain_mm = wire.to_mm(cloud_to_field(message, "intensity").astype(np.float64), "m")
-        self._gain = wire.to_mm(cloud_to_xyz(message, keep_nan=True), "m"), gain_mm
+        gain_mm = units.to_mm(cloud_to_field(message, "intensity").astype(np.float64), "m")
+        self._gain = units.to_mm(cloud_to_xyz(message, keep_nan=True), "m"), gain_mm
 
     def _on_next_view(self, message: PoseStamped) -> None:
-        self._centre = wire.to_mm(pose_to_matrix(message)[:3, 3], "m")
+        self._centre = units.to_mm(pose_to_matrix(message)[:3, 3], "m")
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {pair.key: pair.value for pair in message.values}
@@ -181,4 +181,4 @@ def _ms(stamp_ns: int) -> int:
 
 
 def _millimetres(metres: str) -> float | None:
-    return float(wire.to_mm(np.array(float(metres)), "m")) if metres else None
+    return float(units.to_mm(np.array(float(metres)), "m")) if metres else None

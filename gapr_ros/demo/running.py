@@ -123,12 +123,12 @@ class Sender:
         from rclpy.time import Time
         from std_msgs.msg import Header
 
-        from gapr_ros.node import wire
+        from gapr_ros.node import units
         from msg_adapters import xyz_to_cloud
 
         observer, stamp_ns = self._node.observer, stamp_ms * 1_000_000
         header = Header(frame_id=self._frame_id, stamp=Time(nanoseconds=stamp_ns).to_msg())
-        message = xyz_to_cloud(wire.to_metres(cloud_mm).astype("f4"), header)
+        message = xyz_to_cloud(units.to_metres(cloud_mm).astype("f4"), header)
         observer.note_sent("points", stamp_ns)
         self._publisher.publish(message)
         self._node.wait_for(lambda: stamp_ms in observer.answers)

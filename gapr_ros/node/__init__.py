@@ -6,7 +6,7 @@ The way of one cloud, from bytes to messages:
     session        owns all that lives from configure to cleanup, and hands the cloud on
     admission      judges its frame and its stamp (timeline), which its header says
     worker         holds the newest cloud until the thread that registers is free
-    registration   reads it (intake), looks frames up (frames), crops (region), follows or registers, converts (wire)
+    registration   reads it (intake), looks frames up (frames), crops (region), follows or registers, converts (units)
     outcome        what became of it: a pose, or a reason (refusal)
     course         decides whether the pose goes out: resets, limits, order of time, jumps (track)
     publishers     sends what became of it (messages), and to /tf (frames)

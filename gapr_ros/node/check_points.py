@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.errors import GaprError
 from gapr_core.results import PointCheck, Verdict
-from gapr_ros.node import timeline, wire
+from gapr_ros.node import timeline, units
 from gapr_ros.node.diagnostics import status_message
 from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.method import configured
@@ -57,7 +57,7 @@ def check(message: PoseArray, accepted: Outcome | None, ready: Ready, parameters
     if frame != wanted:
         raise NothingToCheckError(f"check points in '{frame}', the pose is in '{wanted}': publish them there")
     positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses]
-    points_mm = wire.to_mm(np.array(positions, dtype=np.float64).reshape(-1, 3), "m")
+    points_mm = units.to_mm(np.array(positions, dtype=np.float64).reshape(-1, 3), "m")
     if not np.isfinite(points_mm).all(axis=1).any():
         raise NothingToCheckError(NO_POINTS)
     try:
@@ -85,10 +85,10 @@ def status(
     largest_mm = float(np.abs(found.distance_mm).max())  # NaN where no surface is near
     values |= {
         "probability": found.probability,
-        "largest_distance": wire.to_metres(largest_mm),
-        "unseen": wire.to_metres(found.unseen_mm),
-        "tre95": wire.to_metres(found.tre95_mm),
-        "next_point": " ".join(f"{value:.4f}" for value in wire.to_metres(found.next_point)),
+        "largest_distance": units.to_metres(largest_mm),
+        "unseen": units.to_metres(found.unseen_mm),
+        "tre95": units.to_metres(found.tre95_mm),
+        "next_point": " ".join(f"{value:.4f}" for value in units.to_metres(found.next_point)),
     }
     values = {"verdict": str(found.verdict)} | values
     said = _said(message, found, age_s or 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.results import RegistrationResult
-from gapr_ros.node import timeline, wire
+from gapr_ros.node import timeline, units
 from gapr_ros.node.following import continues
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
@@ -86,7 +86,7 @@ class Course:
             return False
         header = outcome.header
         stands = continues(self.place, T_frame_model, header.frame_id, model, parameters)
-        return stands and self.timeline.is_next(T_frame_model, header, wire.to_metres(model.points_mm))
+        return stands and self.timeline.admit_shown(T_frame_model, header, units.to_metres(model.points_mm))
 
     def _check_limits(self, result: RegistrationResult, parameters: NodeParameters) -> None:
         """Limits may have been set while the cloud was on its way."""
@@ -97,7 +97,7 @@ class Course:
             raise
 
     def _judge(self, T_frame_model: Array, outcome: Outcome, model: Model, parameters: NodeParameters) -> None:
-        header, points_m = outcome.header, wire.to_metres(model.points_mm)
+        header, points_m = outcome.header, units.to_metres(model.points_mm)
         self.timeline.check_answer(T_frame_model, header, points_m)
         cloud = timeline.stamp_ns(header) or hash(outcome.job.cloud)  # while no clock runs
         if outcome.has_initial_pose:

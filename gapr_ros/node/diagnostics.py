@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from gapr_ros.node import timeline, wire
+from gapr_ros.node import timeline, units
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason
@@ -223,7 +223,7 @@ def _of_cloud(last: Outcome | None) -> dict[str, object]:
     if last is None:
         return dict.fromkeys(names, "")
     stamp = timeline.stamp_text(last.header)
-    camera_m = "" if last.seen_from is None else " ".join(f"{x:.3f}" for x in wire.to_metres(last.seen_from))
+    camera_m = "" if last.seen_from is None else " ".join(f"{x:.3f}" for x in units.to_metres(last.seen_from))
     values = (stamp, last.cloud_frame, last.points_in, last.points_used, last.age_s, last.confidence_out,
               last.tre_mm, last.tre95_mm, last.inlier_ratio, last.found_by, camera_m, last.exec_ms)  # fmt: skip
     return dict(zip(names, values, strict=True))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from gapr_ros.node.model import Model
 from gapr_ros.node.region import Place
 from gapr_ros.node.situation import Situation
@@ -42,7 +42,7 @@ def continues(place: Place | None, T_frame_model: Array, frame: str, model: Mode
     """Whether a pose (4, 4), metres, may be shown: the last assessed cloud had one in this frame, within the limits."""
     if place is None or place.frame != frame:
         return False
-    centre_m = wire.to_metres(model.points_mm).mean(axis=0)
+    centre_m = units.to_metres(model.points_mm).mean(axis=0)
     return not jump(place.T_frame_model, T_frame_model, centre_m, parameters)
 
 
@@ -51,4 +51,4 @@ def _followed(points_mm: Array, now: Situation) -> Array | None:
     found = None if follow is None else follow(points_mm, now.model.target)
     if found is None or not np.isfinite(found.T_target_source).all():
         return None
-    return wire.wire_pose(found.T_target_source)
+    return units.ros_pose(found.T_target_source)

@@ -105,7 +105,7 @@ class Frames:
 
         def is_ready() -> bool:
             is_known = buffer.can_transform(parent, child, stamp) and not heard.turned(parent, child)
-            return is_known and heard.is_settled(parent, child, stamp.nanoseconds, arrived_s)
+            return is_known and heard.is_final(parent, child, stamp.nanoseconds, arrived_s)
 
         while not is_ready() and time.monotonic() - start < timeout_s:
             time.sleep(POLL_S)

@@ -99,7 +99,7 @@ class Heard:
         self._needed |= frames
         return min((each for each in frames if each in self._back_ns), default="")
 
-    def is_settled(self, frame: str, other: str, stamp: int, arrived_s: float) -> bool:
+    def is_final(self, frame: str, other: str, stamp: int, arrived_s: float) -> bool:
         """False where a cloud has to wait for another transform, which shows what the last one meant.
 
         One that came late: whether time went back. One around whose stamp a frame jumped: whether it moves on.

@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 from gapr_core.clouds import EXTENT_LIMITS_MM, PLAUSIBLE, finite_points
 from gapr_core.geometry import pinhole
 from gapr_core.surface import Surface
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.region import Crop
 from gapr_ros.parameters import NodeParameters
@@ -70,7 +70,7 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
     Raises:
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
     """
-    whole = wire.to_mm(_finite_points(cloud, parameters.cloud_type), parameters.cloud_unit)
+    whole = units.to_mm(_finite_points(cloud, parameters.cloud_type), parameters.cloud_unit)
     points = in_range = _within_range(whole, parameters)
     for crop in crops:
         points = crop(points)
@@ -93,7 +93,7 @@ def seen_from(cloud: Any, parameters: NodeParameters) -> Array | None:
     kind = INPUTS[parameters.cloud_type]
     grid = kind.grid(cloud)
     centre = pinhole.camera_of(kind.points(cloud) if grid is None else grid)
-    return None if centre is None else wire.to_mm(centre, parameters.cloud_unit)
+    return None if centre is None else units.to_mm(centre, parameters.cloud_unit)
 
 
 def check_together(points_mm: Array, model_extent_mm: float, parameters: NodeParameters) -> None:
@@ -178,15 +178,15 @@ def _finite_points(cloud: Any, cloud_type: str) -> Array:
 def _within_range(points_mm: Array, parameters: NodeParameters) -> Array:
     if parameters.range_min <= 0.0 and parameters.range_max <= 0.0:
         return points_mm
-    distance_m = wire.to_metres(np.linalg.norm(points_mm, axis=1))
+    distance_m = units.to_metres(np.linalg.norm(points_mm, axis=1))
     farthest = parameters.range_max if parameters.range_max > 0.0 else np.inf
     return points_mm[(distance_m >= parameters.range_min) & (distance_m <= farthest)]
 
 
 def _looks_like(extent_mm: float, model_extent_mm: float, unit: str) -> str:
     """The other units in which the cloud would be a piece of the bone, else those in which it may be one; or ""."""
-    per_mm = extent_mm / wire.MM_PER_UNIT[unit] / model_extent_mm
-    shares = {name: per_mm * wire.MM_PER_UNIT[other] for other, name in UNIT_NAMES.items() if other != unit}
+    per_mm = extent_mm / units.MM_PER_UNIT[unit] / model_extent_mm
+    shares = {name: per_mm * units.MM_PER_UNIT[other] for other, name in UNIT_NAMES.items() if other != unit}
     low, high = PLAUSIBLE
     fitting = [name for name, share in shares.items() if low <= share <= high]
     return " or ".join(fitting or [name for name, share in shares.items() if LEAST_SHARE <= share <= MOST_SHARE])

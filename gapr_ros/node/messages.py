@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
 from gapr_core.results import Guidance, Residuals
-from gapr_ros.node import timeline, wire
+from gapr_ros.node import timeline, units
 from gapr_ros.node.diagnostics import status_message
 from gapr_ros.node.outcome import Outcome
 from msg_adapters import matrix_to_pose, xyz_to_cloud
@@ -47,7 +47,7 @@ def status(outcome: Outcome, name: str, hardware_id: str) -> DiagnosticStatus:
 def hypotheses(outcome: Outcome) -> PoseArray:
     """The poses that were compared and are not believed, best first: on a refusal all, else those behind the pose."""
     found = () if outcome.result is None else outcome.result.hypotheses
-    poses = [wire.wire_pose(each.T_target_source) for each in found[1 if outcome.ok else 0 :]]
+    poses = [units.ros_pose(each.T_target_source) for each in found[1 if outcome.ok else 0 :]]
     return PoseArray(header=outcome.header, poses=[matrix_to_pose(T) for T in poses])
 
 
@@ -57,22 +57,22 @@ def residuals(found: Residuals, header: Header) -> PointCloud2:
     The stand-off of the sensor is taken off.
     """
     fields = {
-        "distance": wire.to_metres(found.distance_mm).astype("f4"),
+        "distance": units.to_metres(found.distance_mm).astype("f4"),
         "inlier": found.inlier.astype("u1"),
     }
-    return xyz_to_cloud(wire.to_metres(found.points).astype("f4"), header, fields=fields)
+    return xyz_to_cloud(units.to_metres(found.points).astype("f4"), header, fields=fields)
 
 
 def guidance(found: Guidance, header: Header) -> PointCloud2:
     """The bone's points; intensity is by how much a look there would lower the bound of the error, m."""
-    gain = wire.to_metres(found.gain_mm).astype("f4")
-    return xyz_to_cloud(wire.to_metres(found.points).astype("f4"), header, fields={"intensity": gain})
+    gain = units.to_metres(found.gain_mm).astype("f4")
+    return xyz_to_cloud(units.to_metres(found.points).astype("f4"), header, fields={"intensity": gain})
 
 
 def next_view(found: Guidance, header: Header) -> PoseStamped:
     """The middle of the best patch; the x axis leaves the bone there: look from where it points."""
     best = found.patches[0]
-    T = se3.from_rotation_translation(_with_x(best.normal), wire.to_metres(best.centre))
+    T = se3.from_rotation_translation(_with_x(best.normal), units.to_metres(best.centre))
     return PoseStamped(header=header, pose=matrix_to_pose(T))
 
 
@@ -88,7 +88,7 @@ def detection(types: Any, outcome: Outcome, class_id: str, points_mm: Array) -> 
     message = types.Detection3DArray(header=outcome.header)
     if outcome.found is None:
         return message
-    low, high = wire.to_metres(points_mm.min(axis=0)), wire.to_metres(points_mm.max(axis=0))
+    low, high = units.to_metres(points_mm.min(axis=0)), units.to_metres(points_mm.max(axis=0))
     sole = types.ObjectHypothesisWithPose()
     sole.hypothesis.class_id, sole.hypothesis.score = class_id, outcome.confidence
     sole.pose.pose = matrix_to_pose(outcome.found.pose)
@@ -111,7 +111,7 @@ def vision_types() -> Any | None:
 
 
 def _metres(length_mm: float | None) -> float | None:
-    return None if length_mm is None else wire.to_metres(length_mm)
+    return None if length_mm is None else units.to_metres(length_mm)
 
 
 def _with_x(direction: Array) -> Array:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from gapr_core.errors import ConfigError
-from gapr_ros.node.wire import MM_PER_M
+from gapr_ros.node.units import MM_PER_M
 from gapr_ros.parameters import MOST_LOOKS, NodeParameters
 
 if TYPE_CHECKING:

@@ -42,7 +42,8 @@ class Outcome:
         found: where the bone is in the frame; None when refused.
         followed: (4, 4) T_frame_model, metres, of a cloud that was not assessed; it then has no pose and no reason.
         confidence: of the registration, 0 to 1, whatever was decided later.
-        points_in, points_used: of the message; given to registration, those of clouds that are registered with it too.
+        points_in: of the message.
+        points_used: given to registration, with those of the clouds that are registered with it.
         seen_from: (3,) mm, frame of the cloud: where its pixels say that the camera was, if they were asked and say.
         age_s: of the cloud when it was taken in hand; None while the clock does not run.
         tre_mm, tre95_mm, inlier_ratio: of the registration.
@@ -94,7 +95,7 @@ class Outcome:
         """Of a cloud that is not taken in at all."""
         return cls(job, header.frame_id, header, reason, text)
 
-    def tell(self) -> None:
+    def answer_waiters(self) -> None:
         """Give it to those who wait for it."""
         for waiter in self.job.waiters:
             waiter.set_result(self)

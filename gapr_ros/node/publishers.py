@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64, Header
 
 from gapr_core.geometry import se3
-from gapr_ros.node import messages, timeline, wire
+from gapr_ros.node import messages, timeline, units
 from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model
@@ -51,7 +51,7 @@ class Publishers:
     def send_model(self, model: Model) -> None:
         """The bone, latched, in its own frame."""
         header = self._of_model(Time())  # stamp 0: wherever the frame is now; tf2 has forgotten the start after 10 s
-        self._topics["model"].publish(xyz_to_cloud(wire.to_metres(model.points_mm).astype("f4"), header))
+        self._topics["model"].publish(xyz_to_cloud(units.to_metres(model.points_mm).astype("f4"), header))
 
     def send(self, outcome: Outcome, model: Model) -> None:
         """What became of a cloud, then its pose where it has one, then what there is to look at."""
@@ -109,7 +109,7 @@ class Publishers:
 
     def _send_aligned(self, found: Found, header: Header, model: Model) -> None:
         if self._is_heard("aligned"):
-            points = se3.apply(found.pose, wire.to_metres(model.points_mm))
+            points = se3.apply(found.pose, units.to_metres(model.points_mm))
             self._topics["aligned"].publish(xyz_to_cloud(points.astype("f4"), header))
 
     def _send_seen(self, outcome: Outcome) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core import crop_box, crop_to_pose
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from gapr_ros.node.model import Model
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
@@ -47,8 +47,8 @@ def box(parameters: NodeParameters, T_crop_cloud: Array) -> Crop:
             f"crop_min {list(parameters.crop_min)} is not below crop_max {list(parameters.crop_max)} along every axis"
         )
         raise RefusedError(Reason.TOO_FEW_POINTS, f"the box is empty: {corners}; correct them")
-    low, high = (wire.to_mm(np.asarray(corner), "m") for corner in (parameters.crop_min, parameters.crop_max))
-    return partial(crop_box, T_box_points=wire.in_mm(T_crop_cloud), lowest=low, highest=high)
+    low, high = (units.to_mm(np.asarray(corner), "m") for corner in (parameters.crop_min, parameters.crop_max))
+    return partial(crop_box, T_box_points=units.in_mm(T_crop_cloud), lowest=low, highest=high)
 
 
 def around(model: Model, T_cloud_model: Array, reach_m: float) -> Crop:
@@ -59,5 +59,5 @@ def around(model: Model, T_cloud_model: Array, reach_m: float) -> Crop:
         T_cloud_model: (4, 4), metres.
         reach_m: farther points go.
     """
-    T_target_source = wire.core_pose(T_cloud_model)
-    return partial(crop_to_pose, T_target_source=T_target_source, target=model, margin_mm=reach_m * wire.MM_PER_M)
+    T_target_source = units.core_pose(T_cloud_model)
+    return partial(crop_to_pose, T_target_source=T_target_source, target=model, margin_mm=reach_m * units.MM_PER_M)

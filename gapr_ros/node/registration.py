@@ -16,7 +16,7 @@ from gapr_core.baselines.base import takes
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.geometry import sampling, se3
 from gapr_core.results import RegistrationResult, confidence_text
-from gapr_ros.node import intake, region, timeline, wire
+from gapr_ros.node import intake, region, timeline, units
 from gapr_ros.node.collection import Late, forget
 from gapr_ros.node.following import Following
 from gapr_ros.node.frames import Frames
@@ -124,7 +124,7 @@ class Registration:
         crops = self._crops(T_frame_cloud, outcome, now)
         points_mm = intake.take_in(cloud, now.model.extent_mm, now.parameters, crops)
         outcome.seen_from = intake.seen_from(cloud, now.parameters) if takes(now.method, "viewpoint") else None
-        return wire.moved_mm(T_frame_cloud, points_mm)
+        return units.moved_mm(T_frame_cloud, points_mm)
 
     def _crops(self, T_frame_cloud: Array, outcome: Outcome, now: Situation) -> list[Crop]:
         """What the region of interest takes away, in the cloud's own frame."""
@@ -157,7 +157,7 @@ class Registration:
         """The pose as T_target_source, mm, the source being in the frame of the answer."""
         T_given_cloud = self._lookup(given.frame, outcome, now)
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
-        return wire.core_pose(T_frame_cloud @ se3.inverse(T_given_cloud) @ given.T_frame_model)
+        return units.core_pose(T_frame_cloud @ se3.inverse(T_given_cloud) @ given.T_frame_model)
 
     def _seen_from(self, outcome: Outcome, now: Situation) -> dict[str, Array]:
         """`viewpoint` for the method, where there is one."""
@@ -166,7 +166,7 @@ class Registration:
 
     def _check_together(self, points_mm: Array, outcome: Outcome, now: Situation) -> None:
         """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
-        together = now.method.together_with(points_mm)
+        together = now.method.together_with(points_mm, **self._seen_from(outcome, now))
         if len(together) < SEARCHED_FOR_DOUBLES:
             together = sampling.distinct(together)  # a cloud that comes again makes no more of them
         if not intake.is_one_bone(together, now.model.extent_mm):
@@ -186,10 +186,10 @@ class Registration:
             return None
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         if outcome.seen_from is not None:
-            return wire.moved_mm(T_frame_cloud, outcome.seen_from[None])[0]
+            return units.moved_mm(T_frame_cloud, outcome.seen_from[None])[0]
         if frame != "origin":
             T_frame_cloud = T_frame_cloud @ se3.inverse(self._lookup(frame, outcome, now))
-        return T_frame_cloud[:3, 3] * wire.MM_PER_M
+        return T_frame_cloud[:3, 3] * units.MM_PER_M
 
     def _lookup(self, frame: str, outcome: Outcome, now: Situation) -> Array:
         """T_frame_cloud at the cloud's stamp; no frame is that of the cloud. All look-ups of a cloud share one wait."""
@@ -259,7 +259,7 @@ def _check_precision(result: RegistrationResult, most_m: float) -> None:
     """Refuse a pose whose error over the bone is not bounded by `max_tre`; a method that gives no bound has none."""
     if most_m <= 0.0:
         return
-    bound_m = wire.to_metres(np.inf if result.tre95_mm is None else result.tre95_mm)
+    bound_m = units.to_metres(np.inf if result.tre95_mm is None else result.tre95_mm)
     if not bound_m <= most_m:
         text = f"the 95 % bound of the error over the bone is {bound_m:.3g} m, max_tre is {most_m:g} m"
         raise RefusedError(Reason.IMPRECISE, text)
@@ -270,4 +270,4 @@ def _note_pose(outcome: Outcome, result: RegistrationResult, points_mm: Array, p
     assert T is not None and covariance is not None
     centre_mm = se3.apply(T, points_mm.mean(axis=0)[None])[0] if result.centre_mm is None else result.centre_mm
     floors = (parameters.covariance_floor_translation, parameters.covariance_floor_rotation)
-    outcome.found = Found(wire.wire_pose(T), wire.wire_covariance(covariance, T, centre_mm, floors))
+    outcome.found = Found(units.ros_pose(T), units.ros_covariance(covariance, T, centre_mm, floors))

@@ -241,7 +241,7 @@ class Session:
                     self._withdraw_pose()
                 self._admission.note_tf()
         finally:
-            outcome.tell()
+            outcome.answer_waiters()
             self._host.report()
 
     # --- state ---
@@ -322,7 +322,7 @@ class Session:
         if waiting is not None:
             outcome = Outcome(waiting)
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
-            outcome.tell()
+            outcome.answer_waiters()
         if self._accumulates:
             if waiting is not None:
                 self.worker.run(partial(self._registration.collect, waiting))

@@ -96,6 +96,10 @@ class Timeline:
     """
 
     def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Time starts over: whatever comes next is the newest."""
         self._newest_ns = 0
         self._first_ns, self._count = 0, 0  # of this round
         self._answered_ns, self._answered_in, self._answer = 0, "", np.eye(4)  # the last pose that went out
@@ -149,8 +153,8 @@ class Timeline:
         """This pose goes out."""
         self._answered_ns, self._answered_in, self._answer = stamp_ns(header), header.frame_id, T_frame_model
 
-    def is_next(self, T_frame_model: Array, header: Header, points_m: Array) -> bool:
-        """Whether a pose that was followed is newer than all that went out; it is then the last one that is shown."""
+    def admit_shown(self, T_frame_model: Array, header: Header, points_m: Array) -> bool:
+        """Whether a pose that was followed is newer than all that went out; it is the last one shown from now on."""
         try:
             self.check_answer(T_frame_model, header, points_m)
         except RefusedError:
@@ -158,10 +162,6 @@ class Timeline:
         is_next = stamp_ns(header) > self._shown_ns or not self._shown_ns
         self._shown_ns = max(self._shown_ns, stamp_ns(header))
         return is_next
-
-    def forget(self) -> None:
-        """Time starts over: whatever comes next is the newest."""
-        self.__init__()  # type: ignore[misc]
 
     def _is_sent(self, T_frame_model: Array, frame: str, points_m: Array) -> bool:
         """Whether the pose is the one that went out last."""

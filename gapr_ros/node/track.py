@@ -25,15 +25,15 @@ class Track:
     """
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
         self.place: Place | None = None
         self._frame = ""
         self._row: set[object] = set()  # the clouds of the good poses in a row
         self._candidate: Array | None = None
         self._accepted: dict[str, Array] = {}  # by frame
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self.__init__()  # type: ignore[misc]
 
     def judge(
         self, T_frame_model: Array, frame: str, centre_m: Array, cloud: object, parameters: NodeParameters

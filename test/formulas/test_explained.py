@@ -10,7 +10,6 @@ import tiny
 from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import explained, features, rigidity
-from gapr_core.registration.apart import LookFits
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.explained import Explained
@@ -122,9 +121,7 @@ def part_of(share, count=10):
 
 def camera_s():
     """A scene seen from one place."""
-    return SimpleNamespace(
-        source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,), left_out=np.empty((0, 3))
-    )
+    return SimpleNamespace(source=object(), viewpoint=np.ones(3), viewpoints=np.ones((1, 3)), images=(None,))
 
 
 @pytest.fixture
@@ -173,9 +170,8 @@ def test_the_covariance_holds_what_the_looks_err_by_against_each_other(judged, m
     monkeypatch.setattr(explained.covariance, "estimate", lambda *_, **__: known)
     monkeypatch.setattr(rigidity, "of_looks", of_looks)
     monkeypatch.setattr(rigidity, "covariance_added_by", lambda fit, errors, config: errors[:6, :6] ** 2)
-    monkeypatch.setattr(explained, "look_fits", lambda *_: LookFits(*np.zeros((2, looks), dtype=bool)))
     scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=np.ones((looks, 3)), images=(None,) * looks)
-    scene.look, scene.left_out = np.arange(10) % looks, np.empty((0, 3))
+    scene.look = np.arange(10) % looks
     found = explained.assess_part(part, None, scene, None, None, CONFIG).uncertainty
     assert found.covariance == pytest.approx(np.eye(6) + (0.49 if is_added else 0.0))
     assert len(asked) == (looks > 1) and all(np.array_equal(look, scene.look) for look in asked)
@@ -273,25 +269,3 @@ def test_the_margin_has_ends(plane, scores, margin):
 def test_a_pose_without_a_rival_has_no_margin(plane):
     seen = Visible(*(np.array([x]) for x in (0.2, 3.0, 0.0)), CONFIG.clutter.free_space)
     assert explained._visible_features(seen, Candidates(None, np.array([2.0]), None), plane)["rival_margin"] == 0.0
-
-
-@pytest.mark.parametrize(("apart", "blind", "places", "is_refused"), [
-    ([0, 0, 1], [0, 0, 0], [2], True), ([0, 0, 0], [1, 0, 0], [0], False), ([0, 0, 0], [1, 0, 1], [0, 2], True),
-    ([0, 0, 0], [0, 0, 0], [], False),
-])  # fmt: skip
-def test_looks_that_do_not_fit_are_named_and_refused_where_they_are_apart_or_half(
-    judged, monkeypatch, apart, blind, places, is_refused
-):
-    viewpoints = np.arange(9.0).reshape(3, 3)
-    scene = SimpleNamespace(source=None, viewpoint=np.ones(3), viewpoints=viewpoints, images=(None,) * 3)
-    scene.look, scene.left_out = np.arange(10) % 3, np.full((1, 3), 7.0)
-    asked = []
-    found = LookFits(np.array(apart, dtype=bool), np.array(blind, dtype=bool))
-    monkeypatch.setattr(rigidity, "allowing_for_looks", lambda uncertainty, *_: uncertainty)
-    monkeypatch.setattr(explained, "look_fits", lambda *_: asked.append(1) or found)
-    seen = explained.assess_part(part_of(0.4), None, scene, None, None, CONFIG)
-    assert seen.looks_apart.tolist() == [*viewpoints[places].tolist(), [7.0] * 3]
-    assert (seen.refusal is not None) is is_refused and (seen.probability == 0.9) is not is_refused
-    judged.probability = 0.5 * CONFIG.worth_checking  # a pose that is refused anyway says nothing of the looks
-    seen = explained.assess_part(part_of(0.4), None, scene, None, None, CONFIG)
-    assert len(asked) == 1 and not len(seen.looks_apart) and seen.refusal is None

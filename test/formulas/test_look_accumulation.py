@@ -9,7 +9,8 @@ import tiny
 from gapr_core import ConfigError, InvalidPointCloudError, LookAccumulator, Registrar, Tracker
 from gapr_core.geometry import se3
 from gapr_core.registration.look_accumulation import STUCK
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.registration.scene import Look, Places
+from gapr_core.results import LookAnswer, LookFit, RegistrationResult, RegistrationStatus
 
 OK = RegistrationResult(RegistrationStatus.OK, np.eye(4))
 REFUSED = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="too little bone")
@@ -28,11 +29,11 @@ class Asked:
         self.initial, self.alone = [], OK  # `alone`: what a single look says
 
     def __call__(self, source, target, initial, viewpoint):
-        if np.ndim(viewpoint) == 1:
+        if not isinstance(viewpoint, Places):
             return self.alone
         self.initial.append(initial)
         self.sources.append(source)
-        self.places.append(np.unique(viewpoint, axis=0))
+        self.places.append(viewpoint.viewpoints)
         answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
         if isinstance(answer, Exception):
             raise answer
@@ -46,8 +47,9 @@ def looks_of(answer, *more, **how):
 
 
 def points(name):
-    """Three points about the origin whose z says which look they are of."""
-    return np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 0.0]]) + [0.0, 0.0, 0.01 * name]
+    """Six points about the origin whose z says which look they are of."""
+    angles = np.arange(6.0)
+    return np.column_stack([np.cos(angles), np.sin(angles), np.full(6, 0.01 * name)])
 
 
 def eye(deg):
@@ -55,18 +57,29 @@ def eye(deg):
 
 
 def names(collected):
-    return [round(100.0 * z) for z in np.asarray(collected)[::3, 2]]
+    return [round(100.0 * z) for z in np.asarray(collected)[::6, 2]]
+
+
+def saying(answer, fit, *numbers):
+    """An answer in which the looks of these numbers, the oldest 0, fit so, and the others do."""
+
+    def said(places):
+        fits = np.full(len(places.viewpoints), LookFit.FITS, dtype=object)
+        fits[list(numbers)] = fit
+        return replace(answer, looks=tuple(map(LookAnswer, places.viewpoints, fits)))
+
+    return said
 
 
 def apart(*numbers):
-    """An answer in which the looks of these numbers, the oldest 0, do not fit the others."""
+    """A refusal, since the looks of these numbers show the bone elsewhere."""
+    refused = replace(REFUSED, status=RegistrationStatus.AMBIGUOUS, reason="elsewhere")
+    return saying(refused, LookFit.APART, *numbers)
 
-    def said(viewpoint):
-        places = viewpoint[np.sort(np.unique(viewpoint, axis=0, return_index=True)[1])]
-        refused = replace(REFUSED, status=RegistrationStatus.AMBIGUOUS, reason="elsewhere")
-        return replace(refused, looks_apart=places[list(numbers)])
 
-    return said
+def blind(*numbers):
+    """A pose that is accepted although the looks of these numbers show nothing of the bone."""
+    return saying(OK, LookFit.BLIND, *numbers)
 
 
 def test_each_look_is_registered_with_those_before_it_and_keeps_its_place(target):
@@ -74,7 +87,7 @@ def test_each_look_is_registered_with_those_before_it_and_keeps_its_place(target
     assert looks.register(points(1), target, viewpoint=eye(0.0)).method == "gapr_looks"
     looks.register(points(2), target, viewpoint=eye(20.0))
     assert names(asked.sources[0]) == [1] and names(asked.sources[1]) == [1, 2]
-    assert asked.places[1] == pytest.approx(np.array([eye(0.0), eye(20.0)]), abs=1e-5)
+    assert asked.places[1].tolist() == [eye(0.0).tolist(), eye(20.0).tolist()]
 
 
 def test_the_oldest_goes_beyond_most(target):
@@ -82,7 +95,9 @@ def test_the_oldest_goes_beyond_most(target):
     for number in range(4):
         looks.register(points(number), target, viewpoint=eye(20.0 * number))
     assert names(asked.sources[-1]) == [2, 3] == names(looks.collected)
-    assert names(looks.together_with(points(9))) == [3, 9]
+    assert names(looks.together_with(points(9), eye(80.0))) == [3, 9]
+    assert names(looks.together_with(points(9), eye(61.0))) == [2, 9]
+    assert names(looks.together_with(points(9)[:5], eye(80.0))) == [2, 3]
 
 
 @pytest.mark.parametrize(("deg", "kept"), [(7.9, [2, 3]), (8.1, [1, 2, 3])])
@@ -93,11 +108,22 @@ def test_a_look_takes_the_place_of_one_from_nearly_the_same_direction(target, de
     assert names(asked.sources[-1]) == kept
 
 
-def test_the_direction_is_seen_from_what_was_looked_at():
+@pytest.mark.parametrize(("camera_mm", "shown_mm", "kept"), [
+    (100.0, 100.0, 2), (50.0, 50.0, 1), (0.0, 100.0, 2), (0.0, 50.0, 1), (100.0, 0.0, 2), (50.0, 0.0, 1),
+])  # fmt: skip
+def test_looks_differ_by_where_the_camera_is_and_by_what_it_shows(camera_mm, shown_mm, kept):
+    """From 400 mm away, 56 mm are 8 deg."""
     looks, _ = looks_of(OK)
     looks.collect(points(1), eye(0.0))
-    looks.collect(points(2) + [100.0, 0.0, 0.0], eye(0.0) + [100.0, 0.0, 0.0])
-    assert len(looks.collected) == 3
+    looks.collect(points(2) + [shown_mm, 0.0, 0.0], eye(0.0) + [camera_mm, 0.0, 0.0])
+    assert len(looks.collected) == 6 * kept
+
+
+def test_a_camera_in_the_middle_of_what_it_shows_is_no_error():
+    looks, _ = looks_of(OK)
+    looks.collect(points(1), points(1).mean(axis=0))
+    looks.collect(points(2), points(1).mean(axis=0))
+    assert len(looks.collected) in (6, 12)
 
 
 def test_two_looks_from_one_place_stay_two_where_all_are_kept(target):
@@ -128,15 +154,6 @@ def test_a_pose_ends_the_row(target):
     assert names(looks.collected) == [0, 1, 4]
 
 
-def blind(*numbers):
-    """A pose that stands although the looks of these numbers show nothing of the bone."""
-
-    def said(viewpoint):
-        return replace(OK, looks_apart=apart(*numbers)(viewpoint).looks_apart)
-
-    return said
-
-
 def test_a_pose_stands_where_an_older_look_shows_nothing_and_that_one_stays(target):
     looks, _ = looks_of(OK, OK, blind(0))
     for number in range(3):
@@ -144,13 +161,14 @@ def test_a_pose_stands_where_an_older_look_shows_nothing_and_that_one_stays(targ
     assert result.ok and names(looks.collected) == [0, 1, 2]
 
 
-def test_a_newest_look_that_shows_nothing_of_the_bone_is_refused_and_left_out(target):
+@pytest.mark.parametrize("deg", [1.0, 60.0])
+def test_a_newest_look_that_shows_nothing_of_the_bone_is_refused_and_left_out(target, deg):
     """However often: a hand before the camera says nothing of the bone. After ten in a row that one alone is kept."""
     looks, asked = looks_of(OK, OK, blind(-1))
     for number in range(2):
         looks.register(points(number), target, viewpoint=eye(20.0 * number))
     for number in range(STUCK):
-        result = looks.register(points(2 + number), target, viewpoint=eye(1.0))
+        result = looks.register(points(2 + number), target, viewpoint=eye(deg))
         assert result.status is RegistrationStatus.AMBIGUOUS and result.T_target_source is None
         assert "newest look shows nothing" in result.reason and result.confidence <= looks.config.rules.ruled_out
         assert names(looks.collected) == ([0, 1] if number < STUCK - 1 else [2 + number])
@@ -180,11 +198,54 @@ def test_a_first_look_is_not_compared_with_itself(target):
     assert looks.register(points(0), target, viewpoint=eye(0.0)).ok
 
 
-def test_older_looks_that_do_not_fit_are_left_out_from_then_on(target):
-    looks, _ = looks_of(OK, OK, apart(0, 1))
+def test_older_looks_that_do_not_fit_are_left_out_and_the_others_asked_again(target):
+    looks, asked = looks_of(OK, OK, apart(0, 1), OK)
     for number in range(3):
         result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
-    assert not result.ok and result.reason == "elsewhere; left out from now on" and names(looks.collected) == [2]
+    assert [names(each) for each in asked.sources] == [[0], [0, 1], [0, 1, 2], [2]]
+    assert result.ok and names(looks.collected) == [2]
+
+
+def test_the_times_of_all_that_was_asked_add_up(target):
+    first = apart(0)(Places.of([Look(points(0), eye(0.0))] * 2))
+    answers = replace(first, stage_ms={"verify": 5.0}), replace(OK, stage_ms={"verify": 2.0, "refine": 1.0})
+    looks, _ = looks_of(OK, *answers)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    result = looks.register(points(1), target, viewpoint=eye(20.0))
+    assert result.stage_ms["verify"] == 7.0 and result.stage_ms["refine"] == 1.0 and "compare" in result.stage_ms
+
+
+@pytest.mark.parametrize(("answer", "kept"), [
+    (saying(REFUSED, LookFit.BLIND, -1), [0, 1]), (saying(REFUSED, LookFit.TOO_SMALL, -1), [0]),
+    (saying(replace(REFUSED, status=RegistrationStatus.AMBIGUOUS), LookFit.BLIND, -1), [0]),
+    (saying(REFUSED, LookFit.BLIND, 0), [0, 1]),
+])  # fmt: skip
+def test_a_doubtful_pose_does_not_say_that_a_look_shows_nothing(target, answer, kept):
+    looks, _ = looks_of(OK, answer)
+    for number in range(2):
+        result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert names(looks.collected) == kept and "restart" not in result.reason
+
+
+def test_looks_that_show_nothing_are_no_row_that_shows_the_bone_elsewhere(target):
+    looks, _ = looks_of(OK, *[saying(replace(REFUSED, status=RegistrationStatus.AMBIGUOUS), LookFit.BLIND, -1)] * 5)
+    for number in range(5):
+        looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert names(looks.collected) == [0]
+
+
+def test_looks_metres_away_are_left_out_and_the_third_restarts_the_collection(target):
+    looks, _ = looks_of(OK)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    away = [4000.0, 0.0, 0.0]
+    for number in (1, 2):
+        with pytest.raises(InvalidPointCloudError, match="near the others"):
+            looks.register(points(number) + away, target, viewpoint=eye(20.0) + away)
+        assert names(looks.collected) == [0]
+    looks.register(points(3) + away, target, viewpoint=eye(20.0) + away)
+    assert names(looks.collected) == [3]
+    with pytest.raises(InvalidPointCloudError, match="the look"):
+        looks.collect(np.concatenate([points(4), points(4) + away]), eye(40.0))
 
 
 def test_after_ten_refusals_from_one_direction_the_last_look_alone_is_kept(target):
@@ -276,6 +337,26 @@ def test_a_tracker_is_one_of_its_own_whose_sources_count_as_one():
     looks.method._has_track = True
     looks.reset()
     assert not looks.method._has_track
+
+
+@pytest.mark.parametrize(("count", "is_kept"), [(5, False), (6, True)])
+def test_a_look_of_fewer_points_than_a_pose_needs_changes_nothing(target, count, is_kept):
+    looks, asked = looks_of(OK)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    looks.collect(points(1)[:count], eye(1.0))
+    assert names(looks.collected) == [1 if is_kept else 0]
+    result = looks.register(points(2)[:count], target, viewpoint=eye(2.0))
+    assert names(looks.collected) == [2 if is_kept else 0] and result.ok is is_kept
+    assert is_kept or (result.status is RegistrationStatus.TOO_FEW_POINTS and "5 finite points" in result.reason)
+
+
+@pytest.mark.parametrize("bad", [{"viewpoint": None}, {"viewpoint": [1.0]}])
+def test_what_is_no_look_forgets_nothing(target, bad):
+    looks, _ = looks_of(OK)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    with pytest.raises((ConfigError, InvalidPointCloudError)):
+        looks.register(points(1), replace(target), **bad)
+    assert names(looks.collected) == [0]
 
 
 @pytest.mark.parametrize("answer", [apart(-1), REFUSED])

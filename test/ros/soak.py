@@ -34,7 +34,7 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from gapr_ros.node.timeline import stamp_ns
 from msg_adapters import pose_to_matrix, xyz_to_cloud
 
@@ -130,7 +130,7 @@ def soak(folder: Path, kind: str, seconds: float, hz: float = 10.0, distinct: in
     bone = Specimen(make_bone("femur", SUBJECT), "femur", "soak")
     make, parameters = KINDS[kind]
     pairs = make(bone, distinct)
-    clouds = [(wire.to_metres(pair.source).astype(np.float32), _truth(pair, bone)) for pair in pairs]
+    clouds = [(units.to_metres(pair.source).astype(np.float32), _truth(pair, bone)) for pair in pairs]
     model = bones.save(bone.surface, folder / f"{kind}.npz")
     client, result = Client(), Soak(kind)
     node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, **parameters)
@@ -205,7 +205,7 @@ def _truth(pair: Pair, bone: Specimen) -> np.ndarray:
 
 
 def _error_mm(pose: Any, points: np.ndarray, truth: np.ndarray) -> float:
-    return se3.pose_error(wire.core_pose(pose_to_matrix(pose)), truth, points * 1000.0)[0]
+    return se3.pose_error(units.core_pose(pose_to_matrix(pose)), truth, points * 1000.0)[0]
 
 
 def draw(results: list[Soak], path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from harness import PATIENCE_S, NodeProcess, pose_mm, wait_until
 
 from gapr_core.geometry import se3
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from msg_adapters import pose_to_matrix
 
 KINDS = ("accepted", "refused", "dropped", "merged", "lost")
@@ -40,7 +40,7 @@ def test_slices_of_a_probe_that_are_too_small_alone_give_the_pose_together(clien
             time.sleep(0.02)
         wait_until(lambda: sum(int(client.values()[f"frames_{kind}"]) for kind in KINDS) == 51, PATIENCE_S)
         wait_until(lambda: client.poses and stamp_of(client.poses[-1]) == client.values()["cloud_stamp"])
-        estimate = wire.core_pose(pose_to_matrix(client.poses[-1]))
+        estimate = units.core_pose(pose_to_matrix(client.poses[-1]))
         translation_mm, rotation_deg = se3.pose_error(estimate, T, cloud * 1000.0)
         assert translation_mm < 1.0 and rotation_deg < 1.0
         assert int(client.values()["points_used"]) == len(cloud)

@@ -10,7 +10,7 @@ from gapr_core.data.scenes import camera
 from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from msg_adapters import pose_to_matrix
 
 T_ROOM_CAMERA = pose_mm([2.0, 0.4, -0.3], [300.0, -150.0, 900.0])
@@ -34,7 +34,7 @@ def test_a_wound_is_registered_by_its_pixels_or_its_surface_whatever_frame_it_is
         seen_from = [float(x) for x in values["seen_from"].split()]
         np.testing.assert_allclose(seen_from, T_ROOM_CAMERA[:3, 3] / 1000.0, atol=0.002)
         wait_until(lambda: client.poses)
-        estimate = wire.core_pose(pose_to_matrix(client.poses[0])) @ T_ROOM_CAMERA
+        estimate = units.core_pose(pose_to_matrix(client.poses[0])) @ T_ROOM_CAMERA
         translation_mm, rotation_deg = se3.pose_error(estimate, pair.T_target_source, pair.source)
         assert translation_mm < 2.0 and rotation_deg < 3.0
         client.call("reset")
@@ -42,7 +42,7 @@ def test_a_wound_is_registered_by_its_pixels_or_its_surface_whatever_frame_it_is
         assert in_a_row["level"] == 0 and in_a_row["found_by"] == "scene", (in_a_row, node.log)
         assert in_a_row["seen_from"] == "" and float(in_a_row["confidence"]) <= 0.89
         wait_until(lambda: len(client.poses) > 1)
-        estimate = wire.core_pose(pose_to_matrix(client.poses[1])) @ T_ROOM_CAMERA
+        estimate = units.core_pose(pose_to_matrix(client.poses[1])) @ T_ROOM_CAMERA
         translation_mm, rotation_deg = se3.pose_error(estimate, pair.T_target_source, pair.source)
         assert translation_mm < 2.0 and rotation_deg < 3.0
     finally:

@@ -29,7 +29,7 @@ from gapr_ros.demo.children import child
 from gapr_ros.demo.observer import Advice, Answer, Observer, Used
 from gapr_ros.demo.report import Row
 from gapr_ros.demo.running import as_arguments
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from msg_adapters import matrix_to_pose, xyz_to_cloud
 
 RUN = (
@@ -313,7 +313,7 @@ def test_an_answer_is_put_together_from_what_the_node_publishes(observer):
               "exec_ms": "812"}  # fmt: skip
     observer._on_status(DiagnosticStatus(values=[KeyValue(key=k, value=v) for k, v in values.items()]))
     pose = PoseWithCovarianceStamped(header=header(1_700_000_002))
-    pose.pose.pose = matrix_to_pose(wire.wire_pose(TRUTH))
+    pose.pose.pose = matrix_to_pose(units.ros_pose(TRUTH))
     observer._on_pose(pose)
     fields = {"distance": np.array([0.001, np.nan], "f4"), "inlier": np.array([1, 0], "u1")}
     observer._on_residuals(

@@ -14,7 +14,7 @@ from gapr_core.geometry import se3
 from gapr_ros.bags.files import open_bag
 from gapr_ros.bags.replay import Replay, ReplayOptions
 from gapr_ros.bags.writing import BagWriter
-from gapr_ros.node import wire
+from gapr_ros.node import units
 from msg_adapters import list_to_covariance, pose_to_matrix
 
 REFUSALS_OF_SHAPE = {
@@ -57,7 +57,7 @@ def test_a_partial_cloud_gives_the_true_pose(live, bone, seed):
     values = client.ask(cloud)
     assert values["level"] == 0, values
     wait_until(lambda: client.poses)
-    estimate = wire.core_pose(pose_to_matrix(client.poses[0]))
+    estimate = units.core_pose(pose_to_matrix(client.poses[0]))
     translation_mm, rotation_deg = se3.pose_error(estimate, T, cloud * 1000.0)
     assert translation_mm < 1.0 and rotation_deg < 1.0
     assert float(values["confidence"]) >= 0.5
@@ -76,7 +76,7 @@ def test_the_next_cloud_is_looked_for_where_the_last_one_was_until_a_reset(live,
     client.poses.clear()
     assert client.ask(clouds[1])["found_by"] == "track"
     wait_until(lambda: client.poses)
-    estimate = wire.core_pose(pose_to_matrix(client.poses[0]))
+    estimate = units.core_pose(pose_to_matrix(client.poses[0]))
     translation_mm, rotation_deg = se3.pose_error(estimate, nearby, clouds[1] * 1000.0)
     assert translation_mm < 1.0 and rotation_deg < 1.0
     client.call("reset")

@@ -19,7 +19,7 @@ from gapr_core import FollowedPose
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_ros import parameters as node_parameters
-from gapr_ros.node import frames, wire
+from gapr_ros.node import frames, units
 from gapr_ros.node.course import Course
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Found, Outcome
@@ -294,12 +294,12 @@ def test_followed_poses_are_in_the_order_of_their_stamps_and_newer_than_the_last
 
 def test_after_time_starts_over_an_older_stamp_is_the_next():
     timeline, header = Timeline(), lambda stamp_s: Header(stamp=Time(seconds=stamp_s).to_msg())
-    shown = [timeline.is_next(np.eye(4), header(stamp_s), GOOD) for stamp_s in (20, 19, 20, 21)]
+    shown = [timeline.admit_shown(np.eye(4), header(stamp_s), GOOD) for stamp_s in (20, 19, 20, 21)]
     assert shown == [True, False, False, True]
     timeline.forget()
-    assert timeline.is_next(np.eye(4), header(5), GOOD)
+    assert timeline.admit_shown(np.eye(4), header(5), GOOD)
     unstamped = Timeline()
-    assert [unstamped.is_next(np.eye(4), header(0), GOOD) for _ in range(2)] == [True, True], "no clock runs"
+    assert [unstamped.admit_shown(np.eye(4), header(0), GOOD) for _ in range(2)] == [True, True], "no clock runs"
 
 
 def decided(course, stamp_s, reason=None, **parameters):
@@ -381,7 +381,7 @@ def test_the_node_as_users_start_it_follows_a_moving_bone(tmp_path):
     wait_until(lambda: len(heard) == 4 and len(client.poses) == 3, what=lambda: (client.values(), node.log))
     assert stamps(client.poses) == [101, 104, 107] and stamps(heard) == [102, 103, 105, 106]
     for message, number in zip(heard, (1, 2, 4, 5), strict=True):
-        estimate = wire.core_pose(pose_to_matrix(message))
+        estimate = units.core_pose(pose_to_matrix(message))
         shift_mm, turn_deg = se3.pose_error(estimate, poses[number], clouds[number] * 1000.0)
         assert shift_mm < 1.0 and turn_deg < 1.0
     client.send(clouds[0], stamp_s=108.0)

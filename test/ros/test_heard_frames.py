@@ -264,17 +264,17 @@ def test_while_the_stamps_of_a_frame_may_have_gone_back_it_is_not_looked_up(buff
     assert seen_at(buffer, 1000.65) == pytest.approx(3.0) and seen_at(buffer, 1000.95) is None
 
 
-def test_a_cloud_that_came_late_is_settled_by_the_next_transform_of_each_frame(buffer):
+def test_a_cloud_that_came_late_is_final_by_the_next_transform_of_each_frame(buffer):
     heard, hear, _ = hears(buffer)
 
     def settled(stamp_s, arrived_s):
-        return heard.is_settled("world", "camera", round(stamp_s * NS), arrived_s)
+        return heard.is_final("world", "camera", round(stamp_s * NS), arrived_s)
 
     hear(1000.0, 1.0)
     now_s = time.monotonic()
     assert settled(999.96, now_s) and settled(1000.5, now_s), "40 ms is not late"
     assert not settled(999.94, now_s)
-    assert settled(0.0, now_s) and heard.is_settled("world", "bed", 0, now_s) and settled(999.0, now_s - 1.0)
+    assert settled(0.0, now_s) and heard.is_final("world", "bed", 0, now_s) and settled(999.0, now_s - 1.0)
     hear(999.5, 1.0)
     assert settled(999.94, now_s), "whatever it says: whether the stamps went back is asked apart"
 
@@ -410,8 +410,8 @@ def test_between_the_two_places_of_a_frame_that_jumps_nothing_is_looked_up(buffe
         between = round(0.5 * stamps_s[19:21].sum() * NS)
         is_said = "'camera' jumped by" in heard.why_not("world", "camera", between, 0.0)
         assert is_said is (number >= 20), number
-        is_settled = bool(number < 20 or stamp_s > rests_from_s)  # until then it may go on
-        assert heard.is_settled("world", "camera", between, -np.inf) is is_settled, number
+        is_final = bool(number < 20 or stamp_s > rests_from_s)  # until then it may go on
+        assert heard.is_final("world", "camera", between, -np.inf) is is_final, number
     text = why_not(heard, 0.5 * stamps_s[19:21].sum(), most_gap_s=0.0)
     assert text.endswith("mm and 0.0 deg around this stamp: tf2 would say a place at which it never was")
     assert float(text.split(" by ")[1].split()[0]) == pytest.approx(jump_mm, abs=1.5)
@@ -438,7 +438,7 @@ def test_a_frame_that_sets_off_at_once_is_believed_as_soon_as_it_is_seen_to_go_o
     heard, hear, _ = hears(buffer)
     for number, x in enumerate((0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.03)):
         hear(1000.0 + 0.02 * number, x)
-        assert heard.is_settled("world", "camera", round(1000.09 * NS), -np.inf) is (number != 5)
+        assert heard.is_final("world", "camera", round(1000.09 * NS), -np.inf) is (number != 5)
         assert bool(why_not(heard, 1000.09)) is (number == 5)
 
 

@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
 from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
-from gapr_ros.node import messages, wire
+from gapr_ros.node import messages, units
 from gapr_ros.node.guard import RosLogHandler
 from gapr_ros.node.outcome import Found, Outcome
 from gapr_ros.node.publishers import TOPICS
@@ -99,13 +99,13 @@ def test_hypotheses_come_only_when_they_are_asked_for(live):
     wait_until(lambda: heard["hypotheses"])
     assert len(heard["hypotheses"]) == 1
     found = [pose_to_matrix(pose) for pose in heard["hypotheses"][0].poses]
-    np.testing.assert_allclose(found, [wire.wire_pose(T) for T in POSES], atol=1e-12)
+    np.testing.assert_allclose(found, [units.ros_pose(T) for T in POSES], atol=1e-12)
     assert heard["hypotheses"][0].header.frame_id == "probe" and not client.poses
 
 
 def test_an_accepted_pose_is_no_hypothesis():
     believed = RegistrationResult(RegistrationStatus.OK, POSES[0], hypotheses=RANKED)
-    assert len(messages.hypotheses(outcome(believed, wire.wire_pose(POSES[0]))).poses) == 2
+    assert len(messages.hypotheses(outcome(believed, units.ros_pose(POSES[0]))).poses) == 2
     held_back = outcome(believed, reason=Reason.JUMP)
     assert len(messages.hypotheses(held_back).poses) == 3, "refused by the node: none is believed"
     assert messages.hypotheses(outcome()) == PoseArray(header=Header(frame_id="probe"))

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import frames, intake, region, wire
+from gapr_ros.node import frames, intake, region, units
 from gapr_ros.node.model import load_model
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
@@ -202,7 +202,7 @@ def test_looks_that_are_registered_as_one_each_keep_their_place(blob_path, clien
     ("given", "expected_mm"),
     [
         ({}, [100.0, 50.0, -400.0]),
-        ({"output_frame": "table"}, se3.apply(wire.in_mm(T_BOX_PROBE), np.array([[100.0, 50.0, -400.0]]))[0]),
+        ({"output_frame": "table"}, se3.apply(units.in_mm(T_BOX_PROBE), np.array([[100.0, 50.0, -400.0]]))[0]),
         ({"cloud_unit": "mm"}, [100.0, 50.0, -400.0]),
         ({"viewpoint": "origin"}, [0.0, 0.0, 0.0]),
         ({"viewpoint": "none"}, None),

@@ -16,12 +16,13 @@ from scipy.spatial import cKDTree
 from gapr_core.data.scenes.camera import NOTHING, View, noise_mm, seen_in_depth
 from gapr_core.data.sensors import acquired, depth_maps
 from gapr_core.data.sensors.covered import layers
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 WINDOW_MM = (1.0, 3.0)  # standard deviation of the window over which depth is matched
 PATCHY = (0.3, 0.9)  # share of the noise's variance that is alike in a window
 STEP_MM = (0.05, 0.5)  # of depth
-EDGE_MM, BESIDE = 8.0, 7  # a step between a pixel's neighbours that is an edge, and how many neighbours there are
+EDGE_MM, NEIGHBOURS = 8.0, 7  # a step between a pixel's neighbours that is an edge, and how many neighbours there are
 FLYING = (0.0, 0.6)  # share of the pixels at an edge that fly
 SMOOTH_MM = 0.6  # largest smooth error
 NOISIER, WIDER_MM = (1.0, 2.5), (1.0, 5.0)  # of a poor camera: times the noise, and windows
@@ -35,7 +36,7 @@ def seen_in_stereo(view: View, rng: np.random.Generator) -> View:
 
 def seen_by_a_poor_camera(view: View, rng: np.random.Generator) -> View:
     """As in stereo, with .6 to 1.6 mm of noise that is alike over up to 5 mm: of small, moving or wet scenes."""
-    times = float(np.exp(rng.uniform(*np.log(NOISIER))))
+    times = log_uniform(NOISIER, rng)
     return _in_stereo(view, rng, times, WIDER_MM)
 
 
@@ -94,7 +95,7 @@ def _dry(view: View, rng: np.random.Generator) -> NDArray[np.bool_]:
 
 def _flying(depth_mm: Array, sight: Array, rng: np.random.Generator) -> tuple[NDArray[np.bool_], Array]:
     """(N,) which pixels fly, and (N,) a depth between the nearest and the farthest one around each."""
-    around = depth_mm[cKDTree(sight).query(sight, k=min(BESIDE, len(sight)))[1]].reshape(len(sight), -1)
+    around = depth_mm[cKDTree(sight).query(sight, k=min(NEIGHBOURS, len(sight)))[1]].reshape(len(sight), -1)
     near, far = around.min(axis=1), around.max(axis=1)
     flies = (far - near > EDGE_MM) & (rng.random(len(sight)) < rng.uniform(*FLYING))
     return flies, near + rng.random(len(sight)) * (far - near)

@@ -28,6 +28,7 @@ from gapr_core.data.scenes.scene import (
     camera_off,
     first_view,
 )
+from gapr_core.data.sensors.depth_maps import Range
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -78,16 +79,16 @@ def several_looks(
     """One wound as a camera sees it from `LOOKS` places.
 
     Its metadata hold `viewpoint` (N, 3) mm, where the camera was for each point, in the source's frame; `look` (N,);
-    `is_bone` (N,), `bone_share` and how it was made.
+    `is_bone` (N,), `bone_share` of all looks, the `neighbour` at a joint, and how it was made.
 
     Raises:
         ConfigError: a bone on which no wound shows that share of bone, or at a joint, no other bone near.
     """
     kind = kind or LookedAt()
     target, _ = specimen.sample(TARGET_POINTS, rng)
-    setting_of = partial(arrange, specimen)
-    if kind.at_joint:
-        setting_of = partial(joint.at_joint, specimen, joint.next_to(specimen, others))
+    setting_of, neighbour = partial(arrange, specimen), joint.next_to(specimen, others) if kind.at_joint else None
+    if neighbour is not None:
+        setting_of = partial(joint.at_joint, specimen, neighbour)
     setting, first = first_view(specimen, rng, SceneLevel(kind.bone_share), setting_of)
     radius = np.linalg.norm(first.points - setting.wound.centre, axis=1).max()
     views = [first, *(_from(setting, around, radius, rng) for around in _places_around(rng))]
@@ -95,7 +96,8 @@ def several_looks(
     factor = 1.0 + rng.normal(0.0, kind.range_wrong) if kind.range_wrong else 1.0
     views = [_of_range(kind.errors(view, rng), factor) for view in views]
     views = [views[0], *(_tracked(view, rng) for view in views[1:])]
-    return _as_pair(specimen, target, views, setting, rng)
+    pair = _as_pair(specimen, target, views, setting, rng)
+    return pair if neighbour is None else replace(pair, metadata=pair.metadata | {"neighbour": neighbour.bone})
 
 
 def _places_around(rng: np.random.Generator) -> Array:
@@ -125,7 +127,7 @@ def _seen_from(setting: Setting, around: float, radius: float, rng: np.random.Ge
 
 def _of_range(view: View, factor: float) -> View:
     """As a camera sees it whose range is wrong by a factor: the cloud is nearer or farther."""
-    return replace(view, points=view.camera + factor * (view.points - view.camera))
+    return replace(view, points=Range(factor, view.camera).of(view.points))
 
 
 def _tracked(view: View, rng: np.random.Generator) -> View:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.data.sensors.acquired import Acquired, look, smooth_offsets
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ BIAS_MM = 0.5
 def covered(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     """300 to 5000 points of one side, parts of it up to 4 mm above the bone."""
     view = look(specimen, SHARE, "seen", 20_000, rng)
-    view = view.only(rng.permutation(len(view.points))[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))])
+    view = view.only(rng.permutation(len(view.points))[: round(log_uniform(POINTS, rng))])
     above_mm = layers(view.points, rng)
     bias_mm, bias = smooth_offsets(view.points, BIAS_MM, rng)
     noise_mm = rng.uniform(*NOISE_MM)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.data.sensors.acquired import Acquired, View, look, smooth_offsets, towards_viewpoint
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def _pixels(specimen: Specimen, view: View, viewpoint: Array, rng: np.random.Gen
     seen = (slant > STEEPEST) & specimen.visible_from(view.points, rays)
     kept = np.flatnonzero(seen & (rng.random(len(density)) < density / density.max()))
     kept = kept if len(kept) else np.arange(len(view.points))
-    return rng.permutation(kept)[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))]
+    return rng.permutation(kept)[: round(log_uniform(POINTS, rng))]
 
 
 def _rays(view: View, viewpoint: Array) -> tuple[Array, Array]:

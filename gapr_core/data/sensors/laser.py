@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.data.sensors.acquired import Acquired, View, look, smooth_offsets, some, tangents, towards_viewpoint
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -52,4 +53,4 @@ def _lit(specimen: Specimen, view: View, viewpoint: Array, rng: np.random.Genera
     in_stripe = np.mod(view.points @ along / rng.uniform(*STRIPE_MM), 1.0) < STRIPE_SHARE
     lit = np.flatnonzero(seen & in_stripe)
     lit = lit if len(lit) else np.arange(len(view.points))
-    return rng.permutation(lit)[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))]
+    return rng.permutation(lit)[: round(log_uniform(POINTS, rng))]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core.data.sensors.acquired import Acquired, look, smooth_offsets, tangents
 from gapr_core.data.specimen import Specimen
-from gapr_core.geometry.sampling import random_directions
+from gapr_core.geometry.sampling import log_uniform, random_directions
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ BIAS_MM = 0.5
 def moving(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     """300 to 4000 points of one pass; the frame is that of the bone's mean pose."""
     view = look(specimen, SHARE, "band" if rng.random() < 0.5 else "seen", 20_000, rng)
-    view = view.only(rng.permutation(len(view.points))[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))])
+    view = view.only(rng.permutation(len(view.points))[: round(log_uniform(POINTS, rng))])
     place = view.points @ tangents(view)[0]
     when = (place - place.min()) / max(np.ptp(place), 1e-9)
     phase = np.sin(2.0 * np.pi * (rng.uniform(*CYCLES) * when + rng.random()))

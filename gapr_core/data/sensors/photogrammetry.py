@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.data.sensors.acquired import Acquired, look, smooth_offsets, some, tangents
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,7 @@ OUTLIERS, OUTLIER_MM = 0.04, (1.0, 10.0)
 def photogrammetry(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     """500 to 6000 points of one side, bent by up to 1.2 mm."""
     view = look(specimen, SHARE, "seen", 30_000, rng)
-    view = view.only(rng.permutation(len(view.points))[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))])
+    view = view.only(rng.permutation(len(view.points))[: round(log_uniform(POINTS, rng))])
     noise_mm, scale, centre = rng.uniform(*NOISE_MM), 1.0 + rng.normal(0.0, SCALE), view.points.mean(axis=0)
     across = (view.points - centre) @ np.stack(tangents(view), axis=1)
     across /= max(np.abs(across).max(), 1e-9)

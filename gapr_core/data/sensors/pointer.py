@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gapr_core.data.sensors.acquired import Acquired, View, look, smooth_offsets, some
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ def pointer(
         only_dots: no strokes.
     """
     view = look(specimen, SHARE, "seen", 20_000, rng)
-    count = round(float(np.exp(rng.uniform(*np.log(points)))))
+    count = round(log_uniform(points, rng))
     in_dots = count if rng.random() < 0.4 or only_dots else round(count * rng.uniform(0.0, 0.8))
     touched = view.only(_touched(view, count, in_dots, rng))
     standoff_mm, contact_mm, noise_mm = rng.uniform(*STANDOFF_MM), rng.uniform(*CONTACT_MM), rng.uniform(*NOISE_MM)

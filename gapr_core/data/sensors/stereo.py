@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gapr_core.data.sensors.acquired import Acquired, look, smooth_offsets, tangents
 from gapr_core.data.sensors.depth_maps import windows
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ def stereo(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     for middle in rng.integers(len(kept), size=int(rng.integers(HOLES[0], HOLES[1] + 1))):
         kept &= np.linalg.norm(across - across[middle], axis=1) > rng.uniform(*HOLE_MM)
     chosen = rng.permutation(np.flatnonzero(kept) if kept.any() else np.arange(len(kept)))
-    chosen = chosen[: round(float(np.exp(rng.uniform(*np.log(POINTS)))))]
+    chosen = chosen[: round(log_uniform(POINTS, rng))]
     parameters = {
         **view.parameters, **bias, "family": "stereo", "noise_mm": noise_mm, "window_mm": window_mm, "scale": 1.0,
         "standoff_mm": 0.0, "outlier_share": 0.0,

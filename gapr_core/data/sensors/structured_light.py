@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core.data.sensors.acquired import Acquired, View, look, smooth_offsets
 from gapr_core.data.specimen import Specimen
-from gapr_core.geometry.sampling import random_directions
+from gapr_core.geometry.sampling import log_uniform, random_directions
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def structured_light(specimen: Specimen, rng: np.random.Generator) -> Acquired:
         "view_deg": rng.uniform(*VIEW_DEG),
     }  # fmt: skip
     count = int(rng.integers(VIEWS[0], VIEWS[1] + 1))
-    each = round(float(np.exp(rng.uniform(*np.log(POINTS))))) // count
+    each = round(log_uniform(POINTS, rng)) // count
     parts = [_one_view(specimen, view, bias_mm, drawn, each, rng) for _ in range(count)]
     parameters = {**view.parameters, **bias, **drawn, "family": "structured_light", "views": count, "scale": 1.0,
                   "standoff_mm": 0.0, "outlier_share": 0.0}  # fmt: skip

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from gapr_core.data.sensors.acquired import Acquired, View, look, smooth_offsets
 from gapr_core.data.sensors.pointer import stroke
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ RUN = 20  # samples of such a run
 def tracing(specimen: Specimen, rng: np.random.Generator) -> Acquired:
     """300 to 4000 samples of strokes over 5 to 35 % of the surface, outside of the bone and shifted with the tip."""
     view = look(specimen, SHARE, "seen", 60_000, rng)
-    count = round(float(np.exp(rng.uniform(*np.log(POINTS)))))
+    count = round(log_uniform(POINTS, rng))
     chosen, of_stroke = _strokes(view, count, rng.uniform(*SPACING_MM), rng)
     touched = view.only(chosen)
     standoff_mm, lift_mm, noise_mm = rng.uniform(*STANDOFF_MM), rng.uniform(*LIFT_MM), rng.uniform(*NOISE_MM)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core.data.sensors.acquired import Acquired, View, look, smooth_offsets, some, tangents
 from gapr_core.data.specimen import Specimen
+from gapr_core.geometry.sampling import log_uniform
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def ultrasound(specimen: Specimen, rng: np.random.Generator, count: tuple[int, i
 def _slices(view: View, limits: tuple[int, int], rng: np.random.Generator) -> list[NDArray[np.intp]]:
     """Indices of the points of each slice; slices lie across the way of the probe, tilted by hand."""
     along, across = tangents(view)
-    count = round(float(np.exp(rng.uniform(*np.log(limits)))))
+    count = round(log_uniform(limits, rng))
     most, width_mm = int(rng.integers(*SLICE_POINTS)), rng.uniform(*WIDTH_MM)
     low, high = np.quantile(view.points @ along, (0.03, 0.97))
     places = np.linspace(low, high, count) + rng.normal(0.0, 0.2, count) * (high - low) / count

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shapes import ball_specimen
 
 from gapr_core import InvalidPointCloudError
 from gapr_core.data import pair_files, pool, protocols
@@ -109,6 +110,22 @@ def test_what_is_seen_of_a_scene_is_seen_of_its_looks(name, specimen):
     else:
         low, high = LOOKED_AT[name].bone_share
         assert low <= protocols.make_pair(f"{name}-look", specimen, 0).metadata["bone_share"] <= high
+
+
+@pytest.mark.parametrize("name", ["scene-joint-looks", "scene-theatre-looks"])
+def test_looks_at_a_joint_show_the_next_bone_of_the_same_subject_too(name):
+    """Two balls 10 mm apart, as two bones of one scan."""
+    bone, other = ball_specimen(40.0), ball_specimen(30.0, bone="other")
+    other = replace(other, surface=replace(other.surface, points=other.surface.points + [80.0, 0.0, 0.0]))
+    pair = protocols.make_pair(name, bone, 1, [other])
+    is_bone, look = pair.metadata["is_bone"], pair.metadata["look"]
+    assert pair.metadata["neighbour"] == "other" and len(np.unique(look)) == LOOKS
+    low, high = LOOKED_AT[name.removesuffix("-looks")].bone_share
+    assert low <= is_bone[look == 0].mean() <= high
+    in_bone_frame = pair.T_target_source.copy()
+    in_bone_frame[:3, 3] += pair.metadata["origin_mm"]
+    away = np.linalg.norm(se3.apply(in_bone_frame, pair.source) - bone.surface.points.mean(axis=0), axis=1)
+    assert np.median(np.abs(away[is_bone] - 40.0)) < 10.0  # but for layers on it, and a range that is wrong
 
 
 def test_a_file_keeps_the_place_of_each_point(pair, tmp_path):

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from gapr_core import LookAccumulator, Registrar, RegistrarConfig, RegistrationStatus, Tracker, metrics
+from gapr_core import LookAccumulator, LookFit, Registrar, RegistrarConfig, RegistrationStatus, Tracker, metrics
 from gapr_core.data import pool, protocols
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration import explained
-from gapr_core.registration.apart import LookFits
+from gapr_core.registration import look_agreement
 
 SUBJECT, SEED = 0, 5
 MOTION = [4.0, -3.0, 3.0, 0.02, 0.03, -0.02]  # 6 mm and 2.4 deg
@@ -57,8 +56,8 @@ def result(registrar, pair, target):
 
 
 def test_the_looks_together_give_a_pose(result, pair):
-    assert result.ok and result.looks_apart is None and is_right(result.T_target_source, pair)
-    assert result.confidence > 0.8
+    assert result.ok and result.confidence > 0.8 and is_right(result.T_target_source, pair)
+    assert [look.fit for look in result.looks] == [LookFit.FITS] * 4
 
 
 def test_the_order_of_the_points_says_nothing(registrar, pair, target, result):
@@ -71,11 +70,10 @@ def test_the_order_of_the_points_says_nothing(registrar, pair, target, result):
 def test_looks_between_which_the_bone_moved_are_refused_by_this_rule_alone(registrar, moved, target, monkeypatch):
     result = registrar.register(moved[0], target, viewpoint=moved[1])
     assert result.status is RegistrationStatus.AMBIGUOUS and "shows the bone elsewhere" in result.reason
-    assert 1 <= len(result.looks_apart) <= 3 and result.confidence <= registrar.config.rules.ruled_out
-    places = np.unique(moved[1], axis=0)
-    assert all((places == place).all(axis=1).any() for place in result.looks_apart)
-    none = np.zeros((2, 4), dtype=bool)
-    monkeypatch.setattr(explained, "look_fits", lambda *_: LookFits(*none))
+    fits = [look.fit for look in result.looks]
+    assert 1 <= fits.count(LookFit.APART) <= 3 and result.confidence <= registrar.config.rules.ruled_out
+    assert np.array_equal([look.viewpoint for look in result.looks], np.unique(moved[1], axis=0))
+    monkeypatch.setattr(look_agreement, "look_fits", lambda *_: [LookFit.FITS] * 4)
     assert registrar.register(moved[0], target, viewpoint=moved[1]).ok
 
 
@@ -93,10 +91,10 @@ def test_an_accumulator_of_looks_finds_the_bone_where_it_moved_to(registrar, pai
 
 
 def test_a_look_of_too_few_points_is_named_and_as_the_newest_refused(registrar, pair, target):
-    few = pair.source[:4] + 1.0
-    places = np.vstack([pair.viewpoint, np.tile([[0.0, 0.0, 900.0]], (4, 1))])
+    few = pair.source[:7] + 1.0
+    places = np.vstack([pair.viewpoint, np.tile([[0.0, 0.0, 900.0]], (7, 1))])
     result = registrar.register(np.vstack([pair.source, few]), target, viewpoint=places)
-    assert result.ok and result.looks_apart.tolist() == [[0.0, 0.0, 900.0]]
+    assert result.ok and {look.viewpoint[2] for look in result.looks if look.fit is LookFit.TOO_SMALL} == {900.0}
     looks = LookAccumulator(registrar)
     for number in (0, 1):
         looks.register(of_look(pair, number), target, viewpoint=of_look(pair, number, pair.viewpoint)[0])

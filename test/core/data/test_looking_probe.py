@@ -4,7 +4,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from gapr_core.data.looks import LookingProbe, LookSize
+from gapr_core.data.looking_probe import LookingProbe, LookSize
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3

@@ -40,7 +40,7 @@ def in_mm(T: Array) -> Array:
     return scaled
 
 
-def wire_pose(T_target_source: Array) -> Array:
+def ros_pose(T_target_source: Array) -> Array:
     """The core's answer (4, 4), mm, as T_cloud_model in metres."""
     T = se3.inverse(se3.nearest_rigid(T_target_source))
     T[:3, 3] /= MM_PER_M
@@ -52,7 +52,7 @@ def core_pose(T_cloud_model: Array) -> Array:
     return in_mm(se3.inverse(T_cloud_model))
 
 
-def wire_covariance(covariance: Array, T_target_source: Array, centre_mm: Array, floors: tuple[float, float]) -> Array:
+def ros_covariance(covariance: Array, T_target_source: Array, centre_mm: Array, floors: tuple[float, float]) -> Array:
     """The core's covariance as that of T_cloud_model in the cloud's frame.
 
     The core's error xi = (v, w) is a twist in the target's frame that acts on the left of T_target_source about the

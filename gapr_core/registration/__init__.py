@@ -15,10 +15,11 @@ Where to read on, in the order in which a source passes:
 - `guidance`: where to look next. `check_points`: does the pose hold where the source was not? `cortices`: bones whose
   model has an inner surface.
 
-A camera's cloud goes another way: `looks` makes a scene of what it saw from one place or several, then `clutter` (with
-`proposals.regions`, `free_space`, `clutter_kernels`), `explained`; `apart`: do the looks show the bone in one place?
-Streams: `tracking` (with `memory`, `evidence`, `repeats`, `stream_misfit` of `shared_misfit`), `following` between two
-of them, `accumulation`, for a camera `look_accumulation`. `rigidity`: did a bone creep while its sources were
-collected, is a source strained or in two pieces? `doubles`: is the bone in it twice? `crop` cuts a cloud before,
-`inputs` takes poses and places.
+A camera's cloud goes another way: `scene` holds what it saw from one place or several, `scene_rounds` registers it with
+`clutter` (with `proposals.regions`, `free_space`, `clutter_kernels`) and `explained`; `look_agreement`: do the looks
+show the bone in one place? Streams: `tracking` (with `memory`, `evidence`, `repeats`, `stream_misfit` of
+`shared_misfit`), `following` between two of them, `accumulation`, for a camera `look_accumulation`, both with
+`far_away`. `creep`: did the bone move while its sources were collected? `rigidity`: is a source strained or in two
+pieces? Both ask `further_unknowns`. `doubles`: is the bone in it twice? `crop` cuts a cloud before, `inputs` takes
+poses and places.
 """

@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logit
 
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
-from gapr_core.registration import precision, rigidity
+from gapr_core.registration import creep, limits, precision
 from gapr_core.registration.far_away import FarInARow
-from gapr_core.registration.limits import too_unsure, why_no_surer
 from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import fingerprint
@@ -30,7 +28,6 @@ Array = NDArray[np.float64]
 POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
 FEWEST_IN_TIME = 6  # sources that show a motion, as it is refused
 FEWEST_THAT_MAY, MAY_MOVE = 3, 1.0 / 6.0  # sources in which, and share of `rigidity.creeps` from which on it may be one
-MOVING = "moving"  # among the contributions and `limits.LIMITS`
 
 
 class Accumulator:
@@ -41,7 +38,7 @@ class Accumulator:
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
     what lies off the bone, or lay off it under the accepted pose before, is left out, and refused if it is the newest.
     After three of them in a row the bone or its reference has moved, and only these three are kept. Where all show that
-    the bone moves (see `rigidity`), the answer is refused, and those since a step or the last third are kept.
+    the bone moves (see `creep`), the answer is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -177,32 +174,20 @@ class Accumulator:
 
         Those since a step are left; of a steady motion the last third.
         """
-        kept, limits = self._kept, self.config.rigidity
+        kept, rigidity = self._kept, self.config.rigidity
         if len(kept) < FEWEST_THAT_MAY:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
-        found = rigidity.of_motion(refine_fully(T, points, seen, self.config.refinement), order[some], limits)
+        found = creep.of_motion(refine_fully(T, points, seen, self.config.refinement), order[some], rigidity)
         ratio = found.finding.log_ratio
-        if ratio <= limits.creeps or len(kept) < FEWEST_IN_TIME:
-            return self._no_surer(result) if ratio > MAY_MOVE * limits.creeps else result
+        if ratio <= rigidity.creeps or len(kept) < FEWEST_IN_TIME:
+            return limits.no_surer(result, limits.MOVING, self.config) if ratio > MAY_MOVE * rigidity.creeps else result
         self.reset()
         self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
-
-    def _no_surer(self, result: RegistrationResult) -> RegistrationResult:
-        """The answer with `limits.most` as its confidence at most; refused where more is asked for."""
-        most = self.config.limits.most
-        if not result.ok or result.confidence <= most:
-            return result
-        takes = float(logit(most) - logit(result.confidence))
-        found = replace(result, confidence=most, contributions={**result.contributions, MOVING: takes})
-        if most >= self.config.min_confidence:
-            return found
-        why = why_no_surer(found.contributions)
-        return found.refused(RegistrationStatus.LOW_CONFIDENCE, too_unsure(why, self.config))
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import sampling, se3
@@ -22,7 +23,7 @@ from gapr_core.registration import sensor
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.bias_field import UNKNOWNS
 from gapr_core.registration.roughness import NEAR_MM
-from gapr_core.results import Refusal, RegistrationStatus
+from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ NEARLY_ALL = 0.9  # share of the points
 MOST_COMPARED = 1000  # points whose feet are looked at
 SAME_CONTACT_MM = 1.0
 DRAWS = 4096
+MOVING, UNCONFIRMED = "moving", "unconfirmed"  # what collected sources or looks leave open
 
 
 class Limit(NamedTuple):
@@ -239,13 +241,35 @@ LIMITS = (
         "measure on the bone",
     ),
     Limit(
-        "moving",
-        shows_most("moving"),  # an `Accumulator` asks
+        MOVING,
+        shows_most(MOVING),  # an `Accumulator` asks
         "the collected sources hardly exclude that the bone moves against their frame; check what is fixed to it, or "
         "collect more",
     ),
+    Limit(
+        UNCONFIRMED,
+        shows_most(UNCONFIRMED),  # a `LookAccumulator` asks
+        "the newest look alone gives no pose, and so does not show that the bone is still where the others have it; "
+        "look from where more of the bone is seen",
+    ),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )
+
+
+def no_surer(result: RegistrationResult, by: str, config: RegistrarConfig) -> RegistrationResult:
+    """An answer with `limits.most` as its confidence at most, for the limit of this name; for who collects sources.
+
+    Refused where more is asked for than that.
+    """
+    most = config.limits.most
+    if not result.ok or result.confidence <= most:
+        return result
+    takes = float(logit(most) - logit(result.confidence))
+    found = replace(result, confidence=most, contributions={**result.contributions, by: takes})
+    if most >= config.min_confidence:
+        return found
+    why = why_no_surer(found.contributions)
+    return found.refused(RegistrationStatus.LOW_CONFIDENCE, too_unsure(why, config))
 
 
 def why_no_surer(contributions: Mapping[str, float]) -> str:

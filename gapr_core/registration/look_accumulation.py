@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.registration import inputs
+from gapr_core.registration import inputs, limits
 from gapr_core.registration.far_away import FarInARow
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.scene import HOW, MOST_PLACES, Look, Places
@@ -34,7 +34,8 @@ STUCK = 10  # refusals in a row from one direction; what the looks before show m
 class Newest(Enum):
     """What the newest look says of the pose of all."""
 
-    AGREES = ""
+    AGREES = "alone it has the same pose, or it is the only one"
+    IS_UNCONFIRMED = "alone it has no pose"
     IS_REFUSED = "with the others it gives no pose"
     SHOWS_NOTHING = (
         "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
@@ -52,9 +53,10 @@ class LookAccumulator:
     direction, so that those of a video do not push out all others.
 
     An older look that shows the bone elsewhere than the newest is left out, and the others are asked again. The newest
-    is refused where it does not fit the others, shows nothing of the bone there, or alone has another pose. After three
-    that show the bone elsewhere in a row it or its reference has moved, and only these three are kept, whatever their
-    directions. After ten refusals from one direction only the last look is kept.
+    is refused where it does not fit the others, shows nothing of the bone there, or alone has another pose; where it
+    alone has none, the answer is not sure (`limits`). After three in a row that show the bone elsewhere it or its
+    reference has moved, and only these three are kept, whatever their directions. After ten refusals from one direction
+    only the last look is kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
@@ -157,7 +159,9 @@ class LookAccumulator:
         found = replace(result, stage_ms=_added(result.stage_ms, clock.stages))
         if said in (Newest.SHOWS_NOTHING, Newest.DIFFERS):
             found = self._refused(found, said.value)
-        return found if found.ok else replace(found, reason=found.reason + self._after_refusal(said, newest, before))
+        if said is Newest.IS_UNCONFIRMED:
+            found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
+        return replace(found, reason=found.reason + self._after(said, newest, before))
 
     def _of_those_that_fit(self, target: PreparedTarget, initial: ArrayLike | None) -> RegistrationResult:
         """The answer to all looks; without older ones that show the bone elsewhere than the newest and the others."""
@@ -173,7 +177,7 @@ class LookAccumulator:
             self._looks = kept
 
     def _of_newest(self, result: RegistrationResult, target: PreparedTarget) -> Newest:
-        """What the newest look says of the answer to all; a pose that it agrees with ends what is counted."""
+        """What the newest look says of the answer to all."""
         fit = result.looks[-1].fit if result.looks else LookFit.FITS
         may_be_there = result.status in (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)
         if fit is LookFit.APART:
@@ -182,34 +186,35 @@ class LookAccumulator:
             return Newest.SHOWS_NOTHING
         if not result.ok:
             return Newest.IS_REFUSED
-        if self._differs(self._looks[-1], result, target):
-            return Newest.DIFFERS
-        self._off_in_a_row, self._refused_in_a_row = [], 0
-        return Newest.AGREES
+        return self._alone(self._looks[-1], result, target)
 
-    def _differs(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> bool:
-        """True where the newest look alone has a pose that is not right if that of all is."""
-        if len(self._looks) < 2:
-            return False
+    def _alone(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> Newest:
+        """What the newest look alone says of the pose of all: its own is right if that one is, or it has none."""
+        if len(self._looks) < 2 or result.T_target_source is None:
+            return Newest.AGREES
         registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
         alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
-        if alone.T_target_source is None or result.T_target_source is None:
-            return False
-        return not se3.pose_error(alone.T_target_source, result.T_target_source, newest.points).is_right
+        if alone.T_target_source is None:
+            return Newest.IS_UNCONFIRMED
+        error = se3.pose_error(alone.T_target_source, result.T_target_source, newest.points)
+        return Newest.AGREES if error.is_right else Newest.DIFFERS
 
     def _refused(self, result: RegistrationResult, reason: str) -> RegistrationResult:
         """Of a bone that is no longer where the looks have it in common, for all that is known."""
         refused = result.refused(RegistrationStatus.AMBIGUOUS, reason)
         return replace(refused, confidence=min(result.confidence, self.config.rules.ruled_out))
 
-    def _after_refusal(self, said: Newest, newest: Look, before: list[Look]) -> str:
-        """Decide which looks stay after a refusal. Returns how that is said, after the reason.
+    def _after(self, said: Newest, newest: Look, before: list[Look]) -> str:
+        """Decide which looks stay after an answer. Returns how that is said, after the reason.
 
         Args:
-            said: what the newest look says.
+            said: what the newest look says; a pose that it does not speak against ends what is counted.
             newest: the look; among those kept so far.
             before: the looks before it.
         """
+        if said in (Newest.AGREES, Newest.IS_UNCONFIRMED):
+            self._off_in_a_row, self._refused_in_a_row = [], 0
+            return ""
         if said in (Newest.IS_APART, Newest.DIFFERS):
             self._off_in_a_row = [*self._off_in_a_row, newest]
             if len(self._off_in_a_row) >= self.config.accumulation.most_off:

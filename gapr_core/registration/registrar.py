@@ -27,7 +27,18 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
-from gapr_core.registration import checks, clutter, cortices, doubles, explained, inputs, limits, look_agreement, rules
+from gapr_core.registration import (
+    checks,
+    clutter,
+    cortices,
+    doubles,
+    explained,
+    inputs,
+    limits,
+    look_agreement,
+    rules,
+    scene_rounds,
+)
 from gapr_core.registration import scene as scenes
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
@@ -305,7 +316,7 @@ class Registrar:
 
         It is asked all that one of bone alone is asked, since nobody said that it is a scene.
         """
-        config, scene = self.config, self._scene_of_unknown(source)
+        config, scene = self.config, scene_rounds.of_unknown(source, self.config)
         if scene is None:
             return None
         places = clutter.inferred_places(scene, config)
@@ -319,16 +330,11 @@ class Registrar:
                 return found
         return None
 
-    def _scene_of_unknown(self, source: ArrayLike) -> PreparedSource | None:
-        """A source prepared as a scene; None where it is none, or where no pose of it would be sure enough."""
-        config = self.config
-        if config.accepted_if_inferred > config.limits.most or not clutter.sees_from_afar(config):
-            return None
-        try:
-            scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
-        except InvalidPointCloudError:
-            return None  # of all points some are metres away; those that were looked at as bone are not
-        return scene if isinstance(scene, PreparedSource) else None
+    def _in_scene(
+        self, seen: Scene, target: PreparedTarget, poses: Array, clock: Clock, rounds: int | None = None
+    ) -> Assessment | None:
+        """See `scene_rounds.register`."""
+        return scene_rounds.register(seen, target, poses, self.scene_calibration, self.config, clock, rounds)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         """The mirror image of a source, registered in full; `memory.MemoryFirst` leaves what it remembers out."""
@@ -377,36 +383,6 @@ class Registrar:
         config = self.config
         is_good = assessment.reaches(max(config.searched_below, config.min_confidence))
         return assessment.reaches(config.sure_from) or (is_good and assessment.probability <= config.limits.most)
-
-    def _in_scene(
-        self,
-        seen: Scene,
-        target: PreparedTarget,
-        poses: Array,
-        clock: Clock,
-        rounds: int | None = None,
-    ) -> Assessment | None:
-        """A cloud of a camera: more and more regions propose, its lines of sight decide, until an answer is sure."""
-        config, threads = self.config, self.config.num_threads
-        settings = replace(config.clutter, rounds=rounds or config.clutter.rounds)
-        assessment = None
-        for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
-            pool = clutter.propose(scene, target, poses, settings, threads)
-            clock.lap("propose")
-            if not clutter.has_proposed(pool):
-                continue  # a pose that was given is not weighed against nothing
-            start = poses if assessment is None else None
-            candidates = clutter.verify(pool, scene, target, settings, threads, start)
-            poses = candidates.poses
-            clock.lap("verify")
-            part = explained.refine(poses[0], scene, target, config)
-            clock.lap("refine")
-            assessment = explained.assess_part(part, candidates, scene, target, self.scene_calibration, config)
-            assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
-            clock.lap("assess")
-            if assessment.reaches(config.sure_from):
-                break
-        return assessment
 
 
 def _as_config(config: object) -> RegistrarConfig:

@@ -15,6 +15,7 @@ from gapr_core.registration.covariance import PoseUncertainty
 from gapr_core.registration.explained import Explained
 from gapr_core.registration.features import OTHER_BONE, SCENE_FEATURES
 from gapr_core.registration.free_space import Visible
+from gapr_core.registration.further_unknowns import Finding
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.verification import Candidates
 from gapr_core.results import Refusal, RegistrationStatus
@@ -165,7 +166,7 @@ def test_the_covariance_holds_what_the_looks_err_by_against_each_other(judged, m
 
     def of_looks(fit, look, config):
         asked.append(look)
-        return rigidity.Deformation(rigidity.Finding(log_ratio, 0.7), changes, 0.0)
+        return rigidity.Deformation(Finding(log_ratio, 0.7), changes, 0.0)
 
     monkeypatch.setattr(explained.covariance, "estimate", lambda *_, **__: known)
     monkeypatch.setattr(rigidity, "of_looks", of_looks)

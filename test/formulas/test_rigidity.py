@@ -9,20 +9,13 @@ from scipy.stats import multivariate_normal
 from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
-from gapr_core.registration import rigidity
+from gapr_core.registration import further_unknowns, rigidity
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.covariance import PoseUncertainty, covariance_added_by
+from gapr_core.registration.creep import of_motion
+from gapr_core.registration.further_unknowns import BIASES_MM, SHARED_MM, SIZES_MM, Blocks, blocks, findings
 from gapr_core.registration.refinement import Fit
-from gapr_core.registration.rigidity import (
-    BIASES_MM,
-    SHARED_MM,
-    SIZES_MM,
-    Blocks,
-    blocks,
-    findings,
-    of_deformations,
-    of_motion,
-)
+from gapr_core.registration.rigidity import of_deformations
 
 CONFIG = RigidityConfig()
 SMALL = RigidityConfig(cells=12, groups=2)
@@ -31,7 +24,7 @@ NOISE_MM = 0.4
 
 def of_strain(fit, config):
     found = of_deformations(fit, config)
-    return found["strained"].finding if found else rigidity.NOTHING
+    return found["strained"].finding if found else further_unknowns.NOTHING
 
 
 def fit_of(points, normals, errors, weights=None):
@@ -169,11 +162,11 @@ def test_another_size_is_a_strain(seen):
 def test_few_points_or_one_source_say_nothing(seen):
     points, normals = seen(199)
     fit = fit_of(points, normals, noise(199) + 0.2 * points)
-    assert of_strain(fit, CONFIG) == rigidity.NOTHING == of_motion(fit, np.arange(199), CONFIG).finding
+    assert of_strain(fit, CONFIG) == further_unknowns.NOTHING == of_motion(fit, np.arange(199), CONFIG).finding
     points, normals = seen(200)
     fit = fit_of(points, normals, noise(200) + 0.2 * points * [0, 0, 1])
     assert of_strain(fit, CONFIG).log_ratio > 3.0
-    assert of_motion(fit, np.zeros(200, dtype=np.int64), CONFIG).finding == rigidity.NOTHING
+    assert of_motion(fit, np.zeros(200, dtype=np.int64), CONFIG).finding == further_unknowns.NOTHING
 
 
 def test_halves_move_against_each_other_along_each_principal_axis(seen):
@@ -395,7 +388,7 @@ def test_each_look_moves_by_itself(seen):
     fit, look = looks_that_err(seen, 0.5)
     look = np.where(look == 3, 7, look)  # a number that is missing is no look
     found = rigidity.of_looks(fit, look, CONFIG)
-    moved = rigidity.motions(fit)
+    moved = further_unknowns.motions(fit)
     assert found.changes.shape == (len(look), 24)
     for k, number in enumerate((0, 1, 2, 7)):
         of_it = found.changes[:, 6 * k : 6 * k + 6]

@@ -11,7 +11,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, rigidity
+from gapr_core.registration import clutter, creep
 from gapr_core.registration.limits import why_no_surer
 from gapr_core.results import Hypothesis, RegistrationResult
 
@@ -399,7 +399,7 @@ def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
 
 @pytest.mark.parametrize(("log_ratio", "is_refused"), [(5.9, False), (6.1, True)])
 def test_a_motion_is_believed_from_the_setting_on(registrar, target, femur, monkeypatch, log_ratio, is_refused):
-    monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(log_ratio, 1.0)))
+    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(log_ratio, 1.0)))
     accumulator, result = creeping(registrar, target, femur, 0.0, 6.0)
     assert ("the bone moves against the frame" in result.reason) is is_refused and result.ok is not is_refused
     assert len(accumulator.collected) == (150 * 3 if is_refused else 150 * 9)
@@ -412,14 +412,14 @@ def test_where_a_motion_is_hardly_excluded_no_pose_is_sure(
     registrar, target, femur, monkeypatch, log_ratio, creeps, count, most
 ):
     """Only this keeps it from being sure. Of two sources nobody knows; without the rule on motions nobody asks."""
-    monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(log_ratio, 1.0)))
+    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(log_ratio, 1.0)))
     _, result = creeping(registrar, target, femur, 0.0, creeps, count)
     assert result.ok and result.confidence <= most and (count < 9 or (result.confidence > 0.9) is (most == 1.0))
     assert ("hardly exclude that the bone moves" in why_no_surer(result.contributions)) is (most == 0.89)
 
 
 def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(registrar, target, femur, monkeypatch):
-    monkeypatch.setattr(rigidity, "of_motion", lambda *_: rigidity.Motion(rigidity.Finding(1.1, 1.0)))
+    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(1.1, 1.0)))
     strict = Registrar(replace(registrar.config, min_confidence=0.9), registrar.proposers, registrar.calibrations)
     _, result = creeping(strict, target, femur, 0.0, 6.0)
     assert (

@@ -8,7 +8,7 @@ from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import ClutterConfig, SensorConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
-from gapr_core.registration import checks, clutter
+from gapr_core.registration import checks, clutter, scene_rounds
 from gapr_core.registration import source as sources
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import Calibration
@@ -123,7 +123,7 @@ def test_a_pose_that_rests_on_an_inferred_place_needs_more_than_half(target, sce
 def test_sensors_that_touch_the_bone_or_skin_have_no_lines_of_sight(scene, kind, asked):
     config = RegistrarConfig(sensor=SensorConfig(kind=kind))
     assert len(clutter.inferred_places(prepare(scene[0], in_scene=True), config)) == asked
-    assert (Registrar(config)._scene_of_unknown(scene[0]) is not None) is bool(asked), "nothing is prepared in vain"
+    assert (scene_rounds.of_unknown(scene[0], config) is not None) is bool(asked), "nothing is prepared in vain"
 
 
 @pytest.mark.parametrize(("least", "is_asked"), [(0.5, True), (0.89, True), (0.9, False)])

@@ -1,0 +1,76 @@
+"""A scene registered: more and more regions of it propose, its lines of sight decide, until an answer is sure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.registration import clutter, explained
+from gapr_core.registration import source as sources
+from gapr_core.registration.assessment import Assessment
+from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.scene import Scene
+from gapr_core.registration.source import PreparedSource
+from gapr_core.registration.target import PreparedTarget
+from gapr_core.runtime.clock import Clock
+
+Array = NDArray[np.float64]
+
+
+def register(
+    seen: Scene,
+    target: PreparedTarget,
+    poses: Array,
+    calibration: Calibration,
+    config: RegistrarConfig,
+    clock: Clock,
+    rounds: int | None = None,
+) -> Assessment | None:
+    """The best pose of what a camera saw, before the costly checks; None where no region proposes any.
+
+    Args:
+        seen: from one place or several, without regions.
+        target: the bone.
+        poses: (K, 4, 4) T_target_source, mm, to try as well.
+        calibration: the confidence model of scenes.
+        config: every setting.
+        clock: of the call.
+        rounds: of regions at most; `ClutterConfig.rounds` when not given.
+    """
+    settings, threads = replace(config.clutter, rounds=rounds or config.clutter.rounds), config.num_threads
+    assessment = None
+    for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
+        pool = clutter.propose(scene, target, poses, settings, threads)
+        clock.lap("propose")
+        if not clutter.has_proposed(pool):
+            continue  # a pose that was given is not weighed against nothing
+        start = poses if assessment is None else None
+        candidates = clutter.verify(pool, scene, target, settings, threads, start)
+        poses = candidates.poses
+        clock.lap("verify")
+        part = explained.refine(poses[0], scene, target, config)
+        clock.lap("refine")
+        assessment = explained.assess_part(part, candidates, scene, target, calibration, config)
+        assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
+        clock.lap("assess")
+        if assessment.reaches(config.sure_from):
+            break
+    return assessment
+
+
+def of_unknown(source: ArrayLike, config: RegistrarConfig) -> PreparedSource | None:
+    """A source of which nobody said where it was seen from, as what a camera may have seen.
+
+    None where it cannot be that, or where no pose of it would be sure enough.
+    """
+    if config.accepted_if_inferred > config.limits.most or not clutter.sees_from_afar(config):
+        return None
+    try:
+        scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
+    except InvalidPointCloudError:
+        return None  # of all points some are metres away; those that were looked at as bone are not
+    return scene if isinstance(scene, PreparedSource) else None

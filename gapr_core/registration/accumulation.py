@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
-from gapr_core.registration import creep, limits, precision
+from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.registration import creep, limits, precision, rules
 from gapr_core.registration.far_away import FarInARow
 from gapr_core.registration.refinement import distances_mm, refine_fully
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.repeats import fingerprint
+from gapr_core.registration.rigidity import covariance_of_half
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.registration.tracking import Tracker
@@ -172,7 +174,8 @@ class Accumulator:
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
         """The answer; a refusal where the sources show that the bone moves, not sure where they hardly exclude it.
 
-        Those since a step are left; of a steady motion the last third.
+        What it may have moved by is in the covariance then. Those since a step are left; of a steady motion the last
+        third.
         """
         kept, rigidity = self._kept, self.config.rigidity
         if len(kept) < FEWEST_THAT_MAY:
@@ -180,14 +183,30 @@ class Accumulator:
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
-        found = creep.of_motion(refine_fully(T, points, seen, self.config.refinement), order[some], rigidity)
+        fit = refine_fully(T, points, seen, self.config.refinement)
+        found = creep.of_motion(fit, order[some], rigidity)
         ratio = found.finding.log_ratio
+        if ratio <= MAY_MOVE * rigidity.creeps:
+            return result
         if ratio <= rigidity.creeps or len(kept) < FEWEST_IN_TIME:
-            return limits.no_surer(result, limits.MOVING, self.config) if ratio > MAY_MOVE * rigidity.creeps else result
+            widened = self._widened(result, covariance_of_half(fit, found.finding.size_mm), target)
+            return limits.no_surer(widened, limits.MOVING, self.config)
         self.reset()
         self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
+
+    def _widened(self, result: RegistrationResult, added: Array, target: PreparedTarget) -> RegistrationResult:
+        """An answer with more in its covariance (6, 6) and in its errors; refused where these are too large then."""
+        if result.covariance is None or result.centre_mm is None:  # as of methods that predict no error
+            return result
+        covariance = result.covariance + added
+        tre_mm = predicted_rmse_mm(covariance, target.points, result.centre_mm)
+        tre95_mm = result.factor95 * precision.bound_mm(covariance, target.points, result.centre_mm)
+        refusal = rules.by_threshold(result.confidence, tre95_mm, self.config)
+        if refusal is not None:
+            return result.refused(refusal.status, refusal.reason)
+        return replace(result, covariance=covariance, tre_mm=tre_mm, tre95_mm=tre95_mm)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
         """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.

@@ -211,6 +211,12 @@ LIMITS = (
         "not move while it was measured, or measure it again",
     ),
     Limit(
+        "patch_off",
+        shows_most("patch_off"),
+        "one of the separate patches does not fit the others: it may lie on other tissue, or something moved; measure "
+        "that place again",
+    ),
+    Limit(
         "strained",
         shows_most("strained"),
         "the source is longer, wider or slanted against the bone; check that nothing moved while it was measured, and "

@@ -7,7 +7,8 @@ The order in which an answer comes about, with the function of each step:
    `assess_fit` says how sure it is, until that is enough. `_on_both_cortices` once more where a bone is hollow.
 3. `_of_one_view`: what is not sure as bone alone may be what a camera saw. With a viewpoint `_in_scene` comes at once.
 4. `_checked_and_corrected`: sizes, the mirror image, then a stand-off may refuse; `bias_corrected` moves the pose;
-   the precision model and `allowing_for_deformation` widen its covariance, `allowing_for_a_copy` may refuse it too.
+   the precision model, `allowing_for_deformation` and `allowing_for_a_patch` widen its covariance,
+   `allowing_for_a_copy` may refuse it too.
 5. In a stream `Tracker` weighs it with the sources before.
 6. `conclude`: `limits` keep it from being sure, thresholds refuse, and the reason gets its words.
 """
@@ -52,6 +53,7 @@ from gapr_core.registration.refinement import refine_fully, rest_on_whole
 from gapr_core.registration.rigidity import allowing_for_deformation
 from gapr_core.registration.scene import Look, Scene, Viewpoint
 from gapr_core.registration.sensor import offset_surface
+from gapr_core.registration.separate_patches import allowing_for_a_patch
 from gapr_core.registration.smooth_bias import bias_corrected
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.standoff import asking_the_standoff, unless_off_the_bone
@@ -291,7 +293,8 @@ class Registrar:
         def register(source: PreparedSource, poses: Array) -> Assessment | None:
             return self._in_rounds(source, assessment.target, poses, clock)
 
-        found = doubles.allowing_for_a_copy(allowing_for_deformation(corrected, config), config, register)
+        found = allowing_for_a_patch(allowing_for_deformation(corrected, config), config)
+        found = doubles.allowing_for_a_copy(found, config, register)
         clock.lap("assess")
         return found
 

@@ -40,11 +40,13 @@ WORDS = {
     "uncertain": "limit: the covariance leaves the pose loose",
     "loose": "limit: so loose over the bone, the pose may as well be of another subject's",
     "doubled": "limit: points that do not fit lie on the bone in another pose",
+    "patch_off": "limit: one of the separate patches does not fit the others",
     "strained": "limit: the source is longer, wider or slanted against the bone",
     "layered": "limit: the distance from the bone changes along the source",
     "apart": "limit: two halves of the source lie in two poses",
     "far_out": "limit: a stand-off is stated that is larger than a pose may be off",
     "moving": "limit: collected sources hardly exclude that the bone moves",
+    "unconfirmed": "limit: the newest look alone gives no pose",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits
 

@@ -11,7 +11,8 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter, creep
+from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.registration import clutter, creep, precision
 from gapr_core.registration.limits import why_no_surer
 from gapr_core.results import Hypothesis, RegistrationResult
 
@@ -416,6 +417,22 @@ def test_where_a_motion_is_hardly_excluded_no_pose_is_sure(
     _, result = creeping(registrar, target, femur, 0.0, creeps, count)
     assert result.ok and result.confidence <= most and (count < 9 or (result.confidence > 0.9) is (most == 1.0))
     assert ("hardly exclude that the bone moves" in why_no_surer(result.contributions)) is (most == 0.89)
+
+
+def test_what_the_bone_may_have_moved_by_is_in_the_covariance(registrar, target, femur, monkeypatch):
+    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(0.9, 4.0)))
+    _, at_rest = creeping(registrar, target, femur, 0.0, 6.0)
+    monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(1.1, 4.0)))
+    _, result = creeping(registrar, target, femur, 0.0, 6.0)
+    added = result.covariance - at_rest.covariance
+    assert np.linalg.eigvalsh(added).min() > -1e-9 and np.diag(added)[:3].min() >= 0.99 * 2.0**2
+    assert np.array_equal(result.T_target_source, at_rest.T_target_source)
+    assert result.tre_mm == pytest.approx(predicted_rmse_mm(result.covariance, target.points, result.centre_mm))
+    bound_mm = precision.bound_mm(result.covariance, target.points, result.centre_mm)
+    assert result.tre95_mm == pytest.approx(result.factor95 * bound_mm) and result.tre95_mm > at_rest.tre95_mm + 2.0
+    exact = Registrar(replace(registrar.config, max_tre_mm=3.0), registrar.proposers, registrar.calibrations)
+    _, refused = creeping(exact, target, femur, 0.0, 6.0)
+    assert refused.status is RegistrationStatus.IMPRECISE and refused.covariance is None
 
 
 def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(registrar, target, femur, monkeypatch):

@@ -224,6 +224,10 @@ class RegistrationResult:
         """True when there is a pose."""
         return self.status is RegistrationStatus.OK
 
+    def __bool__(self) -> bool:
+        """As `ok`: a refusal is no pose."""
+        return self.ok
+
     def refused(self, status: RegistrationStatus, reason: str) -> RegistrationResult:
         """The same without its pose and all that goes with one; its confidence and hypotheses stay, to look at."""
         return replace(
@@ -266,6 +270,9 @@ class RegistrationResult:
             head += f" (95 %: {self.tre95_mm:.1f} mm)"
         head += f"  inliers {self.inlier_ratio:.2f}  {sum(self.stage_ms.values()):.0f} ms"
         return f"{head}  ({self.reason})" if self.reason else head
+
+    def __repr__(self) -> str:
+        return f"<RegistrationResult: {self}>"
 
 
 class Verdict(str, Enum):

@@ -35,6 +35,7 @@ READ_BY_LAUNCH = (  # needs no declaration
     "sigkill_timeout",
     "ros_namespace",
 )
+BONE_M, ROOM_M = 1.0, 100.0  # longer lengths are odd for a limit at a bone, and for one in a room
 MOST_LOOKS = 16  # of a camera that are registered as one, however many are asked for
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
 Triple = tuple[float, float, float]
@@ -212,6 +213,22 @@ def empty_limits(parameters: NodeParameters) -> list[str]:
     return [f"{pair}: every cloud is refused until it is" for pair in pairs]
 
 
+def odd_lengths(parameters: NodeParameters) -> list[str]:
+    """One sentence for each length with which a limit never holds, as of a bone or of a room: perhaps it is in mm."""
+    at_bone = ("max_tre", "max_jump_translation", "crop_to_track"), BONE_M
+    in_room = ("range_min", "range_max", "crop_min", "crop_max"), ROOM_M
+    return [
+        f"{name} is {getattr(parameters, name)}: lengths are in metres; is it in mm?"
+        for names, longest_m in (at_bone, in_room)
+        for name in names
+        if longest_m < max(map(abs, _each(getattr(parameters, name)))) < math.inf
+    ]
+
+
+def _each(value: float | Triple) -> Triple:
+    return value if isinstance(value, tuple) else (value,) * 3
+
+
 def why_all_assessed(parameters: NodeParameters) -> str:
     """Why no cloud can be followed with these parameters, whatever `assess_every` is; empty where some can."""
     if not parameters.track:
@@ -228,16 +245,23 @@ def _together(parameters: NodeParameters) -> int:
 
 
 def unknown_names(node: Node) -> list[str]:
-    """One sentence for each name that was given and has no effect, with the nearest one that has."""
-    sentences = []
-    for name in node._parameter_overrides:
-        if name.startswith("qos_overrides"):
-            sentences.append(f"'{name}' is ignored: set cloud_reliability")
-        elif name not in FIELDS and name not in NOT_OURS:
-            near = difflib.get_close_matches(name, FIELDS, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            sentences.append(f"unknown parameter '{name}' is ignored{hint}")
-    return sentences
+    """One sentence for each name that was given, has no effect, and resembles none that has one."""
+    of_qos = [name for name in node._parameter_overrides if name.startswith("qos_overrides")]
+    others = [f"unknown parameter '{name}' is ignored" for name, near in _not_ours(node).items() if not near]
+    return [f"'{name}' is ignored: set cloud_reliability" for name in of_qos] + others
+
+
+def misspelt_names(node: Node) -> list[str]:
+    """One sentence for each name that was given, has no effect, and resembles one that has."""
+    named = {name: near[0] for name, near in _not_ours(node).items() if near}
+    return [f"unknown parameter '{name}' is ignored; did you mean '{near}'?" for name, near in named.items()]
+
+
+def _not_ours(node: Node) -> dict[str, list[str]]:
+    """The names that were given and are none of the node's, each with the nearest one that is, where one is near."""
+    known = (*FIELDS, *NOT_OURS)
+    given = [name for name in node._parameter_overrides if name not in known and not name.startswith("qos_overrides")]
+    return {name: difflib.get_close_matches(name, FIELDS, n=1) for name in given}
 
 
 def check_launch_names(

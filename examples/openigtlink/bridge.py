@@ -134,7 +134,7 @@ def main() -> int:
     bridge = Bridge(registrar, target, tracker, slicer, args.device, args.every)
     try:
         while True:
-            if result := bridge.step():
+            if (result := bridge.step()) is not None:
                 sys.stdout.write(f"{time.strftime('%H:%M:%S')} {len(registrar.collected)} points: {result}\n")
     except KeyboardInterrupt:
         return 0

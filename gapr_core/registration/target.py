@@ -63,6 +63,9 @@ class PreparedTarget:
     cache: dict[Any, Any] = dataclasses.field(default_factory=dict)
     offset_mm: float = 0.0
 
+    def __repr__(self) -> str:
+        return f"<PreparedTarget: {len(self.points)} points, {self.surface.extent_mm:.0f} mm across>"
+
     @property
     def faces(self) -> NDArray[np.int64] | None:
         """Faces of the loaded mesh, indices into `surface.points`; None for a cloud."""

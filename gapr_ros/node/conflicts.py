@@ -19,14 +19,14 @@ class Conflicts:
         self._texts: dict[str, str] = {}
         self._until: dict[str, float] = {}
 
-    def note(self, kind: str, text: str, for_s: float = float("inf")) -> None:
+    def note(self, kind: str, text: str, for_s: float = float("inf"), log: bool = True) -> None:
         """There is one of this kind, seen again or for the first time; it lasts `for_s` unless it is seen again.
 
-        An empty text: there is none any more.
+        An empty text: there is none any more. Without `log` it was logged elsewhere.
         """
         now = time.monotonic()
         lasts = now < self._until.get(kind, now)
-        if text and not (lasts and text == self._texts[kind]):
+        if log and text and not (lasts and text == self._texts[kind]):
             self._write(text)
         self._texts[kind], self._until[kind] = text, now + for_s
 

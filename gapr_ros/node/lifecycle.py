@@ -190,10 +190,11 @@ class RegisterNode(LifecycleNode):
         model = str(ready.model)
         for sentence in parameters.remarks(self.parameters):
             self.get_logger().info(sentence)
-        for sentence in parameters.empty_limits(self.parameters):
+        for sentence in parameters.empty_limits(self.parameters) + parameters.odd_lengths(self.parameters):
             self.get_logger().warning(sentence)
         self.get_logger().info(model)
         self.session = Session(self, ready, self._method_factory)
+        self.session.conflicts.note("parameters", "; ".join(parameters.misspelt_names(self)), log=False)
         return super().on_configure(state)
 
     @transition
@@ -257,7 +258,7 @@ class RegisterNode(LifecycleNode):
     # --- what the node watches ---
 
     def _watch_parameters(self) -> None:
-        for sentence in parameters.unknown_names(self):
+        for sentence in parameters.unknown_names(self) + parameters.misspelt_names(self):
             self.get_logger().warning(sentence)
         self.add_on_set_parameters_callback(self._on_change)
         self.add_post_set_parameters_callback(self._on_changed)

@@ -33,6 +33,7 @@ class Model:
         points_mm: (M, 3) of the bone in `model_frame`, for display.
         extent_mm: diagonal of its bounding box.
         tree: of `points_mm`.
+        stamp: of the file as it was read; None where it has none.
     """
 
     path: str
@@ -40,6 +41,12 @@ class Model:
     points_mm: Array
     extent_mm: float
     tree: cKDTree
+    stamp: tuple[int, int] | None = None
+
+    @property
+    def has_changed(self) -> bool:
+        """True where another file is there now than the one that was read."""
+        return self.stamp is not None and _stamp_of(_expanded(self.path)) not in (None, self.stamp)
 
     @property
     def file(self) -> str:
@@ -66,13 +73,27 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     if "://" in parameters.model_path:
         raise ConfigError("model_path: a path", parameters.model_path, "write it without scheme: /path/to/bone.stl")
     options = ReadOptions(axes=parameters.model_axes, labels=labels_of(parameters.model_label))
-    path = Path(parameters.model_path).expanduser()  # a shell leaves the ~ of model_path:=~/bone.stl as it is
+    path = _expanded(parameters.model_path)
+    stamp = _stamp_of(path)
     surface = clouds.load(path, units=parameters.model_unit, options=options)
     surface = Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
     clouds.warn_of_size(path, surface.extent_mm)
     target = method.prepare(surface, units="mm")
     points_mm = _for_display(surface)
-    return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm))
+    return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm), stamp)
+
+
+def _expanded(path: str) -> Path:
+    return Path(path).expanduser()  # a shell leaves the ~ of model_path:=~/bone.stl as it is
+
+
+def _stamp_of(path: Path) -> tuple[int, int] | None:
+    """When a file was written, ns, and its size; None where it cannot be read."""
+    try:
+        seen = path.stat()
+    except OSError:
+        return None
+    return seen.st_mtime_ns, seen.st_size
 
 
 def labels_of(text: str) -> tuple[str, ...]:

@@ -268,6 +268,11 @@ class Session:
         self._admission.start_over(why)
         self._clear(why)
 
+    def look_at_file(self) -> None:
+        """Say so while the bone's file is another one than the one that was read."""
+        text = f"{self.model.path} has changed since it was read: call ~/reload_model" if self.model.has_changed else ""
+        self.conflicts.note("bone file", text)
+
     def reload_failed(self, why: str) -> None:
         """The old bone stays, and the diagnostics say so until another one is read."""
         self.conflicts.note("reload", f"~/reload_model failed, {why}")

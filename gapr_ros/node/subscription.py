@@ -73,6 +73,7 @@ class Subscriptions:
     @guarded
     def look(self) -> None:
         """See who publishes: how many, what, and whether somebody still needs best effort."""
+        self._session.look_at_file()
         topic, kind = self._clouds.topic_name, self._host.parameters.cloud_type
         publishers = self._host.ros.get_publishers_info_by_topic(topic)
         self._note_nobody(topic, any_publisher=bool(publishers))

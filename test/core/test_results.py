@@ -25,3 +25,9 @@ def test_a_refusal_keeps_what_is_looked_at_and_nothing_that_goes_with_a_pose():
 def test_no_confidence_is_shown_larger_than_it_is(confidence, text):
     assert confidence_text(confidence) == text
     assert f"confidence {text}" in str(RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, confidence=confidence))
+
+
+def test_a_refusal_is_no_pose_for_an_if_either():
+    refused = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason="too little bone")
+    assert not refused and RegistrationResult(RegistrationStatus.OK, np.eye(4))
+    assert repr(refused) == f"<RegistrationResult: {refused}>" and "\n" not in repr(refused)

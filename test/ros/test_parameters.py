@@ -221,12 +221,6 @@ def test_a_box_that_no_point_can_be_in_is_said_when_it_is_configured(low, high, 
     assert sum("crop_min" in remark for remark in remarks) == said
 
 
-@pytest.mark.parametrize(("given", "named"), [
-    ({"max_tre": 4.0}, "max_tre is 4.0"), ({"max_tre": 0.9}, ""), ({"max_jump_translation": 50.0}, "max_jump"),
-    ({"crop_to_track": 40.0}, "crop_to_track"), ({"range_max": 800.0}, "range_max"), ({"range_max": 99.0}, ""),
-    ({"range_max": np.inf}, ""), ({"crop_min": (-300.0, -3.0, -3.0)}, "crop_min is (-300.0, -3.0, -3.0)"),
-    ({"crop_min": (-3.0,) * 3, "crop_max": (3.0,) * 3}, ""), ({}, ""),
-])  # fmt: skip
 def test_a_misspelt_limit_stays_in_the_diagnostics(blob_path, client):
     with node_in_thread(StandIn(), blob_path, min_confidense=0.9, of_a_colleague=1.0):
         client.wait_for_state("active")
@@ -235,6 +229,12 @@ def test_a_misspelt_limit_stays_in_the_diagnostics(blob_path, client):
         assert "of_a_colleague" not in client.values("input")["conflicts"]
 
 
+@pytest.mark.parametrize(("given", "named"), [
+    ({"max_tre": 4.0}, "max_tre is 4.0"), ({"max_tre": 0.9}, ""), ({"max_jump_translation": 50.0}, "max_jump"),
+    ({"crop_to_track": 40.0}, "crop_to_track"), ({"range_max": 800.0}, "range_max"), ({"range_max": 99.0}, ""),
+    ({"range_max": np.inf}, ""), ({"crop_min": (-300.0, -3.0, -3.0)}, "crop_min is (-300.0, -3.0, -3.0)"),
+    ({"crop_min": (-3.0,) * 3, "crop_max": (3.0,) * 3}, ""), ({}, ""),
+])  # fmt: skip
 def test_lengths_that_may_be_in_mm_are_warned_of(given, named):
     said = parameters.odd_lengths(parameters.NodeParameters(**given))
     assert len(said) == bool(named) and all(named in sentence and "is it in mm?" in sentence for sentence in said)

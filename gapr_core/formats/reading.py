@@ -152,6 +152,8 @@ def format_of(path: Path) -> Format | plugins.Plugin:
     if ending not in FORMATS:
         if hint := signatures.hint_of_markups(path):
             raise InvalidPointCloudError("markups as .mrk.json", path.name, hint)
+        if signatures.is_dicom(path):
+            raise signatures.dicom_images(f"{path.name}, a DICOM file")
         endings = " ".join([*FORMATS, *plugins.kinds()])
         raise InvalidPointCloudError(f"one of {endings} or a folder", path.name, "convert the file to one of these")
     return FORMATS[ending]

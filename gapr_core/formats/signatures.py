@@ -15,6 +15,7 @@ NIFTI_SIZES = (NIFTI_BYTES.to_bytes(4, "little"), NIFTI_BYTES.to_bytes(4, "big")
 STL_HEADER_BYTES, STL_FACET_BYTES = 84, 50
 SEQUENCE, SEQUENCE_BYTES = b"\nSeq_Frame", 8192  # after the fields of an image
 SEQUENCE_HINTS = {".mha": "rename it to .igs.mha", ".nrrd": "save it as .igs.mha in PLUS"}
+DICOM, DICOM_AT = b"DICM", 128
 SIGNATURES = {
     b"ply": ".ply",
     b"solid": ".stl",
@@ -66,6 +67,17 @@ def hint_of_markups(path: Path) -> str:
     """How to rename control points of 3D Slicer that lie in a plain .json; empty for other files."""
     is_markups = path.suffix.lower() == ".json" and b'"markups"' in _head(path, SEQUENCE_BYTES)
     return f"it looks like markups of 3D Slicer: rename it to {path.stem}.mrk.json" if is_markups else ""
+
+
+def is_dicom(path: Path) -> bool:
+    """Whether a file is DICOM, by its ending or its content."""
+    return path.is_file() and (path.suffix.lower() == ".dcm" or _head(path, DICOM_AT + 4)[DICOM_AT:] == DICOM)
+
+
+def dicom_images(given: str) -> InvalidPointCloudError:
+    """The error for images where a surface is wanted."""
+    how = "DICOM images hold no surface: segment the bone (3D Slicer) and give its .seg.nrrd, or a DICOM SEG as .dcm"
+    return InvalidPointCloudError("the surface of a bone", given, how)
 
 
 def _unpacks_to_nifti(path: Path) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats import axes, columns, text, tracker
+from gapr_core.formats import axes, columns, signatures, text, tracker
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry import se3
 from gapr_core.surface import Surface
@@ -121,15 +121,17 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
 
     Raises:
         InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid; a slice that says
-            that it is in RAS or in another unit.
+            that it is in RAS or in another unit; DICOM files and no slices.
         ValueError: no slices, or another number of poses.
     """
     files = [f for f in path.iterdir() if f.name != POSES and not f.name.startswith(".")]
     if near := sorted(f.name for f in files if NEAR_POSES.search(f.stem.lower())):
         how = f"rename it to {POSES}, 16 numbers a line, or take it out of the folder"
         raise InvalidPointCloudError(f"poses in {POSES}", near[0], how)
-    files = sorted((f for f in files if f.suffix.lower() in SLICE_ENDINGS), key=_by_numbers)
+    others, files = files, sorted((f for f in files if f.suffix.lower() in SLICE_ENDINGS), key=_by_numbers)
     if not files:
+        if any(map(signatures.is_dicom, others)):
+            raise signatures.dicom_images("a folder of DICOM files")
         raise ValueError(f"no slices ({' '.join(SLICE_ENDINGS)}) in it")
     from gapr_core.formats.reading import read
 

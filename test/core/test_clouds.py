@@ -254,6 +254,19 @@ def test_a_folder_of_meshes_is_no_cloud_and_a_file_in_it_is_asked_for(tmp_path):
         clouds.load(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["1.dcm", "IM0001"])
+def test_a_folder_of_dicom_images_is_no_surface_and_a_segmentation_is_asked_for(tmp_path, name):
+    (tmp_path / name).write_bytes(bytes(128) + b"DICM" + bytes(16))
+    with pytest.raises(InvalidPointCloudError, match=r"a folder of DICOM files; .*segment the bone .*\.seg\.nrrd"):
+        clouds.load(tmp_path)
+
+
+def test_a_dicom_file_without_its_ending_is_recognised(tmp_path):
+    (tmp_path / "IM0001").write_bytes(bytes(128) + b"DICM" + bytes(16))
+    with pytest.raises(InvalidPointCloudError, match=r"IM0001, a DICOM file; .* or a DICOM SEG as \.dcm"):
+        clouds.load(tmp_path / "IM0001")
+
+
 def test_a_missing_file_and_an_unknown_format_are_distinguished(tmp_path):
     with pytest.raises(InvalidPointCloudError, match="a file that exists"):
         clouds.load(tmp_path / "none.ply")

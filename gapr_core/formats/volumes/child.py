@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import GaprError, InvalidPointCloudError
+from gapr_core.formats import signatures
 from gapr_core.formats.limits import MB, FileLimits
 from gapr_core.formats.volumes import names, nifti, placement
 from gapr_core.formats.volumes.names import Segment
@@ -119,7 +120,12 @@ def _read_dicom(
     """
     import highdicom
 
-    seg = highdicom.seg.segread(path)
+    try:
+        seg = highdicom.seg.segread(path)
+    except ValueError as error:
+        if "not a Segmentation" in str(error):
+            raise signatures.dicom_images("another kind of DICOM") from error
+        raise
     numbers = [number for number in seg.segment_numbers if number > 0]
     words = [str(seg.get_segment_description(number).SegmentLabel) for number in numbers]
     named = [Segment(word, number, n) for n, (word, number) in enumerate(zip(words, numbers, strict=True))]

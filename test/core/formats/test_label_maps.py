@@ -316,6 +316,19 @@ def test_of_many_segments_those_that_are_asked_for_are_unpacked(tmp_path, monkey
         clouds.load(path, options=options("femur", "tibia"))
 
 
+def test_a_dicom_image_is_no_segmentation_and_one_is_asked_for(tmp_path):
+    pydicom = pytest.importorskip("pydicom", reason="it writes the DICOM image to refuse: pip install pydicom")
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+    image = pydicom.Dataset()
+    image.file_meta = pydicom.dataset.FileMetaDataset()
+    image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    image.SOPClassUID, image.SOPInstanceUID, image.Modality = CTImageStorage, generate_uid(), "CT"
+    pydicom.dcmwrite(tmp_path / "1.dcm", image, enforce_file_format=True)
+    with pytest.raises(InvalidPointCloudError, match=r"1\.dcm: another kind of DICOM; .*segment the bone"):
+        clouds.load(tmp_path / "1.dcm")
+
+
 def dicom_seg(tmp_path, spacing=(1.5, 1.5, 2.0), names=("femur", "tibia"), layers=None, kind="BINARY", numbers=(1, 2)):
     """Balls of radius 12, or `layers` (affine, [k, j, i] of each name), written by highdicom against a CT of slices."""
     highdicom = pytest.importorskip(

@@ -30,7 +30,7 @@ def check_outputs(args: Namespace) -> None:
 
     Raises:
         ConfigError: an ending that nothing is written to, a folder that cannot be written, the file of another
-            option, or files in LPS of a bone that is turned to RAS.
+            option, files of others in the folder of a scene, or files in LPS of a bone that is turned to RAS.
         MethodUnavailableError: a library that an output needs is not installed.
     """
     _check_kinds(args)
@@ -42,6 +42,10 @@ def check_outputs(args: Namespace) -> None:
     check_collisions(_inputs(args), _outputs(args))
     for _, path in _outputs(args):
         files.check_writable(path)
+    if args.slicer:
+        from gapr_core.formats import scene
+
+        scene.check_slicer(args.slicer, [path for option, path in _outputs(args) if option == "--slicer"])
 
 
 def _check_kinds(args: Namespace) -> None:

@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.formats import planning, transforms
+from gapr_core.errors import ConfigError
+from gapr_core.formats import planning, signatures, transforms
 from gapr_core.formats.planning import TargetError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, Residuals
@@ -22,6 +23,7 @@ log = logging.getLogger(__name__)
 
 TARGETS, OFF_BONE = "targets.mrk.json", "off_bone.vtk"
 FILES = ("target.vtk", "source.vtk", OFF_BONE, "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `write_slicer`
+WRITTEN_BY = "written by GAPR"  # a comment of the scene; 3D Slicer keeps none when it saves one
 FULL_COLOUR_MM = 3.0
 BLUE_TO_RED = "vtkMRMLColorTableNodeFileDivergingBlueRed.txt"  # of 3D Slicer; without one VTK's goes from red to blue
 GREY = np.array([150, 150, 150])
@@ -55,6 +57,31 @@ def colours_of(distance_mm: Array) -> NDArray[np.int64]:
     colours = (255 * np.stack([red, np.minimum(red, blue), blue], axis=1)).round().astype(np.int64)
     colours[~np.isfinite(distance_mm)] = GREY
     return colours
+
+
+def check_slicer(folder: Path, files_of_scene: Sequence[Path]) -> None:
+    """Raise for a folder with files of others: all may be replaced where the scene in it is one of GAPR.
+
+    Args:
+        folder: for `write_slicer`; may be missing.
+        files_of_scene: that would be written to it.
+
+    Raises:
+        ConfigError: one of these files is there and not known to be of GAPR, or the folder holds DICOM files.
+    """
+    if not folder.is_dir() or _is_own(folder / "scene.mrml"):
+        return
+    how = "name another folder, or a new one"
+    if taken := [path.name for path in files_of_scene if path.exists()]:
+        given = f"{folder} with {', '.join(taken)}, not known to be written by GAPR"
+        raise ConfigError("a folder for --slicer without files of others", given, how)
+    if any(map(signatures.is_dicom, folder.iterdir())):
+        raise ConfigError("a folder for --slicer without files of others", f"{folder} with DICOM files", how)
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a scene is there, and as `write_slicer` left it."""
+    return path.is_file() and f"<!-- {WRITTEN_BY} -->".encode() in path.read_bytes()
 
 
 def write_slicer(folder: Path, target: Surface, result: RegistrationResult, errors: Sequence[TargetError]) -> None:
@@ -108,6 +135,7 @@ def _mrml(with_off_bone: bool, with_targets: bool) -> str:
     """The scene: each node with its storage, and the source under the transform."""
     moved = {"transformNodeRef": "vtkMRMLLinearTransformNodepose"}
     scene = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
+    scene.append(ElementTree.Comment(f" {WRITTEN_BY} "))
     _node(scene, "LinearTransform", "Transform", "pose", "pose.tfm", {})
     _model(scene, "target", "0.9 0.85 0.75", {"opacity": "0.6"}, {})
     shown = {

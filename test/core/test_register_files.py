@@ -6,6 +6,7 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -396,6 +397,35 @@ def test_a_file_of_another_option_is_never_written_over(folder, capsys, line):
     assert register(line, source="s.txt") == 1 and Known.asked == 0
     assert "expected a file for --" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["scene.mrml", "pose.tfm", "off_bone.vtk"])
+def test_files_of_others_in_the_folder_of_a_scene_are_never_written_over(folder, capsys, name):
+    (folder / "mine").mkdir()
+    (folder / "mine" / name).write_text("<MRML></MRML>")
+    assert register("--slicer mine") == 1 and Known.asked == 0
+    assert f"mine with {name}, not known to be written by GAPR; name another folder" in capsys.readouterr().err
+    assert [path.name for path in (folder / "mine").iterdir()] == [name]
+    assert (folder / "mine" / name).read_text() == "<MRML></MRML>"
+
+
+def test_a_scene_of_gapr_is_written_over_until_somebody_saves_another_one_there(folder, capsys):
+    (folder / "scene").mkdir()
+    (folder / "scene" / "mine.txt").write_text("stays")
+    assert register("--slicer scene") == 0 and register("--slicer scene") == 0
+    mrml = folder / "scene" / "scene.mrml"
+    ElementTree.parse(mrml).write(mrml)  # without its comment, as 3D Slicer saves it
+    assert register("--slicer scene") == 1
+    said = capsys.readouterr().err
+    assert "registered.ply" in said and "targets.mrk.json" not in said and "mine.txt" not in said
+
+
+@pytest.mark.parametrize("name", ["1.dcm", "IM0001"])
+def test_a_folder_of_dicom_is_no_folder_for_a_scene(folder, capsys, name):
+    (folder / "ct").mkdir()
+    (folder / "ct" / name).write_bytes(bytes(128) + b"DICM" + bytes(16))
+    assert register("--slicer ct") == 1 and Known.asked == 0
+    assert "got ct with DICOM files" in capsys.readouterr().err and len(list((folder / "ct").iterdir())) == 1
 
 
 def test_a_pose_does_not_become_a_slice_of_the_source(folder, capsys):

@@ -71,6 +71,7 @@ def load(
         return surface
     if isinstance(source, str | Path):
         units = _agreed(units, columns.unit(Path(source)), name)
+        _warn_of_columns(Path(source), surface)
     units = _known(surface, units, name)
     if of_bone:
         _check_size(surface, units, name, how)
@@ -144,6 +145,14 @@ def warn_of_size(path: Path, extent_mm: float) -> None:
     else:
         said = "longer than any human bone. If this is one bone"
     log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, said, how)
+
+
+def _warn_of_columns(path: Path, surface: Surface) -> None:
+    """Warn of a text file whose other columns nobody has named, and which are no normals."""
+    count = columns.unnamed(path)
+    if count > 3 and surface.normals is None:
+        log.warning("%s has %d columns without names: the first three are taken as x y z, the others are left out; if "
+                    "that is wrong, begin with a line of names", path.name, count)  # fmt: skip
 
 
 def _agreed(units: str, said: str | None, name: str) -> str:

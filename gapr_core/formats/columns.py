@@ -138,6 +138,14 @@ def unit(path: Path) -> str | None:
     return said.pop()
 
 
+def unnamed(path: Path) -> int:
+    """How many columns a text file has of which the first three are taken, since no name says which; 0 for others."""
+    if not path.is_file() or path.suffix.lower() not in ENDINGS:
+        return 0
+    header = _header(path)
+    return 0 if header.is_line or _used(header) else header.cells
+
+
 def _header(path: Path) -> Header:
     with path.open("rb") as file:
         return header_of(io.TextIOWrapper(file, encoding="utf-8-sig", errors="replace"))

@@ -18,6 +18,7 @@ from gapr_core.surface import Array, Surface
 
 Row = tuple[int, list[str]]  # the number of its line in the file, from 1, and its cells
 
+MOST_OF_POINT = 12  # numbers in a row: more, in three rows, are the coordinates of as many points
 MANY_ROWS = 12  # of a column that rises all the time by chance one in 12!
 LONGEST_NAMES = 80  # characters of a line that an error quotes
 FEWEST_OF_POINT = 2  # numbers among the words of a first line, which is no title then, but a point
@@ -32,7 +33,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
     Raises:
         InvalidPointCloudError: names that do not say which columns are the coordinates, numbers of the points in the
-            first one, decimal commas, or a cell that is no number.
+            first one, decimal commas, a cell that is no number, or a row for each coordinate.
     """
     return _surface(options.limits.read(path))
 
@@ -78,6 +79,9 @@ def _of_numbers(values: Array, header: Header, rows: list[str]) -> Surface:
     """Of a file with numbers alone below its names."""
     if values.shape[1] < 3:
         raise ValueError(f"{values.shape[1]} columns, not x y z")
+    if len(values) == 3 and values.shape[1] > MOST_OF_POINT and len(header.names) != values.shape[1]:
+        given, how = f"3 rows of {values.shape[1]} numbers", "is it transposed? Write one point a row"
+        raise InvalidPointCloudError("a point a row", given, how)
     has_normals = values.shape[1] == 6 and _are_units(values[:, 3:])
     if not (header.is_line or has_normals):
         if all(SPLIT_DECIMALS.fullmatch(row.strip()) for row in rows):

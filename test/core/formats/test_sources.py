@@ -539,6 +539,36 @@ def test_a_line_of_names_says_which_column_is_which_and_the_others_may_be_text(t
     np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
 
 
+@pytest.mark.parametrize(("name", "delimiter", "header"), [("a.txt", " ", ""), ("a.csv", ",", ""),
+                                                           ("a.xyz", " ", "x y z")])  # fmt: skip
+def test_a_row_for_each_coordinate_is_refused_as_transposed(tmp_path, name, delimiter, header):
+    """It was read as three points, and refused as too few."""
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    np.savetxt(tmp_path / name, points.T, delimiter=delimiter, header=header)
+    with pytest.raises(InvalidPointCloudError, match=f"{name}: 3 rows of 40 numbers; is it transposed.*one point a"):
+        reading.read(tmp_path / name)
+    np.savetxt(tmp_path / name, points[:12].T, delimiter=delimiter, header=header)
+    assert len(reading.read(tmp_path / name).points) == 3
+    names = "x y z " + " ".join(f"c{i}" for i in range(37))
+    np.savetxt(tmp_path / name, points.T, delimiter=delimiter, header=delimiter.join(names.split()))
+    assert len(reading.read(tmp_path / name).points) == 3
+
+
+@pytest.mark.parametrize(("more", "header", "is_warned"), [
+    ([[7.0, 8.0]], "", True), ([[7.0, 8.0, 9.0]], "", True), ([[0.6, 0.8, 0.0]], "", False), ([[]], "", False),
+    ([[7.0, 8.0]], "x y z a b", False),
+])  # fmt: skip
+def test_columns_that_nobody_named_are_warned_of_unless_they_are_normals(tmp_path, caplog, more, header, is_warned):
+    rows = np.hstack([POINTS, np.repeat(more, len(POINTS), axis=0)])
+    for name, delimiter, comments in (("a.txt", " ", "# "), ("b.csv", ",", "")):
+        caplog.clear()
+        np.savetxt(tmp_path / name, rows, delimiter=delimiter, comments=comments,
+                   header=delimiter.join(header.split()))  # fmt: skip
+        np.testing.assert_allclose(clouds.load(tmp_path / name).points, POINTS)
+        said = f"{name} has {rows.shape[1]} columns without names: the first three are taken as x y z"
+        assert (said in caplog.text) == is_warned
+
+
 @pytest.mark.parametrize("names", ["r,t,s", "id,px,py,pz"])
 def test_names_that_say_something_else_are_refused(tmp_path, names):
     numbers = ",".join("123456"[: names.count(",") + 1])

@@ -37,6 +37,7 @@ def write(path: str | Path, registration: Registration) -> None:
     report.facts(_facts(result))
     if result.reason:
         report.note(f"Reason: {result.reason}")
+    _add_pose(report, result)
     _add_view(report, registration)
     _add_residuals(report, result)
     _add_confidence(report, result)
@@ -66,6 +67,17 @@ def _facts(result: RegistrationResult) -> dict[str, str]:
 
 def _mm(value: float | None) -> str:
     return NONE if value is None else f"{value:.2f} mm"
+
+
+def _add_pose(report: Report, result: RegistrationResult) -> None:
+    if result.T_target_source is None:
+        return
+    report.heading("Pose")
+    report.paragraph(
+        "T_target_source, 4x4, mm: it takes points of the source into the frame of the target (source to target). "
+        "Copy it into a text file: --initial and numpy.loadtxt read it."
+    )
+    report.matrix(result.T_target_source)
 
 
 def _add_view(report: Report, registration: Registration) -> None:

@@ -78,6 +78,11 @@ class Report:
         """Text that must not be overlooked, or, at the end of a page, where it comes from."""
         self._parts.append(f'<p class="note">{escape(text)}</p>')
 
+    def matrix(self, values: Array) -> None:
+        """Numbers (N, M) in rows, to be copied: `numpy.loadtxt` reads them."""
+        rows = (" ".join(f"{value + 0.0:14.9f}" for value in row) for row in np.round(values, 9))
+        self._parts.append("<pre>{}</pre>".format("\n".join(rows)))
+
     def bullets(self, lines: Sequence[str]) -> None:
         """A list."""
         self._parts.append(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>")

@@ -9,7 +9,7 @@ import pytest
 
 from gapr_core.benchmark import methods
 from gapr_core.cli import main
-from gapr_core.formats import markups
+from gapr_core.formats import markups, transforms
 from gapr_core.geometry import se3
 from gapr_core.pages import registration_report
 from gapr_core.pages.report import Step, alignment_figure
@@ -106,6 +106,13 @@ def test_the_page_of_a_pose_holds_all_of_it(register, tmp_path):
     assert not re.search(r"<(script|link|img|iframe)[^>]+(src|href)\s*=", page)
 
 
+def test_the_page_shows_the_pose_with_its_direction_to_be_copied_as_a_first_guess(register, tmp_path):
+    _, page = register()
+    assert "T_target_source, 4x4, mm: it takes points of the source into the frame of the target" in text_of(page)
+    (tmp_path / "copied.txt").write_text(re.search("<pre>(.*?)</pre>", page, re.DOTALL)[1] + "\n")
+    np.testing.assert_allclose(transforms.read(tmp_path / "copied.txt"), T, atol=1e-8)
+
+
 def test_the_page_of_a_refusal_says_why_and_offers_no_pose(register):
     code, page = register(answer=refused)
     text = text_of(page)
@@ -114,6 +121,7 @@ def test_the_page_of_a_refusal_says_why_and_offers_no_pose(register):
     assert "There is no pose, so there is no error to expect." in text and "Accepted" not in text
     assert "lead over the next hypothesis margin against -2.00" in text and "2 0.250" in text
     assert "Where to look next" not in text, "nobody asked"
+    assert "T_target_source" not in text and "<pre>" not in page
     assert page.count("Plotly.newPlot(") == 2
 
 

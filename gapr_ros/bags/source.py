@@ -32,7 +32,8 @@ def read(path: Path, options: ReadOptions) -> Surface:
     """The clouds of one topic, joined, in the unit and the frame of the topic; a single one with its camera.
 
     Raises:
-        InvalidPointCloudError: a damaged or empty bag, no such topic, one without clouds, or clouds of two frames.
+        InvalidPointCloudError: a damaged or empty bag, no such topic, one without clouds, clouds of two frames, or a
+            malformed one.
     """
     try:
         bag = open_bag(path)
@@ -51,10 +52,13 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def _unreadable(path: Path, error: BagError) -> InvalidPointCloudError:
-    why = " ".join(str(error).removeprefix(f"{path}: ").split())
-    if len(why) > LONGEST_REASON:
-        why = f"{why[:LONGEST_REASON]}..."
+    why = _short(str(error).removeprefix(f"{path}: "))
     return InvalidPointCloudError("a bag that can be read", f"{path.name} ({why})", "record it again, or repair it")
+
+
+def _short(why: str) -> str:
+    reason = " ".join(why.split())
+    return reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}..."
 
 
 def _topic(bag: Bag, wanted: str) -> str:
@@ -82,9 +86,13 @@ def _clouds(bag: Bag, topic: str, options: ReadOptions) -> list[tuple[Array, Arr
         raise InvalidPointCloudError("clouds", given, "record the topic, or choose others with --clouds")
     clouds: list[tuple[Array, Array | None]] = []
     frames: set[str] = set()
-    for number, (_, connection, data) in enumerate(bag.messages()):
+    for number, (received_ns, connection, data) in enumerate(bag.messages()):
         if number in wanted:
-            frame, points, camera = _cloud(READABLE[connection.msgtype], data)
+            try:
+                frame, points, camera = _cloud(READABLE[connection.msgtype], data, received_ns)
+            except _MalformedError as error:
+                given, how = f"cloud {number} of {topic}, {error}", _how_to_leave_out(number, wanted)
+                raise InvalidPointCloudError("clouds that can be read", given, how) from error
             clouds.append((points, camera))
             frames.add(frame)
             options.limits.check_counts(sum(len(points) for points, _ in clouds))
@@ -101,11 +109,25 @@ def _clouds(bag: Bag, topic: str, options: ReadOptions) -> list[tuple[Array, Arr
     return clouds
 
 
-def _cloud(kind: Input, data: bytes) -> tuple[str, Array, Array | None]:
+class _MalformedError(ValueError):
+    """A message that cannot be used; the text says when it was, and what is wrong."""
+
+
+def _cloud(kind: Input, data: bytes, received_ns: int) -> tuple[str, Array, Array | None]:
     """Frame and finite points of one message, and where its camera was if it says."""
+    when = f"received at {received_ns // 10**9}.{received_ns % 10**9:09d} s"
     try:
         message: Any = deserialize_message(data, kind.message)
+        when = f"stamp {message.header.stamp.sec}.{message.header.stamp.nanosec:09d} s"
         points, grid = kind.points(message), kind.grid(message)
     except Exception as error:  # the middleware raises several kinds
-        raise BagError(f"damaged: a message that is no {kind.message.__name__}: {error}") from error
+        raise _MalformedError(f"{when} ({_short(str(error))})") from error
     return message.header.frame_id.lstrip("/"), points, None if grid is None else pinhole.centre_of(grid)
+
+
+def _how_to_leave_out(number: int, wanted: range) -> str:
+    """What to do about a malformed cloud of those that are wanted, counted from 0 as --clouds does."""
+    parts = [part for part in (range(wanted.start, number), range(number + 1, wanted.stop)) if part]
+    if not parts:
+        return "record it again"
+    return f"choose others: {' or '.join(f'--clouds {part.start}:{part.stop}' for part in parts)}"

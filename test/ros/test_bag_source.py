@@ -6,7 +6,9 @@ import sys
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseArray, TransformStamped
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from gapr_core import clouds
@@ -17,8 +19,9 @@ from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry import se3
 from gapr_ros.bags.files import Bag
 from gapr_ros.bags.writing import BagWriter
+from msg_adapters import xyz_to_cloud
 
-START_NS = 1_700_000_000_000_000_000
+START_NS = 1_700_000_000_250_000_000
 PIECES = np.random.default_rng(0).normal(size=(4, 50, 3)) * 0.05
 
 
@@ -76,6 +79,34 @@ def test_a_topic_that_cannot_be_meant_is_answered_with_those_that_can(bag, how, 
     assert expected in str(caught.value) and "\n" not in str(caught.value)
 
 
+def with_one_malformed(folder, number, is_cut):
+    """Four clouds; one has no x, or is cut."""
+    with BagWriter(folder) as writer:
+        for i, points in enumerate(PIECES):
+            cloud = xyz_to_cloud(points, Header(frame_id="probe", stamp=Time(sec=1_600_000_000, nanosec=i)))
+            cloud.fields = cloud.fields[1:] if i == number else cloud.fields
+            data = serialize_message(cloud)[: 40 if is_cut and i == number else None]
+            writer.write_raw("/points", "sensor_msgs/msg/PointCloud2", data, START_NS + i)
+    return folder
+
+
+@pytest.mark.parametrize(("number", "clouds", "how"), [
+    (0, (None, None), "--clouds 1:4"), (2, (None, None), "--clouds 0:2 or --clouds 3:4"),
+    (3, (None, None), "--clouds 0:3"), (2, (1, 3), "--clouds 1:2"),
+])  # fmt: skip
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_a_malformed_cloud_among_others_is_named_and_others_are_suggested(tmp_path, number, clouds, how, is_cut):
+    path = with_one_malformed(tmp_path / "bag", number, is_cut)
+    with pytest.raises(InvalidPointCloudError) as caught:
+        read(path, topic="/points", clouds=clouds)
+    said = "received at 1700000000.25000000" if is_cut else "stamp 1600000000.00000000"
+    assert f"got bag: cloud {number} of /points, {said}{number} s (" in str(caught.value)
+    assert "need exactly one field x" in str(caught.value) or is_cut
+    assert str(caught.value).endswith(f"; choose others: {how}") and "repair" not in str(caught.value)
+    first, last = how.split()[1].split(":")
+    assert len(read(path, topic="/points", clouds=(int(first), int(last)))) == 50 * (int(last) - int(first))
+
+
 def test_the_only_topic_with_clouds_needs_no_name(tmp_path):
     with BagWriter(tmp_path / "bag") as writer:
         writer.write_cloud("/points", PIECES[0], "probe", START_NS)
@@ -130,7 +161,7 @@ def without_clouds(folder):
 
 
 @pytest.mark.parametrize(("make", "expected"), [
-    (empty, "no messages"), (damaged, "damaged|not a readable"), (no_message, "damaged"),
+    (empty, "no messages"), (damaged, "damaged|not a readable"), (no_message, "cloud 0 of /points"),
     (millimetres, "looks like mm"), (without_clouds, "0 of them"),
 ])  # fmt: skip
 def test_a_bag_that_cannot_be_used_is_one_line_and_exit_code_1(tmp_path, capsys, make, expected):

@@ -254,6 +254,12 @@ def test_a_folder_of_meshes_is_no_cloud_and_a_file_in_it_is_asked_for(tmp_path):
         clouds.load(tmp_path)
 
 
+def test_an_npz_file_without_a_name_for_its_points_says_how_to_save_it(tmp_path):
+    np.savez(tmp_path / "pc.npz", VERTICES)
+    with pytest.raises(InvalidPointCloudError, match=r"points; got pc.npz: only arr_0; .*np\.savez\(file, points=P\)"):
+        clouds.load(tmp_path / "pc.npz")
+
+
 @pytest.mark.parametrize("name", ["1.dcm", "IM0001"])
 def test_a_folder_of_dicom_images_is_no_surface_and_a_segmentation_is_asked_for(tmp_path, name):
     (tmp_path / name).write_bytes(bytes(128) + b"DICM" + bytes(16))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.lib import format as npy
 
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface, as_points
@@ -21,12 +22,18 @@ def read_npy(path: Path, options: ReadOptions) -> Surface:
 
 
 def read_npz(path: Path, options: ReadOptions) -> Surface:
-    """The arrays `points` (N, 3) and, where there is one, `faces` (F, 3) integers."""
+    """The arrays `points` (N, 3) and, where there is one, `faces` (F, 3) integers.
+
+    Raises:
+        InvalidPointCloudError: no array of that name.
+        ValueError: faces that are no integers.
+    """
     limits = options.limits
     with zipfile.ZipFile(io.BytesIO(limits.read(path))) as archive:
         names = {name.removesuffix(".npy"): name for name in archive.namelist()}
         if "points" not in names:
-            raise ValueError(f"no array named points, only {', '.join(names) or 'nothing'}")
+            given = f"only {', '.join(names) or 'nothing'}"
+            raise InvalidPointCloudError("an array named points", given, "save it as np.savez(file, points=P)")
         wanted = [names[name] for name in ("points", "faces") if name in names]
         limits.check_unpacked(sum(archive.getinfo(name).file_size for name in wanted))
         arrays = [array_of(archive.read(name), limits) for name in wanted]

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gapr_core.errors import GaprError
+from gapr_core.runtime import files
 from gapr_core.runtime.arguments import at_least_one
 from gapr_ros.demo import interrupt
 from gapr_ros.demo.act import DemoError, camera_round, probe_sweep, write_bag
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
         return real.run(args.real, console)
     args.frames = FRAMES[args.act] if args.frames is None else args.frames
     try:
+        files.check_writable(args.out / "report.html")
         args.out.mkdir(parents=True, exist_ok=True)
         with interrupt.heeded():
             return _guided(args, console) if args.act == "guided" else _from_bag(args, console)

@@ -38,6 +38,18 @@ RUN = (
 )
 
 
+@pytest.mark.parametrize("out", ["/proc/d", "a_file", "a_file/d"])
+def test_a_folder_that_cannot_be_made_is_one_line_before_the_work(tmp_path, monkeypatch, capsys, out):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a_file").touch()
+    parser = argparse.ArgumentParser()
+    demo.add_arguments(parser)
+    assert demo.run(parser.parse_args(["--out", out])) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"expected a path that can be written; got {out}" in said and "choose another path" in said
+    assert "Errno" not in said and "Making" not in said
+
+
 def start(*arguments):
     return subprocess.Popen(
         [sys.executable, "-c", RUN, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

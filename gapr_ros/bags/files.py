@@ -12,6 +12,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 
+METADATA = "metadata.yaml"  # names the files of the bag in its folder
 DEEPEST = 2**31 - 1  # history that rclpy takes
 
 
@@ -53,7 +54,7 @@ class Bag:
 
 
 def open_bag(path: str | Path, topics: Sequence[str] = ()) -> Bag:
-    """Open a bag for replay; close its `reader` afterwards.
+    """Open a bag by its folder, its metadata or its one file, for replay; close its `reader` afterwards.
 
     Raises:
         BagError: no bag, a damaged one, a topic it does not have, or nothing in it that can be played.
@@ -61,6 +62,8 @@ def open_bag(path: str | Path, topics: Sequence[str] = ()) -> Bag:
     path = Path(path)
     if not path.exists():
         raise BagError(f"{path}: no such file or folder")
+    if path.name == METADATA:
+        path = path.absolute().parent
     try:
         reader = Reader(path)
         reader.open()

@@ -170,7 +170,7 @@ class Replay:
 def parse_arguments(args: Sequence[str]) -> tuple[Path, ReplayOptions]:
     """Path and options from the command line."""
     parser = argparse.ArgumentParser(prog="bag_replay", description="Play a rosbag2 bag over rclpy.")
-    parser.add_argument("bag", type=Path, help="folder of the bag, or its .mcap or .db3 file")
+    parser.add_argument("bag", type=Path, help="folder of the bag, its metadata.yaml, .mcap or .db3 file")
     parser.add_argument("--topics", nargs="+", default=(), help="play only these")
     parser.add_argument("--rate", type=_positive, default=1.0, help="speed; 2: twice as fast")
     parser.add_argument("--loop", action="store_true", help="start over at the end")

@@ -245,6 +245,14 @@ def test_a_bag_that_cannot_be_played_is_one_clear_line(tmp_path, bag_path, capsy
     assert "/points" in error, "an unknown topic is answered with the known ones"
 
 
+def test_a_bag_may_be_named_by_its_metadata(bag_path, monkeypatch):
+    monkeypatch.chdir(bag_path)
+    for path in (bag_path / "metadata.yaml", "metadata.yaml"):
+        opened = open_bag(path)
+        assert opened.count == 12
+        opened.reader.close()
+
+
 def test_a_bag_that_is_cut_off_plays_what_can_be_read(tmp_path, listener):
     with BagWriter(tmp_path / "bag") as bag:
         for i in range(20):

@@ -110,8 +110,17 @@ def check_readme(names):
 
 def check_slicer(names):
     assert np.percentile(names["off_mm"], 95) < 1.5, names["off_mm"]
-    assert json.loads(Path("result.json").read_text())["targets"][0]["label"] == "entry"
+    answer = json.loads(Path("result.json").read_text())
+    (entry,) = answer["targets"]
+    text = (ROOT / "docs/tutorials/slicer.md").read_text(encoding="utf-8")
+    shown = re.findall(r"(?:TRE|entry: expected error) ([.\d]+) mm \(95 %: ([.\d]+) mm\)", text)
+    printed = [[answer["tre_mm"], answer["tre95_mm"]], [entry["expected_mm"], entry["bound95_mm"]]]
+    assert entry["label"] == "entry" and np.array(shown, dtype=float) == pytest.approx(np.array(printed), abs=0.06)
     assert Path("result/scene.mrml").is_file()
+
+
+def check_library(names):
+    assert names["sure"] == "0.99", "as print(result) says, and no 1.00"
 
 
 def check_own_bag(names):
@@ -130,6 +139,7 @@ def check_own_data(names):
 CHECKS = {
     "README.md": check_readme,
     "docs/tutorials/slicer.md": check_slicer,
+    "docs/tutorials/library.md": check_library,
     "docs/tutorials/own_bag.md": check_own_bag,
     "docs/tutorials/own_data.md": check_own_data,
 }  # what must have come out of a page
@@ -254,6 +264,14 @@ def test_every_page_is_on_the_site():
     pages = [page.relative_to(ROOT / "docs") for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "tables"]
     assert len(pages) > 20
     assert not [str(page) for page in pages if not re.search(rf"\b{re.escape(str(page))}$", listed, re.MULTILINE)]
+
+
+def test_a_page_that_the_site_fills_says_what_to_read_instead():
+    filled = [page for page in PAGES if re.search(r"^(--8<--|:::) ", page.read_text(encoding="utf-8"), re.MULTILINE)]
+    assert {page.name for page in filled} == {"parameters.md", "api.md"}
+    for page in filled:
+        line = page.read_text(encoding="utf-8").splitlines()[2]
+        assert line.startswith("Expanded on the site (`make docs`); as Markdown, read "), page
 
 
 def test_every_table_of_the_results_is_on_a_page():

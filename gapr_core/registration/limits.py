@@ -255,8 +255,8 @@ LIMITS = (
     Limit(
         UNCONFIRMED,
         shows_most(UNCONFIRMED),  # a `LookAccumulator` asks
-        "the newest look alone gives no pose, and so does not show that the bone is still where the others have it; "
-        "look from where more of the bone is seen",
+        "the newest look alone gives no pose, or there is no other: nothing confirms where the bone is now; look from "
+        "elsewhere, and from where more of the bone is seen",
     ),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )

@@ -34,8 +34,8 @@ STUCK = 10  # refusals in a row from one direction; what the looks before show m
 class Newest(Enum):
     """What the newest look says of the pose of all."""
 
-    AGREES = "alone it has the same pose, or it is the only one"
-    IS_UNCONFIRMED = "alone it has no pose"
+    AGREES = "alone it has the same pose"
+    IS_UNCONFIRMED = "alone it has no pose, or there is no other"
     IS_REFUSED = "with the others it gives no pose"
     SHOWS_NOTHING = (
         "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
@@ -54,9 +54,9 @@ class LookAccumulator:
 
     An older look that shows the bone elsewhere than the newest is left out, and the others are asked again. The newest
     is refused where it does not fit the others, shows nothing of the bone there, or alone has another pose; where it
-    alone has none, the answer is not sure (`limits`). After three in a row that show the bone elsewhere it or its
-    reference has moved, and only these three are kept, whatever their directions. After ten refusals from one direction
-    only the last look is kept.
+    alone has none, or there is no other, the answer is not sure (`limits`). After three in a row that show the bone
+    elsewhere it or its reference has moved, and only these three are kept, whatever their directions. After ten
+    refusals from one direction only the last look is kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
@@ -190,7 +190,9 @@ class LookAccumulator:
 
     def _alone(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> Newest:
         """What the newest look alone says of the pose of all: its own is right if that one is, or it has none."""
-        if len(self._looks) < 2 or result.T_target_source is None:
+        if len(self._looks) < 2:
+            return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
+        if result.T_target_source is None:
             return Newest.AGREES
         registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
         alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)

@@ -195,13 +195,16 @@ def test_a_pose_that_the_newest_look_alone_does_not_confirm_is_not_sure(target, 
     looks, asked = looks_of(replace(OK, confidence=0.99))
     looks.config = replace(looks.config, min_confidence=least)
     asked.alone = REFUSED
-    assert looks.register(points(0), target, viewpoint=eye(0.0)).confidence == 0.99, "of the only one nothing is asked"
+    result = looks.register(points(0), target, viewpoint=eye(0.0))
+    assert result.confidence == looks.config.limits.most and "unconfirmed" in result.contributions, "there is no other"
     result = looks.register(points(1), target, viewpoint=eye(20.0))
     assert result.confidence == looks.config.limits.most and "unconfirmed" in result.contributions
     assert result.ok is not is_refused and ("newest look alone gives no pose" in result.reason) is is_refused
     assert names(looks.collected) == [0, 1]
     asked.alone = OK
     assert looks.register(points(2), target, viewpoint=eye(40.0)).confidence == 0.99
+    each, _ = looks_of(replace(OK, confidence=0.99), most=1)
+    assert each.register(points(0), target, viewpoint=eye(0.0)).confidence == 0.99, "each is asked for by itself"
 
 
 def test_a_first_look_is_not_compared_with_itself(target):

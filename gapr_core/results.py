@@ -189,8 +189,8 @@ class RegistrationResult:
         residuals: of every used point under the best hypothesis; None where a method does not say.
         inferred_viewpoint: (3,) mm, source frame: where the camera is taken to be, as its cloud gave no pose as bone
             alone and nobody said it; None where it was given or is not needed.
-        looks: of a camera's several looks, how each fits the pose; () of one. A pose can be accepted although fewer
-            than half of them saw nothing of the bone.
+        looks: of a camera's several looks, how each fits the pose; () of one. A pose can be accepted although some,
+            fewer than half of those with enough points, saw nothing of the bone.
     """
 
     status: RegistrationStatus

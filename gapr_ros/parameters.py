@@ -35,7 +35,7 @@ READ_BY_LAUNCH = (  # needs no declaration
     "sigkill_timeout",
     "ros_namespace",
 )
-BONE_M, ROOM_M = 1.0, 100.0  # longer lengths are odd for a limit at a bone, and for one in a room
+TRE_M, BONE_M, ROOM_M = 0.1, 1.0, 100.0  # longer lengths are odd for a bound, for a limit at a bone, for one in a room
 MOST_LOOKS = 16  # of a camera that are registered as one, however many are asked for
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
 Triple = tuple[float, float, float]
@@ -215,13 +215,14 @@ def empty_limits(parameters: NodeParameters) -> list[str]:
 
 def odd_lengths(parameters: NodeParameters) -> list[str]:
     """One sentence for each length with which a limit never holds, as of a bone or of a room: perhaps it is in mm."""
-    at_bone = ("max_tre", "max_jump_translation", "crop_to_track"), BONE_M
+    of_bound = ("max_tre",), TRE_M
+    at_bone = ("max_jump_translation", "crop_to_track"), BONE_M
     in_room = ("range_min", "range_max", "crop_min", "crop_max"), ROOM_M
     return [
         f"{name} is {getattr(parameters, name)}: lengths are in metres; is it in mm?"
-        for names, longest_m in (at_bone, in_room)
+        for names, longest_m in (of_bound, at_bone, in_room)
         for name in names
-        if longest_m < max(map(abs, _each(getattr(parameters, name)))) < math.inf
+        if any(longest_m < abs(length_m) < math.inf for length_m in _each(getattr(parameters, name)))
     ]
 
 

@@ -97,8 +97,10 @@ def write_slicer(folder: Path, target: Surface, result: RegistrationResult, erro
     """
     if result.T_target_source is None or result.residuals is None:
         raise ValueError("a scene needs a pose and its residuals")
-    files.write_text(folder / "target.vtk", _vtk(target.points, target.faces))
     residuals, near = result.residuals, np.isfinite(result.residuals.distance_mm)
+    # first: after an interrupted run the folder is known as one of GAPR
+    files.write_text(folder / "scene.mrml", _mrml(not near.all(), bool(errors)))
+    files.write_text(folder / "target.vtk", _vtk(target.points, target.faces))
     files.write_text(folder / "source.vtk", _vtk(residuals.points[near], None, residuals.distance_mm[near]))
     if not near.all():
         files.write_text(folder / OFF_BONE, _vtk(residuals.points[~near], None))
@@ -108,7 +110,6 @@ def write_slicer(folder: Path, target: Surface, result: RegistrationResult, erro
         planning.save_targets(folder / TARGETS, errors)
     _warn_of_old(folder / TARGETS, bool(errors), "it has no --targets")
     _warn_of_old(folder / OFF_BONE, not near.all(), "a surface is near all its points")
-    files.write_text(folder / "scene.mrml", _mrml(not near.all(), bool(errors)))
 
 
 def _warn_of_old(path: Path, is_written: bool, why: str) -> None:

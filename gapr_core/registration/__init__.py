@@ -20,6 +20,6 @@ A camera's cloud goes another way: `scene` holds what it saw from one place or s
 show the bone in one place? Streams: `tracking` (with `memory`, `evidence`, `repeats`, `stream_misfit` of
 `shared_misfit`), `following` between two of them, `accumulation`, for a camera `look_accumulation`, both with
 `far_away`. `creep`: did the bone move while its sources were collected? `rigidity`: is a source strained or in two
-pieces? Both ask `further_unknowns`. `doubles`: is the bone in it twice? `crop` cuts a cloud before, `inputs` takes
-poses and places.
+pieces? Both ask `further_unknowns`. `separate_patches`: does one patch lie off the bone? `doubles`: is the bone in it
+twice? `crop` cuts a cloud before, `inputs` takes poses and places.
 """

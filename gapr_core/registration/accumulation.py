@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
-from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
 from gapr_core.registration import creep, limits, precision, rules
 from gapr_core.registration.far_away import FarInARow
 from gapr_core.registration.refinement import distances_mm, refine_fully
@@ -189,18 +189,29 @@ class Accumulator:
         if ratio <= MAY_MOVE * rigidity.creeps:
             return result
         if ratio <= rigidity.creeps or len(kept) < FEWEST_IN_TIME:
-            widened = self._widened(result, covariance_of_half(fit, found.finding.size_mm), target)
+            widened = self._widened(
+                result, covariance_of_half(fit, found.finding.size_mm), fit.moved.mean(axis=0), target
+            )
             return limits.no_surer(widened, limits.MOVING, self.config)
         self.reset()
         self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
 
-    def _widened(self, result: RegistrationResult, added: Array, target: PreparedTarget) -> RegistrationResult:
-        """An answer with more in its covariance (6, 6) and in its errors; refused where these are too large then."""
+    def _widened(
+        self, result: RegistrationResult, added: Array, about_mm: Array, target: PreparedTarget
+    ) -> RegistrationResult:
+        """An answer with more in its covariance and in its errors; refused where these are too large then.
+
+        Args:
+            result: an answer.
+            added: (6, 6) covariance about a centre of its own.
+            about_mm: (3,) that centre, target frame.
+            target: the bone.
+        """
         if result.covariance is None or result.centre_mm is None:  # as of methods that predict no error
             return result
-        covariance = result.covariance + added
+        covariance = result.covariance + covariance_about(result.centre_mm - about_mm, added)
         tre_mm = predicted_rmse_mm(covariance, target.points, result.centre_mm)
         tre95_mm = result.factor95 * precision.bound_mm(covariance, target.points, result.centre_mm)
         refusal = rules.by_threshold(result.confidence, tre95_mm, self.config)

@@ -62,8 +62,8 @@ class Assessment:
         factor95: takes the bound that the covariance gives to what 95 % of the true errors stay below.
         independent_points: independent residuals that the source counts for where `hypotheses` share the probability.
         most: no surer than this, in a stream neither: no such source was calibrated.
-        deformed: sizes, mm, of what the points show besides one rigid piece of bone (`rigidity`, `doubles`), the surest
-            first.
+        deformed: sizes, mm, of what the points show besides one rigid piece of bone (`rigidity`, `separate_patches`,
+            `doubles`), that of the module asked last first, of `rigidity` the surest.
         looks: of several looks, what the pose says of each (`look_agreement`); else ().
     """
 

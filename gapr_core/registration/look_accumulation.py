@@ -36,12 +36,24 @@ class Newest(Enum):
 
     AGREES = "alone it has the same pose"
     IS_UNCONFIRMED = "alone it has no pose, or there is no other"
+    IS_DOUBTFUL = "the newest look alone gives no pose, and the one before showed the bone elsewhere"
     IS_REFUSED = "with the others it gives no pose"
+    IS_TOO_SMALL = "the newest look has too few points for an image"
     SHOWS_NOTHING = (
         "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
     )
-    IS_APART = "it shows the bone elsewhere"
+    IS_APART = "it shows the bone elsewhere, or most others do"
     DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
+
+
+STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # the pose stands
+ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS)
+REFUSED_FOR = {
+    Newest.DIFFERS: RegistrationStatus.AMBIGUOUS,
+    Newest.SHOWS_NOTHING: RegistrationStatus.AMBIGUOUS,
+    Newest.IS_DOUBTFUL: RegistrationStatus.AMBIGUOUS,
+    Newest.IS_TOO_SMALL: RegistrationStatus.TOO_FEW_POINTS,
+}
 
 
 class LookAccumulator:
@@ -52,11 +64,11 @@ class LookAccumulator:
     fixed to it, and the camera's place must be known for each. A look takes the place of one from nearly the same
     direction, so that those of a video do not push out all others.
 
-    An older look that shows the bone elsewhere than the newest is left out, and the others are asked again. The newest
-    is refused where it does not fit the others, shows nothing of the bone there, or alone has another pose; where it
-    alone has none, or there is no other, the answer is not sure (`limits`). After three in a row that show the bone
-    elsewhere it or its reference has moved, and only these three are kept, whatever their directions. After ten
-    refusals from one direction only the last look is kept.
+    Older looks that show the bone elsewhere than the newest and most others are left out, and the others are asked
+    again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
+    pose; where it alone has none, or there is no other, the answer is not sure (`limits`). After three in a row that
+    show the bone elsewhere it or its reference has moved, and only these three are kept, whatever their directions.
+    After ten refusals from one direction only the last look is kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
@@ -149,51 +161,57 @@ class LookAccumulator:
             return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=reason, method=self.name)
         before = self._add(newest)
         try:
-            result = self._of_those_that_fit(target, initial)
+            result, asked = self._of_those_that_fit(target, initial)
         except Exception:
             self._looks = before
             raise
         clock = Clock()
-        said = self._of_newest(result, target)
+        said = self._of_newest(result, asked, target)
         clock.lap("compare")
-        found = replace(result, stage_ms=_added(result.stage_ms, clock.stages))
-        if said in (Newest.SHOWS_NOTHING, Newest.DIFFERS):
-            found = self._refused(found, said.value)
+        found = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
+        if said in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
+            ruled_out = min(found.confidence, self.config.rules.ruled_out)
+            found = replace(found.refused(REFUSED_FOR[said], said.value), confidence=ruled_out)
         if said is Newest.IS_UNCONFIRMED:
             found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
-        return replace(found, reason=found.reason + self._after(said, newest, before))
+        return replace(found, reason=found.reason + self._after(said, newest, before, asked))
 
-    def _of_those_that_fit(self, target: PreparedTarget, initial: ArrayLike | None) -> RegistrationResult:
-        """The answer to all looks; without older ones that show the bone elsewhere than the newest and the others."""
+    def _of_those_that_fit(
+        self, target: PreparedTarget, initial: ArrayLike | None
+    ) -> tuple[RegistrationResult, list[Look]]:
+        """The answer to all looks but older ones that show the bone elsewhere than the newest and most; and these."""
         stage_ms: dict[str, float] = {}
+        asked = self._looks
         while True:
-            result = self.method.register(self.collected, target, initial, Places.of(self._looks))
+            result = self.method.register(_together(asked), target, initial, Places.of(asked))
             stage_ms = _added(stage_ms, result.stage_ms)
-            fits = [look.fit for look in result.looks] or [LookFit.FITS] * len(self._looks)
-            kept = [look for look, fit in zip(self._looks, fits, strict=True) if fit is not LookFit.APART]
-            if fits[-1] is LookFit.APART or len(kept) == len(self._looks):
-                return replace(result, method=self.name, stage_ms=stage_ms)
-            log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(kept))
-            self._looks = kept
+            apart = [look.fit is LookFit.APART for look in result.looks] or [False] * len(asked)
+            if apart[-1] or not any(apart) or 2 * sum(apart) >= len(asked):
+                return replace(result, stage_ms=stage_ms), asked
+            asked = [look for look, is_apart in zip(asked, apart, strict=True) if not is_apart]
 
-    def _of_newest(self, result: RegistrationResult, target: PreparedTarget) -> Newest:
-        """What the newest look says of the answer to all."""
-        fit = result.looks[-1].fit if result.looks else LookFit.FITS
+    def _of_newest(self, result: RegistrationResult, asked: list[Look], target: PreparedTarget) -> Newest:
+        """What the newest of the looks that were asked says of the answer."""
+        fits = [look.fit for look in result.looks] or [LookFit.FITS]
         may_be_there = result.status in (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)
-        if fit is LookFit.APART:
+        if LookFit.APART in fits:
             return Newest.IS_APART
-        if fit is LookFit.TOO_SMALL or (fit is LookFit.BLIND and may_be_there):
+        if fits[-1] is LookFit.TOO_SMALL:
+            return Newest.IS_TOO_SMALL
+        if fits[-1] is LookFit.BLIND and may_be_there:
             return Newest.SHOWS_NOTHING
         if not result.ok:
             return Newest.IS_REFUSED
-        return self._alone(self._looks[-1], result, target)
+        said = self._alone(asked, result, target)
+        return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said
 
-    def _alone(self, newest: Look, result: RegistrationResult, target: PreparedTarget) -> Newest:
+    def _alone(self, asked: list[Look], result: RegistrationResult, target: PreparedTarget) -> Newest:
         """What the newest look alone says of the pose of all: its own is right if that one is, or it has none."""
-        if len(self._looks) < 2:
+        if len(asked) < 2:
             return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
         if result.T_target_source is None:
             return Newest.AGREES
+        newest = asked[-1]
         registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
         alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
         if alone.T_target_source is None:
@@ -201,23 +219,21 @@ class LookAccumulator:
         error = se3.pose_error(alone.T_target_source, result.T_target_source, newest.points)
         return Newest.AGREES if error.is_right else Newest.DIFFERS
 
-    def _refused(self, result: RegistrationResult, reason: str) -> RegistrationResult:
-        """Of a bone that is no longer where the looks have it in common, for all that is known."""
-        refused = result.refused(RegistrationStatus.AMBIGUOUS, reason)
-        return replace(refused, confidence=min(result.confidence, self.config.rules.ruled_out))
-
-    def _after(self, said: Newest, newest: Look, before: list[Look]) -> str:
+    def _after(self, said: Newest, newest: Look, before: list[Look], asked: list[Look]) -> str:
         """Decide which looks stay after an answer. Returns how that is said, after the reason.
 
         Args:
             said: what the newest look says; a pose that it does not speak against ends what is counted.
             newest: the look; among those kept so far.
             before: the looks before it.
+            asked: those with which it has a pose, itself included; after a refusal all others stay, too.
         """
-        if said in (Newest.AGREES, Newest.IS_UNCONFIRMED):
-            self._off_in_a_row, self._refused_in_a_row = [], 0
+        if said in STANDING:
+            if len(asked) < len(self._looks):
+                log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
+            self._looks, self._off_in_a_row, self._refused_in_a_row = asked, [], 0
             return ""
-        if said in (Newest.IS_APART, Newest.DIFFERS):
+        if said in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
             if len(self._off_in_a_row) >= self.config.accumulation.most_off:
                 moved = self._off_in_a_row
@@ -232,7 +248,7 @@ class LookAccumulator:
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
             self._restart_with([newest])
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
-        return "; left out" if said is Newest.SHOWS_NOTHING else ""
+        return "" if said is Newest.IS_REFUSED else "; left out"
 
     def _is_stuck(self, newest: Look) -> bool:
         """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""

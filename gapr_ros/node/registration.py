@@ -169,7 +169,7 @@ class Registration:
         together = now.method.together_with(points_mm, **self._seen_from(outcome, now))
         if len(together) < SEARCHED_FOR_DOUBLES:
             together = sampling.distinct(together)  # a cloud that comes again makes no more of them
-        if not intake.is_one_bone(together, now.model.extent_mm):
+        if not len(together) or not intake.is_one_bone(together, now.model.extent_mm):
             together = points_mm  # the method leaves this cloud out, or starts again with it
         outcome.points_used = len(together)
         try:

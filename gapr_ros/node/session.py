@@ -300,6 +300,7 @@ class Session:
             self._ready = ready
         self._changes = Changes(ready.parameters, self._host.parameters)
         self._outdate()
+        self.look_at_file()
         self.parameters_changed()
         self.send_model()
 

@@ -86,7 +86,7 @@ def test_a_pose_reaches_slicer_in_ras_and_a_refusal_as_a_status_alone(bridge, li
         for _ in range(2):  # a pointer that rests: the same point does not count twice
             touch(tracker, point)
             answers.append(made.step(WAIT_S))
-    assert [answer for answer in answers if answer] == [refused, good]
+    assert [answer for answer in answers if answer is not None] == [refused, good]
     np.testing.assert_allclose(registrar.sources[0], points[:3], atol=1e-4)
     np.testing.assert_allclose(registrar.sources[1], points[3:], atol=1e-4)
 

@@ -410,7 +410,7 @@ class Collecting(StandIn):
     def collected(self):
         return np.concatenate([np.empty((0, 3)), *self.kept])
 
-    def together_with(self, source):
+    def together_with(self, source, viewpoint=None):
         return np.concatenate([self.collected, source])
 
     def collect(self, source, viewpoint=None):

@@ -230,7 +230,8 @@ def test_a_misspelt_limit_stays_in_the_diagnostics(blob_path, client):
 
 
 @pytest.mark.parametrize(("given", "named"), [
-    ({"max_tre": 4.0}, "max_tre is 4.0"), ({"max_tre": 0.9}, ""), ({"max_jump_translation": 50.0}, "max_jump"),
+    ({"max_tre": 1.0}, "max_tre is 1.0"), ({"max_tre": 0.09}, ""), ({"crop_max": (300.0, 1.0, np.inf)}, "crop_max"),
+    ({"max_jump_translation": 50.0}, "max_jump"),
     ({"crop_to_track": 40.0}, "crop_to_track"), ({"range_max": 800.0}, "range_max"), ({"range_max": 99.0}, ""),
     ({"range_max": np.inf}, ""), ({"crop_min": (-300.0, -3.0, -3.0)}, "crop_min is (-300.0, -3.0, -3.0)"),
     ({"crop_min": (-3.0,) * 3, "crop_max": (3.0,) * 3}, ""), ({}, ""),

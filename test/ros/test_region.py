@@ -171,6 +171,15 @@ def test_the_origin_of_the_cloud_is_given_in_the_frame_of_the_answer(blob_path, 
     np.testing.assert_allclose(method.calls[-1]["viewpoint"], T_BOX_PROBE[:3, 3] * 1000.0, atol=1e-9)
 
 
+def test_a_first_cloud_that_no_collection_keeps_is_refused_for_its_number_of_points(blob_path, client, monkeypatch):
+    """As one of five points by a `LookAccumulator`."""
+    method = Collecting()
+    monkeypatch.setattr(method, "together_with", lambda source, viewpoint=None: np.empty((0, 3)))
+    with node_in_thread(method, blob_path, accumulate=4):
+        client.wait_for_state("active")
+        assert client.ask(GOOD[:5], frame="probe")["last_refusal"].startswith("too_few_points")
+
+
 @pytest.mark.parametrize(
     ("given", "is_given"),
     [

@@ -11,7 +11,7 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.geometry.twists import predicted_rmse_mm
+from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
 from gapr_core.registration import clutter, creep, precision
 from gapr_core.registration.limits import why_no_surer
 from gapr_core.results import Hypothesis, RegistrationResult
@@ -424,6 +424,10 @@ def test_what_the_bone_may_have_moved_by_is_in_the_covariance(registrar, target,
     _, at_rest = creeping(registrar, target, femur, 0.0, 6.0)
     monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(1.1, 4.0)))
     _, result = creeping(registrar, target, femur, 0.0, 6.0)
+    motion = np.diag([2.0**2] * 3 + [0.02**2] * 3)
+    about = np.array([30.0, -10.0, 5.0])
+    widened = Accumulator(registrar, most=3)._widened(at_rest, motion, about, target).covariance - at_rest.covariance
+    assert widened == pytest.approx(covariance_about(at_rest.centre_mm - about, motion)), "about the answer's centre"
     added = result.covariance - at_rest.covariance
     assert np.linalg.eigvalsh(added).min() > -1e-9 and np.diag(added)[:3].min() >= 0.99 * 2.0**2
     assert np.array_equal(result.T_target_source, at_rest.T_target_source)

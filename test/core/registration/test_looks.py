@@ -99,7 +99,7 @@ def test_a_look_of_too_few_points_is_named_and_as_the_newest_refused(registrar, 
     for number in (0, 1):
         looks.register(of_look(pair, number), target, viewpoint=of_look(pair, number, pair.viewpoint)[0])
     result = looks.register(few, target, viewpoint=pair.viewpoint[pair.metadata["look"] == 2][0])
-    assert result.status is RegistrationStatus.AMBIGUOUS and "newest look shows nothing" in result.reason
+    assert result.status is RegistrationStatus.TOO_FEW_POINTS and "too few points for an image" in result.reason
     assert len(looks.collected) == len(of_look(pair, 0)) + len(of_look(pair, 1))
 
 

@@ -34,7 +34,7 @@ def test_each_other_place_is_enough(nowhere, monkeypatch, place):
         monkeypatch.setenv(compiled_code.VARIABLE, "/somewhere")
     else:
         of_user = compiled_code._of_user()
-        wanted = of_user if place == "user" else compiled_code.BESIDE / "__pycache__"
+        wanted = of_user if place == "user" else compiled_code.PACKAGE / "__pycache__"
         monkeypatch.setattr(compiled_code, "_can_write", lambda folder: folder == wanted)
     compiled_code.find_a_place()
     assert os.environ.get(compiled_code.VARIABLE) == ("/somewhere" if place == "variable" else None)

@@ -138,6 +138,11 @@ def shows_most(name: str) -> Callable[[Assessment, RegistrarConfig], bool]:
     return lambda assessment, _: next(iter(assessment.deformed), None) == name
 
 
+def asked_of_a_collection(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """False: what one source does not show; who collects several asks it, and calls `no_surer`."""
+    return False
+
+
 def residual_mm(assessment: Assessment) -> float:
     """Root mean square residual of the points that count for the pose, whose unknowns count; infinite without any."""
     signed = assessment.fit.signed_mm[assessment.fit.weights > 0.0]
@@ -248,13 +253,13 @@ LIMITS = (
     ),
     Limit(
         MOVING,
-        shows_most(MOVING),  # an `Accumulator` asks
+        asked_of_a_collection,  # by an `Accumulator`
         "the collected sources hardly exclude that the bone moves against their frame; check what is fixed to it, or "
         "collect more",
     ),
     Limit(
         UNCONFIRMED,
-        shows_most(UNCONFIRMED),  # a `LookAccumulator` asks
+        asked_of_a_collection,  # by a `LookAccumulator`
         "the newest look alone gives no pose, or there is no other: nothing confirms where the bone is now; look from "
         "elsewhere, and from where more of the bone is seen",
     ),

@@ -110,8 +110,7 @@ class LookAccumulator:
         """Forget all looks, and the track of a `Tracker`."""
         self._looks: list[Look] = []
         self._off_in_a_row: list[Look] = []  # newest ones that show the bone elsewhere than those before
-        self._refused_in_a_row = 0  # from nearly one direction, since a pose
-        self._first_refused: Look | None = None  # of that row
+        self._refused_in_a_row: list[Look] = []  # from nearly one direction, since a pose
         self._far_away.reset()
         if isinstance(self.method, Tracker):
             self.method.reset()
@@ -231,7 +230,7 @@ class LookAccumulator:
         if said in STANDING:
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
-            self._looks, self._off_in_a_row, self._refused_in_a_row = asked, [], 0
+            self._looks, self._off_in_a_row, self._refused_in_a_row = asked, [], []
             return ""
         if said in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
@@ -241,9 +240,7 @@ class LookAccumulator:
                 return f"; {len(moved)} in a row: the collection restarts with them"
             self._looks = before
             return "; left out"
-        if said is Newest.IS_REFUSED:
-            self._off_in_a_row = []
-        else:
+        if said is not Newest.IS_REFUSED:
             self._looks = before
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
             self._restart_with([newest])
@@ -252,11 +249,11 @@ class LookAccumulator:
 
     def _is_stuck(self, newest: Look) -> bool:
         """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""
-        first = self._first_refused
-        if first is None or not self._refused_in_a_row or _apart_deg(first, newest) >= self.apart_deg:
-            self._refused_in_a_row, self._first_refused = 0, newest
-        self._refused_in_a_row += 1
-        return self._refused_in_a_row >= STUCK
+        row = self._refused_in_a_row
+        if row and _apart_deg(row[0], newest) >= self.apart_deg:
+            row = []
+        self._refused_in_a_row = [*row, newest]
+        return len(self._refused_in_a_row) >= STUCK
 
     def _restart_with(self, looks: list[Look]) -> None:
         log.warning("the collection of looks restarts with the last %d", len(looks))

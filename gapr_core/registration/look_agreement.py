@@ -88,8 +88,8 @@ def unless_apart(
     for name, fit in zip(scene.names, found, strict=True):
         fits[name] = fit
     answers = tuple(map(LookAnswer, scene.given, fits))
-    is_refused = LookFit.APART in found or 2 * found.count(LookFit.BLIND) >= len(found)
-    refusal = _refusal(answers) if is_refused else None
+    do_not_fit = LookFit.APART in found or 2 * found.count(LookFit.BLIND) >= len(found)
+    refusal = _refusal(answers) if do_not_fit else None
     return replace(assessment, looks=answers).with_refusal(refusal, config.rules)
 
 

@@ -63,10 +63,11 @@ def patches(points: Array) -> NDArray[np.int64]:
     Points nearer than `GAP_MM` to each other are of one patch.
     """
     some = sampling.voxel_indices(points, GRAIN_MM)
-    near = cKDTree(points[some]).query_pairs(GAP_MM, output_type="ndarray")
+    tree = cKDTree(points[some])
+    near = tree.query_pairs(GAP_MM, output_type="ndarray")
     joined = csr_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=2 * (len(some),))
     _, of_some = connected_components(joined, directed=False)
-    found = of_some[cKDTree(points[some]).query(points)[1]]
+    found = of_some[tree.query(points)[1]]
     counts = np.bincount(found)
     large = [
         k for k in np.argsort(-counts, kind="stable") if counts[k] >= max(FEWEST_POINTS, LEAST_SHARE * len(points))

@@ -166,7 +166,8 @@ class Registration:
 
     def _check_together(self, points_mm: Array, outcome: Outcome, now: Situation) -> None:
         """Number and unit of this cloud and those before it; where they are too few it is kept for the next one."""
-        together = now.method.together_with(points_mm, **self._seen_from(outcome, now))
+        seen_from = self._seen_from(outcome, now)
+        together = now.method.together_with(points_mm, **seen_from)
         if len(together) < SEARCHED_FOR_DOUBLES:
             together = sampling.distinct(together)  # a cloud that comes again makes no more of them
         if not len(together) or not intake.is_one_bone(together, now.model.extent_mm):
@@ -176,7 +177,7 @@ class Registration:
             intake.check_together(together, now.model.extent_mm, now.parameters)
         except RefusedError as refusal:
             if refusal.reason is Reason.TOO_FEW_POINTS:
-                now.method.collect(points_mm, **self._seen_from(outcome, now))
+                now.method.collect(points_mm, **seen_from)
             raise
 
     def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:

@@ -252,6 +252,14 @@ def test_after_looks_that_show_the_bone_elsewhere_one_that_says_nothing_is_refus
     assert "3 in a row" in result.reason and names(looks.collected) == [1, 3, 4]
 
 
+def test_a_refusal_does_not_end_the_row_of_looks_that_show_the_bone_elsewhere(target):
+    looks, asked = looks_of(OK, OK, REFUSED, OK)
+    for number, alone in enumerate((OK, MOVED, OK, REFUSED)):
+        asked.alone = alone
+        result = looks.register(points(number), target, viewpoint=eye(20.0 * number))
+    assert result.status is RegistrationStatus.AMBIGUOUS and "alone gives no pose" in result.reason
+
+
 def test_the_times_of_all_that_was_asked_add_up(target):
     first = apart(0)(Places.of([Look(points(0), eye(0.0))] * 3))
     answers = replace(first, stage_ms={"verify": 5.0}), replace(OK, stage_ms={"verify": 2.0, "refine": 1.0})

@@ -208,6 +208,7 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
         return surface
     if surface.faces is not None:
         raise InvalidPointCloudError("finite vertices", f"{(~finite).sum()} that are not in {name}", "repair the mesh")
+    log.warning("%s: %d of %d points are not finite: left out", name, (~finite).sum(), len(finite))
     normals = None if surface.normals is None else surface.normals[finite]
     return replace(surface, points=surface.points[finite], normals=normals)
 

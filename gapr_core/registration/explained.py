@@ -122,8 +122,8 @@ def _clutter(share: float, other: Refusal | None, more: str) -> Refusal:
     return Refusal(
         RegistrationStatus.CLUTTER,
         f"in the best pose {100.0 * share:.0f} % of the cloud is this bone, and {why}: is it the right bone? "
-        f"If so, crop the cloud with a box around the wound or around the last pose (crop_to_track), or expose more of "
-        f"the bone{more}",
+        f"If so, crop the cloud with a box around the wound or around the last pose (crop_to_track of the node), or "
+        f"expose more of the bone{more}",
     )
 
 

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 SD_OF_MEDIAN = 1.4826  # standard deviation of normal residuals over the median of their absolute values
 FAR_SIGMAS = 3.0  # beyond so many standard deviations lies an outlier, or noise with a long tail
+WORTH_A_THREAD = 100_000  # points moved, some 3 ms: a second thread costs more than it saves below that
 PATCH_POINTS = SourceConfig().normal_neighbours  # of a source that was not prepared
 
 
@@ -91,7 +92,9 @@ def refine_many(
     def work(piece: Array) -> tuple[Array, Array]:
         return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances)
 
-    refined, scores = zip(*in_pieces(work, np.ascontiguousarray(poses), num_threads), strict=True)
+    is_little = len(poses) * len(points) * len(limits_mm) < WORTH_A_THREAD
+    pieces = in_pieces(work, np.ascontiguousarray(poses), 1 if is_little else num_threads)
+    refined, scores = zip(*pieces, strict=True)
     return np.concatenate(refined), np.concatenate(scores)
 
 

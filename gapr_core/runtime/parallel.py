@@ -35,9 +35,10 @@ def in_threads(work: Callable[[Any], Result], items: Iterable[Any], num_threads:
 
 
 def in_pieces(work: Callable[[NDArray[Any]], Result], rows: NDArray[Any], num_threads: int = 0) -> list[Result]:
-    """`work` of consecutive pieces of `rows`, in threads; four for each, so that none waits long for another."""
-    count = min(4 * thread_count(num_threads), len(rows))
-    return in_threads(work, np.array_split(rows, max(count, 1)), num_threads=num_threads)
+    """`work` of consecutive pieces of `rows`, in threads; four for each of several, so that none waits long."""
+    threads = thread_count(num_threads)
+    count = min(4 * threads, len(rows)) if threads > 1 else 1
+    return in_threads(work, np.array_split(rows, max(count, 1)), num_threads=threads)
 
 
 def end_with_parent() -> None:

@@ -296,9 +296,10 @@ def test_what_is_no_array_is_answered_with_how_to_make_one(given, how):
         as_points(given)
 
 
-def test_rows_that_are_not_finite_are_dropped_but_not_all_of_them():
+def test_rows_that_are_not_finite_are_dropped_with_a_warning_but_not_all_of_them(caplog):
     dirty = np.vstack([VERTICES, [[np.nan, 0, 0], [np.inf, 0, 0]]])
     assert len(clouds.load(dirty).points) == 4
+    assert "array: 2 of 6 points are not finite: left out" in caplog.text
     with pytest.raises(InvalidPointCloudError, match="none finite"):
         clouds.load(np.full((5, 3), np.nan))
 

@@ -52,9 +52,9 @@ def test_libraries_have_one_thread_while_a_cloud_is_registered_and_as_many_as_be
 
 
 @pytest.mark.parametrize(("rows", "num_threads"), [(0, 2), (1, 2), (3, 1), (50, 1), (50, 3)])
-def test_pieces_are_consecutive_and_four_for_each_thread(rows, num_threads):
+def test_pieces_are_consecutive_and_four_for_each_of_several_threads(rows, num_threads):
     pieces = in_pieces(lambda piece: piece, np.arange(rows), num_threads)
-    assert len(pieces) == min(4 * num_threads, rows) or (rows == 0 and len(pieces) == 1)
+    assert len(pieces) == (1 if num_threads == 1 or not rows else min(4 * num_threads, rows))
     assert list(np.concatenate(pieces)) == list(range(rows))
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtr
 
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
@@ -135,8 +135,8 @@ def _probability(distance_mm: Array, S: Array) -> float:
 
     All together (chi-square), and the farthest of all by itself, which many good ones would hide (Bonferroni).
     """
-    together = chi2.sf(distance_mm @ np.linalg.solve(S, distance_mm), len(distance_mm))
-    farthest = 2.0 * norm.sf(np.abs(distance_mm / np.sqrt(np.diag(S))).max()) * len(distance_mm)
+    together = chdtrc(len(distance_mm), distance_mm @ np.linalg.solve(S, distance_mm))
+    farthest = 2.0 * ndtr(-np.abs(distance_mm / np.sqrt(np.diag(S))).max()) * len(distance_mm)
     return float(min(2.0 * min(together, farthest), 1.0))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from gapr_core.geometry.twists import mean_square
 
@@ -31,4 +31,5 @@ def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = 
     product = mean_square(points, centre) @ covariance
     mean, variance = np.trace(product), 2.0 * np.trace(product @ product)
     scale, freedom = variance / (2.0 * mean), 2.0 * mean**2 / variance
-    return float(np.sqrt(scale * chi2.ppf(quantile, freedom)))
+    chi_square = 2.0 * gammaincinv(freedom / 2.0, quantile)  # as `scipy.stats.chi2.ppf`, which takes long to import
+    return float(np.sqrt(scale * chi_square))

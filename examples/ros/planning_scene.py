@@ -2,6 +2,9 @@
 
 python examples/ros/planning_scene.py femur.stl --ros-args -p min_confidence:=0.9 -p max_tre:=0.002
 
+Where register_node has `model_unit`, `model_scale`, `model_axes` or `model_label`, give the same here: the pose is that
+of the bone as the node reads it, and in other axes the obstacle would lie on the other side of the patient.
+
 Needs a ROS installation with moveit_msgs. A refusal leaves the obstacle where it was last: a robot that moves near a
 bone whose pose is no longer known should stop, which is for `hold` to do.
 """
@@ -21,24 +24,28 @@ from rclpy.utilities import remove_ros_args
 from shape_msgs.msg import Mesh, MeshTriangle
 from trusted_pose import TrustedPose, parser
 
-from gapr_core import load
+from gapr_ros.node.model import surface_of
+from gapr_ros.parameters import NodeParameters
 
 MM_PER_M = 1000.0
 MOST_TRIANGLES = 20_000
+NAMES = ("model_unit", "model_scale", "model_axes", "model_label")
+AS_THE_NODE = {name: getattr(NodeParameters(), name) for name in NAMES}  # the values that it has by itself
 
 
 class BoneInScene(TrustedPose):
     """Sends the bone to /planning_scene.
 
     Args:
-        path: file of the bone, as register_node reads it.
+        path: file of the bone.
         types: the module `moveit_msgs.msg`.
         kwargs: of rclpy's Node.
     """
 
     def __init__(self, path: str | Path, types: Any, **kwargs: object) -> None:
         super().__init__(**kwargs)
-        self._types, self._mesh = types, mesh_of(path)
+        how = {name: self.declare_parameter(name, value).value for name, value in AS_THE_NODE.items()}
+        self._types, self._mesh = types, mesh_of(NodeParameters(model_path=str(path), **how))
         self._scene = self.create_publisher(types.PlanningScene, "/planning_scene", 1)
 
     def act(self, transform: TransformStamped, values: dict[str, str]) -> None:
@@ -48,13 +55,14 @@ class BoneInScene(TrustedPose):
         self._scene.publish(scene)
 
 
-def mesh_of(path: str | Path) -> Mesh:
-    """A bone's triangles, metres.
+def mesh_of(bone: NodeParameters) -> Mesh:
+    """The triangles of the bone that parameters of register_node name, metres.
 
     Raises:
-        ValueError: it has none, or more than a planner handles.
+        GaprError: the file cannot be read.
+        ValueError: it has no triangles, or more than a planner handles.
     """
-    surface = load(path)
+    surface = surface_of(bone)
     if surface.faces is None or not 0 < len(surface.faces) <= MOST_TRIANGLES:
         count = 0 if surface.faces is None else len(surface.faces)
         raise ValueError(f"expected a mesh of at most {MOST_TRIANGLES} triangles, got {count}: decimate it")

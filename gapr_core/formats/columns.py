@@ -14,7 +14,15 @@ from gapr_core.errors import InvalidPointCloudError
 DELIMITERS = ",;\t"
 COMMENTS = ("#", "//")
 ENDINGS = (".csv", ".txt", ".xyz")
-IN_NAME = re.compile(r"\b[xyzlpsra][\s(\[_/]+(mm|cm)\b|\b[xyzlpsra]\s*[(\[]\s*(m)\s*[)\]]", re.IGNORECASE)
+UNITS = {
+    "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
+    "cm": "cm", "centimeter": "cm", "centimeters": "cm", "centimetre": "cm", "centimetres": "cm",
+    "m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
+}  # fmt: skip
+OTHER_UNITS = ("um", "\u00b5m", "\u03bcm", "micron", "microns", "nm", "dm", "in", "inch", "inches", "ft", "feet", "km")
+IN_BRACKETS = re.compile(r"\b[xyzlpsra]\s*[(\[]\s*(\w+)\s*[)\]]", re.IGNORECASE)  # x (mm), x[inch]
+OUTSIDE = "|".join(name for name in UNITS if name != "m")
+BY_ITSELF = re.compile(rf"\b[xyzlpsra][\s_/]+(?:in\s+)?({OUTSIDE})\b", re.IGNORECASE)  # x_mm, x in cm
 AXES = {"xyz": None, "lps": "lps", "ras": "ras"}  # names of three columns -> the axes that they say
 
 
@@ -125,14 +133,18 @@ def unit(path: Path) -> str | None:
     """The unit that the names of the coordinates say, "mm", "cm" or "m", as in `x (cm)`; None where they say none.
 
     Raises:
-        InvalidPointCloudError: several units, or as `space`.
+        InvalidPointCloudError: several units or another one, or as `space`.
     """
     if not path.is_file() or path.suffix.lower() not in ENDINGS:
         return None
     header = _header(path)
-    said = {(two or one).lower() for two, one in IN_NAME.findall(header.line)}
-    if not said or _used(header) is None:
+    words = {word.lower() for way in (IN_BRACKETS, BY_ITSELF) for word in way.findall(header.line)}
+    said = {UNITS[word] for word in words if word in UNITS}
+    if _used(header) is None or not words & {*UNITS, *OTHER_UNITS}:
         return None
+    if others := sorted(words.intersection(OTHER_UNITS)):
+        given = f"{path.name} with columns in {' and '.join(others)}"
+        raise InvalidPointCloudError("coordinates in mm, cm or m", given, "convert them, and name the columns so")
     if len(said) > 1:
         raise InvalidPointCloudError("one unit of all coordinates", " and ".join(sorted(said)), "correct the names")
     return said.pop()

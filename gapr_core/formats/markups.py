@@ -25,7 +25,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 
 NUMBERED = {"0": "ras", "1": "lps", "ras": "ras", "lps": "lps"}  # Slicer before 4.11 wrote a number
-STATUS, PLACED = 14, "2"  # the column after those with a name; undefined 0, preview 1, missing 3
+STATUS, PLACED = ("0", "1", "2", "3"), "2"  # of a position in .fcsv: undefined, preview, placed, missing
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001}
 SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
 
@@ -138,8 +138,8 @@ def _of_fcsv(data: bytes) -> Markups:
     names = [name.strip() for name in (columns[1] if columns else "id,x,y,z").split(",")]
     lines = re.sub(r"\r+(?=,)", "", text).splitlines()  # some versions keep a CR within the row
     rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
-    if len(names) == STATUS:  # some versions add two columns without a name: status of the position, type of the point
-        rows = [row for row in rows if len(row) <= STATUS or row[STATUS].strip() in ("", PLACED)]
+    if columns:
+        rows = [row for row in rows if _is_placed(row, len(names))]
     if not set("xyz") <= set(names):
         raise ValueError(f"columns {' '.join(names)[:60]}, not x y z")
     at = [names.index(axis) for axis in "xyz"]
@@ -148,6 +148,18 @@ def _of_fcsv(data: bytes) -> Markups:
     points = np.array([[float(row[i]) for i in at] for row in rows]).reshape(-1, 3)
     label = names.index("label") if "label" in names else 0
     return Markups(axes.to_lps(points, space), tuple(row[label] if label < len(row) else "" for row in rows))
+
+
+def _is_placed(row: list[str], count: int) -> bool:
+    """Whether the point of a row under `count` names was placed.
+
+    Some versions add two cells without a name: the status of the position, and the type of the point.
+    """
+    more = [cell.strip() for cell in row[count:]]
+    if more and not (len(more) == 2 and more[0] in STATUS and more[1].isdecimal()):
+        counts, said = f"a row of {len(row)} values under {count} names", ",".join(row)[:50]
+        raise ValueError(f"{counts}, {said!r}: quote texts and numbers with a comma")
+    return not more or more[0] == PLACED
 
 
 def _mm_per_unit(said: object) -> float:

@@ -175,7 +175,8 @@ def reason_of(error: Exception) -> str:
 def unreadable(path: Path, why: str) -> InvalidPointCloudError:
     """The error for a file that cannot be read, in one line."""
     if path.is_dir():
-        return InvalidPointCloudError("a readable folder", f"{path.name} ({_short(why)})", "name a file in it")
+        how = "name a file in it" if why.startswith("no slices") else "correct it: a slice by itself has no pose"
+        return InvalidPointCloudError("a readable folder", f"{path.name} ({_short(why)})", how)
     ending = ending_of(path)
     if path.is_file() and path.stat().st_size == 0:
         why = "0 bytes, an empty file"

@@ -7,9 +7,6 @@ Slicer inverts it again as it reads, so that the source, placed under the transf
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,12 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.runtime import files
+from gapr_core.runtime import child, files
 
 Array = NDArray[np.float64]
 
 ENDINGS = (".tfm", ".h5", ".txt")
-PACKAGES = str(Path(__file__).parents[2])
 TFM = (
     "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
     "Parameters: {}\nFixedParameters: 0 0 0\n"
@@ -95,9 +91,7 @@ def _matrix_of_itk(path: Path) -> Array:
     if find_spec("SimpleITK") is None:
         how = "pip install 'gapr_ros[medical]'"
         raise MethodUnavailableError(f"reading {path.suffix} files", "no SimpleITK", how)
-    command = [sys.executable, "-m", "gapr_core.formats.itk_child", str(path)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = child.run("gapr_core.formats.itk_child", str(path.absolute()))
     if done.returncode != 0:
         given = f"{path.name}, which ITK cannot read"
         raise ConfigError("an ITK transform", given, "save it from 3D Slicer as .tfm or .h5")

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 from tempfile import TemporaryFile, gettempdir
 from typing import Any
 
@@ -17,8 +19,8 @@ from gapr_core.errors import ConfigError
 def replacing(path: str | Path) -> Iterator[Path]:
     """A hidden file in the folder of `path`, to be written; it takes the place of `path` when the block ends well.
 
-    After an error the old file is as it was. Missing folders are made. A link stays, and what it leads to is replaced;
-    a device or a pipe, such as /dev/null, gets the content.
+    After an error the old file is as it was. Missing folders are made. A file that is replaced keeps its permissions. A
+    link stays, and what it leads to is replaced; a device or a pipe, such as /dev/null, gets the content.
 
     Raises:
         ConfigError: the file cannot be written: no such folder, no permission, a full disk.
@@ -26,14 +28,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     _refuse_folder(path)
     into = Path(gettempdir()) / path.name if is_special(path) else Path(os.path.realpath(path))
-    scratch = into.with_name(f".{into.stem}.{os.getpid()}{into.suffix}")
+    scratch = into.with_name(f".{token_hex(8)}{into.suffix}")  # of this call alone, in any thread, container or machine
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
         yield scratch
         if is_special(path):
             path.write_bytes(scratch.read_bytes())
-        else:
-            os.replace(scratch, into)
+            return
+        if into.exists():
+            shutil.copymode(into, scratch)
+        os.replace(scratch, into)
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
@@ -43,7 +47,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 def is_special(path: Path) -> bool:
     """Whether something is there that no file may replace: a device, a pipe, a socket."""
-    return path.exists() and not path.is_file() and not path.is_dir()
+    return os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
 
 
 @contextmanager
@@ -91,8 +95,9 @@ def check_writable(path: str | Path) -> None:
     _refuse_folder(path)
     if is_special(path):
         return
-    folder = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
     try:
+        path.exists()  # raises where its name is too long
+        folder = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
         with TemporaryFile(dir=folder):
             pass
     except OSError as error:
@@ -129,7 +134,7 @@ def read_json(path: str | Path, what: str, how: str = "check the path, or make t
 
 
 def _refuse_folder(path: Path) -> None:
-    if not path.name or path.is_dir():
+    if not path.name or os.path.isdir(path):
         raise ConfigError("a path of a file", f"{path}, a folder", "add the name of the file")
 
 

@@ -66,21 +66,34 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     """Read the bone that the parameters name and prepare it with the registration method.
 
     Raises:
-        GaprError: no path, an unreadable file, or something that cannot be a bone in the unit named.
+        GaprError: as `surface_of`.
     """
-    if not parameters.model_path:
-        raise ConfigError("model_path", "nothing", "give -p model_path:=/path/to/bone.stl")
-    if "://" in parameters.model_path:
-        raise ConfigError("model_path: a path", parameters.model_path, "write it without scheme: /path/to/bone.stl")
-    options = ReadOptions(axes=parameters.model_axes, labels=labels_of(parameters.model_label))
-    path = _expanded(parameters.model_path)
+    path = _path(parameters)
     stamp = _stamp_of(path)
-    surface = clouds.load(path, units=parameters.model_unit, options=options)
-    surface = Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
+    surface = surface_of(parameters)
     clouds.warn_of_size(path, surface.extent_mm)
     target = method.prepare(surface, units="mm")
     points_mm = _for_display(surface)
     return Model(parameters.model_path, target, points_mm, surface.extent_mm, cKDTree(points_mm), stamp)
+
+
+def surface_of(parameters: NodeParameters) -> Surface:
+    """The bone that `model_path` names, mm, by the unit, axes, label and scale that stand with it.
+
+    Raises:
+        GaprError: no path, an unreadable file, or something that cannot be a bone in the unit named.
+    """
+    options = ReadOptions(axes=parameters.model_axes, labels=labels_of(parameters.model_label))
+    surface = clouds.load(_path(parameters), units=parameters.model_unit, options=options)
+    return Surface(surface.points * parameters.model_scale, surface.faces, surface.normals)
+
+
+def _path(parameters: NodeParameters) -> Path:
+    if not parameters.model_path:
+        raise ConfigError("model_path", "nothing", "give -p model_path:=/path/to/bone.stl")
+    if "://" in parameters.model_path:
+        raise ConfigError("model_path: a path", parameters.model_path, "write it without scheme: /path/to/bone.stl")
+    return _expanded(parameters.model_path)
 
 
 def _expanded(path: str) -> Path:

@@ -278,7 +278,7 @@ def test_the_obstacle_is_the_bone_in_metres_at_its_pose(tmp_path, monkeypatch):
     module = loaded("planning_scene", monkeypatch)
     bone = bones.bone()
     monkeypatch.setattr(module, "MOST_TRIANGLES", len(bone.faces))
-    mesh = module.mesh_of(bones.save(bone, tmp_path / "bone.npz"))
+    mesh = module.mesh_of(module.NodeParameters(model_path=str(bones.save(bone, tmp_path / "bone.npz"))))
     found = np.array([[p.x, p.y, p.z] for p in mesh.vertices])
     corners = found[np.array([t.vertex_indices for t in mesh.triangles])]
     np.testing.assert_allclose(corners, bone.points[bone.faces] / 1000.0, atol=1e-9)
@@ -290,7 +290,19 @@ def test_the_obstacle_is_the_bone_in_metres_at_its_pose(tmp_path, monkeypatch):
     assert (made.pose.position.x, made.pose.orientation) == (0.5, transform.transform.rotation)
     monkeypatch.setattr(module, "MOST_TRIANGLES", 10)
     with pytest.raises(ValueError, match="decimate"):
-        module.mesh_of(tmp_path / "bone.npz")
+        module.mesh_of(module.NodeParameters(model_path=str(tmp_path / "bone.npz")))
+
+
+@pytest.mark.parametrize(("axes", "turn"), [("as_is", 1.0), ("auto", -1.0), ("ras", -1.0)])
+def test_the_obstacle_has_the_axes_that_the_node_has(tmp_path, monkeypatch, axes, turn):
+    """A mesh that says SPACE=RAS was turned here, and by a node that was given nothing it was not."""
+    loaded("trusted_pose", monkeypatch)
+    module = loaded("planning_scene", monkeypatch)
+    (tmp_path / "bone.obj").write_text("# SPACE=RAS\nv 30 20 0\nv 130 20 0\nv 30 20 200\nf 1 2 3\n")
+    node = module.NodeParameters(model_path=str(tmp_path / "bone.obj"), model_axes=axes, model_unit="mm")
+    first = module.mesh_of(node).vertices[0]
+    assert (first.x, first.y, first.z) == pytest.approx((0.03 * turn, 0.02 * turn, 0.0))
+    assert module.AS_THE_NODE["model_axes"] == "as_is", "given nothing, both read it as it is"
 
 
 def test_the_filter_hears_the_pose_with_its_covariance_and_sends_the_frame_that_the_node_then_does_not():

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import logging
-import os
 import subprocess
-import sys
 import tempfile
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import InvalidPointCloudError, MethodUnavailableError
 from gapr_core.formats.options import ReadOptions
 from gapr_core.formats.volumes import contour
+from gapr_core.runtime import child
 from gapr_core.surface import Surface
 
 Mask = NDArray[np.uint8]
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 NEEDS = ("SimpleITK", "skimage", "highdicom")
 LONGEST_READ_S = 300
-PACKAGES = str(Path(__file__).parents[3])
+CHILD = "gapr_core.formats.volumes.child"
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
@@ -50,22 +50,27 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def _with_small_ending(path: Path, folder: Path) -> Path:
-    """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers."""
+    """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers.
+
+    Its voxels may be in a file of their own beside it.
+    """
     ending = "".join(path.suffixes[-2:]) if path.suffix.lower() == ".gz" else path.suffix
     if ending == ending.lower():
         return path
-    link = folder / f"file{ending.lower()}"
+    stem = path.name.removesuffix(ending)
+    for other in path.parent.glob(f"{glob.escape(stem)}.*"):
+        (folder / other.name).symlink_to(other.resolve())
+    link = folder / f"{stem}{ending.lower()}"
+    link.unlink(missing_ok=True)  # another file of that very name
     link.symlink_to(path.resolve())
     return link
 
 
 def _in_a_child(path: Path, options: ReadOptions, out: Path) -> tuple[Mask, NDArray[np.float64], list[str]]:
     """The cropped mask [k, j, i], the affine of its own indices (i, j, k), and what there is to say."""
-    request = {"path": str(path), "labels": list(options.labels), "limits": asdict(options.limits)}
-    command = [sys.executable, "-m", "gapr_core.formats.volumes.child", json.dumps(request), str(out)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    request = {"path": str(path.absolute()), "labels": list(options.labels), "limits": asdict(options.limits)}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_READ_S, env=environment)
+        done = child.run(CHILD, json.dumps(request), str(out.absolute()), timeout_s=LONGEST_READ_S)
     except subprocess.TimeoutExpired as error:
         raise ValueError(f"not read in {LONGEST_READ_S} s") from error
     if done.returncode != 0:

@@ -275,6 +275,15 @@ def test_endings_may_be_in_capitals(tmp_path, ending):
     np.testing.assert_allclose(surface.points.mean(axis=0), CENTRE, atol=0.5)
 
 
+def test_the_voxels_of_a_file_with_an_ending_in_capitals_may_lie_beside_it(tmp_path):
+    """It is read through a link in another folder, where they were not found."""
+    affine, size = affine_of((3.0, 3.0, 3.0))
+    written = write(tmp_path / "scan.mhd", voxels_of(affine, size), affine)
+    capital = written.rename(tmp_path / "scan.MHA")
+    assert not (tmp_path / "scan.mha").exists() and list(tmp_path.glob("scan.*raw"))
+    np.testing.assert_allclose(clouds.load(capital).points.mean(axis=0), CENTRE, atol=0.5)
+
+
 def test_one_name_twice_is_no_choice():
     with pytest.raises(InvalidPointCloudError, match="2 of the name bone"):
         names.choose(["bone"], [Segment("bone", 1), Segment("Bone", 2)], {0: {1, 2}})
@@ -580,11 +589,11 @@ def test_a_label_map_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(t
 
 
 def test_a_reader_that_dies_takes_nobody_along(tmp_path, monkeypatch):
-    from gapr_core.formats.volumes import label_map
+    from gapr_core.runtime import child
 
     affine, size = affine_of((3.0, 3.0, 3.0))
     path = write(tmp_path / "a.nrrd", voxels_of(affine, size), affine)
-    monkeypatch.setattr(label_map.sys, "executable", "/bin/false")
+    monkeypatch.setattr(child.sys, "executable", "/bin/false")
     with pytest.raises(InvalidPointCloudError, match="its reader ended with 1"):
         clouds.load(path)
 

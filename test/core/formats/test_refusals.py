@@ -162,6 +162,26 @@ def test_rows_and_names_of_an_fcsv_file_have_x_y_z(tmp_path, content, said):
     assert said in refusal(tmp_path / "a.fcsv", content)
 
 
+@pytest.mark.parametrize(
+    "row",
+    [
+        b"1,10,20,30,0,0,0,1,1,1,0,knee,left, upper,node",
+        b"1,10,20,30,0,0,0,1,1,1,0,knee,,node,2",
+        b"1,10,20,30,0,0,0,1,1,1,0,knee,,node,4,0",
+        b"1,10,20,30,0,0,0,1,1,1,0,knee,a,b,c,node",
+        b"1,1,5,2,5,3,0,0,0,1,1,1,0,knee,,",
+        b"1,1,5,2,5,3,0,0,0,1,1,1,0,2,2,node",
+    ],
+)
+def test_a_row_of_an_fcsv_file_with_more_cells_than_names_is_refused(tmp_path, row):
+    """One decimal comma, or one in a description, moved the cells: points were lost or became others."""
+    head = b"# CoordinateSystem = LPS\n# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+    good = b"0,10,20,30,0,0,0,1,1,1,0,hip,,node,2,0\n"
+    said = refusal(tmp_path / "a.fcsv", head + good + row + b"\n")
+    assert f"a row of {row.count(b',') + 1} values under 14 names" in said
+    assert "quote texts and numbers with a comma" in said
+
+
 PLY = "ply\nformat ascii 1.0\n{}end_header\n{}"
 XYZ = "element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
 

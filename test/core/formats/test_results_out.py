@@ -17,6 +17,7 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import markups, planning, scene, transforms
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
+from gapr_core.runtime import child
 
 sitk = pytest.importorskip("SimpleITK", reason="reference: pip install SimpleITK")
 
@@ -102,7 +103,7 @@ def test_a_damaged_start_is_refused_in_one_line(tmp_path):
     np.save(tmp_path / "a.npy", POINTS)
     files = ["--source", "a.npy", "--target", "a.npy", "--method", "gapr_search", "--initial", "cut.h5"]
     command = [sys.executable, "-m", "gapr_core.cli", "register", *files]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([transforms.PACKAGES, os.environ.get("PYTHONPATH", "")])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(child.PACKAGES), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cut.h5, which ITK cannot read" in done.stderr
 

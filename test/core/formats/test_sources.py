@@ -580,6 +580,9 @@ def test_names_that_say_something_else_are_refused(tmp_path, names):
 @pytest.mark.parametrize(("names", "unit"), [
     ("x (cm),y (cm),z (cm)", "cm"), ("x_m,y_m,z_m", None), ("X [m],Y [m],Z [m]", "m"), ("t (mm),x,y_cm,z_cm", "cm"),
     ("L (mm),P (mm),S (mm)", "mm"), ("x,y,z,error_cm", None), ("# x/cm,y/cm,z/cm", "cm"), ("# of the hip_cm", None),
+    ("x (centimeters),y (centimeters),z (centimeters)", "cm"), ("x in cm,y in cm,z in cm", "cm"),
+    ("# x,y,z in cm", "cm"), ("x (metres),y (metres),z (metres)", "m"), ("x in,y in,z in", None),
+    ("x_millimetre,y_millimetre,z_millimetre", "mm"),
 ])  # fmt: skip
 def test_a_unit_in_the_names_of_the_coordinates_is_never_passed_over(tmp_path, names, unit):
     """Points in cm were read as mm, as a tenth of the bone."""
@@ -597,6 +600,16 @@ def test_a_unit_in_the_names_of_the_coordinates_is_never_passed_over(tmp_path, n
             clouds.load(path, units=named)
     if unit == "cm":
         np.testing.assert_allclose(clouds.load(path, units="auto").points, POINTS * 10.0)
+
+
+@pytest.mark.parametrize("unit", ["in", "inch", "um", "\u00b5m", "dm", "ft"])
+def test_a_unit_that_is_none_of_ours_is_refused(tmp_path, unit):
+    """Inches were read as mm."""
+    (tmp_path / "a.csv").write_text(f"x ({unit}),y [{unit}],z({unit})\n1,2,3\n40,50,60\n")
+    for named in clouds.MM_PER_UNIT:
+        said = f"coordinates in mm, cm or m; got a.csv with columns in {unit}; convert them"
+        with pytest.raises(InvalidPointCloudError, match=said):
+            clouds.load(tmp_path / "a.csv", units=named)
 
 
 def test_several_units_and_slices_in_another_one_are_refused(tmp_path):

@@ -72,3 +72,42 @@ def test_a_pipe_or_a_device_is_written_to_and_never_replaced(tmp_path):
     reader.join(10.0)
     assert json.loads(read[0]) == {"a": 1} and stat.S_ISFIFO(pipe.stat().st_mode)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe.json"]
+
+
+def test_threads_that_write_one_file_each_leave_a_whole_one(tmp_path):
+    """One scratch name for the whole process: the first to end took the others' file away."""
+    together, failed = threading.Barrier(4), []
+
+    def write(number):
+        try:
+            with files.replacing(tmp_path / "a.txt") as scratch:
+                scratch.write_text(str(number) * 1000)
+                together.wait(10)
+        except ConfigError as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed and (tmp_path / "a.txt").read_text() in {str(number) * 1000 for number in range(4)}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
+    for mode in (0o600, 0o664):
+        files.write_text(tmp_path / "a.txt", "old")
+        (tmp_path / "a.txt").chmod(mode)
+        files.write_text(tmp_path / "a.txt", "new")
+        assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == mode
+
+
+def test_a_name_may_be_as_long_as_the_file_system_allows_and_no_longer(tmp_path):
+    longest = tmp_path / ("a" * 251 + ".txt")
+    files.check_writable(longest)
+    files.write_text(longest, "new")
+    assert longest.read_text() == "new"
+    for refused in (files.check_writable, lambda path: files.write_text(path, "new")):
+        with pytest.raises(ConfigError, match="too long"):
+            refused(tmp_path / ("a" * 252 + ".txt"))

@@ -30,6 +30,7 @@ from gapr_core.config import FollowingConfig, SourceConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
+from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.pages import markdown
@@ -41,11 +42,13 @@ from gapr_core.runtime.memory import allocated_mb
 Case = Callable[[], object]
 TRIANGLES = 200_000
 STREAM = Motion(frames=8, points=4000, step_mm=2.0, step_deg=1.0)
+SCENES = scenes.SceneMotion(frames=8, level="scene-C2")
 GICP_VOXEL_MM = 2.0
 TARGET, OPEN3D = "prepare a target of 200 000 triangles", "Open3D: read it, and its normals"
 FULL = {protocol: f"register ({protocol})" for protocol in ("paper", "L1", "L2")}
 KISS = {protocol: f"KISS-Matcher and refinement, of that pair ({protocol})" for protocol in FULL}
 TRACK, GICP = "track a frame of 4000 points", "small_gicp: thin and align that frame"
+TRACK_SCENE = "track a scene (C2)"
 FOLLOW = "follow a frame of 4000 points, not assessed"
 STAGED = FULL["paper"], TRACK  # whose stages are printed too
 
@@ -108,6 +111,7 @@ def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -
         **{name: case for both in zip(full.items(), of_kiss.items(), strict=True) for name, case in both},
         "register, both rounds (paper)": lambda: twice.register(clean.source, target),
         "register a scene (C2)": lambda: registrar.register(scene.source, of_scene, viewpoint=scene.viewpoint),
+        TRACK_SCENE: tracked(list(scenes.simulate(bone, 3, SCENES)), registrar),
         TRACK: tracked(frames, registrar),
         FOLLOW: followed(frames, registrar),
         GICP: aligned(frames, threads),
@@ -117,7 +121,12 @@ def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -
 def tracked(frames: Sequence[Pair], registrar: Registrar) -> Case:
     """Each call registers the next frame of a stream, to and fro, from the track."""
     tracker, target, turn = Tracker(registrar, recheck=10**9), registrar.prepare(frames[0].target), to_and_fro(frames)
-    return lambda: tracker.register(next(turn)[1].source, target)
+
+    def call() -> object:
+        frame = next(turn)[1]
+        return tracker.register(frame.source, target, viewpoint=frame.viewpoint)
+
+    return call
 
 
 def followed(frames: Sequence[Pair], registrar: Registrar) -> Case:

@@ -91,8 +91,8 @@ def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:
     return (replace(scene, regions=found) for found in regions.rounds(scene.source, config))
 
 
-def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
-    """Hypotheses of all regions, each refined on its own region; and those that are given (K, 4, 4)."""
+def propose(scene: Scene, target: PreparedTarget, start: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
+    """Hypotheses of all regions, each refined on its own region; and those to start from (K, 4, 4)."""
     steps = steps_on(target, config.region_limits_mm, config)
 
     def work(region: Region) -> Array:
@@ -100,8 +100,8 @@ def propose(scene: Scene, target: PreparedTarget, given: Array, config: ClutterC
         return steps.refined(poses, region.source, region.source.order[: config.region_points])
 
     found = in_threads(work, scene.regions, num_threads=num_threads)
-    label = np.repeat(np.arange(GIVEN, len(found)), [len(given), *map(len, found)])
-    return Pool(np.concatenate([given, *found]), label, np.zeros(len(label)))
+    label = np.repeat(np.arange(GIVEN, len(found)), [len(start), *map(len, found)])
+    return Pool(np.concatenate([start, *found]), label, np.zeros(len(label)))
 
 
 def has_proposed(pool: Pool) -> bool:
@@ -123,7 +123,7 @@ def verify(
     """
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
-    best = refine_on_all(best if start is None else _given(start) + best, scene, target, config, num_threads)
+    best = refine_on_all(best if start is None else given(start) + best, scene, target, config, num_threads)
     shares = support(best.poses, crowd.poses, scene.source, config.markers, config.same_pose_mm)
     return Candidates(best.poses, small_is_good(best.scores), shares)
 
@@ -235,7 +235,8 @@ def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
     return target.cache[key]  # type: ignore[no-any-return]
 
 
-def _given(poses: Array) -> Pool:
+def given(poses: Array) -> Pool:
+    """Hypotheses (K, 4, 4) that no region proposed."""
     return Pool(poses, np.full(len(poses), GIVEN), np.zeros(len(poses)))
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.geometry import se3
+from gapr_core.registration import scene_rounds
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.registrar import Enough, Registrar
+from gapr_core.registration.scene import Scene
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.runtime.clock import Clock
@@ -82,6 +85,20 @@ class MemoryFirst(Registrar):
         if assessment.proposer == Memory.name:
             return assessment.reaches(self.config.sure_from)
         return super()._needs_no_other_proposer(assessment)
+
+    def _all_of_scene(
+        self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
+    ) -> Assessment | None:
+        """What is remembered first; of several looks, which may contradict each other, no region is left out."""
+        poses = np.concatenate([start, self._memory.now])
+        found = None
+        if len(scene.images) == 1:
+            found = scene_rounds.of_remembered(scene, target, poses, self.scene_calibration, self.config, clock)
+        if found is not None:
+            found = replace(found, proposer=Memory.name, rounds=1)
+            if self._needs_no_other_proposer(found) or enough(found):
+                return found
+        return self._in_scene(scene, target, poses, clock)
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         return self._full._of_image(flipped, target, clock)

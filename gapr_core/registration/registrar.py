@@ -260,7 +260,7 @@ class Registrar:
         clock.lap("prepare")
         if isinstance(scene, Refusal):
             return rules.asking_the_unit(scene, np.concatenate([look.points for look in seen]), target.points)
-        assessment = self._in_scene(scene, target, start, clock)
+        assessment = self._all_of_scene(scene, target, start, clock, enough)
         if assessment is None:
             return NO_POSE
 
@@ -271,6 +271,12 @@ class Registrar:
         agreed = look_agreement.unless_apart(assessment, scene, target, alone, self.config)
         clock.lap("assess")
         return self._checked_and_corrected(agreed, clock, enough)
+
+    def _all_of_scene(
+        self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
+    ) -> Assessment | None:
+        """All looks of a scene; `memory.MemoryFirst` asks what it remembers first."""
+        return self._in_scene(scene, target, start, clock)
 
     def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""

@@ -1,4 +1,7 @@
-"""A scene registered: more and more regions of it propose, its lines of sight decide, until an answer is sure."""
+"""A scene registered: more and more regions of it propose, its lines of sight decide, until an answer is sure.
+
+In a stream the last pose and its rivals are compared first, and no region is asked where that is sure.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.scene import Scene
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.verification import Candidates
 from gapr_core.runtime.clock import Clock
 
 Array = NDArray[np.float64]
@@ -52,13 +56,39 @@ def register(
         candidates = clutter.verify(pool, scene, target, settings, threads, start)
         poses = candidates.poses
         clock.lap("verify")
-        part = explained.refine(poses[0], scene, target, config)
-        clock.lap("refine")
-        assessment = explained.assess_part(part, candidates, scene, target, calibration, config)
-        assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
-        clock.lap("assess")
+        found = _assessed(candidates, scene, target, calibration, config, clock)
+        assessment = replace(found, proposer=clutter.NAME, rounds=number)
         if assessment.reaches(config.sure_from):
             break
+    return assessment
+
+
+def of_remembered(
+    seen: Scene, target: PreparedTarget, poses: Array, calibration: Calibration, config: RegistrarConfig, clock: Clock
+) -> Assessment | None:
+    """The best of the poses (K, 4, 4) T_target_source, mm, that the scene before had, its rivals among them.
+
+    No region is asked. None where only one is left: nothing would compete with it.
+    """
+    pool = clutter.given(poses)
+    candidates = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
+    clock.lap("verify")
+    return None if len(candidates.poses) < 2 else _assessed(candidates, seen, target, calibration, config, clock)
+
+
+def _assessed(
+    candidates: Candidates,
+    scene: Scene,
+    target: PreparedTarget,
+    calibration: Calibration,
+    config: RegistrarConfig,
+    clock: Clock,
+) -> Assessment:
+    """The first of the candidates, refined on what it explains, and how sure it is."""
+    part = explained.refine(candidates.poses[0], scene, target, config)
+    clock.lap("refine")
+    assessment = explained.assess_part(part, candidates, scene, target, calibration, config)
+    clock.lap("assess")
     return assessment
 
 

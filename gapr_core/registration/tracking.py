@@ -206,11 +206,11 @@ class Tracker:
         viewpoint: Viewpoint | None,
         clock: Clock,
     ) -> Assessment | Refusal:
-        """Where the last pose was, or in full; a re-check and a camera's cloud try the last pose and its rivals too."""
+        """Where the last pose was, or in full; a re-check tries the last pose and its rivals too."""
         if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
-        if viewpoint is None and self._since_full + 1 < self.recheck:
-            return self._tracking.assess(source, target, clock=clock, enough=self._stands)
+        if self._since_full + 1 < self.recheck:
+            return self._tracking.assess(source, target, viewpoint=viewpoint, clock=clock, enough=self._stands)
         return self.registrar.assess_from(source, target, self._memory.now, viewpoint, clock)
 
     def _stands(self, assessment: Assessment) -> bool:

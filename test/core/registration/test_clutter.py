@@ -1,5 +1,7 @@
 """A camera looks at a bone between things that are not bone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -168,10 +170,10 @@ def test_a_stream_with_a_viewpoint_is_seen_from_there_to_the_last_cloud(target, 
     """A tracker that left it out would infer one of its own, and find the bone as well."""
     rng = np.random.default_rng(3)
     tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
-    for _ in range(3):
+    for proposer in (clutter.NAME, Memory.name, Memory.name):
         points = scene[0] + rng.normal(0.0, 0.1, scene[0].shape)
         result = tracker.register(points, target, viewpoint=scene[1])
-        assert result.ok and result.proposer == clutter.NAME and result.inferred_viewpoint is None
+        assert result.ok and result.proposer == proposer and result.inferred_viewpoint is None
 
 
 def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target, scene, monkeypatch):
@@ -202,6 +204,59 @@ def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
     unbelieving = Calibration("scene", Additive(-3.0, ()), {})
     tracker = Tracker(Registrar(RegistrarConfig(num_threads=1), scene_calibration=unbelieving))
     assert tracker._tracking.scene_calibration is unbelieving and not tracker.register(scene[0], target).ok
+
+
+@pytest.fixture
+def tracker(target, scene):
+    """It has a pose of the scene."""
+    made = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    first = made.register(scene[0], target, viewpoint=scene[1])
+    assert first.ok and first.proposer == clutter.NAME and made._has_track
+    return made
+
+
+def test_the_next_scene_is_compared_with_what_is_remembered_and_no_region_proposes(tracker, target, scene, monkeypatch):
+    monkeypatch.setattr(clutter, "propose", lambda *_: pytest.fail("a region was asked"))
+    shift = np.array([2.0, -3.0, 1.0])
+    found = tracker.register(scene[0] + shift, target, viewpoint=scene[1] + shift)
+    assert found.ok and found.proposer == Memory.name and len(found.hypotheses) > 1
+    truth = se3.inverse(T_SOURCE_TARGET) @ se3.exp([*-shift, 0.0, 0.0, 0.0])
+    error = se3.pose_error(found.T_target_source, truth, scene[0][: scene[2]] + shift)
+    assert error.rte_mm < 1.0 and error.rre_deg < 1.0
+    assert tracker._since_full == 1
+
+
+def test_every_so_many_scenes_one_is_registered_in_full(target, scene):
+    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)), recheck=2)
+    found = [tracker.register(scene[0] + 0.01 * n, target, viewpoint=scene[1]).proposer for n in range(4)]
+    assert found == [clutter.NAME, Memory.name, clutter.NAME, Memory.name]
+
+
+def test_regions_propose_where_what_is_remembered_is_not_sure(tracker, target, scene, monkeypatch):
+    """All that is remembered is tried with them."""
+    asked, propose = [], clutter.propose
+
+    def noted(scene, target, start, *more):
+        asked.append(start)
+        return propose(scene, target, start, *more)
+
+    monkeypatch.setattr(clutter, "propose", noted)
+    monkeypatch.setattr(tracker, "_is_sure", False)  # so that nothing but a sure answer stands
+    monkeypatch.setattr(tracker._tracking, "config", replace(tracker.config, sure=1.1))
+    remembered = tracker._memory.now
+    found = tracker.register(scene[0] + 0.01, target, viewpoint=scene[1])
+    assert found.proposer == clutter.NAME and np.array_equal(asked[0], remembered)
+
+
+def test_regions_propose_where_only_one_remembered_pose_is_left(tracker, target, scene):
+    """Nothing would compete with it."""
+    tracker._memory.keep(tracker._memory.poses[[0, 0]])
+    assert tracker.register(scene[0] + 0.01, target, viewpoint=scene[1]).proposer == clutter.NAME
+
+
+def test_several_looks_are_always_registered_in_full(tracker, target, scene):
+    looks = np.where(np.arange(len(scene[0]))[:, None] % 2, scene[1], scene[1] + [60.0, 0.0, 0.0])
+    assert tracker.register(scene[0], target, viewpoint=looks).proposer == clutter.NAME
 
 
 def test_a_cloud_that_is_sure_as_bone_is_not_asked_for_its_camera(target, femur, monkeypatch):
@@ -294,7 +349,7 @@ def test_a_pose_that_was_given_is_not_weighed_against_nothing(method, target, sc
     truth, alone = se3.inverse(T_SOURCE_TARGET), clutter.propose
 
     def no_regions(scene, target, given, *more):
-        return clutter._given(given)
+        return clutter.given(given)
 
     monkeypatch.setattr(clutter, "propose", no_regions)
     found = method.register(points, target, initial=truth, viewpoint=viewpoint)

@@ -31,7 +31,7 @@ NEARLY_ALL = 0.9  # share of the points
 MOST_COMPARED = 1000  # points whose feet are looked at
 SAME_CONTACT_MM = 1.0
 DRAWS = 4096
-MOVING, UNCONFIRMED = "moving", "unconfirmed"  # what collected sources or looks leave open
+MOVING, UNCONFIRMED, DOUBTED = "moving", "unconfirmed", "doubted"  # what several sources leave open
 
 
 class Limit(NamedTuple):
@@ -138,8 +138,8 @@ def shows_most(name: str) -> Callable[[Assessment, RegistrarConfig], bool]:
     return lambda assessment, _: next(iter(assessment.deformed), None) == name
 
 
-def asked_of_a_collection(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """False: what one source does not show; who collects several asks it, and calls `no_surer`."""
+def asked_of_several(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """False: what one source does not show; who knows several asks it, and calls `no_surer`."""
     return False
 
 
@@ -253,22 +253,28 @@ LIMITS = (
     ),
     Limit(
         MOVING,
-        asked_of_a_collection,  # by an `Accumulator`
+        asked_of_several,  # by an `Accumulator`
         "the collected sources hardly exclude that the bone moves against their frame; check what is fixed to it, or "
         "collect more",
     ),
     Limit(
         UNCONFIRMED,
-        asked_of_a_collection,  # by a `LookAccumulator`
+        asked_of_several,  # by a `LookAccumulator`
         "the newest look alone gives no pose, or there is no other: nothing confirms where the bone is now; look from "
         "elsewhere, and from where more of the bone is seen",
+    ),
+    Limit(
+        DOUBTED,
+        asked_of_several,  # by a `Tracker`
+        "one of the last scenes was hardly believed with the bone here: it may be another subject's; check that it is "
+        "the right bone, or look from where more of it is seen",
     ),
     Limit("inferred", is_inferred, "where the camera was is inferred from what it saw; say where (viewpoint)"),
 )
 
 
 def no_surer(result: RegistrationResult, by: str, config: RegistrarConfig) -> RegistrationResult:
-    """An answer with `limits.most` as its confidence at most, for the limit of this name; for who collects sources.
+    """An answer with `limits.most` as its confidence at most, for the limit of this name; for who knows several.
 
     Refused where more is asked for than that.
     """

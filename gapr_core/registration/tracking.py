@@ -14,6 +14,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.registration import limits
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.evidence import Evidence
@@ -31,6 +32,10 @@ from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+
+# A scene that is hardly believed makes the next ones doubtful: of another subject's bone single scenes may be sure, but
+# seldom all (chosen on scenes of train subjects, docs/log.md, "Streams of scenes")
+DOUBTFUL, DOUBTED_FOR = 0.5, 5  # probability of a scene alone; scenes
 
 
 class Last(NamedTuple):
@@ -56,7 +61,8 @@ class Tracker:
     it stands. In a stream that is sure, so does one near the last pose that reaches `evidence.stands`. Else the
     registrar's proposers are asked as for a single source. So a jump, another frame or a wrong track costs time, not
     truth. The confidence of a source also rests on those before it: sources that agree raise it, those that fit badly
-    lower it (`Evidence`), and so does a misfit that they share (`StreamMisfit`). Used by one thread at a time.
+    lower it (`Evidence`), and so does a misfit that they share (`StreamMisfit`); after a camera's cloud that was hardly
+    believed the next ones are not sure. Used by one thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
@@ -110,6 +116,8 @@ class Tracker:
         self._bone: PreparedTarget | None = None
         self._evidence.reset()
         self._misfit.forget()
+        self._scenes_since_doubt = DOUBTED_FOR
+        self._is_doubted = False  # the scene that is asked about
 
     def of_bone_alone(self) -> Tracker:
         """As `Registrar.of_bone_alone`: another tracker, which begins a stream of its own."""
@@ -117,7 +125,7 @@ class Tracker:
         twin.registrar, twin._memory = self.registrar.of_bone_alone(), Memory()
         twin._tracking = MemoryFirst(twin._memory, self._tracking.calibrations[0], twin.registrar)
         twin._evidence = Evidence(self._evidence.config)
-        if not isinstance(self._misfit, NoMisfit):
+        if not self._shares_points:
             twin._misfit = StreamMisfit(self._evidence.config.memory, self._stream)
         twin.reset()
         return twin
@@ -131,6 +139,11 @@ class Tracker:
         twin._evidence = Evidence(replace(self._evidence.config, correlation=1.0))
         twin._misfit = NoMisfit()
         return twin
+
+    @property
+    def _shares_points(self) -> bool:
+        """See `sharing_points`: the first few say less than all, and are no reason to doubt."""
+        return isinstance(self._misfit, NoMisfit)
 
     def _forget_track(self) -> None:
         self._has_track = False  # there are poses to follow
@@ -168,6 +181,8 @@ class Tracker:
             assessment = self._with_evidence(assessment, fingerprint(finite_points(source)))
         result = replace(self.registrar.conclude(assessment, clock), method=self.name)
         if isinstance(assessment, Assessment):
+            if self._is_doubted and assessment.seen is not None:
+                result = limits.no_surer(result, limits.DOUBTED, self.config)
             self._remember(result, assessment.source.points)
             if self._is_sure and self._has_track and assessment.seen is None:
                 self._follower = Follower(assessment, source, self.config)
@@ -237,6 +252,9 @@ class Tracker:
             assessment = assessment.capped(self.config.limits.most)
         a, last = assessment, self._last
         again = last is not None and cloud.is_of_same(last.cloud)
+        if a.seen is not None and not again and not self._shares_points:
+            self._is_doubted = self._scenes_since_doubt < DOUBTED_FOR
+            self._scenes_since_doubt = 0 if a.probability < DOUBTFUL else self._scenes_since_doubt + 1
         agrees = self._agrees(a) and (last is None or last.agreed or not again)
         one_by_one = replace(a, probability=self._evidence.add(a.probability, agrees, again))
         most = min(float(np.sqrt(a.probability)) if agrees else a.probability, a.most)

@@ -46,6 +46,7 @@ WORDS = {
     "apart": "limit: two halves of the source lie in two poses",
     "far_out": "limit: a stand-off is stated that is larger than a pose may be off",
     "moving": "limit: collected sources hardly exclude that the bone moves",
+    "doubted": "limit: one of the last scenes was hardly believed",
     "unconfirmed": "limit: the newest look alone gives no pose, or there is no other",
     "inferred": "limit: where the camera was is inferred from what it saw",
 }  # features of the confidence, and its limits

@@ -10,7 +10,7 @@ from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import ClutterConfig, SensorConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
-from gapr_core.registration import checks, clutter, scene_rounds
+from gapr_core.registration import checks, clutter, limits, scene_rounds
 from gapr_core.registration import source as sources
 from gapr_core.registration.additive import Additive
 from gapr_core.registration.confidence import Calibration
@@ -252,6 +252,51 @@ def test_regions_propose_where_only_one_remembered_pose_is_left(tracker, target,
     """Nothing would compete with it."""
     tracker._memory.keep(tracker._memory.poses[[0, 0]])
     assert tracker.register(scene[0] + 0.01, target, viewpoint=scene[1]).proposer == clutter.NAME
+
+
+def saying(tracker, monkeypatch, probabilities):
+    """The answers to scenes that have these probabilities by themselves, at one place."""
+    of_one, left = tracker.registrar.assess_from, list(probabilities)
+
+    def said(*given):
+        return replace(of_one(*given), probability=left.pop(0))
+
+    monkeypatch.setattr(tracker.registrar, "assess_from", said)
+    monkeypatch.setattr(tracker, "recheck", 1)
+    return lambda points, target, viewpoint: tracker.register(points, target, viewpoint=viewpoint)
+
+
+def test_after_a_scene_that_was_hardly_believed_five_are_not_sure(tracker, target, scene, monkeypatch):
+    """Another subject's femur in a wound: of 16 scenes most had less than .9, some of them .4, and one .96."""
+    ask = saying(tracker, monkeypatch, [0.99, 0.49] + [0.99] * 6)
+    rng, shown = np.random.default_rng(1), []
+    for _ in range(8):
+        found = ask(scene[0] + rng.normal(0.0, 0.05, scene[0].shape), target, scene[1])
+        shown.append((found.confidence >= 0.9, limits.DOUBTED in found.contributions))
+    assert shown == [(True, False), (False, False)] + [(False, True)] * 5 + [(True, False)]
+
+
+def test_a_scene_that_is_sent_again_does_not_end_the_doubt(tracker, target, scene, monkeypatch):
+    ask = saying(tracker, monkeypatch, [0.49] + [0.99] * 9)
+    ask(scene[0] + 0.05, target, scene[1])
+    assert all(ask(scene[0], target, scene[1]).confidence < 0.9 for _ in range(8))
+
+
+def test_half_believed_is_no_doubt_and_a_reset_ends_it(tracker, target, scene, monkeypatch):
+    ask = saying(tracker, monkeypatch, [0.5, 0.99, 0.49, 0.99])
+    rng = np.random.default_rng(1)
+    found = [ask(scene[0] + rng.normal(0.0, 0.05, scene[0].shape), target, scene[1]) for _ in range(3)]
+    assert not any(limits.DOUBTED in each.contributions for each in found) and tracker._scenes_since_doubt == 0
+    tracker.reset()
+    assert limits.DOUBTED not in tracker.register(scene[0], target, viewpoint=scene[1]).contributions
+
+
+def test_looks_of_a_collection_are_not_doubted_for_the_first_of_them(tracker, target, scene, monkeypatch):
+    """One look says less than four."""
+    for twin in (tracker.sharing_points(), tracker.sharing_points().of_bone_alone()):
+        ask = saying(twin, monkeypatch, [0.49, 0.99])
+        found = [ask(scene[0] + 0.05 * n, target, scene[1]) for n in range(2)]
+        assert limits.DOUBTED not in found[1].contributions
 
 
 def test_several_looks_are_always_registered_in_full(tracker, target, scene):

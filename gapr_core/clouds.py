@@ -85,10 +85,15 @@ def load(
 
 def _checked(surface: Surface) -> Surface:
     """A surface of the caller's own, with arrays where it has lists."""
-    faces = surface.faces
+    points, faces, normals = as_points(surface.points), surface.faces, surface.normals
     if faces is not None:
         faces = as_array(faces, "triangles as (F, 3) integers", "triangulate the mesh")
-    return replace(surface, points=as_points(surface.points), faces=faces)
+    if normals is not None:
+        normals = as_points(normals)
+        if len(normals) != len(points):
+            given = f"{len(normals)} normals of {len(points)} points"
+            raise InvalidPointCloudError("a normal for each point", given, "leave the normals out, or pass all")
+    return replace(surface, points=points, faces=faces, normals=normals)
 
 
 def finite_points(array: ArrayLike) -> Array:

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 LPS_RAS = np.array([-1.0, -1.0, 1.0])  # the same both ways
 FACTORS = {"lps": np.ones(3), "as_is": np.ones(3), "ras": LPS_RAS, "lps_to_ras": LPS_RAS}
 CHOICES = ("auto", *FACTORS)
-COMMENT = re.compile(rb"SPACE[ \t]*=[ \t]*(LPS|RAS)\b")
+COMMENT = re.compile(rb"\bSPACE[ \t]*=[ \t]*(LPS|RAS)\b")
 COMMENT_BYTES = 8192
 IN_FIELDS = {".vtk": vtk.space, ".vtp": vtp.space}  # wherever in the file the field is
 OPTIONS = "--axes, --source-axes or model_axes"
@@ -92,7 +92,8 @@ def stated(path: Path) -> str | None:
     """What a comment in the file's beginning or the names of its columns say, "lps" or "ras"; None without.
 
     Raises:
-        InvalidPointCloudError: columns of several kinds, or others than the comment says.
+        InvalidPointCloudError: comments that contradict each other, columns of several kinds, or others than the
+            comment says.
     """
     said = _said(path)
     return said[0] if said else None
@@ -113,8 +114,11 @@ def _said(path: Path) -> tuple[str, str] | None:
 def _in_comment(path: Path) -> str | None:
     with path.open("rb") as file:
         head = file.read(COMMENT_BYTES)
-    if found := COMMENT.search(head):
-        return found[1].decode().lower()
+    if found := {space.decode().lower() for space in COMMENT.findall(head)}:
+        if len(found) > 1:
+            how = "take out the one that is wrong"
+            raise InvalidPointCloudError("one SPACE in all comments", "SPACE=LPS and SPACE=RAS", how)
+        return found.pop()
     if space_of := IN_FIELDS.get(path.suffix.lower()):
         text = space_of(path, FileLimits.from_environment()).lower()
         return text if text in ("lps", "ras") else None

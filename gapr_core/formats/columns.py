@@ -12,7 +12,7 @@ from typing import NamedTuple
 from gapr_core.errors import InvalidPointCloudError
 
 DELIMITERS = ",;\t"
-COMMENTS = ("#", "//")
+COMMENTS = ("#", "//", "sep=")  # the last as Excel begins a file with, such as sep=;
 ENDINGS = (".csv", ".txt", ".xyz")
 UNITS = {
     "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",

@@ -75,11 +75,15 @@ def read(path: Path) -> Array:
 
 
 def _matrix_of_text(path: Path) -> Array:
+    content = ""
     try:
-        T = np.loadtxt(path, ndmin=2)
+        content = path.read_text(encoding="utf-8-sig")
+        T = np.loadtxt(content.splitlines(), ndmin=2)
     except (OSError, ValueError) as error:
-        given = f"{path.name} with other content"
+        given = f"{path.name} with {'commas' if ',' in content else 'other content'}"
         how = "write T_target_source so, or rename an ITK transform to .tfm"
+        if "," in content:
+            how = "put spaces between the numbers, and write decimals with a point"
         raise ConfigError("four lines of four numbers", given, how) from error
     if T.shape != (4, 4):
         raise ConfigError("four lines of four numbers", f"{path.name} with {T.shape[0]} by {T.shape[1]}", "correct it")

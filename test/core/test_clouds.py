@@ -1,4 +1,5 @@
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -302,6 +303,15 @@ def test_rows_that_are_not_finite_are_dropped_with_a_warning_but_not_all_of_them
     assert "array: 2 of 6 points are not finite: left out" in caplog.text
     with pytest.raises(InvalidPointCloudError, match="none finite"):
         clouds.load(np.full((5, 3), np.nan))
+
+
+def test_normals_of_a_surface_may_be_a_list_and_are_as_many_as_its_points():
+    """A list of them with a point that is not finite was a TypeError."""
+    dirty = Surface([*VERTICES.tolist(), [np.nan, 0, 0]], None, [[0, 0, 1]] * 5)
+    surface = clouds.load(dirty)
+    assert len(surface.points) == 4 and np.array_equal(surface.normals, [[0, 0, 1]] * 4)
+    with pytest.raises(InvalidPointCloudError, match="a normal for each point; got 4 normals of 5 points; leave"):
+        clouds.load(replace(dirty, normals=[[0, 0, 1]] * 4))
 
 
 @pytest.mark.parametrize("ragged", [[[1.0, 2.0, 3.0], [1.0, 2.0]], [[1.0, 2.0, 3.0], 4.0], [np.zeros((2, 3)), [1.0]]])

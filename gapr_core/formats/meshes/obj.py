@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +28,13 @@ def read(path: Path, options: ReadOptions) -> Surface:
     A cut at the end of a line that leaves every vertex with a face cannot be known: an open mesh is logged.
     """
     vertices, corners, ends, announced = array("d"), array("q"), array("q", [0]), {}
-    for line in text.lines(options.limits.read(path)):
+    lines = text.lines(options.limits.read(path))
+    for line in lines:
         kind, rest = (*line.split(None, 1), "", "")[:2]
         if kind == "v":
-            vertices.extend(_coordinates(rest))
+            vertices.extend(_coordinates(_words(rest, lines)))
         elif kind == "f":
-            corners.extend(_vertex(corner, len(vertices) // 3) for corner in rest.split())
+            corners.extend(_vertex(corner, len(vertices) // 3) for corner in _words(rest, lines))
             ends.append(len(corners))
         elif found := ANNOUNCED.match(line):
             announced[found[1].lower()] = int(found[2])
@@ -45,8 +47,22 @@ def read(path: Path, options: ReadOptions) -> Surface:
     return surface
 
 
-def _coordinates(rest: str) -> list[float]:
-    values = [float(value) for value in rest.split()[:3]]
+def _words(rest: str, lines: Iterator[str]) -> list[str]:
+    """Without a comment, and with those of the next line where a backslash is the last one.
+
+    Raises:
+        ValueError: no next line.
+    """
+    words = rest.partition("#")[0].split()
+    while words and words[-1].endswith("\\"):
+        if (following := next(lines, None)) is None:
+            raise ValueError("a backslash at the end: the file is cut")
+        words = [*words[:-1], *f"{words[-1][:-1]} {following}".partition("#")[0].split()]
+    return words
+
+
+def _coordinates(words: list[str]) -> list[float]:
+    values = [float(word) for word in words[:3]]
     if len(values) < 3:
         raise ValueError("a vertex with fewer than three coordinates")
     return values

@@ -73,7 +73,7 @@ def _is_identity(viewpoint: list[str]) -> bool:
 
 def _fields(header: dict[str, list[str]]) -> np.dtype:
     """The layout of one point; a name that comes twice (padding) is kept once."""
-    names, sizes, kinds = header["FIELDS"], header["SIZE"], header["TYPE"]
+    names, sizes, kinds = header["FIELDS"], header["SIZE"], [kind.upper() for kind in header["TYPE"]]
     counts = header.get("COUNT", ["1"] * len(names))
     if not len(names) == len(sizes) == len(kinds) == len(counts):
         raise ValueError("FIELDS, SIZE, TYPE and COUNT of different lengths")

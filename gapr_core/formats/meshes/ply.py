@@ -26,6 +26,8 @@ BYTES = {
 SHORTEST_TEXT = 2  # bytes of a number and what follows it
 FEWEST_CORNERS = 3
 CORNERS = ("vertex_indices", "vertex_index")
+END = re.compile(rb"[\r\n]end_header(?=[\r\n])")
+IS_TEXT = re.compile(rb"[\r\n]format[ \t]+ascii\b")
 MOST_LISTS = 3  # of one element: vertices, texture coordinates, and one more
 
 
@@ -57,8 +59,20 @@ def _parse(data: bytes) -> Any:
 
 def _with_ascii_header(data: bytes) -> bytes:
     """The same, with a question mark for each byte of another alphabet in a comment, which plyfile refuses."""
-    header, end, body = data.partition(b"end_header")
-    return data if header.isascii() else re.sub(rb"[\x80-\xff]", b"?", header) + end + body
+    header, body = _halves(data)
+    return data if header.isascii() else re.sub(rb"[\x80-\xff]", b"?", header) + body
+
+
+def _halves(data: bytes) -> tuple[bytes, bytes]:
+    """Up to the line end_header, and after it.
+
+    Raises:
+        ValueError: no header.
+    """
+    end = END.search(data)
+    if not data.startswith(b"ply") or not end:
+        raise ValueError("no PLY header")
+    return data[: end.end()], data[end.end() :]
 
 
 def _columns(table: Any, names: Any) -> Array:
@@ -71,10 +85,8 @@ def _check_header(data: bytes, limits: FileLimits) -> None:
     Raises:
         ValueError: no header, or a file that is shorter.
     """
-    header, found, body = data.partition(b"end_header")
-    if not data.startswith(b"ply") or not found:
-        raise ValueError("no PLY header")
-    is_text = b"format ascii" in header
+    header, body = _halves(data)
+    is_text = IS_TEXT.search(header) is not None
     if is_text:
         text.lines(data)
     shortest, elements = 0, _elements(header.decode("ascii", "replace"))

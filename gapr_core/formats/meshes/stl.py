@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +12,23 @@ from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
 HEADER_BYTES, FACET_BYTES = 84, 50
+SOLID = re.compile(rb"(\xef\xbb\xbf)?\s*solid", re.IGNORECASE)  # a text file, with or without a byte order mark
+BEGINNING = re.compile(rb"^[ \t]*facet[ \t]+normal\b", re.MULTILINE)
+END = re.compile(rb"^[ \t]*endfacet\b", re.MULTILINE)
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
     """Vertices that facets share become one."""
     data = options.limits.read(path)
-    if len(data) < HEADER_BYTES and not data.lstrip().startswith(b"solid"):
+    is_text = SOLID.match(data) is not None
+    if len(data) < HEADER_BYTES and not is_text:
         raise ValueError(f"{len(data)} bytes, less than a header")
     facets = int.from_bytes(data[80:84], "little")
     if len(data) == HEADER_BYTES + FACET_BYTES * facets:
         options.limits.check_counts(0, facets)
         corners = np.frombuffer(data, FACET, offset=HEADER_BYTES)["corners"].reshape(-1, 3).astype(np.float64)
-    elif data.lstrip()[:5].lower() == b"solid":
+    elif is_text:
         corners = _corners_of_text(data)
     else:
         expected = HEADER_BYTES + FACET_BYTES * facets
@@ -38,7 +43,8 @@ def _corners_of_text(data: bytes) -> Array:
         raise ValueError("no endsolid at the end: the file is cut")
     vertices = (line.split("vertex", 1)[1] for line in text.lines(lower + b"\n") if line.lstrip().startswith("vertex"))
     corners = text.table(vertices, 3)
-    if len(corners) != 3 * lower.count(b"endfacet") or lower.count(b"endfacet") != lower.count(b"facet normal"):
+    begun, ended = (sum(1 for _ in words.finditer(lower)) for words in (BEGINNING, END))
+    if len(corners) != 3 * ended or ended != begun:
         raise ValueError("facets that do not have three vertices each")
     return corners
 

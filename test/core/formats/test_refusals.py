@@ -234,6 +234,11 @@ def test_numbers_in_a_pcd_header_are_whole(tmp_path, wrong, said):
     assert said in refusal(tmp_path / "a.pcd", (PCD.format("").replace(*wrong) + ROWS).encode())
 
 
+def test_types_in_a_pcd_header_may_be_in_small_letters(tmp_path):
+    (tmp_path / "a.pcd").write_text(PCD.format("").replace("F F F", "f f f") + ROWS)
+    np.testing.assert_allclose(reading.read(tmp_path / "a.pcd").points, [[10, 20, 30], [-40, 5, 60]])
+
+
 @pytest.mark.parametrize(("viewpoint", "is_said"), [
     ("", False), ("VIEWPOINT 0 0 0 1 0 0 0\n", False), ("VIEWPOINT 0.0 -0 0 1.0 0 0 0\n", False),
     ("VIEWPOINT 0 0 5 1 0 0 0\n", True), ("VIEWPOINT 0 0 0 0 1 0 0\n", True), ("VIEWPOINT 0 0 0\n", True),

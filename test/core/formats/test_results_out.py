@@ -95,6 +95,18 @@ def test_a_start_that_is_no_rigid_motion_is_refused_by_its_name(tmp_path):
             transforms.read(tmp_path / name)
 
 
+def test_a_start_as_text_may_begin_with_a_byte_order_mark_and_is_refused_for_its_commas(tmp_path):
+    """Both were said to have other content."""
+    np.savetxt(tmp_path / "pose.txt", T, header="source to target")
+    content = (tmp_path / "pose.txt").read_text()
+    (tmp_path / "mark.txt").write_text("\ufeff" + content, encoding="utf-8")
+    np.testing.assert_allclose(transforms.read(tmp_path / "mark.txt"), T, atol=1e-9)
+    for name, commas in (("between.txt", content.replace(" ", ", ")), ("decimal.txt", content.replace(".", ","))):
+        (tmp_path / name).write_text(commas)
+        with pytest.raises(ConfigError, match=f"four lines of four numbers; got {name} with commas; put spaces betwee"):
+            transforms.read(tmp_path / name)
+
+
 def test_a_damaged_start_is_refused_in_one_line(tmp_path):
     """HDF5 writes lines of its own, which Python does not see."""
     transforms.write(tmp_path / "pose.h5", T)

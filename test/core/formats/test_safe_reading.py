@@ -117,6 +117,7 @@ def test_entities_of_xml_are_never_unfolded(tmp_path):
     "v 0 0 0\nv 40 0\nv 0 30 0\nf 1 2 3\n",
     "v 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 7\n",
     "v 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 -9\n",
+    "v 0 0 0\nv 40 0 0\nv 0 30 0\nf 1 2 3 \\\n",
 ])  # fmt: skip
 def test_an_obj_file_that_ends_too_early_is_refused(tmp_path, text):
     refusal(tmp_path / "a.obj", text)

@@ -100,6 +100,8 @@ def test_damaged_and_empty_markups_are_refused_in_one_line(tmp_path, content):
     ("b.csv", "Time,Z,X,Y\n0,30,10,20\n1,60,-40,5\n2,90,7,-8\n"),
     ("c.csv", "\ufeff10,20,30\r\n-40,5,60\r\n7,-8,90\r\n"),
     ("d.xyz", "\ufeff# z x y\r\n30 10 20\r\n60 -40 5\r\n90 7 -8\r\n"),
+    ("e.csv", "sep=;\nz;x;y\n30;10;20\n60;-40;5\n90;7;-8\n"),
+    ("f.csv", "\ufeffsep=,\r\nz,x,y\r\n30,10,20\r\n60,-40,5\r\n90,7,-8\r\n"),
 ])  # fmt: skip
 def test_text_clouds_have_a_point_a_line(tmp_path, name, content):
     (tmp_path / name).write_text(content)
@@ -112,6 +114,17 @@ def test_words_of_an_obj_file_may_have_tabs_between_them(tmp_path, between):
     rows = [("v", *point) for point in POINTS] + [("v", 0, 0, 0)]
     rows += [("f", *corners) for corners in ((1, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4))]
     (tmp_path / "a.obj").write_text("".join(between.join(map(str, row)) + "\n" for row in rows))
+    surface = reading.read(tmp_path / "a.obj")
+    np.testing.assert_allclose(surface.points, [*POINTS, [0, 0, 0]])
+    assert surface.faces.tolist() == [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+
+
+def test_lines_of_an_obj_file_may_end_with_a_comment_or_go_on_after_a_backslash(tmp_path):
+    """They were refused with the words of Python. A backslash in a comment ends it like any other letter."""
+    (tmp_path / "a.obj").write_text(
+        "# C:\\bones\\\nv 10 20 30 # C:\\\nv -40 5\\\n60#\nv 7 -8 90\nv 0 \\\n 0 \\\r\n0\n"
+        "f 1 3 2#c\nf 1 \\\n2 4 # \\\nf 2 3 4\\\n\nf 3 1 4 # 5\n"
+    )
     surface = reading.read(tmp_path / "a.obj")
     np.testing.assert_allclose(surface.points, [*POINTS, [0, 0, 0]])
     assert surface.faces.tolist() == [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
@@ -392,10 +405,19 @@ MESH = (
     ("SPACE=RAS", "as_is", [1, 1, 1]), ("SPACE=RAS", "lps", [1, 1, 1]), ("SPACE=RAS", "ras", LPS_RAS),
     ("SPACE=LPS", "ras", LPS_RAS), ("SPACE=LPS", "lps_to_ras", LPS_RAS), ("SPACE=LPS", "as_is", [1, 1, 1]),
     ("SPACE = RAS", "auto", LPS_RAS), ("SPACE =LPS", "lps_to_ras", LPS_RAS), ("SPACE", "auto", [1, 1, 1]),
+    ("WORKSPACE=RAS", "auto", [1, 1, 1]), ("SPACE=RAS, SPACE=RAS", "auto", LPS_RAS),
 ])  # fmt: skip
 def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title, axes, factors):
     (tmp_path / "a.vtk").write_text(MESH.format(title))
     np.testing.assert_allclose(reading.read(tmp_path / "a.vtk", ReadOptions(axes=axes)).points, POINTS * factors)
+
+
+@pytest.mark.parametrize("axes", ["auto", "lps", "ras"])
+def test_comments_that_contradict_each_other_about_the_axes_are_refused(tmp_path, axes):
+    """The first one was believed, and the points were turned."""
+    (tmp_path / "a.csv").write_text("# was SPACE=RAS, now turned: SPACE=LPS\n10,20,30\n")
+    with pytest.raises(InvalidPointCloudError, match="one SPACE in all comments; got a.csv: SPACE=LPS and SPACE=RAS; "):
+        reading.read(tmp_path / "a.csv", ReadOptions(axes=axes))
 
 
 @pytest.mark.parametrize("compressor", ["None", "ZLib"])
@@ -485,6 +507,29 @@ def test_comments_of_a_ply_file_may_be_in_any_language(tmp_path):
     (tmp_path / "binary.ply").write_bytes(binary)
     for name in ("text.ply", "binary.ply"):
         np.testing.assert_allclose(reading.read(tmp_path / name).points, POINTS)
+
+
+@pytest.mark.parametrize("comment", ["converted from format ascii", "no end_header here", "end_header", "format ascii"])
+@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+def test_comments_of_a_ply_file_may_hold_the_words_of_its_header(tmp_path, comment, ending):
+    """A binary file was taken for a text, and refused as cut; a header ended in its comment."""
+    head = f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex 3\n"
+    head += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    (tmp_path / "a.ply").write_bytes(head.replace("\n", ending).encode() + POINTS.astype("<f4").tobytes())
+    np.testing.assert_allclose(reading.read(tmp_path / "a.ply").points, POINTS)
+
+
+@pytest.mark.parametrize("change", [
+    ("facet normal", "facet  normal"), ("facet normal", "facet\tnormal"), ("solid a", "solid endfacet"),
+    ("solid a", "solid facet normal"), ("solid a\nfacet", "\ufeffsolid a\nfacet"), ("\n", "\r\n"), ("\n", "\n\t"),
+])  # fmt: skip
+def test_words_of_a_text_stl_file_count_at_the_beginning_of_its_lines(tmp_path, change):
+    """Such files were said to have facets without three vertices each, or millions of them."""
+    corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in POINTS)
+    content = f"solid a\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\nendsolid a\n"
+    (tmp_path / "a.stl").write_text(content.replace(*change), encoding="utf-8", newline="")
+    surface = reading.read(tmp_path / "a.stl")
+    np.testing.assert_allclose(surface.points[surface.faces[0]], POINTS)
 
 
 def triangle_with(*texts):

@@ -20,8 +20,13 @@ RUN=${RUN:-$(mktemp -d)/run}
 PIECE=15M
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} MPLBACKEND=Agg OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 
+if [ -n "${RESUME:-}" ] && [ ! -f "$RESUME/run.tar.gz" ]; then
+  echo "train_on_gpu: expected the OUT of an earlier slice as RESUME; got $RESUME without run.tar.gz;" \
+    "correct the path, or leave RESUME out to start from nothing" >&2
+  exit 1
+fi
 mkdir -p "$OUT" "$RUN"
-if [ -n "${RESUME:-}" ] && [ -f "$RESUME/run.tar.gz" ]; then
+if [ -n "${RESUME:-}" ]; then
   tar xzf "$RESUME/run.tar.gz" -C "$RUN"
   cat "$RESUME"/checkpoint.part_* > "$RUN/checkpoint.safetensors"
   sha256sum --quiet --check <(sed "s|  .*|  $RUN/checkpoint.safetensors|" "$RESUME/checkpoint.sha256")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -33,16 +33,17 @@ def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch
     """Fill network, averaged network and optimiser; returns the state.
 
     Raises:
-        WeightsError: the checkpoint is of another configuration.
+        WeightsError: the checkpoint is damaged, or of another configuration.
     """
-    with safe_open(str(path), framework="pt") as file:
-        state = json.loads(file.metadata()["state"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}
     try:
+        with safe_open(str(path), framework="pt") as file:
+            state = json.loads(file.metadata()["state"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
         network.load_state_dict(_under(tensors, "network."))
         ema.load_state_dict(_under(tensors, "ema."))
-    except RuntimeError as error:
-        raise WeightsError("a checkpoint of this configuration", f"{path}: {error}", "choose another folder") from error
+    except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        given, how = f"{path}: {' '.join(str(error).split())}", "restore it, or choose another folder"
+        raise WeightsError("a checkpoint of this configuration", given, how) from error
     moments: dict[int, dict[str, Tensor]] = {}
     for name, tensor in _under(tensors, "adam.").items():
         index, key = name.split(".")

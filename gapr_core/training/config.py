@@ -89,11 +89,16 @@ class Variant:
 
 
 def default_plan() -> Path:
-    """config/ablation.yaml of the source tree, or where the package was installed with its data."""
+    """config/ablation.yaml of the source tree, or where the package was installed with its data.
+
+    Raises:
+        ConfigError: it was installed without.
+    """
     places = [Path(__file__).resolve().parents[2], Path(sysconfig.get_path("data")) / "share" / "gapr_ros"]
     found = [place / "config" / "ablation.yaml" for place in places if (place / "config" / "ablation.yaml").is_file()]
     if not found:
-        raise ConfigError("config/ablation.yaml", "none installed", "name one with --plan")
+        how = "install gapr_ros again, with its data; gapr ablate takes one as --plan, too"
+        raise ConfigError("config/ablation.yaml", "none installed", how)
     return found[0]
 
 

@@ -5,7 +5,6 @@ Kept in a file of its own next to config.json: another commit or machine is no r
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections.abc import Iterable
@@ -18,7 +17,7 @@ import torch
 
 import gapr_core.data
 from gapr_core.data import anatomy
-from gapr_core.runtime.files import write_json
+from gapr_core.runtime.files import read_json, write_json
 from gapr_core.runtime.origin import commit, cpu_name, release
 from gapr_core.training.config import TrainConfig
 
@@ -39,9 +38,12 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
 
     Returns:
         All entries, the oldest first; what the header of the weights carries.
+
+    Raises:
+        ConfigError: the file there cannot be read.
     """
     path = folder / FILE
-    entries = json.loads(path.read_text()) if path.exists() else []
+    entries = _read(path) if path.exists() else []
     begun_with = _digest([Path(config.initial).read_bytes()]) if config.initial and not step else None
     entry = {"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)}
     entries.append(entry | {"initial": begun_with})
@@ -52,7 +54,13 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
 def summary(folders: Iterable[Path]) -> list[str]:
     """One sentence for every kind of code, machine and data that these runs had, in order; none of runs not begun."""
     files = [folder / FILE for folder in folders if (folder / FILE).exists()]
-    return list(dict.fromkeys(_sentence(entry) for file in files for entry in json.loads(file.read_text())))
+    return list(dict.fromkeys(_sentence(entry) for file in files for entry in _read(file)))
+
+
+def _read(path: Path) -> list[Entry]:
+    what, how = "the provenance of a training run", "restore it, or move it out of the folder"
+    entries: list[Entry] = read_json(path, what, how)
+    return entries
 
 
 def _sentence(entry: Entry) -> str:

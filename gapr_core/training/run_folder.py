@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import logging
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -30,14 +29,23 @@ def check(folder: Path, config: TrainConfig, model: ModelConfig) -> None:
     The network's settings count, not the path of their yaml; an entry that did not exist then stood at its default.
 
     Raises:
-        ConfigError: the folder holds another run.
+        ConfigError: the folder holds another run, or its settings cannot be read.
     """
     path = folder / "config.json"
     if path.exists():
-        begun = json.loads(path.read_text())
-        there = TrainConfig.from_dict(begun["train"]), ModelConfig.from_dict(begun["model"])
-        if (replace(there[0], model=config.model), there[1]) != (config, model):
+        train, network = _begun_with(path)
+        if (replace(train, model=config.model), network) != (config, model):
             raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
+
+
+def _begun_with(path: Path) -> tuple[TrainConfig, ModelConfig]:
+    """The settings in a config.json."""
+    what, how = "the settings of a training run", "restore it, or choose a new folder"
+    begun = files.read_json(path, what, how)
+    try:
+        return TrainConfig.from_dict(begun["train"]), ModelConfig.from_dict(begun["model"])
+    except (KeyError, TypeError) as error:
+        raise ConfigError(what, f"{path} with other content", how) from error
 
 
 def claim(

@@ -48,7 +48,8 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
         The averaged weights, ready for `NetworkProposer`.
 
     Raises:
-        ConfigError: fewer pairs than one batch, another run in `folder`, or see `start.begin`.
+        ConfigError: fewer pairs than one batch, another or a damaged run in `folder`, or see `start.begin`.
+        WeightsError: a damaged checkpoint, or see `start.begin`.
         FloatingPointError: step after step had gradients that are not finite.
     """
     if config.pairs < config.batch:

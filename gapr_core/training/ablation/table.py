@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 from gapr_core import metrics
 from gapr_core.data.make_pairs import Recipe
 from gapr_core.pages.markdown import table as table_of
+from gapr_core.pages.writers import write_csv
 from gapr_core.runtime import files
 from gapr_core.training import curves, provenance
 from gapr_core.training.config import TrainConfig, Variant, trained_as
@@ -43,10 +43,7 @@ def write(out: Path, plan: Sequence[Variant], config: TrainConfig, recipe: Recip
     made = provenance.summary([folder for found in folders.values() for folder in found])
     settings = {"train": config.to_dict(), "exam": asdict(recipe), "seeds": seeds, "made": made}
     files.write_json(out / "table.json", {"settings": settings, "rows": rows, "differences": apart})
-    with (out / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(out / "table.csv", rows)
     tables = list(dict.fromkeys(v.table for v in plan))
     pictures = {table: draw(out, {v: folders[v] for v in plan if v.table == table}) for table in tables}
     files.write_text(out / "table.md", markdown(rows, apart, pictures, settings))

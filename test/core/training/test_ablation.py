@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from dataclasses import replace
@@ -19,6 +20,7 @@ from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import matching_radius, target_frame
+from gapr_core.training import config as training_config
 from gapr_core.training.ablation import cli as ablation
 from gapr_core.training.ablation import table as ablation_table
 from gapr_core.training.config import TrainConfig, default_plan, read_plan, trained_as
@@ -163,6 +165,28 @@ def test_the_plan_that_ships_holds_the_papers_tables():
     assert len(ours) == 6 and all(v.paper is None for v in ours)
     assert len(set(trained_as(plan).values())) == 16
     assert all(ModelConfig.from_yaml(v.model).name == v.model.stem for v in plan)
+
+
+def test_without_the_plan_that_ships_every_command_is_answered_with_how_to_install_it(tmp_path, monkeypatch):
+    """`gapr paper` was referred to an option that it has not."""
+    monkeypatch.setattr(training_config, "__file__", str(tmp_path / "a" / "b" / "c.py"))
+    monkeypatch.setattr(training_config.sysconfig, "get_path", lambda name: str(tmp_path))
+    with pytest.raises(ConfigError, match="got none installed; install gapr_ros again, with its data; gapr ablate ta"):
+        default_plan()
+
+
+def test_a_table_that_cannot_be_written_leaves_the_one_before_as_it_is(plan, tmp_path, monkeypatch):
+    """table.csv was cut."""
+    ablation_table.write(tmp_path, read_plan(plan), BUDGET, EXAM, seeds=1)
+    before = (tmp_path / "table.csv").read_bytes()
+
+    def refuse(*_):
+        raise OSError(28, "No space left")
+
+    monkeypatch.setattr(csv.DictWriter, "writerows", refuse)
+    with pytest.raises(ConfigError, match="table.csv .No space left"):
+        ablation_table.write(tmp_path, read_plan(plan), BUDGET, EXAM, seeds=1)
+    assert (tmp_path / "table.csv").read_bytes() == before
 
 
 def test_the_command_wants_a_budget(capsys, tmp_path):

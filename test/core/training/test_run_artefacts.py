@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from gapr_core import cli
-from gapr_core.errors import ConfigError
+from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model.config import ModelConfig
+from gapr_core.model.network import GAPRNet
 from gapr_core.training import curves, provenance, run_folder
+from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.config import TrainConfig
 
 PNG = b"\x89PNG\r\n"
@@ -135,3 +141,55 @@ def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused
     for config, model in ((TrainConfig(share=3), ModelConfig()), (TrainConfig(), ModelConfig(centred_features=True))):
         with pytest.raises(ConfigError, match="begun"):
             run_folder.check(tmp_path, config, model)
+
+
+@pytest.mark.parametrize("content", ["{", "", "{}", "[1]"])
+def test_settings_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, content):
+    """They ended `gapr train` with a traceback."""
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(ConfigError, match="the settings of a training run; got .*config.json .*; restore it"):
+        run_folder.check(tmp_path, TrainConfig(), ModelConfig())
+
+
+def test_provenance_that_is_damaged_is_refused_by_its_name(tmp_path):
+    (tmp_path / provenance.FILE).write_text("[")
+    with pytest.raises(ConfigError, match="the provenance of a training run; got .*provenance.json .*; restore it"):
+        provenance.append(tmp_path, TrainConfig(), None, 0, 1)
+    with pytest.raises(ConfigError, match="provenance.json"):
+        provenance.summary([tmp_path])
+
+
+@pytest.mark.parametrize("damage", ["random", "cut", "empty", "of something else"])
+def test_a_checkpoint_that_is_damaged_is_refused_by_its_name(toy, tmp_path, damage):
+    network, ema = (GAPRNet(toy.small_config(superpoints=(10, 20), width=8, global_width=16)) for _ in range(2))
+    optimizer, path = torch.optim.AdamW(network.parameters()), tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, network, ema, optimizer, {"step": 1})
+    assert load_checkpoint(path, network, ema, optimizer) == {"step": 1}
+    whole = path.read_bytes()
+    path.write_bytes({"random": np.random.default_rng(0).bytes(500), "cut": whole[:-9]}.get(damage, b""))
+    if damage == "of something else":
+        save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(WeightsError, match="a checkpoint of this configuration; got .*checkpoint.safetensors: .*; re"):
+        load_checkpoint(path, network, ema, optimizer)
+
+
+@pytest.mark.parametrize(("resume", "is_right"), [(None, True), ("", True), ("first", True), ("frist", False)])
+def test_a_slice_that_is_to_go_on_from_a_folder_without_one_is_refused(tmp_path, resume, is_right):
+    """With a mistyped path the training began from nothing, without a word."""
+    python, script = tmp_path / "python", Path(__file__).parents[3] / "scripts" / "train_on_gpu.sh"
+    python.write_text('#!/bin/sh\ncd "$5"\ntouch weights.safetensors\necho 1 | tee -a checkpoint.safetensors log.csv\n')
+    python.chmod(0o755)
+
+    def train(out, **given):
+        given |= {"OUT": str(tmp_path / out), "RUN": str(tmp_path / f"{out}_run"), "PYTHON": str(python)}
+        return subprocess.run(["bash", script], env={**os.environ, **given}, capture_output=True, text=True)
+
+    assert train("first").returncode == 0
+    given = {} if resume is None else {"RESUME": resume and str(tmp_path / resume)}
+    second = train("second", **given)
+    assert (second.returncode == 0) == is_right == (tmp_path / "second").exists(), second.stderr
+    if is_right:
+        steps = (tmp_path / "second_run" / "checkpoint.safetensors").read_text().split()
+        assert len(steps) == (2 if resume else 1)
+    else:
+        assert f"as RESUME; got {tmp_path / resume} without run.tar.gz; correct the path, or" in second.stderr

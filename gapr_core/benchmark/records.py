@@ -53,7 +53,7 @@ class Inputs:
 
 
 def append(path: Path, record: Record) -> None:
-    """Add one line, on disk before the next pair starts.
+    """Add one line, which stays if the run is killed later; after a loss of power it may be lost.
 
     Raises:
         ConfigError: the file cannot be written.

@@ -73,7 +73,8 @@ def factor_in_each(scores: Array, *groupings: NDArray[np.str_]) -> float:
 def conformal_quantile(scores: Array, share: float) -> float:
     """What the next score of the same kind stays below with at least this probability (Vovk et al. 2005).
 
-    The k-th smallest of n scores, k = ceil((n + 1) share): one more than the plain quantile has.
+    The k-th smallest of n scores, k = ceil((n + 1) share): one more than the plain quantile has. Where k > n, as of 5
+    scores for .95, it is the largest one, which the next score stays below with n / (n + 1) only.
     """
     k = int(np.ceil((len(scores) + 1) * share))
     return float(np.sort(scores)[min(k, len(scores)) - 1])

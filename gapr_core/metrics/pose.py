@@ -73,9 +73,12 @@ def r2_translation(T_estimates: ArrayLike, T_trues: ArrayLike) -> float:
 
 
 def r2(predicted: ArrayLike, true: ArrayLike) -> float:
-    """1 - residual / total sum of squares per column of (K, D), averaged; NaN for fewer than two rows."""
+    """1 - residual / total sum of squares per column of (K, D), averaged.
+
+    NaN for fewer than two rows, and where a column of the true ones is constant.
+    """
     predicted, true = np.asarray(predicted, dtype=np.float64), np.asarray(true, dtype=np.float64)
-    if len(true) < 2:
+    if len(true) < 2 or not np.ptp(true, axis=0).all():
         return float("nan")
     total = ((true - true.mean(axis=0)) ** 2).sum(axis=0)
     return float(np.mean(1.0 - ((true - predicted) ** 2).sum(axis=0) / total))

@@ -16,5 +16,6 @@ def head(header: Sequence[object]) -> str:
 
 
 def row(cells: Iterable[object]) -> str:
-    """One line."""
-    return f"| {' | '.join(map(str, cells))} |"
+    """One line; a `|` in a cell is escaped, since it would end the cell."""
+    escaped = (str(cell).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"

@@ -105,7 +105,7 @@ def error_ellipsoids(records: Sequence[Record], method: str) -> Figure | None:
             axes.set(xlabel=f"axis {i + 1}, mm", ylabel=f"axis {j + 1}, mm")
             axes.locator_params(nbins=5)
         line[0].set_title(f"{protocol}, {len(own)} right answers", fontsize=10, loc="left")
-    title = f"{method}: translation error at the source's centroid, bone axes (1 is the longest); 95 % ellipses"
+    title = f"{method}: translation error at the mean of the points used, bone axes (1 is the longest); 95 % ellipses"
     figure.suptitle(title, fontsize=11)
     handles, labels = all_axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)

@@ -5,3 +5,8 @@ from gapr_core.pages import markdown
 
 def test_a_markdown_table_has_a_head_a_rule_and_a_line_for_each_row():
     assert markdown.table(["a", "b"], [[1, "x"], [2.5, "y"]]) == "| a | b |\n| --- | --- |\n| 1 | x |\n| 2.5 | y |"
+
+
+def test_a_bar_in_a_cell_is_escaped():
+    """A bone of that name split its row."""
+    assert markdown.row(["fe|mur", 1]) == r"| fe\|mur | 1 |"

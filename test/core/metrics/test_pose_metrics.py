@@ -128,6 +128,13 @@ def test_r2_needs_two_pairs(rng):
     assert pose.r2([[1.0], [4.0]], [[1.0], [3.0]]) == pytest.approx(0.5)  # 1 of 2 is left
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("truth", [[[0.1, 1.0]] * 3, [[0.1, 1.0], [0.1, 2.0], [0.1, 5.0]]])
+def test_r2_has_no_value_where_a_component_of_all_truths_is_the_same(truth):
+    """Pairs with one common truth printed a warning of NumPy; rounding could give any number."""
+    assert np.isnan(pose.r2(np.add(truth, 0.5), truth))
+
+
 def test_the_stand_in_for_a_refusal_lays_centroid_on_centroid(rng):
     source, target = rng.normal(size=(20, 3)), rng.normal(size=(30, 3)) + 70
     T = pose.centroid_alignment(source, target)

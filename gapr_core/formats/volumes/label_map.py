@@ -52,7 +52,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
 def _with_small_ending(path: Path, folder: Path) -> Path:
     """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers.
 
-    Its voxels may be in a file of their own beside it.
+    Its voxels may be in a file of their own in its folder.
     """
     ending = "".join(path.suffixes[-2:]) if path.suffix.lower() == ".gz" else path.suffix
     if ending == ending.lower():

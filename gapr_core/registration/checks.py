@@ -20,6 +20,7 @@ from gapr_core.registration.verification import mean_square_mm2
 from gapr_core.results import Refusal
 
 Register = Callable[[PreparedSource, PreparedTarget], Assessment | None]
+RegisterScene = Callable[[], Assessment | None]
 
 
 def unless_grown(assessment: Assessment, config: RegistrarConfig) -> Assessment:
@@ -39,8 +40,12 @@ def unless_grown(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     return a.with_refusal(rules.by_growth(found, config.rules), config.rules)
 
 
-def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: bool, register: Register) -> Assessment:
+def unless_mirrored(
+    assessment: Assessment, config: RegistrarConfig, believed: bool, register: Register, scene: RegisterScene
+) -> Assessment:
     """The same; refused where the mirror image of the source fits better.
+
+    Of a nonsensical pose on the bone of the other side the image is as nonsensical, so it takes more than that image.
 
     Args:
         assessment: the answer.
@@ -48,14 +53,15 @@ def unless_mirrored(assessment: Assessment, config: RegistrarConfig, believed: b
         believed: the answer is sure. Where it is not, or of few points, much is left to chance, wherever on the bone:
             the mirror image of such a source is registered in full.
         register: does that.
+        scene: does that with all that a camera saw.
     """
     a = assessment
     if mirror.is_symmetric(a.target, config):
         return a
     found = mirror.image_margin(a.fit.T, a.source, a.target, config)
     by_chance = len(a.source.points) <= config.rules.mirrored_points or not believed
-    if not _is_known_scene(a) and by_chance and rules.by_mirror(found, config.rules) is None:
-        found = full_image_margin(a, config, register)
+    if by_chance and rules.by_mirror(found, config.rules) is None:
+        found = scene_image_margin(a, scene()) if _is_known_scene(a) else full_image_margin(a, config, register)
     return a.with_refusal(rules.by_mirror(found, config.rules), config.rules)
 
 
@@ -72,6 +78,13 @@ def full_image_margin(assessment: Assessment, config: RegistrarConfig, register:
     if image is None:
         return np.inf
     return _misfit(image, config).log_ratio(_misfit(a, config))
+
+
+def scene_image_margin(assessment: Assessment, image: Assessment | None) -> float:
+    """Log of the score of lines of sight over that of the mirrored scene; infinite where that has no pose."""
+    if image is None:
+        return np.inf
+    return float(np.log(image.candidates.scores[0] / assessment.candidates.scores[0]))  # 1 / score each
 
 
 def _misfit(assessment: Assessment, config: RegistrarConfig) -> Misfit:

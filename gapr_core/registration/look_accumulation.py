@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,16 +45,37 @@ class Newest(Enum):
     )
     IS_APART = "it shows the bone elsewhere, or most others do"
     DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
+    CONTRADICTS = "the pose is another one than the last, in a frame in which the bone rests, and it is not sure"
 
 
 STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # the pose stands
-ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS)
+ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS, Newest.CONTRADICTS)
 REFUSED_FOR = {
     Newest.DIFFERS: RegistrationStatus.AMBIGUOUS,
+    Newest.CONTRADICTS: RegistrationStatus.AMBIGUOUS,
     Newest.SHOWS_NOTHING: RegistrationStatus.AMBIGUOUS,
     Newest.IS_DOUBTFUL: RegistrationStatus.AMBIGUOUS,
     Newest.IS_TOO_SMALL: RegistrationStatus.TOO_FEW_POINTS,
 }
+
+
+class Direction(NamedTuple):
+    """Where a look was taken: the camera (3,) and the middle (3,) of what it saw, mm."""
+
+    camera: Array
+    middle: Array
+
+
+@dataclass(frozen=True, eq=False)
+class KeptLook(Look):
+    """A look of the collection.
+
+    Attributes:
+        first: the direction of the first of those whose place it took, one after the other; else its own. A camera
+            that moves on slowly would else push each look out by the next one, and keep one alone.
+    """
+
+    first: Direction
 
 
 class LookAccumulator:
@@ -62,18 +84,19 @@ class LookAccumulator:
     A single image of a wound shows little of the bone, with one set of errors. A few from places some ten degrees apart
     show more of it and of what hid it. All must be in one frame in which the bone rests, such as that of a reference
     fixed to it, and the camera's place must be known for each. A look takes the place of one from nearly the same
-    direction, so that those of a video do not push out all others.
+    direction, so that those of a video do not push out all others; of a camera that moves on some stay.
 
     Older looks that show the bone elsewhere than the newest and most others are left out, and the others are asked
     again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
-    pose; where it alone has none, or there is no other, the answer is not sure (`limits`). After three in a row that
+    pose, and so is a pose that is not sure and another one than the last; where it alone has none, or there is no
+    other, the answer is not sure (`limits`). After three in a row that
     show the bone elsewhere it or its reference has moved, and only these three are kept, whatever their directions.
     After ten refusals from one direction only the last look is kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
         most: how many looks are kept, the newest among them; each costs time.
-        apart_deg: between the directions of two looks that are kept.
+        apart_deg: between the direction of a look and those of the others whose place it does not take.
 
     Raises:
         ConfigError: `most` is no whole number from 1 to 16, `apart_deg` no angle from 0 to 90; a method that takes no
@@ -104,13 +127,14 @@ class LookAccumulator:
     def together_with(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> Array:
         """(N, 3) mm, what `register` would register with a look: those kept, and itself; as `collect`."""
         newest = _look(source, viewpoint)
-        return _together(self._with(newest) if self._is_enough(newest) else self._looks)
+        return _together(self._with(newest)[1] if self._is_enough(newest) else self._looks)
 
     def reset(self) -> None:
         """Forget all looks, and the track of a `Tracker`."""
-        self._looks: list[Look] = []
-        self._off_in_a_row: list[Look] = []  # newest ones that show the bone elsewhere than those before
-        self._refused_in_a_row: list[Look] = []  # from nearly one direction, since a pose
+        self._looks: list[KeptLook] = []
+        self._off_in_a_row: list[KeptLook] = []  # newest ones that show the bone elsewhere than those before
+        self._refused_in_a_row: list[KeptLook] = []  # from nearly one direction, since a pose
+        self._last: Array | None = None  # (4, 4) the last pose that was given
         self._far_away.reset()
         if isinstance(self.method, Tracker):
             self.method.reset()
@@ -151,14 +175,14 @@ class LookAccumulator:
             ConfigError, InvalidPointCloudError: as `collect` and `Registrar.register`.
         """
         check_call(target, initial)
-        newest = _look(source, viewpoint)
+        look = _look(source, viewpoint)
         if self._target is not None and self._target is not target:
             self.reset()
         self._target = target
-        if not self._is_enough(newest):
-            reason = f"the look has {len(newest.points)} finite points, a pose needs {self.config.source.fewest_points}"
+        if not self._is_enough(look):
+            reason = f"the look has {len(look.points)} finite points, a pose needs {self.config.source.fewest_points}"
             return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=reason, method=self.name)
-        before = self._add(newest)
+        newest, before = self._add(look)
         try:
             result, asked = self._of_those_that_fit(target, initial)
         except Exception:
@@ -173,11 +197,11 @@ class LookAccumulator:
             found = replace(found.refused(REFUSED_FOR[said], said.value), confidence=ruled_out)
         if said is Newest.IS_UNCONFIRMED:
             found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
-        return replace(found, reason=found.reason + self._after(said, newest, before, asked))
+        return replace(found, reason=found.reason + self._after(said, result, newest, before, asked))
 
     def _of_those_that_fit(
         self, target: PreparedTarget, initial: ArrayLike | None
-    ) -> tuple[RegistrationResult, list[Look]]:
+    ) -> tuple[RegistrationResult, list[KeptLook]]:
         """The answer to all looks but older ones that show the bone elsewhere than the newest and most; and these."""
         stage_ms: dict[str, float] = {}
         asked = self._looks
@@ -189,7 +213,7 @@ class LookAccumulator:
                 return replace(result, stage_ms=stage_ms), asked
             asked = [look for look, is_apart in zip(asked, apart, strict=True) if not is_apart]
 
-    def _of_newest(self, result: RegistrationResult, asked: list[Look], target: PreparedTarget) -> Newest:
+    def _of_newest(self, result: RegistrationResult, asked: list[KeptLook], target: PreparedTarget) -> Newest:
         """What the newest of the looks that were asked says of the answer."""
         fits = [look.fit for look in result.looks] or [LookFit.FITS]
         may_be_there = result.status in (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)
@@ -202,9 +226,18 @@ class LookAccumulator:
         if not result.ok:
             return Newest.IS_REFUSED
         said = self._alone(asked, result, target)
-        return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said
+        if said is Newest.IS_UNCONFIRMED and self._off_in_a_row:
+            return Newest.IS_DOUBTFUL
+        is_sure = said is Newest.AGREES and result.confidence > self.config.limits.most
+        return Newest.CONTRADICTS if said in STANDING and not is_sure and self._is_another(result) else said
 
-    def _alone(self, asked: list[Look], result: RegistrationResult, target: PreparedTarget) -> Newest:
+    def _is_another(self, result: RegistrationResult) -> bool:
+        """Whether the pose is another one than the last that was given, since the collection began."""
+        if self._last is None or result.T_target_source is None:
+            return False
+        return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
+
+    def _alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
         """What the newest look alone says of the pose of all: its own is right if that one is, or it has none."""
         if len(asked) < 2:
             return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
@@ -218,11 +251,19 @@ class LookAccumulator:
         error = se3.pose_error(alone.T_target_source, result.T_target_source, newest.points)
         return Newest.AGREES if error.is_right else Newest.DIFFERS
 
-    def _after(self, said: Newest, newest: Look, before: list[Look], asked: list[Look]) -> str:
+    def _after(
+        self,
+        said: Newest,
+        result: RegistrationResult,
+        newest: KeptLook,
+        before: list[KeptLook],
+        asked: list[KeptLook],
+    ) -> str:
         """Decide which looks stay after an answer. Returns how that is said, after the reason.
 
         Args:
             said: what the newest look says; a pose that it does not speak against ends what is counted.
+            result: the answer.
             newest: the look; among those kept so far.
             before: the looks before it.
             asked: those with which it has a pose, itself included; after a refusal all others stay, too.
@@ -231,6 +272,7 @@ class LookAccumulator:
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
             self._looks, self._off_in_a_row, self._refused_in_a_row = asked, [], []
+            self._last = result.T_target_source
             return ""
         if said in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
@@ -247,15 +289,15 @@ class LookAccumulator:
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
         return "" if said is Newest.IS_REFUSED else "; left out"
 
-    def _is_stuck(self, newest: Look) -> bool:
+    def _is_stuck(self, newest: KeptLook) -> bool:
         """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""
         row = self._refused_in_a_row
-        if row and _apart_deg(row[0], newest) >= self.apart_deg:
+        if row and _apart_deg(_direction(row[0]), _direction(newest)) >= self.apart_deg:
             row = []
         self._refused_in_a_row = [*row, newest]
         return len(self._refused_in_a_row) >= STUCK
 
-    def _restart_with(self, looks: list[Look]) -> None:
+    def _restart_with(self, looks: list[KeptLook]) -> None:
         log.warning("the collection of looks restarts with the last %d", len(looks))
         self.reset()
         self._looks = looks[-self.most :]
@@ -264,17 +306,23 @@ class LookAccumulator:
         """Whether a look may have a pose at all; fewer points say nothing of it."""
         return len(look.points) >= self.config.source.fewest_points
 
-    def _add(self, newest: Look) -> list[Look]:
-        """Keep a look. Returns those before it; none where the collection restarts with it."""
-        if self._far_away.restarts_with(newest.points, self.collected):
+    def _add(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
+        """Keep a look. Returns it, and those before it; none where the collection restarts with it."""
+        if self._far_away.restarts_with(look.points, self.collected):
             self.reset()
-        before, self._looks = self._looks, self._with(newest)
-        return before
+        before = self._looks
+        newest, self._looks = self._with(look)
+        return newest, before
 
-    def _with(self, newest: Look) -> list[Look]:
-        """The looks that are kept, those from nearly the direction of the newest replaced by it."""
-        others = [each for each in self._looks if _apart_deg(each, newest) >= self.apart_deg]
-        return [*others, newest][-self.most :]
+    def _with(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
+        """A look as it is kept, and all that are, itself the last: those near to it give their place to it."""
+        own = _direction(look)
+        apart_deg = [_apart_deg(each.first, own) for each in self._looks]
+        others = [each for each, deg in zip(self._looks, apart_deg, strict=True) if deg >= self.apart_deg]
+        is_alone = len(others) == len(self._looks)
+        first = own if is_alone else self._looks[int(np.argmin(apart_deg))].first
+        newest = KeptLook(look.points, look.viewpoint, first)
+        return newest, [*others, newest][-self.most :]
 
 
 def _look(source: ArrayLike, viewpoint: ArrayLike | None) -> Look:
@@ -288,18 +336,22 @@ def _added(stage_ms: Mapping[str, float], more_ms: Mapping[str, float]) -> dict[
     return {stage: stage_ms.get(stage, 0.0) + more_ms.get(stage, 0.0) for stage in [*stage_ms, *more_ms]}
 
 
-def _together(looks: list[Look]) -> Array:
+def _together(looks: Sequence[Look]) -> Array:
     return np.concatenate([np.empty((0, 3)), *(look.points for look in looks)])
 
 
-def _apart_deg(first: Look, second: Look) -> float:
-    """How different two looks are: the larger of two angles.
+def _direction(look: Look) -> Direction:
+    return Direction(look.viewpoint, look.points.mean(axis=0))
 
-    That between their cameras, seen from the middle of what both show; and that between what they show, seen from the
+
+def _apart_deg(first: Direction, second: Direction) -> float:
+    """How different two directions are: the larger of two angles.
+
+    That between the cameras, seen from the middle of what both show; and that between what they show, seen from the
     middle of both cameras.
     """
-    cameras = np.stack([first.viewpoint, second.viewpoint])
-    shown = np.stack([first.points.mean(axis=0), second.points.mean(axis=0)])
+    cameras = np.stack([first.camera, second.camera])
+    shown = np.stack([first.middle, second.middle])
     return max(_angle_deg(cameras - shown.mean(axis=0)), _angle_deg(shown - cameras.mean(axis=0)))
 
 

@@ -37,6 +37,7 @@ from gapr_core.registration import (
     inputs,
     limits,
     look_agreement,
+    mirror,
     rules,
     scene_rounds,
 )
@@ -71,12 +72,17 @@ Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by i
 
 NO_POSES = np.empty((0, 4, 4))
 NO_POSE = Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
+MIRRORED_ROUNDS = 1  # of regions of a mirrored scene: on its own side it is found at once
 WITHIN_MM = 15.0  # root mean square over the source: refinement comes from there to the same pose
 
 
 def never(assessment: Assessment) -> bool:
     """Only what is sure by itself is enough."""
     return False
+
+
+def no_image() -> None:
+    """Of a source that is no scene, or one look of several."""
 
 
 class Registrar:
@@ -268,9 +274,16 @@ class Registrar:
             found = self._in_scene(look, target, NO_POSES, clock)
             return None if found is None else self._checked_and_corrected(found, clock, never)
 
+        def mirrored() -> Assessment | None:
+            flip = mirror.FLIP.diagonal()[:3]
+            image = scenes.prepared([Look(look.points * flip, look.viewpoint * flip) for look in seen], self.config)
+            return (
+                None if isinstance(image, Refusal) else self._in_scene(image, target, NO_POSES, clock, MIRRORED_ROUNDS)
+            )
+
         agreed = look_agreement.unless_apart(assessment, scene, target, alone, self.config)
         clock.lap("assess")
-        return self._checked_and_corrected(agreed, clock, enough)
+        return self._checked_and_corrected(agreed, clock, enough, mirrored)
 
     def _all_of_scene(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
@@ -278,14 +291,17 @@ class Registrar:
         """All looks of a scene; `memory.MemoryFirst` asks what it remembers first."""
         return self._in_scene(scene, target, start, clock)
 
-    def _checked_and_corrected(self, assessment: Assessment, clock: Clock, enough: Enough) -> Assessment:
+    def _checked_and_corrected(
+        self, assessment: Assessment, clock: Clock, enough: Enough, mirrored: checks.RegisterScene = no_image
+    ) -> Assessment:
         """The answer after the costly steps that only one that may yet be accepted takes, and its predicted errors."""
         config = self.config
         if assessment.reaches(config.worth_checking):
             assessment = checks.unless_grown(assessment, config)
         if assessment.reaches(config.worth_checking):
             believed = assessment.reaches(config.rules.mirrored_below) or enough(assessment)
-            assessment = checks.unless_mirrored(assessment, config, believed, partial(self._of_image, clock=clock))
+            image = partial(self._of_image, clock=clock)
+            assessment = checks.unless_mirrored(assessment, config, believed, image, mirrored)
         if assessment.reaches(config.worth_checking):
             assessment = unless_off_the_bone(assessment, config)
         clock.lap("assess")

@@ -121,7 +121,11 @@ def by_mirror(log_ratio: float, rules: RulesConfig) -> Refusal | None:
 
 
 def by_threshold(
-    probability: float, tre95_mm: float, config: RegistrarConfig, contributions: Mapping[str, float] | None = None
+    probability: float,
+    tre95_mm: float,
+    config: RegistrarConfig,
+    contributions: Mapping[str, float] | None = None,
+    since: str = "",
 ) -> Refusal | None:
     """Why the pose does not meet what the user asks for; None when it does. A probability of NaN does not.
 
@@ -130,9 +134,10 @@ def by_threshold(
         tre95_mm: bound of the error over the bone.
         config: what is asked for.
         contributions: log odds that each feature adds, of which the reason names the worst.
+        since: why so much is asked for, where it is not what the user set.
     """
     if not probability >= config.min_confidence:
-        worst, asked = words.against(contributions or {}), f"{config.min_confidence:g} is asked for"
+        worst, asked = words.against(contributions or {}), f"{config.min_confidence:g} is asked for{since}"
         reason = f"the best pose is right with a probability of only {confidence_text(probability)}, {asked}"
         return Refusal(RegistrationStatus.LOW_CONFIDENCE, f"{reason}; against it: {worst}" if worst else reason)
     if config.max_tre_mm > 0.0 and not tre95_mm <= config.max_tre_mm:

@@ -19,6 +19,8 @@ THROTTLE_S = 5.0
 LATE_NS = 50_000_000  # a cloud that is so much older than a transform came late, or the clock was set back before it
 OUT_OF_ORDER_NS = 10_000_000  # a transform may be so much older than the newest of its frame, as where threads race
 
+AFTER_A_STEP_S = 1.0  # of the clock: what comes may be of before it
+
 
 class Heard:
     """Stands between tf2's listener and its buffer, which takes everything and interpolates between any two stamps.
@@ -42,10 +44,11 @@ class Heard:
         self._came_s: dict[str, float] = {}  # when the last one came, `time.monotonic`
         self._links, self._needed = Links(), set[str]()  # frames through which something was looked up
         self._any_older: set[str] = set()
+        self._began_s = -AFTER_A_STEP_S  # when the clock stepped last, `time.monotonic`
 
     def start_over(self) -> None:
         """Forget all but what is static: between that and what comes tf2 would interpolate."""
-        self._back_ns, self._any_older = {}, set()
+        self._back_ns, self._any_older, self._began_s = {}, set(), time.monotonic()
         self._links.forget()
         self._buffer.clear()
 
@@ -58,6 +61,8 @@ class Heard:
         child, stamp = plain_frame(transform.child_frame_id), stamp_ns(transform.header)
         self._came_s[child] = time.monotonic()
         if self._is_future(stamp):
+            if time.monotonic() - self._began_s < AFTER_A_STEP_S:
+                return  # the last ones of the round before
             self._warn(f"a transform of '{child}' is left out: its stamp is ahead of the clock; synchronise the clocks")
         elif self._is_of_now(child, stamp):
             self._links.note(transform, stamp)

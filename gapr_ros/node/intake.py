@@ -21,6 +21,7 @@ from msg_adapters import INPUTS, InvalidMessageError
 
 Array = NDArray[np.float64]
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
+MOST_OF_ANY_MM = 1e8
 LEAST_SHARE, MOST_SHARE = 0.005, 20.0  # of the bone's extent, that a cloud of it can have in the right unit
 
 
@@ -71,6 +72,7 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
     """
     whole = units.to_mm(_finite_points(cloud, parameters.cloud_type), parameters.cloud_unit)
+    check_bytes(whole)
     points = in_range = _within_range(whole, parameters)
     for crop in crops:
         points = crop(points)
@@ -79,7 +81,7 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
     points = thin(points, parameters.max_points, parameters.seed)
     if parameters.accumulate <= 1:
         check_unit(points, model_extent_mm, parameters.cloud_unit)
-    check_spread(points, parameters.cloud_unit)
+    check_spread(points, model_extent_mm, parameters.cloud_unit)
     return points
 
 
@@ -126,11 +128,23 @@ def is_one_bone(points_mm: Array, model_extent_mm: float) -> bool:
     return Surface(points_mm).extent_mm <= most_mm
 
 
-def check_spread(points_mm: Array, unit: str) -> None:
+def check_bytes(points_mm: Array) -> None:
+    """Refuse coordinates that no camera has, in any unit: bytes that were read as other numbers."""
+    if not len(points_mm) or np.abs(points_mm).max() <= MOST_OF_ANY_MM:
+        return
+    if (extent_mm := robust_extent(points_mm)) > MOST_OF_ANY_MM:
+        how = "the bytes may be in the other order (is_bigendian), or the fields at other offsets"
+        raise RefusedError(Reason.BAD_FIELDS, f"points {extent_mm:.3g} mm apart: {how}")
+
+
+def check_spread(points_mm: Array, model_extent_mm: float, unit: str) -> None:
     """Refuse a cloud with points that are metres apart, even a few: no bone is so long."""
     extent_mm = Surface(points_mm).extent_mm
     if extent_mm > EXTENT_LIMITS_MM[1]:
         size = f"{extent_mm:.3g} mm across read as {unit}, {EXTENT_LIMITS_MM[1]:g} mm are the most"
+        most_mm = robust_extent(points_mm)
+        if most_mm > EXTENT_LIMITS_MM[1] and (other := _looks_like(most_mm, model_extent_mm, unit)):
+            raise RefusedError(Reason.UNIT_MISMATCH, f"looks like {other}: {size}; set cloud_unit")
         raise RefusedError(Reason.UNIT_MISMATCH, f"points too far apart: {size}; set range_max, or cloud_unit")
 
 

@@ -32,6 +32,7 @@ from msg_adapters import INPUTS
 
 Array = NDArray[np.float64]
 
+FARTHEST_M = 50.0  # of a cloud from a frame that its pose is asked in
 SEARCHED_FOR_DOUBLES = 20_000  # of more points there are enough, and sorting them takes time
 
 
@@ -200,11 +201,22 @@ class Registration:
         left_s = max(now.parameters.tf_timeout - outcome.tf_wait_s, 0.0)
         try:
             gap_s, arrived_s = now.parameters.max_tf_gap, outcome.job.arrived_s
-            return self._frames.lookup(intake.plain_frame(frame), outcome.cloud_frame, stamp, left_s, gap_s, arrived_s)
+            name = intake.plain_frame(frame)
+            found = self._frames.lookup(name, outcome.cloud_frame, stamp, left_s, gap_s, arrived_s)
+            _check_distance(found, name, outcome.cloud_frame)
+            return found
         except RefusedError as refusal:
             raise RefusedError(refusal.reason, _who_asks(frame, now.parameters) + refusal.text) from refusal
         finally:
             outcome.tf_wait_s += time.monotonic() - start
+
+
+def _check_distance(T_frame_cloud: Array, frame: str, cloud_frame: str) -> None:
+    """Refuse a transform that leads out of any operating room: a driver that sends millimetres, say."""
+    away_m = float(np.linalg.norm(T_frame_cloud[:3, 3]))
+    if away_m > FARTHEST_M:
+        text = f"'{cloud_frame}' is {away_m:.0f} m from '{frame}': are the transforms between them in millimetres?"
+        raise RefusedError(Reason.BAD_FRAME, text)
 
 
 def _who_asks(frame: str, parameters: NodeParameters) -> str:

@@ -109,6 +109,51 @@ def test_a_look_takes_the_place_of_one_from_nearly_the_same_direction(target, de
     assert names(asked.sources[-1]) == kept
 
 
+@pytest.mark.parametrize("step", [1.0, 3.0, 7.0])
+def test_of_a_camera_that_moves_on_slowly_some_looks_stay(target, step):
+    """Each took the place of the one before, and a whole circle left one look."""
+    looks, _ = looks_of(OK)
+    for number in range(int(57.0 / step)):
+        looks.register(points(number), target, viewpoint=eye(step * number))
+    at = step * np.array(names(looks.collected))
+    assert len(at) == 4 and at[-1] == step * (int(57.0 / step) - 1), "the newest is among them"
+    assert at[-1] - at[0] >= 16.0
+
+
+def test_a_camera_that_rests_keeps_one_look(target):
+    looks, _ = looks_of(OK)
+    for number, deg in enumerate((0.0, 5.0, 7.0, 3.0, 7.5)):
+        looks.register(points(number), target, viewpoint=eye(deg))
+    assert names(looks.collected) == [4]
+
+
+@pytest.mark.parametrize(("mm", "confidence", "alone", "is_refused"), [
+    (3.9, 0.8, "same", False), (4.1, 0.8, "same", True), (9.0, 0.89, "same", True), (9.0, 0.9, "same", False),
+    (9.0, 0.99, "none", True), (3.9, 0.99, "none", False),
+])  # fmt: skip
+def test_a_pose_that_is_not_sure_and_another_than_the_last_is_refused(target, mm, confidence, alone, is_refused):
+    """The bone rests in the frame of the looks: poses at .5 and .8 lay 460 mm from right ones before them."""
+    moved = replace(OK, confidence=confidence, T_target_source=se3.exp([mm, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    looks, asked = looks_of(replace(OK, confidence=0.7), moved)
+    assert looks.register(points(0), target, viewpoint=eye(0.0)).ok
+    asked.alone = moved if alone == "same" else REFUSED
+    result = looks.register(points(1), target, viewpoint=eye(20.0))
+    assert result.ok is not is_refused and names(looks.collected) == ([0] if is_refused else [0, 1])
+    if is_refused:
+        assert result.status is RegistrationStatus.AMBIGUOUS and "another one than the last" in result.reason
+        assert result.confidence <= looks.config.rules.ruled_out
+
+
+def test_the_third_pose_in_a_row_that_is_another_than_the_last_restarts_the_collection(target):
+    moved = replace(MOVED, confidence=0.8)
+    looks, asked = looks_of(replace(OK, confidence=0.8), moved)
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    asked.alone = moved
+    results = [looks.register(points(number), target, viewpoint=eye(20.0 * number)) for number in range(1, 5)]
+    assert [result.ok for result in results] == [False, False, False, True]
+    assert "3 in a row" in results[2].reason and names(looks.collected) == [1, 2, 3, 4]
+
+
 @pytest.mark.parametrize(("camera_mm", "shown_mm", "kept"), [
     (100.0, 100.0, 2), (50.0, 50.0, 1), (0.0, 100.0, 2), (0.0, 50.0, 1), (100.0, 0.0, 2), (50.0, 0.0, 1),
 ])  # fmt: skip

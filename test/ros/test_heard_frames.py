@@ -16,6 +16,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from gapr_ros.node import frames, timeline
+from gapr_ros.node import heard as heard_module
 from gapr_ros.node.heard import Heard
 
 GOOD = np.random.default_rng(1).normal(size=(1000, 3)) * 0.02
@@ -181,6 +182,19 @@ def test_one_transform_from_the_future_neither_freezes_the_camera_nor_shuts_out_
     assert said == ["a transform of 'camera' is left out: its stamp is ahead of the clock; synchronise the clocks"]
     hear(1001.4, 2.0)
     assert seen_at(buffer, 1001.3) == pytest.approx(2.0), "some nodes send what holds for the second to come"
+
+
+def test_what_is_left_of_the_last_round_is_no_clock_to_synchronise(buffer, monkeypatch):
+    """A bag in a loop with /clock: the last transforms of a round came after its end, and were warned of."""
+    heard, hear, said = hears(buffer, now_s=1000)
+    now_s = heard_module.time.monotonic()
+    monkeypatch.setattr(heard_module.time, "monotonic", lambda: now_s)
+    heard.start_over()
+    hear(3e7, 1.0)
+    assert seen_at(buffer, 3e7) is None and not said
+    now_s += heard_module.AFTER_A_STEP_S
+    hear(3e7, 1.0)
+    assert len(said) == 1
 
 
 def test_transforms_that_go_on_after_one_ahead_of_all_others_are_soon_heard(buffer):

@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 
 from gapr_core.geometry import se3
 from gapr_core.results import Guidance, Hypothesis, Patch, RegistrationResult, RegistrationStatus, Residuals
-from gapr_ros.node import messages, units
+from gapr_ros.node import diagnostics, messages, units
 from gapr_ros.node.guard import RosLogHandler
 from gapr_ros.node.outcome import Found, Outcome
 from gapr_ros.node.publishers import TOPICS
@@ -237,3 +237,12 @@ def test_a_failure_in_the_log_comes_with_its_reason():
         log.exception("work failed")
     log.removeHandler(handler)
     assert len(said) == 1 and said[0].startswith("work failed") and "no such settings file" in said[0]
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (11730.4, "11730"), (9999.4, "9999"), (0.00071, "0.00071"), (1e16, "1e+16"), (float("nan"), "nan"), (None, ""),
+])  # fmt: skip
+def test_numbers_are_written_without_exponents_as_long_as_they_are_short(value, text):
+    """A time of 11.7 s was 1.173e+04 ms."""
+    found = diagnostics.status_message(b"\x00", "a", "", "", {"value": value})
+    assert found.values[0].value == text

@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool
 from gapr_core.errors import InvalidPointCloudError, InvalidViewpointError
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.surface import Surface
-from gapr_ros.node import diagnostics, initial_pose
+from gapr_ros.node import diagnostics, initial_pose, intake
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason, RefusedError
@@ -109,7 +109,8 @@ BAD_INPUT = {
     "all at the sensor's origin": (np.zeros((500, 3)), Reason.NON_FINITE),
     "NaN but for 100 points": (np.vstack([np.full((500, 3), np.nan), GOOD[:100]]), Reason.TOO_FEW_POINTS),
     "millimetres given as metres": (GOOD * 1000.0, Reason.UNIT_MISMATCH),
-    "far too large in any unit": (GOOD * 1e9, Reason.UNIT_MISMATCH),
+    "far too large in any unit": (GOOD * 1e5, Reason.UNIT_MISMATCH),
+    "larger than a country": (GOOD * 1e9, Reason.BAD_FIELDS),
     "wrong field types": (INTEGERS, Reason.BAD_FIELDS),
     "no fields": (damaged(lambda c: c.fields.clear()), Reason.BAD_FIELDS),
     "truncated data": (damaged(lambda c: setattr(c, "data", c.data[:-7])), Reason.BAD_FIELDS),
@@ -222,6 +223,48 @@ def processed(frames, **parameters):
 def test_the_wait_for_a_transform_is_no_time_of_the_registration():
     outcome = processed(Slow(0.3), output_frame="ref", tf_timeout=1.0, timeout=0.25)
     assert outcome.ok and outcome.tf_wait_s == pytest.approx(0.3, abs=0.1)
+
+
+class Away:
+    """Frames that are so far apart, m."""
+
+    def __init__(self, x_m):
+        self.T = np.eye(4)
+        self.T[0, 3] = x_m
+
+    def lookup(self, *_):
+        return self.T
+
+
+@pytest.mark.parametrize(("x_m", "is_refused"), [(49.9, False), (50.1, True), (-700.0, True)])
+def test_a_transform_that_leads_out_of_any_room_is_refused(x_m, is_refused):
+    """/tf in millimetres: poses 955 m off went out as OK."""
+    outcome = processed(Away(x_m), output_frame="ref")
+    assert outcome.ok is not is_refused
+    if is_refused:
+        assert outcome.reason is Reason.BAD_FRAME
+        assert outcome.text.startswith(f"output_frame: 'probe' is {abs(x_m):.0f} m from 'ref': ")
+        assert "in millimetres?" in outcome.text
+
+
+@pytest.mark.parametrize("together", [0, 4])
+@pytest.mark.parametrize(("factor", "reason", "said"), [
+    (1000.0, Reason.UNIT_MISMATCH, "looks like .*millimetres"), (1e12, Reason.BAD_FIELDS, "is_bigendian"),
+    (1e3 * 1e3, Reason.UNIT_MISMATCH, "range_max"),
+])  # fmt: skip
+def test_a_cloud_that_is_far_too_large_is_refused_with_what_may_be_wrong(factor, reason, said, together):
+    """With `accumulate` a cloud in mm was answered with range_max, and swapped bytes always were."""
+    given = NodeParameters(cloud_type="PointCloud2", accumulate=together)
+    cloud = xyz_to_cloud(GOOD * factor, Header(frame_id="probe"))
+    with pytest.raises(RefusedError, match=said) as caught:
+        intake.take_in(cloud, 150.0, given)
+    assert caught.value.reason is reason
+
+
+def test_a_few_points_of_wild_bytes_do_not_refuse_a_cloud_that_is_in_range():
+    wild = np.vstack([GOOD, np.full((3, 3), 1e11)])
+    given = NodeParameters(cloud_type="PointCloud2", range_max=10.0)
+    assert len(intake.take_in(xyz_to_cloud(wild, Header(frame_id="probe")), 150.0, given)) == len(GOOD)
 
 
 def test_all_transforms_of_a_cloud_share_one_wait_and_a_missing_one_names_who_asks_for_it():

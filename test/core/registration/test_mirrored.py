@@ -219,13 +219,28 @@ def test_the_image_of_what_a_camera_saw_is_compared_by_distances_and_not_by_scor
 
 
 @pytest.mark.parametrize(
-    ("seen_from", "refused"), [({}, True), ({"seen": 1}, False), ({"seen": 1, "inferred_viewpoint": np.zeros(3)}, True)]
+    ("seen_from", "asks_scene"),
+    [({}, False), ({"seen": 1}, True), ({"seen": 1, "inferred_viewpoint": np.zeros(3)}, False)],
 )
-def test_a_scene_is_not_registered_mirrored_unless_nobody_called_it_one(monkeypatch, target, seen_from, refused):
+@pytest.mark.parametrize(("times", "refused"), [(1.0 / 0.98, False), (1.0 / 1.02, True)])
+def test_the_image_of_a_known_scene_is_registered_as_one(monkeypatch, target, seen_from, asks_scene, times, refused):
+    """Of a wound on the other side's model the pose was nonsense, and so was its image on the bone: .65."""
+    asked = []
     monkeypatch.setattr(checks.mirror, "is_symmetric", lambda *_: False)
     monkeypatch.setattr(checks.mirror, "image_margin", lambda *_: 0.0)
-    monkeypatch.setattr(checks, "full_image_margin", lambda *_: -1.0)
+    monkeypatch.setattr(checks, "full_image_margin", lambda *_: asked.append("source") or np.log(times))
     answer = Registrar(CONFIG).assess(seen(make_bone("pelvis", 900_001)), target)
     answer = replace(answer, refusal=None, **seen_from)
-    found = checks.unless_mirrored(answer, CONFIG, False, lambda *_: pytest.fail("asked"))
-    assert (found.refusal is not None) is refused
+
+    def scene():
+        asked.append("scene")
+        return replace(answer, candidates=replace(answer.candidates, scores=answer.candidates.scores * times))
+
+    found = checks.unless_mirrored(answer, CONFIG, False, lambda *_: pytest.fail("asked"), scene)
+    assert asked == ["scene" if asks_scene else "source"] and (found.refusal is not None) is refused
+    few = checks.unless_mirrored(answer, CONFIG, True, lambda *_: pytest.fail("asked"), scene)
+    assert (len(asked) == 2) is (len(answer.source.points) <= CONFIG.rules.mirrored_points) and few.fit is answer.fit
+
+
+def test_a_mirrored_scene_without_a_pose_fits_no_better():
+    assert checks.scene_image_margin(SimpleNamespace(), None) == np.inf

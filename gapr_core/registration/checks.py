@@ -81,8 +81,11 @@ def full_image_margin(assessment: Assessment, config: RegistrarConfig, register:
 
 
 def scene_image_margin(assessment: Assessment, image: Assessment | None) -> float:
-    """Log of the score of lines of sight over that of the mirrored scene; infinite where that has no pose."""
-    if image is None:
+    """Log of the score of lines of sight over that of the mirrored scene; infinite where that is no surer.
+
+    A poor image may give its mirror image a slightly better score. On the bone of the other side that is sure (.999).
+    """
+    if image is None or not image.probability > assessment.probability:
         return np.inf
     return float(np.log(image.candidates.scores[0] / assessment.candidates.scores[0]))  # 1 / score each
 

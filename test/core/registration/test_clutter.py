@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
-from gapr_core.config import ClutterConfig, SensorConfig, SourceConfig
+from gapr_core.config import ClutterConfig, RulesConfig, SensorConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
 from gapr_core.registration import checks, clutter, limits, scene_rounds
 from gapr_core.registration import source as sources
-from gapr_core.registration.additive import Additive
+from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.features import SCENE_FEATURES
 from gapr_core.registration.memory import Memory, MemoryFirst
@@ -210,8 +210,10 @@ def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
 def test_a_wound_on_the_model_of_the_other_side_is_refused(femur, target, scene):
     """Only the mirrored scene, registered as one, shows it; three of 38 were accepted."""
     other = Surface(femur.points * [-1.0, 1.0, 1.0], femur.faces[:, ::-1])
-    undecided = Calibration("scene", Additive(0.0, ()), {})
-    method = Registrar(RegistrarConfig(num_threads=1, min_confidence=0.4), scene_calibration=undecided)
+    rising = Curve("free_space_score", np.array([0.0, 0.2]), np.array([0.0, 2.0]))
+    by_score = Calibration("scene", Additive(0.0, (rising,)), {})
+    anything = RulesConfig(largest_turn_deg=180.0, largest_shift_mm=1000.0, largest_scale_z=100.0, equal_mm=0.0)
+    method = Registrar(RegistrarConfig(num_threads=1, rules=anything), scene_calibration=by_score)
     result = method.register(scene[0], method.prepare(other), viewpoint=scene[1])
     assert not result.ok and "the mirror image of the source fits the bone better" in result.reason
     assert method.register(scene[0], target, viewpoint=scene[1]).ok

@@ -222,22 +222,28 @@ def test_the_image_of_what_a_camera_saw_is_compared_by_distances_and_not_by_scor
     ("seen_from", "asks_scene"),
     [({}, False), ({"seen": 1}, True), ({"seen": 1, "inferred_viewpoint": np.zeros(3)}, False)],
 )
-@pytest.mark.parametrize(("times", "refused"), [(1.0 / 0.98, False), (1.0 / 1.02, True)])
-def test_the_image_of_a_known_scene_is_registered_as_one(monkeypatch, target, seen_from, asks_scene, times, refused):
+@pytest.mark.parametrize(
+    ("times", "more", "refused"), [(1.0 / 0.98, 0.1, False), (1.0 / 1.02, 0.1, True), (1.0 / 1.02, 0.0, False)]
+)
+def test_the_image_of_a_known_scene_is_registered_as_one(
+    monkeypatch, target, seen_from, asks_scene, times, more, refused
+):
     """Of a wound on the other side's model the pose was nonsense, and so was its image on the bone: .65."""
     asked = []
     monkeypatch.setattr(checks.mirror, "is_symmetric", lambda *_: False)
     monkeypatch.setattr(checks.mirror, "image_margin", lambda *_: 0.0)
     monkeypatch.setattr(checks, "full_image_margin", lambda *_: asked.append("source") or np.log(times))
     answer = Registrar(CONFIG).assess(seen(make_bone("pelvis", 900_001)), target)
-    answer = replace(answer, refusal=None, **seen_from)
+    answer = replace(answer, refusal=None, probability=0.6, **seen_from)
 
     def scene():
         asked.append("scene")
-        return replace(answer, candidates=replace(answer.candidates, scores=answer.candidates.scores * times))
+        image = replace(answer.candidates, scores=answer.candidates.scores * times)
+        return replace(answer, candidates=image, probability=0.6 + more)
 
     found = checks.unless_mirrored(answer, CONFIG, False, lambda *_: pytest.fail("asked"), scene)
-    assert asked == ["scene" if asks_scene else "source"] and (found.refusal is not None) is refused
+    is_refused = refused if asks_scene else times < 1.0
+    assert asked == ["scene" if asks_scene else "source"] and (found.refusal is not None) is is_refused
     few = checks.unless_mirrored(answer, CONFIG, True, lambda *_: pytest.fail("asked"), scene)
     assert (len(asked) == 2) is (len(answer.source.points) <= CONFIG.rules.mirrored_points) and few.fit is answer.fit
 

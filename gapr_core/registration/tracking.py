@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 # A scene that is hardly believed makes the next ones doubtful: of another subject's bone single scenes may be sure, but
 # seldom all (chosen on scenes of train subjects, docs/log.md, "Streams of scenes")
-DOUBTFUL, DOUBTED_FOR = 0.5, 5  # probability of a scene alone; scenes
+DOUBTFUL, DOUBTED_FOR = 0.5, 5  # probability of a scene, alone or in its stream; scenes
 
 
 class Last(NamedTuple):
@@ -252,9 +252,6 @@ class Tracker:
             assessment = assessment.capped(self.config.limits.most)
         a, last = assessment, self._last
         again = last is not None and cloud.is_of_same(last.cloud)
-        if a.seen is not None and not again and not self._shares_points:
-            self._is_doubted = self._scenes_since_doubt < DOUBTED_FOR
-            self._scenes_since_doubt = 0 if a.probability < DOUBTFUL else self._scenes_since_doubt + 1
         agrees = self._agrees(a) and (last is None or last.agreed or not again)
         one_by_one = replace(a, probability=self._evidence.add(a.probability, agrees, again))
         most = min(float(np.sqrt(a.probability)) if agrees else a.probability, a.most)
@@ -262,6 +259,10 @@ class Tracker:
         if last is not None and again:
             found = found.capped(last.said)
         self._last = Last(a.fit.T, cloud, agrees, found.probability)
+        if a.seen is not None and not again and not self._shares_points:
+            self._is_doubted = self._scenes_since_doubt < DOUBTED_FOR
+            is_doubtful = min(a.probability, found.probability) < DOUBTFUL
+            self._scenes_since_doubt = 0 if is_doubtful else self._scenes_since_doubt + 1
         return found
 
     def _remember(self, result: RegistrationResult, source: Array) -> None:

@@ -289,6 +289,14 @@ def test_after_a_scene_that_was_hardly_believed_five_are_not_sure(tracker, targe
     assert shown == [(True, False), (False, False)] + [(False, True)] * 5 + [(True, False)]
 
 
+def test_a_scene_that_its_stream_hardly_believes_is_a_doubt_too(tracker, target, scene, monkeypatch):
+    ask = saying(tracker, monkeypatch, [0.99, 0.99])
+    monkeypatch.setattr(tracker._evidence, "add", lambda *_: 0.49)
+    assert not ask(scene[0] + 0.05, target, scene[1]).ok
+    monkeypatch.setattr(tracker._evidence, "add", lambda probability, *_: probability)
+    assert limits.DOUBTED in ask(scene[0] + 0.1, target, scene[1]).contributions
+
+
 def test_a_scene_that_is_sent_again_does_not_end_the_doubt(tracker, target, scene, monkeypatch):
     ask = saying(tracker, monkeypatch, [0.49] + [0.99] * 9)
     ask(scene[0] + 0.05, target, scene[1])

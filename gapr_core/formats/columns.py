@@ -19,10 +19,25 @@ UNITS = {
     "cm": "cm", "centimeter": "cm", "centimeters": "cm", "centimetre": "cm", "centimetres": "cm",
     "m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
 }  # fmt: skip
-OTHER_UNITS = ("um", "\u00b5m", "\u03bcm", "micron", "microns", "nm", "dm", "in", "inch", "inches", "ft", "feet", "km")
-IN_BRACKETS = re.compile(r"\b[xyzlpsra]\s*[(\[]\s*(\w+)\s*[)\]]", re.IGNORECASE)  # x (mm), x[inch]
-OUTSIDE = "|".join(name for name in UNITS if name != "m")
-BY_ITSELF = re.compile(rf"\b[xyzlpsra][\s_/]+(?:in\s+)?({OUTSIDE})\b", re.IGNORECASE)  # x_mm, x in cm
+OTHER_UNITS = (
+    "um",
+    "\u00b5m",
+    "\u03bcm",
+    "micron",
+    "microns",
+    "nm",
+    "dm",
+    "inch",
+    "inches",
+    "in",
+    "ft",
+    "feet",
+    "yd",
+    "km",
+)
+IN_BRACKETS = re.compile(r"\b([xyzlpsra])\s*[(\[]\s*(\w+)\s*[)\]]", re.IGNORECASE)  # x (mm), x[inch]
+OUTSIDE = "|".join(name for name in (*UNITS, *OTHER_UNITS) if name not in ("m", "in"))
+BY_ITSELF = re.compile(rf"\b([xyzlpsra])[\s_/]+(?:in\s+)?({OUTSIDE})\b", re.IGNORECASE)  # x_mm, x in cm
 AXES = {"xyz": None, "lps": "lps", "ras": "ras"}  # names of three columns -> the axes that they say
 
 
@@ -138,13 +153,16 @@ def unit(path: Path) -> str | None:
     if not path.is_file() or path.suffix.lower() not in ENDINGS:
         return None
     header = _header(path)
-    words = {word.lower() for way in (IN_BRACKETS, BY_ITSELF) for word in way.findall(header.line)}
-    said = {UNITS[word] for word in words if word in UNITS}
-    if _used(header) is None or not words & {*UNITS, *OTHER_UNITS}:
+    if (used := _used(header)) is None:
         return None
+    named = [pair for way in (IN_BRACKETS, BY_ITSELF) for pair in way.findall(header.line)]
+    words = {word.lower() for letter, word in named if letter.lower() in (used.space or "xyz")}
+    said = {UNITS[word] for word in words if word in UNITS}
     if others := sorted(words.intersection(OTHER_UNITS)):
         given = f"{path.name} with columns in {' and '.join(others)}"
         raise InvalidPointCloudError("coordinates in mm, cm or m", given, "convert them, and name the columns so")
+    if not said:
+        return None
     if len(said) > 1:
         raise InvalidPointCloudError("one unit of all coordinates", " and ".join(sorted(said)), "correct the names")
     return said.pop()

@@ -158,7 +158,7 @@ def _is_placed(row: list[str], count: int) -> bool:
     more = [cell.strip() for cell in row[count:]]
     if more and not (len(more) == 2 and more[0] in STATUS and more[1].isdecimal()):
         counts, said = f"a row of {len(row)} values under {count} names", ",".join(row)[:50]
-        raise ValueError(f"{counts}, {said!r}: quote texts and numbers with a comma")
+        raise ValueError(f"{counts}, {said!r}: quote texts and numbers with a comma, and end no row with one")
     return not more or more[0] == PLACED
 
 

@@ -213,10 +213,15 @@ def shared_probability(best: float, scores: Array, independent_points: float) ->
     return (best, *(share * likelihood))
 
 
-def answer(assessment: Assessment, config: RegistrarConfig) -> RegistrationResult:
-    """What the caller gets: a pose where neither a rule nor a threshold refuses, else the reason."""
+def answer(assessment: Assessment, config: RegistrarConfig, since: str = "") -> RegistrationResult:
+    """What the caller gets: a pose where neither a rule nor a threshold refuses, else the reason.
+
+    Args:
+        assessment: the answer.
+        config: what is asked for.
+        since: why more is than the caller set, for the reason.
+    """
     a, tre95_mm = assessment, assessment.tre95_mm
-    since = "" if a.inferred_viewpoint is None else ", as nobody said where the camera was"
     refusal = a.refusal or rules.by_threshold(a.probability, tre95_mm, config, a.contributions, since)
     common = RegistrationResult(
         status=RegistrationStatus.LOW_CONFIDENCE,

@@ -49,7 +49,7 @@ class Newest(Enum):
 
 
 STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # the pose stands
-ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS, Newest.CONTRADICTS)
+ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS)
 REFUSED_FOR = {
     Newest.DIFFERS: RegistrationStatus.AMBIGUOUS,
     Newest.CONTRADICTS: RegistrationStatus.AMBIGUOUS,
@@ -88,10 +88,10 @@ class LookAccumulator:
 
     Older looks that show the bone elsewhere than the newest and most others are left out, and the others are asked
     again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
-    pose, and so is a pose that is not sure and another one than the last; where it alone has none, or there is no
-    other, the answer is not sure (`limits`). After three in a row that
-    show the bone elsewhere it or its reference has moved, and only these three are kept, whatever their directions.
-    After ten refusals from one direction only the last look is kept.
+    pose, and so is a pose that is not sure and another one than the last. Where the newest alone has none, or there is
+    none from elsewhere, the answer is not sure (`limits`). After three in a row that show the bone elsewhere it or its
+    reference has moved, and only these three are kept, whatever their directions; so after three poses in a row that
+    are another. After ten refusals from one direction only the last look is kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
@@ -133,6 +133,7 @@ class LookAccumulator:
         """Forget all looks, and the track of a `Tracker`."""
         self._looks: list[KeptLook] = []
         self._off_in_a_row: list[KeptLook] = []  # newest ones that show the bone elsewhere than those before
+        self._another_in_a_row: list[KeptLook] = []  # newest ones with which the pose is another than the last
         self._refused_in_a_row: list[KeptLook] = []  # from nearly one direction, since a pose
         self._last: Array | None = None  # (4, 4) the last pose that was given
         self._far_away.reset()
@@ -197,7 +198,7 @@ class LookAccumulator:
             found = replace(found.refused(REFUSED_FOR[said], said.value), confidence=ruled_out)
         if said is Newest.IS_UNCONFIRMED:
             found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
-        return replace(found, reason=found.reason + self._after(said, result, newest, before, asked))
+        return replace(found, reason=found.reason + self._after(said, found, newest, before, asked))
 
     def _of_those_that_fit(
         self, target: PreparedTarget, initial: ArrayLike | None
@@ -226,19 +227,22 @@ class LookAccumulator:
         if not result.ok:
             return Newest.IS_REFUSED
         said = self._alone(asked, result, target)
-        if said is Newest.IS_UNCONFIRMED and self._off_in_a_row:
-            return Newest.IS_DOUBTFUL
         is_sure = said is Newest.AGREES and result.confidence > self.config.limits.most
-        return Newest.CONTRADICTS if said in STANDING and not is_sure and self._is_another(result) else said
+        if said in STANDING and not is_sure and self._is_another(result):
+            return Newest.CONTRADICTS
+        return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said
 
     def _is_another(self, result: RegistrationResult) -> bool:
         """Whether the pose is another one than the last that was given, since the collection began."""
-        if self._last is None or result.T_target_source is None:
+        if self._last is None or result.T_target_source is None or self.most == 1:
             return False
         return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
 
     def _alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
-        """What the newest look alone says of the pose of all: its own is right if that one is, or it has none."""
+        """What the newest look alone says of the pose of all: its own is right if that one is, or it has none.
+
+        Others from where it was taken confirm nothing.
+        """
         if len(asked) < 2:
             return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
         if result.T_target_source is None:
@@ -248,8 +252,11 @@ class LookAccumulator:
         alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
         if alone.T_target_source is None:
             return Newest.IS_UNCONFIRMED
-        error = se3.pose_error(alone.T_target_source, result.T_target_source, newest.points)
-        return Newest.AGREES if error.is_right else Newest.DIFFERS
+        if not se3.pose_error(alone.T_target_source, result.T_target_source, newest.points).is_right:
+            return Newest.DIFFERS
+        own = _direction(newest)
+        is_from_elsewhere = any(_apart_deg(_direction(each), own) >= self.apart_deg for each in asked[:-1])
+        return Newest.AGREES if is_from_elsewhere else Newest.IS_UNCONFIRMED
 
     def _after(
         self,
@@ -271,23 +278,29 @@ class LookAccumulator:
         if said in STANDING:
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
-            self._looks, self._off_in_a_row, self._refused_in_a_row = asked, [], []
-            self._last = result.T_target_source
+            self._looks, self._off_in_a_row, self._another_in_a_row, self._refused_in_a_row = asked, [], [], []
+            self._last = self._last if result.T_target_source is None else result.T_target_source
             return ""
         if said in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
-            if len(self._off_in_a_row) >= self.config.accumulation.most_off:
-                moved = self._off_in_a_row
-                self._restart_with(moved)
-                return f"; {len(moved)} in a row: the collection restarts with them"
-            self._looks = before
-            return "; left out"
+            return self._after_one_elsewhere(self._off_in_a_row, before)
+        if said is Newest.CONTRADICTS:
+            self._another_in_a_row = [*self._another_in_a_row, newest]
+            return self._after_one_elsewhere(self._another_in_a_row, before)
         if said is not Newest.IS_REFUSED:
             self._looks = before
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
             self._restart_with([newest])
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
         return "" if said is Newest.IS_REFUSED else "; left out"
+
+    def _after_one_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
+        """As `_after`, for the last of a row of looks with which the bone is elsewhere than before."""
+        if len(row) < self.config.accumulation.most_off:
+            self._looks = before
+            return "; left out"
+        self._restart_with(row)
+        return f"; {len(row)} in a row: the collection restarts with them"
 
     def _is_stuck(self, newest: KeptLook) -> bool:
         """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""
@@ -315,12 +328,11 @@ class LookAccumulator:
         return newest, before
 
     def _with(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
-        """A look as it is kept, and all that are, itself the last: those near to it give their place to it."""
-        own = _direction(look)
-        apart_deg = [_apart_deg(each.first, own) for each in self._looks]
-        others = [each for each, deg in zip(self._looks, apart_deg, strict=True) if deg >= self.apart_deg]
-        is_alone = len(others) == len(self._looks)
-        first = own if is_alone else self._looks[int(np.argmin(apart_deg))].first
+        """A look as it is kept, and all that are, itself the last; the nearest gives its place to it, if it is near."""
+        own, others = _direction(look), list(self._looks)
+        apart_deg = [_apart_deg(each.first, own) for each in others]
+        is_near = bool(others) and min(apart_deg) < self.apart_deg
+        first = others.pop(int(np.argmin(apart_deg))).first if is_near else own
         newest = KeptLook(look.points, look.viewpoint, first)
         return newest, [*others, newest][-self.most :]
 

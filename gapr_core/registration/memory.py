@@ -30,6 +30,7 @@ class Memory:
 
     Attributes:
         poses: (K, 4, 4) T_target_source of the last source that was assessed, mm, best first.
+        support: share of the hypotheses that came to the pose in the last full registration.
         motion: (4, 4) how the source has moved since without an assessment, inv(T_then) T_now.
     """
 
@@ -37,6 +38,7 @@ class Memory:
 
     def __init__(self) -> None:
         self.poses: Array = np.empty((0, 4, 4))
+        self.support = 0.0
         self.motion: Array = np.eye(4)
 
     @property
@@ -93,7 +95,8 @@ class MemoryFirst(Registrar):
         poses = np.concatenate([start, self._memory.now])
         found = None
         if len(scene.images) == 1:
-            found = scene_rounds.of_remembered(scene, target, poses, self.scene_calibration, self.config, clock)
+            how = self._memory.support, self.scene_calibration, self.config, clock
+            found = scene_rounds.of_remembered(scene, target, poses, *how)
         if found is not None:
             found = replace(found, proposer=Memory.name, rounds=1)
             if self._needs_no_other_proposer(found) or enough(found):

@@ -206,7 +206,9 @@ class Registrar:
         named = explained.named_clutter(limits.applied(assessment, self.config), self.config)
         inferred = assessment.inferred_viewpoint is not None
         asked = replace(self.config, min_confidence=self.config.accepted_if_inferred) if inferred else self.config
-        result = asking_the_standoff(answer(named, asked), named, self.config)
+        is_more = asked.min_confidence > self.config.min_confidence
+        since = ", as nobody said where the camera was" if is_more else ""
+        result = asking_the_standoff(answer(named, asked, since), named, self.config)
         clock.lap("assess")
         return deepcopy(replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages))
 

@@ -64,14 +64,27 @@ def register(
 
 
 def of_remembered(
-    seen: Scene, target: PreparedTarget, poses: Array, calibration: Calibration, config: RegistrarConfig, clock: Clock
+    seen: Scene,
+    target: PreparedTarget,
+    poses: Array,
+    most_support: float,
+    calibration: Calibration,
+    config: RegistrarConfig,
+    clock: Clock,
 ) -> Assessment | None:
-    """The best of the poses (K, 4, 4) T_target_source, mm, that the scene before had, its rivals among them.
+    """The best of the poses that the scene before had, its rivals among them; no region is asked.
 
-    No region is asked. None where only one is left: nothing would compete with it.
+    None where only one is left: nothing would compete with it.
+
+    Args:
+        poses: (K, 4, 4) T_target_source, mm.
+        most_support: share of the hypotheses that came to the pose when regions were asked last. Of a few remembered
+            ones, its own is a large share.
+        seen, target, calibration, config, clock: as `register`.
     """
     pool = clutter.given(poses)
-    candidates = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
+    found = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
+    candidates = replace(found, support=np.minimum(found.support, most_support))
     clock.lap("verify")
     return None if len(candidates.poses) < 2 else _assessed(candidates, seen, target, calibration, config, clock)
 

@@ -279,6 +279,7 @@ class Tracker:
             self._memory.follow(result.T_target_source, source)
         elif len(result.hypotheses) > 1:
             self._has_track = True
+            self._memory.support = result.features.get("support", 0.0)
             self._memory.keep([result.T_target_source, *(rival.T_target_source for rival in result.hypotheses[1:])])
         else:
             self._forget_track()  # no rival: the next answer could not be weighed against anything

@@ -17,6 +17,7 @@ import torch
 
 import gapr_core.data
 from gapr_core.data import anatomy
+from gapr_core.errors import ConfigError
 from gapr_core.runtime.files import read_json, write_json
 from gapr_core.runtime.origin import commit, cpu_name, release
 from gapr_core.training.config import TrainConfig
@@ -59,7 +60,9 @@ def summary(folders: Iterable[Path]) -> list[str]:
 
 def _read(path: Path) -> list[Entry]:
     what, how = "the provenance of a training run", "restore it, or move it out of the folder"
-    entries: list[Entry] = read_json(path, what, how)
+    entries = read_json(path, what, how)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ConfigError(what, f"{path} with other content", how)
     return entries
 
 

@@ -72,8 +72,8 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
         RefusedError: empty_cloud, bad_fields, non_finite, too_few_points or unit_mismatch.
     """
     whole = units.to_mm(_finite_points(cloud, parameters.cloud_type), parameters.cloud_unit)
-    check_bytes(whole)
     points = in_range = _within_range(whole, parameters)
+    check_bytes(in_range)
     for crop in crops:
         points = crop(points)
     left_out = _left_out(len(whole), len(in_range), len(points))
@@ -144,7 +144,7 @@ def check_spread(points_mm: Array, model_extent_mm: float, unit: str) -> None:
         size = f"{extent_mm:.3g} mm across read as {unit}, {EXTENT_LIMITS_MM[1]:g} mm are the most"
         most_mm = robust_extent(points_mm)
         if most_mm > EXTENT_LIMITS_MM[1] and (other := _looks_like(most_mm, model_extent_mm, unit)):
-            raise RefusedError(Reason.UNIT_MISMATCH, f"looks like {other}: {size}; set cloud_unit")
+            raise RefusedError(Reason.UNIT_MISMATCH, f"looks like {other}: {size}; set cloud_unit, or range_max")
         raise RefusedError(Reason.UNIT_MISMATCH, f"points too far apart: {size}; set range_max, or cloud_unit")
 
 

@@ -154,6 +154,47 @@ def test_the_third_pose_in_a_row_that_is_another_than_the_last_restarts_the_coll
     assert "3 in a row" in results[2].reason and names(looks.collected) == [1, 2, 3, 4]
 
 
+WRONG = replace(MOVED, confidence=0.8)
+RIGHT = replace(OK, confidence=0.8)
+
+
+@pytest.mark.parametrize(("answers", "accepted"), [
+    ([RIGHT, RIGHT, WRONG, RIGHT, RIGHT], [1, 1, 0, 1, 1]),
+    ([WRONG, RIGHT, RIGHT, RIGHT, RIGHT], [1, 0, 0, 0, 1]),
+    ([RIGHT, WRONG, WRONG, RIGHT, WRONG, WRONG, WRONG], [1, 0, 0, 1, 0, 0, 0]),
+])  # fmt: skip
+def test_a_pose_that_contradicts_the_last_is_no_doubt_of_what_comes(target, answers, accepted):
+    """Newest looks that have no pose alone: one contradiction refused all that came after it."""
+    looks, asked = looks_of(*answers)
+    asked.alone = REFUSED
+    found = [looks.register(points(n), target, viewpoint=eye(20.0 * n)).ok for n in range(len(answers))]
+    assert found == [bool(is_right) for is_right in accepted]
+
+
+def test_each_by_itself_is_not_compared_with_the_last(target):
+    looks, _ = looks_of(RIGHT, WRONG, most=1)
+    assert all(looks.register(points(n), target, viewpoint=eye(20.0 * n)).ok for n in range(2))
+
+
+@pytest.mark.parametrize(("deg", "is_sure"), [(0.2, False), (7.9, False), (8.1, True)])
+def test_a_look_confirms_nothing_that_was_taken_from_where_the_newest_was(target, deg, is_sure):
+    """A camera that moved on by 8 deg in all kept two looks that were .2 deg apart, and was sure."""
+    looks, _ = looks_of(replace(OK, confidence=0.99))
+    looks.register(points(0), target, viewpoint=eye(0.0))
+    looks.register(points(1), target, viewpoint=eye(7.9))
+    last = looks.register(points(2), target, viewpoint=eye(7.9 + deg))
+    assert names(looks.collected) == [1, 2] and (last.confidence > 0.89) is is_sure
+
+
+def test_a_camera_that_sways_keeps_two_looks(target):
+    looks, _ = looks_of(OK)
+    kept = []
+    for number, deg in enumerate((0.0, 6.0, 12.0, 6.0, 0.0, 6.0, 12.0)):
+        looks.register(points(number), target, viewpoint=eye(deg))
+        kept.append(len(looks.collected) // 6)
+    assert kept == [1, 1, 2, 2, 2, 2, 2]
+
+
 @pytest.mark.parametrize(("camera_mm", "shown_mm", "kept"), [
     (100.0, 100.0, 2), (50.0, 50.0, 1), (0.0, 100.0, 2), (0.0, 50.0, 1), (100.0, 0.0, 2), (50.0, 0.0, 1),
 ])  # fmt: skip

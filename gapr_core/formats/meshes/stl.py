@@ -14,7 +14,7 @@ from gapr_core.surface import Array, Surface
 HEADER_BYTES, FACET_BYTES = 84, 50
 SOLID = re.compile(rb"(\xef\xbb\xbf)?\s*solid", re.IGNORECASE)  # a text file, with or without a byte order mark
 BEGINNING = re.compile(rb"^[ \t]*facet[ \t]+normal\b", re.MULTILINE)
-END = re.compile(rb"^[ \t]*endfacet\b", re.MULTILINE)
+END = re.compile(rb"^(?![ \t]*(?:end)?solid\b).*\bendfacet\b", re.MULTILINE)  # in a line that is no name
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
 
 

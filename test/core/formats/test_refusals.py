@@ -179,7 +179,7 @@ def test_a_row_of_an_fcsv_file_with_more_cells_than_names_is_refused(tmp_path, r
     good = b"0,10,20,30,0,0,0,1,1,1,0,hip,,node,2,0\n"
     said = refusal(tmp_path / "a.fcsv", head + good + row + b"\n")
     assert f"a row of {row.count(b',') + 1} values under 14 names" in said
-    assert "quote texts and numbers with a comma" in said
+    assert "quote texts and numbers with a comma, and end no row with one" in said
 
 
 PLY = "ply\nformat ascii 1.0\n{}end_header\n{}"

@@ -521,6 +521,7 @@ def test_comments_of_a_ply_file_may_hold_the_words_of_its_header(tmp_path, comme
 
 @pytest.mark.parametrize("change", [
     ("facet normal", "facet  normal"), ("facet normal", "facet\tnormal"), ("solid a", "solid endfacet"),
+    ("endloop\nendfacet", "endloop endfacet"),
     ("solid a", "solid facet normal"), ("solid a\nfacet", "\ufeffsolid a\nfacet"), ("\n", "\r\n"), ("\n", "\n\t"),
 ])  # fmt: skip
 def test_words_of_a_text_stl_file_count_at_the_beginning_of_its_lines(tmp_path, change):
@@ -647,14 +648,22 @@ def test_a_unit_in_the_names_of_the_coordinates_is_never_passed_over(tmp_path, n
         np.testing.assert_allclose(clouds.load(path, units="auto").points, POINTS * 10.0)
 
 
-@pytest.mark.parametrize("unit", ["in", "inch", "um", "\u00b5m", "dm", "ft"])
-def test_a_unit_that_is_none_of_ours_is_refused(tmp_path, unit):
+@pytest.mark.parametrize(("names", "unit"), [
+    *[(f"x ({unit}),y [{unit}],z({unit})", unit) for unit in ("in", "inch", "um", "\u00b5m", "dm", "ft", "yd")],
+    ("x_inch,y_inch,z_inch", "inch"), ("x in inches,y in inches,z in inches", "inches"), ("x_um,y_um,z_um", "um"),
+])  # fmt: skip
+def test_a_unit_that_is_none_of_ours_is_refused(tmp_path, names, unit):
     """Inches were read as mm."""
-    (tmp_path / "a.csv").write_text(f"x ({unit}),y [{unit}],z({unit})\n1,2,3\n40,50,60\n")
+    (tmp_path / "a.csv").write_text(f"{names}\n1,2,3\n40,50,60\n")
     for named in clouds.MM_PER_UNIT:
         said = f"coordinates in mm, cm or m; got a.csv with columns in {unit}; convert them"
         with pytest.raises(InvalidPointCloudError, match=said):
             clouds.load(tmp_path / "a.csv", units=named)
+
+
+def test_the_unit_of_another_column_is_not_that_of_the_coordinates(tmp_path):
+    (tmp_path / "a.csv").write_text("x (mm),y (mm),z (mm),r (um)\n1,2,3,4\n40,50,60,4\n10,20,90,4\n")
+    assert clouds.load(tmp_path / "a.csv").extent_mm > 90.0
 
 
 def test_several_units_and_slices_in_another_one_are_refused(tmp_path):

@@ -11,6 +11,7 @@ from gapr_core.config import ClutterConfig, RulesConfig, SensorConfig, SourceCon
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
 from gapr_core.registration import checks, clutter, limits, scene_rounds
+from gapr_core.registration import scene as scenes
 from gapr_core.registration import source as sources
 from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import Calibration
@@ -19,6 +20,7 @@ from gapr_core.registration.memory import Memory, MemoryFirst
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.source import prepare
 from gapr_core.results import Refusal
+from gapr_core.runtime.clock import Clock
 from gapr_core.surface import Surface
 
 T_SOURCE_TARGET = se3.exp(np.array([80.0, -40.0, 25.0, 0.4, -1.1, 0.7]), np.zeros(3))
@@ -259,6 +261,24 @@ def test_regions_propose_where_what_is_remembered_is_not_sure(tracker, target, s
     remembered = tracker._memory.now
     found = tracker.register(scene[0] + 0.01, target, viewpoint=scene[1])
     assert found.proposer == clutter.NAME and np.array_equal(asked[0], remembered)
+
+
+@pytest.mark.parametrize("most", [0.0, 0.01, 0.5])
+def test_a_remembered_pose_has_no_more_support_than_the_last_full_registration_gave_it(tracker, target, scene, most):
+    """Of four remembered poses its own is a quarter; of all that regions propose, a right one is a fiftieth."""
+    tracker._memory.support = most
+    seen = scenes.prepared(scenes.split(scene[0], scene[1]), tracker.config)
+    how = tracker._tracking.scene_calibration, tracker.config, Clock()
+    found = scene_rounds.of_remembered(seen, target, tracker._memory.now, most, *how)
+    assert found.features["support"] <= most and (found.features["support"] == most or most == 0.5)
+
+
+def test_what_a_full_registration_found_of_support_is_remembered(target, scene):
+    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    first = tracker.register(scene[0], target, viewpoint=scene[1])
+    assert tracker._memory.support == first.features["support"] > 0.0
+    tracker.register(scene[0] + 0.01, target, viewpoint=scene[1])
+    assert tracker._memory.support == first.features["support"], "a tracked answer has none of its own"
 
 
 def test_regions_propose_where_only_one_remembered_pose_is_left(tracker, target, scene):

@@ -151,8 +151,9 @@ def test_settings_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, 
         run_folder.check(tmp_path, TrainConfig(), ModelConfig())
 
 
-def test_provenance_that_is_damaged_is_refused_by_its_name(tmp_path):
-    (tmp_path / provenance.FILE).write_text("[")
+@pytest.mark.parametrize("content", ["[", "{}", '"a"', "[1]"])
+def test_provenance_that_is_damaged_is_refused_by_its_name(tmp_path, content):
+    (tmp_path / provenance.FILE).write_text(content)
     with pytest.raises(ConfigError, match="the provenance of a training run; got .*provenance.json .*; restore it"):
         provenance.append(tmp_path, TrainConfig(), None, 0, 1)
     with pytest.raises(ConfigError, match="provenance.json"):

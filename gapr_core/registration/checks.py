@@ -51,7 +51,7 @@ def unless_mirrored(
         assessment: the answer.
         config: when a mirror image is registered in full, and what it may not be better by.
         believed: the answer is sure. Where it is not, or of few points, much is left to chance, wherever on the bone:
-            the mirror image of such a source is registered in full.
+            the mirror image of such a source is registered in full. Of a scene the part that is bone may be small.
         register: does that.
         scene: does that with all that a camera saw.
     """
@@ -59,9 +59,10 @@ def unless_mirrored(
     if mirror.is_symmetric(a.target, config):
         return a
     found = mirror.image_margin(a.fit.T, a.source, a.target, config)
-    by_chance = len(a.source.points) <= config.rules.mirrored_points or not believed
+    in_scene = _is_known_scene(a)
+    by_chance = not believed or (not in_scene and len(a.source.points) <= config.rules.mirrored_points)
     if by_chance and rules.by_mirror(found, config.rules) is None:
-        found = scene_image_margin(a, scene()) if _is_known_scene(a) else full_image_margin(a, config, register)
+        found = scene_image_margin(a, scene()) if in_scene else full_image_margin(a, config, register)
     return a.with_refusal(rules.by_mirror(found, config.rules), config.rules)
 
 

@@ -93,10 +93,10 @@ class MemoryFirst(Registrar):
     ) -> Assessment | None:
         """What is remembered first; of several looks, which may contradict each other, no region is left out."""
         poses = np.concatenate([start, self._memory.now])
-        found = None
-        if len(scene.images) == 1:
-            how = self._memory.support, self.scene_calibration, self.config, clock
-            found = scene_rounds.of_remembered(scene, target, poses, *how)
+        if len(scene.images) > 1:
+            return self._in_scene(scene, target, poses, clock)
+        how = self._memory.support, self.scene_calibration, self.config, clock
+        found = scene_rounds.of_remembered(scene, target, poses, *how)
         if found is not None:
             found = replace(found, proposer=Memory.name, rounds=1)
             if self._needs_no_other_proposer(found) or enough(found):

@@ -30,7 +30,7 @@ def test_what_a_child_prints_and_how_it_ends_is_known(tmp_path):
 
 
 def test_transforms_and_label_maps_are_read_beside_such_files(in_a_folder_of_traps):
-    sitk = pytest.importorskip("SimpleITK")
+    sitk = pytest.importorskip("SimpleITK", reason="it writes the label map: pip install SimpleITK")
     (in_a_folder_of_traps / "a.tfm").write_text(transforms.TFM.format("1 0 0 0 1 0 0 0 1 10 0 0"))
     assert transforms.read(in_a_folder_of_traps / "a.tfm")[0, 3] == -10.0
     image = sitk.Image(30, 30, 30, sitk.sitkUInt8)

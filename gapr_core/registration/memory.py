@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.geometry import se3
+from gapr_core.registration import scene as scenes
 from gapr_core.registration import scene_rounds
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.registrar import Enough, Registrar
-from gapr_core.registration.scene import Scene
+from gapr_core.registration.registrar import Enough, Registrar, never
+from gapr_core.registration.scene import Scene, Viewpoint
+from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.source import PreparedSource
 from gapr_core.registration.target import PreparedTarget
+from gapr_core.results import Refusal
 from gapr_core.runtime.clock import Clock
 
 Array = NDArray[np.float64]
@@ -31,6 +34,7 @@ class Memory:
     Attributes:
         poses: (K, 4, 4) T_target_source of the last source that was assessed, mm, best first.
         support: share of the hypotheses that came to the pose in the last full registration.
+        place: (3,) mm, frame of the last source: where its camera was inferred to be; None where nobody had to ask.
         motion: (4, 4) how the source has moved since without an assessment, inv(T_then) T_now.
     """
 
@@ -39,6 +43,7 @@ class Memory:
     def __init__(self) -> None:
         self.poses: Array = np.empty((0, 4, 4))
         self.support = 0.0
+        self.place: Array | None = None
         self.motion: Array = np.eye(4)
 
     @property
@@ -88,6 +93,53 @@ class MemoryFirst(Registrar):
             return assessment.reaches(self.config.sure_from)
         return super()._needs_no_other_proposer(assessment)
 
+    def assess_from(
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        start: Array,
+        viewpoint: Viewpoint | None,
+        clock: Clock,
+        enough: Enough = never,
+    ) -> Assessment | Refusal:
+        """Where the camera of the last source had to be inferred, this one is compared as its next view at once."""
+        if viewpoint is None and self._memory.place is not None:
+            surface = offset_surface(target, self.config.sensor)
+            found = self._of_next_view(source, surface, start, clock, enough)
+            if found is not None:
+                return found
+        return super().assess_from(source, target, start, viewpoint, clock, enough)
+
+    def _of_next_view(
+        self, source: ArrayLike, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
+    ) -> Assessment | None:
+        """A source of which nobody said where it was seen from; None where what is remembered is not sure there."""
+        scene = scene_rounds.of_unknown(source, self.config)
+        places = [] if scene is None else self._places_of(scene)
+        clock.lap("prepare")
+        if scene is None or not places:
+            return None
+        place, _ = places[0]
+        found = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
+        if found is None or not found.reaches(self.config.accepted_if_inferred):
+            return None
+        found = self._checked_and_corrected(replace(found, inferred_viewpoint=place), clock, enough)
+        return found if found.refusal is None else None
+
+    def _places_of(self, source: PreparedSource) -> list[tuple[Array, int]]:
+        """Only the one nearest to where the last source was seen from, if that had to be inferred."""
+        places, last = super()._places_of(source), self._memory.place
+        if last is None:
+            return places
+        return sorted(places, key=lambda place: float(np.linalg.norm(place[0] - last)))[:1]
+
+    def _of_unsure_views(self, unsure: list[Assessment], clock: Clock) -> Assessment | None:
+        """The surest, in a stream of such views: as bone it is nonsense, which would speak against the bone."""
+        if self._memory.place is None or not unsure:
+            return None
+        surest = max(unsure, key=lambda view: view.probability)
+        return self._checked_and_corrected(surest, clock, never)
+
     def _all_of_scene(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
@@ -95,13 +147,19 @@ class MemoryFirst(Registrar):
         poses = np.concatenate([start, self._memory.now])
         if len(scene.images) > 1:
             return self._in_scene(scene, target, poses, clock)
-        how = self._memory.support, self.scene_calibration, self.config, clock
-        found = scene_rounds.of_remembered(scene, target, poses, *how)
-        if found is not None:
-            found = replace(found, proposer=Memory.name, rounds=1)
-            if self._needs_no_other_proposer(found) or enough(found):
-                return found
-        return self._in_scene(scene, target, poses, clock)
+        found = self._remembered(scene, target, start, clock, enough)
+        return self._in_scene(scene, target, poses, clock) if found is None else found
+
+    def _remembered(
+        self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
+    ) -> Assessment | None:
+        """The best of what is remembered; None where it is not sure, and regions have to be asked."""
+        poses, how = np.concatenate([start, self._memory.now]), (self.scene_calibration, self.config, clock)
+        found = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
+        if found is None:
+            return None
+        found = replace(found, proposer=Memory.name, rounds=1)
+        return found if self._needs_no_other_proposer(found) or enough(found) else None
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
         return self._full._of_image(flipped, target, clock)

@@ -346,15 +346,27 @@ class Registrar:
         config, scene = self.config, scene_rounds.of_unknown(source, self.config)
         if scene is None:
             return None
-        places = clutter.inferred_places(scene, config)
+        places, unsure = self._places_of(scene), []
         clock.lap("prepare")
         for viewpoint, rounds in places:
             found = self._in_scene(scenes.scene_from(scene, viewpoint, config), target, poses, clock, rounds)
-            if found is None or not found.reaches(config.accepted_if_inferred):
+            if found is None:
                 continue
-            found = self._checked_and_corrected(replace(found, inferred_viewpoint=viewpoint), clock, never)
+            found = replace(found, inferred_viewpoint=viewpoint)
+            if not found.reaches(config.accepted_if_inferred):
+                unsure.append(found)
+                continue
+            found = self._checked_and_corrected(found, clock, never)
             if found.refusal is None:
                 return found
+        return self._of_unsure_views(unsure, clock)
+
+    def _places_of(self, source: PreparedSource) -> list[tuple[Array, int]]:
+        """See `clutter.inferred_places`; `memory.MemoryFirst` knows where the last source was seen from."""
+        return clutter.inferred_places(source, self.config)
+
+    def _of_unsure_views(self, unsure: list[Assessment], clock: Clock) -> Assessment | None:
+        """None: a source by itself is rather refused as bone; `memory.MemoryFirst` knows whether it is one."""
         return None
 
     def _in_scene(

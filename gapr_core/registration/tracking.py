@@ -240,13 +240,18 @@ class Tracker:
         moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last.T_target_source, assessment.source.points)
         return moved_mm <= self.config.evidence.agree_mm
 
+    def _is_no_view(self, assessment: Assessment) -> bool:
+        """True for an answer as bone alone that is refused, where the last one accepted was of a camera's view."""
+        was_view, is_view = self._memory.place is not None, assessment.seen is not None
+        return self._has_track and was_view and not is_view and not assessment.reaches(self.config.min_confidence)
+
     def _with_evidence(self, assessment: Assessment, cloud: Fingerprint) -> Assessment:
         """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.
 
         What they say of the bone cannot make a pose right (see `evidence`). A frame that a safety rule refuses says
-        nothing, and one that is sent again nothing new.
+        nothing, nor does a camera's view that was taken for bone, and one that is sent again nothing new.
         """
-        if assessment.refusal is not None:
+        if assessment.refusal is not None or self._is_no_view(assessment):
             return assessment
         if assessment.inferred_viewpoint is not None:
             assessment = assessment.capped(self.config.limits.most)
@@ -274,6 +279,7 @@ class Tracker:
         if result.T_target_source is None:
             return
         followed = result.proposer == Memory.name
+        self._memory.place = result.inferred_viewpoint
         self._since_full = self._since_full + 1 if followed else 0
         if followed:
             self._memory.follow(result.T_target_source, source)

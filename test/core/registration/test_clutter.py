@@ -17,6 +17,7 @@ from gapr_core.registration.additive import Additive, Curve
 from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.features import SCENE_FEATURES
 from gapr_core.registration.memory import Memory, MemoryFirst
+from gapr_core.registration.repeats import fingerprint
 from gapr_core.registration.sensor import offset_surface
 from gapr_core.registration.source import prepare
 from gapr_core.results import Refusal
@@ -191,6 +192,81 @@ def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target
     monkeypatch.setattr(clutter, "propose", nothing)
     method.assess(scene[0], target)
     assert given and all(np.array_equal(poses, memory.poses[:1]) for poses in given)
+
+
+@pytest.fixture
+def of_views(target, scene):
+    """A tracker that has a pose of the scene, whose camera it inferred."""
+    made = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    assert made.register(scene[0], target).inferred_viewpoint is not None
+    return made
+
+
+def test_the_next_view_is_compared_with_what_is_remembered_and_not_taken_for_bone(of_views, target, scene, monkeypatch):
+    monkeypatch.setattr(MemoryFirst, "_as_bone", lambda *_: pytest.fail("it was taken for bone"))
+    monkeypatch.setattr(clutter, "propose", lambda *_: pytest.fail("a region was asked"))
+    shift, first = np.array([2.0, -3.0, 1.0]), of_views._memory.place
+    found = of_views.register(scene[0] + shift, target)
+    assert found.ok and found.proposer == Memory.name and found.confidence <= RegistrarConfig().limits.most
+    assert found.inferred_viewpoint == pytest.approx(first + shift, abs=30.0)
+    truth = se3.inverse(T_SOURCE_TARGET) @ se3.exp([*-shift, 0.0, 0.0, 0.0])
+    error = se3.pose_error(found.T_target_source, truth, scene[0][: scene[2]] + shift)
+    assert error.rte_mm < 1.0 and error.rre_deg < 1.0
+
+
+@pytest.mark.parametrize("nearest", [0, 1])
+def test_of_two_places_the_one_near_the_last_is_asked(of_views, target, scene, monkeypatch, nearest):
+    """Without it a full registration asks both."""
+    places = [(np.array([0.0, 0.0, z]), 1) for z in (-500.0, 500.0)]
+    monkeypatch.setattr(clutter, "inferred_places", lambda *_: places)
+    of_views._memory.place = np.array([0.0, 10.0, (-400.0, 400.0)[nearest]])
+    assert of_views._tracking._places_of(None) == [places[nearest]]
+    of_views._memory.place = None
+    assert of_views._tracking._places_of(None) == places == of_views.registrar._places_of(None)
+
+
+def test_a_view_that_a_check_refuses_is_no_answer_by_itself(of_views, target, scene, monkeypatch):
+    def refuse(assessment, config):
+        why = Refusal(RegistrationStatus.LOW_CONFIDENCE, "grown")
+        return assessment.with_refusal(why, config.rules) if assessment.proposer == Memory.name else assessment
+
+    monkeypatch.setattr(checks, "unless_grown", refuse)
+    assert of_views.register(scene[0] + 0.01, target).proposer == clutter.NAME
+
+
+@pytest.mark.parametrize(("odds", "proposer"), [(2.9, clutter.NAME), (3.0, Memory.name)])  # .948 and .953
+def test_what_is_remembered_of_a_view_has_to_be_sure(of_views, target, scene, monkeypatch, odds, proposer):
+    monkeypatch.setattr(of_views._tracking, "_scene_calibration", Calibration("scene", Additive(odds, ()), {}))
+    assert of_views.register(scene[0] + 0.01, target).proposer == proposer
+
+
+def test_in_a_stream_of_views_an_unsure_one_is_no_bone_that_speaks_against_it(of_views, target, scene, monkeypatch):
+    """As bone alone it is nonsense (less than .01); the stream would need eight sure views to believe one again."""
+    unsure = Calibration("scene", Additive(1.0, ()), {})
+    alone = Registrar(RegistrarConfig(num_threads=1), scene_calibration=unsure).register(scene[0] + 0.01, target)
+    assert alone.inferred_viewpoint is None and alone.confidence < 0.01, "a source by itself is refused as bone"
+    with monkeypatch.context() as changed:
+        changed.setitem(of_views._tracking.__dict__, "scene_calibration", unsure)
+        result = of_views.register(scene[0] + 0.01, target)
+    assert not result.ok and result.inferred_viewpoint is not None and 0.5 < result.confidence < 0.85
+    assert [of_views.register(scene[0] + shift, target) for shift in (0.02, 0.03)][-1].ok
+
+
+@pytest.mark.parametrize(("was_view", "probability", "counts"), [(1, 0.1, 0), (0, 0.1, 1), (1, 0.6, 1)])
+def test_what_was_refused_as_bone_says_nothing_in_a_stream_of_views(
+    of_views, method, target, scene, was_view, probability, counts
+):
+    if not was_view:
+        of_views._memory.place = None
+    as_bone = replace(method.of_bone_alone().assess(scene[0], target), refusal=None, probability=probability)
+    before = of_views._evidence._sum
+    found = of_views._with_evidence(as_bone, fingerprint(scene[0] + 0.01))
+    assert (of_views._evidence._sum != before) == (found is not as_bone) == bool(counts)
+
+
+def test_a_given_place_or_an_answer_as_bone_ends_a_stream_of_views(of_views, target, scene):
+    assert of_views.register(scene[0] + 0.01, target, viewpoint=scene[1]).ok
+    assert of_views._memory.place is None
 
 
 def test_frames_that_spoke_against_the_bone_refuse_an_inferred_pose(target, scene):

@@ -1,10 +1,11 @@
 """A stream of scenes through register_node: right, wrong, refused and late, with and without `crop_to_track`.
 
-    python benchmarks/scene_stream.py [--anatomy DIR --split val] [--bone femur] [--frames 200] [--direct]
+    python benchmarks/scene_stream.py [--anatomy DIR --split val] [--bone femur] [--frames 200] [--direct] [--unnamed]
 
 A camera circles a wound while the bone sways (`gapr_core.data.scenes.stream`); the clouds are in the camera's own
 frame, and the next one is sent when the last one was answered, so that none is dropped. With --direct the clouds go
-through a `Tracker` in this process, without ROS: cheaper, and without `crop_to_track`, which is the node's.
+through a `Tracker` in this process, without ROS: cheaper, and without `crop_to_track`, which is the node's. With
+--unnamed nobody says where the camera is, and its place is inferred.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gapr_core import RegistrarConfig, Tracker
@@ -48,6 +50,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--direct", action="store_true", help="a Tracker in this process, no ROS")
+    parser.add_argument("--unnamed", action="store_true", help="say nothing of where the camera is")
     args = parser.parse_args()
     people = specimens(args.bone, args.split, 1 + args.seed, args.anatomy)
     specimen = people[args.seed % len(people)]
@@ -55,7 +58,7 @@ def main() -> int:
     say(markdown.head(HEAD))
     with tempfile.TemporaryDirectory() as folder:
         act = stream(specimen, args.seed, SceneMotion(args.frames, args.level), Path(folder))
-        for name, run in runs(act, args.direct, Path(folder)).items():
+        for name, run in runs(act, args.direct, args.unnamed, Path(folder)).items():
             with run as ask:
                 say(line(f"{args.bone}, {args.level}, {name}", answered(act, ask)))
     return 0
@@ -69,22 +72,27 @@ def stream(specimen: Specimen, seed: int, motion: SceneMotion, folder: Path) -> 
     return act_of_pairs(specimen, path, pairs, period_s=1.0)
 
 
-def runs(act: Act, direct: bool, folder: Path) -> dict[str, object]:
+def runs(act: Act, direct: bool, unnamed: bool, folder: Path) -> dict[str, object]:
     """What is compared: name to a context that gives a function from a frame's number to its answer."""
+    viewpoint, said = (None, ", no viewpoint") if unnamed else (np.zeros(3), "")
     if direct:
-        return {"in-process": in_process(act)}
-    return {f"node, crop_to_track {crop:g} m": through_node(act, crop, folder) for crop in CROPS_M}
+        return {f"in-process{said}": in_process(act, viewpoint)}
+    where = {"viewpoint": "auto" if unnamed else "origin"}
+    return {
+        f"node, crop_to_track {crop:g} m{said}": through_node(act, where | {"crop_to_track": crop}, folder)
+        for crop in CROPS_M
+    }
 
 
 @contextmanager
-def in_process(act: Act) -> Iterator[Ask]:
-    """A `Tracker` that is asked directly."""
+def in_process(act: Act, viewpoint: NDArray[np.float64] | None) -> Iterator[Ask]:
+    """A `Tracker` that is asked directly; the viewpoint is (3,) mm, frame of the camera."""
     tracker = Tracker.from_pretrained(RegistrarConfig())
     target = tracker.prepare(act.bone)
 
     def ask(frame: int) -> Answer:
         sent = time.monotonic()
-        result = tracker.register(act.clouds[frame], target, viewpoint=np.zeros(3))
+        result = tracker.register(act.clouds[frame], target, viewpoint=viewpoint)
         return Answer(
             result.T_target_source, result.reason, result.confidence, result.tre_mm, result.tre95_mm,
             1000.0 * result.seconds, time.monotonic(), sent,
@@ -94,12 +102,12 @@ def in_process(act: Act) -> Iterator[Ask]:
 
 
 @contextmanager
-def through_node(act: Act, crop_m: float, folder: Path) -> Iterator[Ask]:
+def through_node(act: Act, parameters: dict[str, object], folder: Path) -> Iterator[Ask]:
     """A node as its own process; a cloud is sent when the one before was answered."""
     from gapr_ros.demo.running import Sender, observing, running
 
     with observing(folder / "log") as observer:
-        with running(observer, folder, {**act.node_parameters, "crop_to_track": crop_m}) as node:
+        with running(observer, folder, {**act.node_parameters, **parameters}) as node:
             sender = Sender(node, act.frame_id)
             node.wait_until_ready()
             yield lambda frame: sender.ask(act.clouds[frame], act.stamp_ms(frame))

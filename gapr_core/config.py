@@ -223,9 +223,7 @@ class RulesConfig(Settings):
     mirrored_points: int = setting(
         400, "a source of at most so many points is registered mirrored as well", low=0, high=1_000_000
     )
-    mirrored_below: float = setting(
-        0.95, "so is one without a viewpoint whose answer is less sure than this", low=0, high=1
-    )
+    mirrored_below: float = setting(0.95, "so is one whose answer is less sure than this, a scene too", low=0, high=1)
     push: float = setting(1.5, "how far a pose is pushed, in units of verification.same_pose_mm", low=1, high=100)
     pushed_motions: int = setting(
         3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6

@@ -127,11 +127,11 @@ class MemoryFirst(Registrar):
         return found if found.refusal is None else None
 
     def _places_of(self, source: PreparedSource) -> list[tuple[Array, int]]:
-        """Only the one nearest to where the last source was seen from, if that had to be inferred."""
+        """The one nearest to where the last source was seen from comes first, if that had to be inferred."""
         places, last = super()._places_of(source), self._memory.place
         if last is None:
             return places
-        return sorted(places, key=lambda place: float(np.linalg.norm(place[0] - last)))[:1]
+        return sorted(places, key=lambda place: float(np.linalg.norm(place[0] - last)))
 
     def _of_unsure_views(self, unsure: list[Assessment], clock: Clock) -> Assessment | None:
         """The surest, in a stream of such views: as bone it is nonsense, which would speak against the bone."""

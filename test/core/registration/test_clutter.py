@@ -215,12 +215,12 @@ def test_the_next_view_is_compared_with_what_is_remembered_and_not_taken_for_bon
 
 
 @pytest.mark.parametrize("nearest", [0, 1])
-def test_of_two_places_the_one_near_the_last_is_asked(of_views, target, scene, monkeypatch, nearest):
-    """Without it a full registration asks both."""
+def test_of_several_places_the_one_near_the_last_is_asked_first(of_views, target, scene, monkeypatch, nearest):
+    """And all of them where it is not sure: the camera may be on the other side now."""
     places = [(np.array([0.0, 0.0, z]), 1) for z in (-500.0, 500.0)]
     monkeypatch.setattr(clutter, "inferred_places", lambda *_: places)
     of_views._memory.place = np.array([0.0, 10.0, (-400.0, 400.0)[nearest]])
-    assert of_views._tracking._places_of(None) == [places[nearest]]
+    assert of_views._tracking._places_of(None) == [places[nearest], places[1 - nearest]]
     of_views._memory.place = None
     assert of_views._tracking._places_of(None) == places == of_views.registrar._places_of(None)
 

@@ -318,10 +318,11 @@ class PointCheck:
     def text(self, none_near: str = "none near the bone: are they in the frame and the unit of the source?") -> str:
         """The answer in one line; `none_near` is what it says where no point has a surface near."""
         sizes = np.abs(self.distance_mm)
-        largest = "one with no surface near" if np.isnan(sizes).any() else f"{sizes.max():.1f} mm off at most"
-        if np.isnan(sizes).all():
+        far, count = int(np.isnan(sizes).sum()), f"{len(sizes)} point{'s' if len(sizes) > 1 else ''}"
+        largest = f"{far} with no surface near" if far else f"{sizes.max():.1f} mm off at most"
+        if far == len(sizes):
             largest = none_near
         return (
-            f"{self.verdict}  {len(self.points)} points, {largest}  probability {self.probability:.3f}  "
+            f"{self.verdict}  {count}, {largest}  probability {self.probability:.3f}  "
             f"unseen {self.unseen_mm:.1f} mm  TRE 95 %: {self.tre95_mm:.1f} mm"
         )

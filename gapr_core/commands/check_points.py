@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.commands import answer, checks, options
 from gapr_core.geometry import se3
@@ -16,11 +17,13 @@ from gapr_core.runtime.arguments import a_path, above_zero
 from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
-    from gapr_core.results import PointCheck
+    from gapr_core.results import PointCheck, RegistrationResult
 
+Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 HOLDS, REFUSED = 0, 2
+ELSEWHERE = 0.5  # share of the points above which those with no surface near are no single slips
 CLOSE_MM = 1.0  # a bone in m has less than one of them
 
 
@@ -69,6 +72,8 @@ def run(args: Namespace) -> int:
     target = targets.prepare(bone, "mm", config.target, config.num_threads)
     found = check_points(touched.points, target, result, config, args.within)
     _show(found, args.within)
+    if np.isnan(found.distance_mm).mean() > ELSEWHERE:
+        _say_elsewhere(found.points, bone.points, result)
     if args.json:
         files.write_json(args.json, _as_json(found))
     return HOLDS if found.verdict is Verdict.HOLDS else REFUSED
@@ -91,14 +96,29 @@ def _show(found: PointCheck, within_mm: float) -> None:
             say(f"{number}. no surface is near")
         else:
             say(f"{number}. {distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)")
-    if np.isnan(found.distance_mm).all():
-        say("none is near the bone: are the points in the frame of the source, and in its unit (--points-units)?")
-    elif found.verdict is Verdict.CONTRADICTED:
+    if np.isnan(found.distance_mm).mean() > ELSEWHERE:
+        return
+    if found.verdict is Verdict.CONTRADICTED:
         say("the pose does not hold there: touch the farthest point again; if it stays, register again")
     elif found.verdict is Verdict.SAYS_LITTLE:
         where = "({:.0f}, {:.0f}, {:.0f})".format(*found.next_point)
         say(f"an error of {found.unseen_mm:.1f} mm over the bone might not show, {within_mm:g} mm matters: "
             f"touch more points, the next one at {where} mm on the target")  # fmt: skip
+
+
+def _say_elsewhere(points: Array, bone: Array, result: RegistrationResult) -> None:
+    """Ask what keeps points (N, 3), source frame, from the bone (M, 3), target frame, under the pose; mm."""
+    from gapr_core.formats import axes
+
+    near_mm = checks.MUCH_NEARER * checks.median_mm(result.apply(points), bone)
+    cause = "are they in the frame of the source, and in its unit and axes (--points-units, --points-axes)?"
+    if np.ptp(points, axis=0).max() < CLOSE_MM:
+        cause = "are they in the frame of the source, and in its unit (--points-units)?"
+    elif checks.median_mm(points, bone) < near_mm:
+        cause = "without the pose they are near: are they in the frame of the target? The source's is wanted"
+    elif checks.median_mm(result.apply(points * axes.LPS_RAS), bone) < near_mm:
+        cause = "with x and y negated they are near: name their axes as those of the source (--points-axes)"
+    say(f"most points are not near the bone: {cause}")
 
 
 def _as_json(found: PointCheck) -> dict[str, Any]:

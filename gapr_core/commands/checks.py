@@ -251,7 +251,7 @@ def warn_of_start(args: Namespace, start: Array | None, source: Array, target: A
     """Warn of a transform whose inverse would lay the source (N, 3) on the target (M, 3), mm, and which does not."""
     if start is None or not args.initial:
         return
-    apart_mm, turned_mm = (_median_mm(se3.apply(T, source), target) for T in (start, se3.inverse(start)))
+    apart_mm, turned_mm = (median_mm(se3.apply(T, source), target) for T in (start, se3.inverse(start)))
     if apart_mm > FAR_LANDMARKS_MM and turned_mm < MUCH_NEARER * apart_mm:
         said = f"lays the source {apart_mm:.0f} mm from the bone, and its inverse {turned_mm:.0f} mm"
         log.warning("%s %s: is it the other way round? docs/formats.md says which is meant", args.initial.name, said)
@@ -262,18 +262,18 @@ def _is_elsewhere(path: Path, cloud: Array, other: Array) -> bool:
     from gapr_core.formats import markups
 
     points = markups.load(path).points
-    apart_mm = _median_mm(points, cloud)
-    return apart_mm > FAR_LANDMARKS_MM and _median_mm(points, other) < MUCH_NEARER * apart_mm
+    apart_mm = median_mm(points, cloud)
+    return apart_mm > FAR_LANDMARKS_MM and median_mm(points, other) < MUCH_NEARER * apart_mm
 
 
 def _apart_mm(landmarks: Array, cloud: Array) -> tuple[float, float]:
     """Median distance, mm, of landmarks (K, 3) to a cloud (N, 3): as they are, and with x and y negated."""
     from gapr_core.formats.axes import LPS_RAS
 
-    return _median_mm(landmarks, cloud), _median_mm(landmarks * LPS_RAS, cloud)
+    return median_mm(landmarks, cloud), median_mm(landmarks * LPS_RAS, cloud)
 
 
-def _median_mm(points: Array, cloud: Array) -> float:
+def median_mm(points: Array, cloud: Array) -> float:
     """Median distance, mm, of points (K, 3) to the nearest ones of a cloud (N, 3)."""
     from scipy.spatial import cKDTree
 

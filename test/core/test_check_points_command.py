@@ -85,7 +85,27 @@ def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, caps
     np.savetxt("elsewhere.txt", moved + 4000.0)
     assert run(points="elsewhere.txt") == 2
     shown = capsys.readouterr().out
-    assert "are the points in the frame of the source" in shown and "register again" not in shown
+    assert "are they in the frame of the source, and in its unit" in shown and "register again" not in shown
+
+
+@pytest.mark.parametrize(
+    ("in_source", "said"),
+    [
+        (lambda touched: se3.apply(T, touched), "are they in the frame of the target?"),
+        (lambda touched: touched * [-1.0, -1.0, 1.0], "name their axes as those of the source (--points-axes)"),
+        (lambda touched: touched[:, [1, 2, 0]] + [0.0, 150.0, 0.0], "are they in the frame of the source, and in its"),
+    ],
+    ids=["target frame", "other axes", "another frame"],
+)
+def test_most_points_far_from_the_bone_are_asked_for_their_frame_and_not_for_another_registration(
+    folder, capsys, in_source, said
+):
+    """One of them by chance near the bone was enough for the advice to register again."""
+    touched = np.loadtxt("touched.txt")
+    np.savetxt("other.txt", np.vstack([in_source(touched), touched[:1]]))
+    assert run(points="other.txt") == 2
+    shown = capsys.readouterr().out
+    assert said in shown and "register again" not in shown and "one with no surface near" not in shown, shown
 
 
 @pytest.mark.parametrize(

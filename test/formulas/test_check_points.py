@@ -37,7 +37,7 @@ def test_a_distance_is_positive_outside_less_the_stand_off_and_nan_where_no_surf
     found = check(points, plane(), answer(), stated)
     assert found.distance_mm[:2] == pytest.approx([0.7, -1.2]) and np.isnan(found.distance_mm[2])
     assert found.verdict is Verdict.CONTRADICTED and found.probability == 0.0
-    assert "one with no surface near" in str(found)
+    assert "3 points, 1 with no surface near" in str(found)
     elsewhere = check(points + [0.0, 0.0, 400.0], plane(), answer(), stated)
     assert "none near the bone: are they in the frame and the unit of the source?" in str(elsewhere)
 

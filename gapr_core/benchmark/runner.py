@@ -13,6 +13,9 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from scipy.spatial import cKDTree
+
 from gapr_core.baselines import RegistrationMethod
 from gapr_core.benchmark import methods
 from gapr_core.benchmark.judge import answer_of, failure, judge, pair_facts, why_unusable
@@ -21,6 +24,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import facts_hash, load_facts, load_pair, pair_hash
 from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
+from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.parallel import end_with_parent
@@ -28,6 +32,8 @@ from gapr_core.runtime.parallel import end_with_parent
 log = logging.getLogger(__name__)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+FAR_MM = 10.0  # median of a source to its target under a truth that is looked at
+MUCH_NEARER = 0.3  # share of it that is left under the motion that was meant
 _methods: dict[tuple[str, RegistrarConfig], RegistrationMethod] = {}  # of this worker process, made at their first use
 
 
@@ -138,6 +144,21 @@ def check_truth(pair: Pair) -> None:
             "a true `transform` (4, 4) in every pair", f"none in {pair.name}",
             "add it, or protocol='wrong' where no pose is right; gapr evaluate runs pairs without truth",
         )  # fmt: skip
+
+
+def doubt_of_truth(pair: Pair) -> str:
+    """Why the truth of a pair seems to be written in another way; empty where nothing speaks for it."""
+    if not pair.has_truth:
+        return ""
+    tree, T = cKDTree(pair.target), pair.T_target_source
+    in_mm = se3.from_rotation_translation(T[:3, :3], 1000.0 * T[:3, 3])
+    said, turned, longer = (
+        float(np.median(tree.query(se3.apply(motion, pair.source))[0])) for motion in (T, se3.inverse(T), in_mm)
+    )
+    if said < FAR_MM or min(turned, longer) > MUCH_NEARER * said:
+        return ""
+    cause = "its inverse" if turned < longer else "with a translation in m, and not in mm, it would be"
+    return f"lays the source {said:.0f} mm from the target, {cause} {min(turned, longer):.0f} mm"
 
 
 def _timed(method: RegistrationMethod, pair: Pair) -> tuple[RegistrationResult, tuple[float, float]]:

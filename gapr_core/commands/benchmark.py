@@ -7,6 +7,7 @@ gapr benchmark merge OUT_1 OUT_2 ... --out OUT
 
 from __future__ import annotations
 
+import logging
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
@@ -30,6 +31,8 @@ from gapr_core.pages import benchmark_report, writers
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import a_path, at_least_one, names
 from gapr_core.runtime.console import say
+
+log = logging.getLogger(__name__)
 
 DIFFERENT = {"commit": "commits", "threads": "numbers of threads", "machine": "machines"}
 DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
@@ -191,10 +194,17 @@ def write(out: Path, plan: Plan) -> list[Row]:
 
 
 def _hashes(pairs: Path, paths: Sequence[Path]) -> dict[str, str]:
-    """Name to sha256 of all pairs of a folder."""
+    """Name to sha256 of all pairs of a folder, with a warning of truths that seem to be written in another way."""
     listed = listed_hashes(pairs)
     missing = [path for path in paths if path.stem not in listed]
-    read = {path.stem: pair_hash(load_pair(path)) for path in tqdm(missing, desc="reading pairs", disable=None)}
+    read, doubts = {}, []
+    for path in tqdm(missing, desc="reading pairs", disable=None):
+        pair = load_pair(path)
+        read[path.stem] = pair_hash(pair)
+        doubts += [f"that of {path.name} {doubt}" for doubt in [runner.doubt_of_truth(pair)] if doubt]
+    if doubts:
+        how = "Write T_target_source, source to target, in mm"
+        log.warning("%d of %d transforms may not be the truth: %s. %s", len(doubts), len(missing), doubts[0], how)
     return {path.stem: listed.get(path.stem) or read[path.stem] for path in paths}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Callable, Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -68,12 +69,13 @@ def load_pair(path: str | Path) -> Pair:
     """Read one pair; a file with `source` and `target` alone is a pair without truth, named after the file.
 
     Raises:
-        InvalidPointCloudError: not a readable .npz with these arrays, or one with points that are not finite, a
-            transform that is not rigid, or landmarks and facts that are none.
+        InvalidPointCloudError: not a readable .npz with these arrays, or one with no points or some that are not
+            finite, a transform that is not rigid, or landmarks and facts that are none.
     """
     arrays = _arrays(path)
     clouds = _clouds(arrays, path)
     for name, points in zip(CLOUDS, clouds, strict=True):
+        _check_count(name, len(points), path)
         if not np.isfinite(points).all():
             raise _wrong(path, f"finite points in {name}", "some that are not", "remove these rows")
     return _pair(clouds, arrays, path)
@@ -94,7 +96,14 @@ def load_facts(path: str | Path) -> Pair:
     for name, (shape, dtype) in heads.items():
         if len(shape) != 2 or shape[1] != 3 or dtype.kind not in "fiu":
             raise _unreadable(path, f"{name} of shape {shape} and type {dtype}")
+        _check_count(name, shape[0], path)
     return _pair((np.zeros((0, 3)), np.zeros((0, 3))), arrays, path)
+
+
+def _check_count(name: str, count: int, path: str | Path) -> None:
+    """Raise for a cloud of no points: there is nothing to judge an answer by."""
+    if count == 0:
+        raise _wrong(path, f"points in {name}", "none", "take the file out; gapr evaluate answers without a judge")
 
 
 def _is_fact(name: str) -> bool:
@@ -150,6 +159,8 @@ def _transform(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> Array:
 
 
 def _arrays(path: str | Path, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, NDArray[Any]]:
+    if Path(path).is_file() and not zipfile.is_zipfile(path):  # NumPy would speak of pickled data, and of trust
+        raise _unreadable(path, "cut, or no .npz file")
     try:
         with np.load(path, allow_pickle=False) as data:
             return {key: data[key] for key in data.files if is_wanted(key)}

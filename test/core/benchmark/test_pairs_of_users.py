@@ -12,6 +12,7 @@ from gapr_core.benchmark import records, runner
 from gapr_core.commands import benchmark
 from gapr_core.data.pair_files import load_facts, load_pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
+from gapr_core.geometry import se3
 
 sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
 
@@ -37,6 +38,8 @@ WRONG = [
     ({"viewpoint": np.zeros(4)}, "viewpoint as (3,) numbers"),
     ({"source": PAIR.source[:, :2]}, "source"),
     ({"target": np.array(["a"])}, "target"),
+    ({"source": np.zeros((0, 3))}, "points in source; got none"),
+    ({"target": np.zeros((0, 3))}, "points in target; got none"),
 ]
 
 
@@ -54,6 +57,13 @@ def test_a_pair_that_cannot_be_is_refused_with_its_file(tmp_path, changes, said)
         assert said in str(raised.value) and "odd.npz" in str(raised.value)
 
 
+def test_a_file_that_is_no_archive_is_said_to_be_none_and_nothing_is_said_of_trust(tmp_path):
+    (tmp_path / "odd.npz").write_bytes(b"hello")
+    for load in (load_pair, load_facts):
+        with pytest.raises(InvalidPointCloudError, match=r"odd.npz \(cut, or no .npz file\)"):
+            load(tmp_path / "odd.npz")
+
+
 def test_points_that_are_not_finite_are_refused_before_they_are_judged(tmp_path):
     source = PAIR.source.copy()
     source[3] = np.nan
@@ -66,6 +76,30 @@ def test_a_transform_with_few_digits_and_one_without_truth_are_taken(tmp_path):
     assert not load_pair(written(tmp_path / "b.npz", transform=np.full((4, 4), np.nan))).has_truth
     facts = load_facts(written(tmp_path / "c.npz", landmark_hip=[1, 2, 3], noise_mm=np.float32(0.5), overlap=np.nan))
     assert facts.metadata["noise_mm"] == 0.5 and len(facts.source) == 0
+
+
+@pytest.mark.parametrize(
+    ("transform", "said"),
+    [
+        (np.linalg.inv(TRUE), "its inverse 0 mm"),
+        (np.block([[TRUE[:3, :3], TRUE[:3, 3:] / 1000.0], [TRUE[3:]]]), "in m, and not in mm, it would be 0 mm"),
+        (TRUE, ""),
+        (se3.random_rotation(np.random.default_rng(9)), ""),
+    ],
+    ids=["inverse", "metres", "true", "another"],
+)
+def test_a_truth_that_is_written_in_another_way_is_warned_of(
+    pairs, fakes, tmp_path, in_process, caplog, transform, said
+):
+    """Right answers were counted as false accepts in silence."""
+    for old in pairs.glob("*"):
+        old.unlink()
+    matrix = np.eye(4)
+    matrix[: len(transform), : len(transform)] = transform
+    written(pairs / "mine.npz", transform=matrix)
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    warned = [record.getMessage() for record in caplog.records if "may not be the truth" in record.getMessage()]
+    assert len(warned) == bool(said) and all(said in line and "mine.npz" in line for line in warned), warned
 
 
 def test_nothing_is_registered_when_a_later_pair_cannot_be_judged(pairs, fakes, tmp_path, in_process, monkeypatch):

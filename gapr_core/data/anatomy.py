@@ -142,7 +142,7 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
     fixed seed (adding subjects changes it: write `splits.json` to freeze it).
 
     Raises:
-        ConfigError: no such folder, no meshes there, or an unknown split.
+        ConfigError: no such folder, no meshes there, two files of one subject, or an unknown split.
         InvalidPointCloudError: an unreadable file, one without faces, or one of a size that no bone has.
     """
     folder = Path(folder)
@@ -153,6 +153,8 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
         names = ", ".join([flat[0].name, *(name for name, found in nested.items() if found)][:4])
         raise ConfigError("meshes of one bone, or a folder for each bone", f"both ({names})", "move the files")
     of_bone = {bone or folder.resolve().name: flat} if flat else {b: f for b, f in nested.items() if bone in (None, b)}
+    for found in of_bone.values():
+        _check_alone(found)
     specimens = [Specimen(load(f, units), b, _stem(f), "meshes") for b, found in of_bone.items() for f in found]
     if not specimens:
         raise ConfigError(
@@ -195,7 +197,17 @@ def _hash_of(found: Sequence[Path], folder: Path) -> str:
 
 
 def _mesh_files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("*") if ending_of(p) in MESHES)
+    """Those that are not hidden: macOS leaves `._NAME` of each on other disks."""
+    return sorted(p for p in folder.glob("*") if ending_of(p) in MESHES and not p.name.startswith("."))
+
+
+def _check_alone(files: Sequence[Path]) -> None:
+    """Raise `ConfigError` for two files of one subject, such as .stl and .ply: it would count twice."""
+    whose: dict[str, Path] = {}
+    for file in files:
+        if (other := whose.setdefault(_stem(file), file)) != file:
+            given = f"{other.name} and {file.name}"
+            raise ConfigError("one mesh for each subject and bone", given, "take one of them out, or rename it")
 
 
 def _stem(path: Path) -> str:

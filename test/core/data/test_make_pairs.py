@@ -253,6 +253,16 @@ def test_a_folder_without_meshes_says_what_it_wants(tmp_path):
         anatomy.meshes(tmp_path)
 
 
+def test_hidden_files_of_macos_are_no_meshes_and_two_files_of_one_subject_are_refused(tmp_path):
+    write_meshes(tmp_path / "humerus", 2)
+    (tmp_path / "humerus" / "._person0.stl").write_bytes(b"\x00\x05\x16\x07")
+    assert [specimen.person for specimen in anatomy.meshes(tmp_path)] == ["person0", "person1"]
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / "humerus" / "person1.stl"))
+    o3d.io.write_triangle_mesh(str(tmp_path / "humerus" / "person1.ply"), mesh)
+    with pytest.raises(ConfigError, match=r"one mesh for each subject and bone; got person1.ply and person1.stl"):
+        anatomy.meshes(tmp_path)
+
+
 def test_no_parametric_person_is_in_two_splits():
     people = [set(pool.parametric_people(split, 50)) for split in anatomy.SPLITS]
     assert all(len(p) == 50 for p in people)

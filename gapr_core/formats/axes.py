@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 LPS_RAS = np.array([-1.0, -1.0, 1.0])  # the same both ways
 FACTORS = {"lps": np.ones(3), "as_is": np.ones(3), "ras": LPS_RAS, "lps_to_ras": LPS_RAS}
 CHOICES = ("auto", *FACTORS)
-COMMENT = re.compile(rb"\bSPACE[ \t]*=[ \t]*(LPS|RAS)\b")
+COMMENT = re.compile(rb"\bSPACE[ \t]*=[ \t]*(LPS|RAS)\b", re.IGNORECASE)
 COMMENT_BYTES = 8192
 IN_FIELDS = {".vtk": vtk.space, ".vtp": vtp.space}  # wherever in the file the field is
 OPTIONS = "--axes, --source-axes or model_axes"

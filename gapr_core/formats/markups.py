@@ -132,8 +132,9 @@ def _position(point: dict[str, Any]) -> list[float]:
 def _of_fcsv(data: bytes) -> Markups:
     check_end(data)
     text = data.decode("utf-8-sig")
-    found = re.search(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE)
-    space = _space(found[1] if found else None)
+    spaces = {_space(word) for word in re.findall(r"^#\s*CoordinateSystem\s*=\s*(\w+)", text, re.MULTILINE) or [None]}
+    if len(spaces) > 1:
+        raise ValueError("lines CoordinateSystem that contradict each other: several files in one, split them")
     columns = re.search(r"^#\s*columns\s*=\s*(.+)$", text, re.MULTILINE)
     names = [name.strip() for name in (columns[1] if columns else "id,x,y,z").split(",")]
     lines = re.sub(r"\r+(?=,)", "", text).splitlines()  # some versions keep a CR within the row
@@ -147,7 +148,7 @@ def _of_fcsv(data: bytes) -> Markups:
         raise ValueError("a row that ends before its x y z")
     points = np.array([[float(row[i]) for i in at] for row in rows]).reshape(-1, 3)
     label = names.index("label") if "label" in names else 0
-    return Markups(axes.to_lps(points, space), tuple(row[label] if label < len(row) else "" for row in rows))
+    return Markups(axes.to_lps(points, spaces.pop()), tuple(row[label] if label < len(row) else "" for row in rows))
 
 
 def _is_placed(row: list[str], count: int) -> bool:

@@ -54,6 +54,16 @@ def test_axes_of_markups_are_never_guessed(tmp_path, said):
         reading.read(fcsv(tmp_path / "a.fcsv", said))
 
 
+def test_lists_of_other_axes_in_one_fcsv_file_are_refused(tmp_path):
+    """Files that were joined: the points of the second were read in the axes of the first."""
+    first, second = (fcsv(tmp_path / "a.fcsv", f"# CoordinateSystem = {s}\n").read_text() for s in ("LPS", "RAS"))
+    (tmp_path / "a.fcsv").write_text(first + first)
+    assert len(markups.load(tmp_path / "a.fcsv").points) == 6
+    (tmp_path / "a.fcsv").write_text(first + second)
+    with pytest.raises(InvalidPointCloudError, match="lines CoordinateSystem that contradict each other"):
+        markups.load(tmp_path / "a.fcsv")
+
+
 @pytest.mark.parametrize("value", [1e308, np.inf, np.nan, -1e12])
 def test_markups_with_a_number_beyond_any_coordinate_are_refused_by_their_name(tmp_path, value):
     """A planned target at 1e308 ended a registration with a traceback, and the pose was lost."""
@@ -405,7 +415,7 @@ MESH = (
     ("SPACE=RAS", "as_is", [1, 1, 1]), ("SPACE=RAS", "lps", [1, 1, 1]), ("SPACE=RAS", "ras", LPS_RAS),
     ("SPACE=LPS", "ras", LPS_RAS), ("SPACE=LPS", "lps_to_ras", LPS_RAS), ("SPACE=LPS", "as_is", [1, 1, 1]),
     ("SPACE = RAS", "auto", LPS_RAS), ("SPACE =LPS", "lps_to_ras", LPS_RAS), ("SPACE", "auto", [1, 1, 1]),
-    ("WORKSPACE=RAS", "auto", [1, 1, 1]), ("SPACE=RAS, SPACE=RAS", "auto", LPS_RAS),
+    ("WORKSPACE=RAS", "auto", [1, 1, 1]), ("SPACE=RAS, SPACE=RAS", "auto", LPS_RAS), ("space=ras", "auto", LPS_RAS),
 ])  # fmt: skip
 def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title, axes, factors):
     (tmp_path / "a.vtk").write_text(MESH.format(title))

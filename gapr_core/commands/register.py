@@ -214,8 +214,9 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
         x, y, z = result.inferred_viewpoint
         say(f"taken for what a camera at {x:.0f},{y:.0f},{z:.0f} mm saw: as bone alone it gave no pose (--viewpoint)")
     say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
-    for error in errors:
-        say(f"{error.label}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")
+    for number, error in enumerate(errors, 1):
+        name = " ".join(error.label.split()) or f"target {number}"
+        say(f"{name}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")
     return OK
 
 

@@ -204,6 +204,14 @@ def test_planned_targets_far_from_the_bone_are_warned_of_with_the_likely_cause(f
     assert not said or "2 of 2 points of plan.mrk.json are far from t.npy" in caplog.text
 
 
+def test_a_planned_target_without_a_name_is_printed_by_its_number_and_each_in_a_line(folder, capsys):
+    save(folder / "p.mrk.json", Markups(POINTS[:3], ("entry", " ", "a\nb")))
+    assert register("--targets p.mrk.json --json x.json") == 0
+    lines = [line.partition(":")[0] for line in capsys.readouterr().out.splitlines() if "expected error" in line]
+    assert lines == ["entry", "target 2", "a b"]
+    assert [t["label"] for t in json.loads((folder / "x.json").read_text())["targets"]] == ["entry", " ", "a\nb"]
+
+
 def test_a_target_too_far_for_any_number_is_refused_before_the_work(folder, capsys):
     save(folder / "p.mrk.json", Markups(np.array([[1.0, 2.0, 1e308]]), ("a",)))
     assert register("--targets p.mrk.json --out p.tfm") == 1 and Known.asked == 0

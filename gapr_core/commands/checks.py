@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Named = tuple[str, Path]  # an option, and what it names
 
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
+FAR_PAIRS_MM = 20.0  # of landmarks under the pose that fits them best, more than anybody errs by as he touches them
 FAR_TARGETS = 0.5  # of the diagonal of the bone's box: a planned target is nearer to that box
 MM_PER_M = 1000.0
 MUCH_NEARER = 0.3  # share of that distance that is left with the axes turned, or to the other cloud, and it was wrong
@@ -207,6 +208,15 @@ def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:
                 "the other way round. Correct what the file says of its axes (SPACE=, coordinateSystem)",
                 path.name, apart_mm, cloud.name, turned_mm,
             )  # fmt: skip
+
+
+def warn_of_pairs(rms_mm: float) -> None:
+    """Warn of landmarks that are far from their partners under the pose that fits them best."""
+    if rms_mm > FAR_PAIRS_MM:
+        log.warning(
+            "the landmarks fit no pose: they are paired by their names where both files have the same, else in order. "
+            "Look for another order, another unit, or the other side of the body"
+        )
 
 
 def warn_of_frames(args: Namespace, source: Array, target: Array) -> None:

@@ -169,6 +169,7 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
 
         start = planning.start_of(*args.landmarks)
         say(f"landmarks lie {start.rms_mm:.2f} mm apart (rms) at the start")
+        checks.warn_of_pairs(start.rms_mm)
         hints["initial"] = start.T_target_source
     elif args.initial:
         from gapr_core.formats import transforms

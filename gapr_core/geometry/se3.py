@@ -71,9 +71,12 @@ def why_not_rigid(T: Array) -> str:
         return "last row is {:g} {:g} {:g} {:g}, not 0 0 0 1".format(*last)
     if (largest := np.abs(R).max()) > LARGEST_ENTRY:  # whose square may be infinite
         return f"rotation part has an entry of size {largest:.3g}"
-    if np.abs(R.T @ R - np.eye(3)).max() > FARTHEST_FROM_RIGID or np.linalg.det(R) < 0.0:
-        return f"rotation part has determinant {np.linalg.det(R):.3g}"
-    return ""
+    off, determinant = np.abs(R.T @ R - np.eye(3)).max(), np.linalg.det(R)
+    if off <= FARTHEST_FROM_RIGID and determinant > 0.0:
+        return ""
+    if f"{determinant:.3g}" != "1":
+        return f"rotation part has determinant {determinant:.3g}"
+    return f"rotation part has axes that are off right angles and length 1 by {off:.2g}: sheared, or of few digits"
 
 
 def kabsch(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:

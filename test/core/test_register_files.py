@@ -204,6 +204,16 @@ def test_planned_targets_far_from_the_bone_are_warned_of_with_the_likely_cause(f
     assert not said or "2 of 2 points of plan.mrk.json are far from t.npy" in caplog.text
 
 
+def test_landmarks_that_fit_no_pose_are_warned_of(folder, caplog):
+    """In another order they lay 150 mm apart, which stood in a line without a word of what it means."""
+    names = ("a", "b", "c", "d")
+    save(folder / "other.mrk.json", Markups(POINTS[[1, 0, 3, 2]], names))
+    save(folder / "near.mrk.json", Markups(POINTS[:4] + [[0, 5, 0], [5, 0, 0], [0, 0, 5], [-5, 0, 0]], names))
+    assert register("--landmarks p.mrk.json near.mrk.json") == 0 and "fit no pose" not in caplog.text
+    assert register("--landmarks p.mrk.json other.mrk.json") == 0
+    assert "the landmarks fit no pose" in caplog.text and "another order" in caplog.text
+
+
 def test_a_planned_target_without_a_name_is_printed_by_its_number_and_each_in_a_line(folder, capsys):
     save(folder / "p.mrk.json", Markups(POINTS[:3], ("entry", " ", "a\nb")))
     assert register("--targets p.mrk.json --json x.json") == 0

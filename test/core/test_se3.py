@@ -96,3 +96,10 @@ def test_poses_are_as_far_apart_as_they_put_points_on_average():
 def test_what_keeps_a_motion_from_being_rigid_is_said_of_numbers_of_any_size(size, said):
     why = se3.why_not_rigid(np.diag([size, size, size, 1.0]))
     assert why == (f"rotation part has {said}" if said else "")
+
+
+def test_a_matrix_of_few_digits_is_not_said_to_have_a_determinant_of_1():
+    sheared = np.eye(4) + 0.1 * np.eye(4, k=1) * [1, 1, 0, 0]
+    assert se3.why_not_rigid(sheared) == (
+        "rotation part has axes that are off right angles and length 1 by 0.1: sheared, or of few digits"
+    )

@@ -53,7 +53,7 @@ def _limit_memory(limits: FileLimits) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
-def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:
+def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[Any]], Array, list[Segment]]:
     """Layers [k, j, i], the affine of (i, j, k) to LPS mm, and the segments that the header lists."""
     import SimpleITK
 
@@ -69,8 +69,9 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[np.int64]], 
             how = "save it as .nrrd or .mha, or resample it"
             raise InvalidPointCloudError("voxels at right angles in NIfTI", "a sheared grid", how) from error
         raise
-    size = int(np.prod(reader.GetSize(), dtype=np.float64)) * reader.GetNumberOfComponents()
-    limits.check_unpacked(size * 8)
+    one = SimpleITK.Image([1] * reader.GetDimension(), reader.GetPixelID(), reader.GetNumberOfComponents())
+    size = one.GetNumberOfComponentsPerPixel() * one.GetSizeOfPixelComponent()
+    limits.check_unpacked(int(np.prod(reader.GetSize(), dtype=np.float64)) * size)
     try:
         image = reader.Execute()
     except RuntimeError as error:  # ITK says why not, and where in its source, or that a file that is here is not
@@ -146,9 +147,10 @@ def _read_dicom(
     return [layer.transpose(2, 1, 0) for layer in layers], affine, named
 
 
-def _integers(voxels: NDArray[Any]) -> NDArray[np.int64]:
-    whole = voxels.astype(np.int64)
-    if voxels.dtype.kind == "f" and (whole != voxels).any():
+def _integers(voxels: NDArray[Any]) -> NDArray[Any]:
+    """Voxels that are whole numbers from 0, in as few bytes as the file has them in."""
+    whole = voxels.astype(np.int64) if voxels.dtype.kind == "f" else voxels
+    if whole is not voxels and (whole != voxels).any():
         raise InvalidPointCloudError("a label map: whole numbers", "fractions", "give the segmentation, not the image")
     if whole.min() < 0:
         given = f"values from {whole.min()} to {whole.max()}"

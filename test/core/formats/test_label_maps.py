@@ -583,8 +583,21 @@ def test_nifti_2_is_refused_by_its_name(tmp_path):
 def test_a_label_map_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     affine, size = affine_of((1.5, 1.5, 1.5))
     path = write(tmp_path / "a.nii.gz", voxels_of(affine, size), affine)
-    monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", "1")
-    with pytest.raises(InvalidPointCloudError, match="at most 1 MB of unpacked data"):
+    monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", "0.1")
+    with pytest.raises(InvalidPointCloudError, match="at most 0.1 MB of unpacked data"):
+        clouds.load(path)
+
+
+@pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha"])
+def test_a_label_map_counts_as_many_bytes_as_it_unpacks_to(tmp_path, monkeypatch, ending):
+    """Eight for each voxel, whatever its type, refused the whole leg of a CT: 512 x 512 x 1100 voxels of one byte."""
+    affine, size = affine_of((1.5, 1.5, 1.5))
+    voxels = voxels_of(affine, size).astype(np.uint8)
+    path = write(tmp_path / f"a{ending}", voxels, affine)
+    monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", str(1.1 * voxels.nbytes / (1 << 20)))
+    assert len(clouds.load(path).points)
+    monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", str(0.9 * voxels.nbytes / (1 << 20)))
+    with pytest.raises(InvalidPointCloudError, match="GAPR_MAX_UNPACKED_MB"):
         clouds.load(path)
 
 

@@ -185,9 +185,9 @@ def _known(surface: Surface, units: str, name: str) -> str:
 
 
 def _check_size(surface: Surface, unit: str, name: str, how: str) -> None:
-    """As `check_extent`; a few points of a cloud that are metres from all others are named as such."""
+    """As `check_extent`; a few points that are metres from all others are named as such, also in no face of a mesh."""
     mm, (low, high) = MM_PER_UNIT[unit], EXTENT_LIMITS_MM
-    if surface.faces is None and surface.extent_mm * mm > high:
+    if surface.extent_mm * mm > high:
         far = np.linalg.norm(surface.points - np.median(surface.points, axis=0), axis=1) * mm > high
         if 2 * far.sum() < len(far) and low <= Surface(surface.points[~far]).extent_mm * mm <= high:
             given = f"{name} with {far.sum()} of its {len(far)} points metres from the others"

@@ -149,6 +149,12 @@ def test_points_that_no_unit_helps_are_not_blamed_on_the_unit(tmp_path, monkeypa
         clouds.load("a.xyz", units=unit)
 
 
+def test_a_vertex_of_no_face_that_is_metres_away_is_named_and_not_the_unit():
+    mesh = Surface(np.vstack([VERTICES, [0.0, 9e3, 0.0]]), FACES)
+    with pytest.raises(InvalidPointCloudError, match="with 1 of its 5 points metres from the others; take these out"):
+        clouds.load(mesh, units="mm")
+
+
 @pytest.mark.parametrize(("points", "unit"), [([[1.0, 2.0, 3.0]], "mm"), (VERTICES / 1e3, "mm"), (VERTICES, "m")])
 def test_points_that_need_not_be_a_bone_may_have_any_size(points, unit):
     found = clouds.load(points, unit, of_bone=False).points

@@ -210,6 +210,12 @@ def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:
             )  # fmt: skip
 
 
+def warn_of_one_file(args: Namespace) -> None:
+    """Warn of a bone that is registered to itself, which fits at once and says nothing."""
+    if args.source_label == args.label and _is_same(args.source, args.target):
+        log.warning("source and target are one file, %s: the pose lays it on itself", args.source.name)
+
+
 def warn_of_pairs(rms_mm: float) -> None:
     """Warn of landmarks that are far from their partners under the pose that fits them best."""
     if rms_mm > FAR_PAIRS_MM:

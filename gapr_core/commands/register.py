@@ -145,6 +145,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
         log.warning(
             "the source is a surface and the target a cloud; exchange them if %s is the whole bone", args.source
         )
+    checks.warn_of_one_file(args)
     checks.warn_of_units(args)
     checks.warn_of_axes(args)
     checks.warn_of_tracker(args)

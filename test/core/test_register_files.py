@@ -204,6 +204,12 @@ def test_planned_targets_far_from_the_bone_are_warned_of_with_the_likely_cause(f
     assert not said or "2 of 2 points of plan.mrk.json are far from t.npy" in caplog.text
 
 
+def test_one_file_for_source_and_target_is_warned_of(folder, caplog):
+    (folder / "link.ply").symlink_to(folder / "bone.ply")
+    assert register("", source="bone.ply", target="lps.ply") == 0 and "one file" not in caplog.text
+    assert register("", source="link.ply") == 0 and "source and target are one file, link.ply" in caplog.text
+
+
 def test_landmarks_that_fit_no_pose_are_warned_of(folder, caplog):
     """In another order they lay 150 mm apart, which stood in a line without a word of what it means."""
     names = ("a", "b", "c", "d")

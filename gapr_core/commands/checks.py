@@ -154,8 +154,11 @@ def warn_of_axes(args: Namespace) -> None:
     is_known = args.target.is_dir() or reading.says_axes(args.target)
     if names and (args.axes == "as_is" or (args.axes == "auto" and not is_known)):
         log.warning("in LPS: %s. If %s is RAS, give --axes ras", names, args.target.name)
-    if args.landmarks and args.source_axes == "auto" and not reading.says_axes(args.source):
-        log.warning("in LPS: %s. If %s is RAS, give --source-axes ras", args.landmarks[0].name, args.source.name)
+    of_source = args.landmarks[:1] if args.landmarks else []
+    of_source += [] if _is_tracked(args) else _files_of_itk(args)  # of a tracker's `warn_of_tracker` says more
+    if of_source and args.source_axes == "auto" and not reading.says_axes(args.source):
+        names = ", ".join(path.name for path in of_source)
+        log.warning("in LPS: %s. If %s is RAS, give --source-axes ras", names, args.source.name)
     said = axes.stated(args.source) if args.source_axes == "auto" and args.source.is_file() else args.source_axes
     if not isinstance(args.viewpoint, str) and said == "ras":
         log.warning("%s is turned from RAS to LPS: --viewpoint is taken to be in LPS", args.source.name)
@@ -163,18 +166,26 @@ def warn_of_axes(args: Namespace) -> None:
 
 def warn_of_tracker(args: Namespace) -> None:
     """Warn of a transform for ITK and 3D Slicer of a tracker's numbers, whose axes nobody has named."""
-    from gapr_core.formats import reading
-    from gapr_core.formats.options import ReadOptions
-
-    kind = reading.format_of(args.source)
-    is_tracked = kind.is_in_mm(ReadOptions(tip_mm=args.tip)) and not kind.in_lps
-    is_of_itk = args.slicer or (args.out and args.out.suffix != ".txt")
-    if is_tracked and is_of_itk and args.source_axes == "auto":
+    if _is_tracked(args) and _files_of_itk(args) and args.source_axes == "auto":
         log.warning(
             "%s is taken as LPS. 3D Slicer shows a live tracker (OpenIGTLink, PLUS) as RAS, where this transform would "
             "be wrong: for such a scene give --source-axes ras, else --source-axes lps (docs/how-to/slicer.md)",
             args.source.name,
         )
+
+
+def _is_tracked(args: Namespace) -> bool:
+    """Whether the numbers of the source are a tracker's."""
+    from gapr_core.formats import reading
+    from gapr_core.formats.options import ReadOptions
+
+    kind = reading.format_of(args.source)
+    return kind.is_in_mm(ReadOptions(tip_mm=args.tip)) and not kind.in_lps
+
+
+def _files_of_itk(args: Namespace) -> list[Path]:
+    """The outputs whose transform is LPS on both sides, as ITK and 3D Slicer want it."""
+    return [path for path in (args.out, args.slicer) if path and path.suffix != ".txt"]
 
 
 def warn_of_units(args: Namespace) -> None:

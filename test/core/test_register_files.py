@@ -111,6 +111,21 @@ def test_landmarks_of_a_source_without_axes_are_warned_of(folder, caplog, source
     assert register("", "lps.ply", source) == 0 and "in LPS: " not in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("source", "is_known"), [("s.npy", False), ("bone.ply", False), ("lps.ply", True), ("p.mrk.json", True)]
+)
+@pytest.mark.parametrize("line", ["--out p.tfm", "--out p.h5", "--slicer scene"])
+def test_a_transform_for_slicer_of_a_cloud_without_axes_is_warned_of(folder, caplog, source, is_known, line):
+    """Arrays that 3D Slicer's Python gives are RAS, and their transform was for LPS in silence."""
+    pytest.importorskip("SimpleITK", reason=".h5 is optional: pip install '.[medical]'")
+    said = f"in LPS: {line.split()[1]}. If {source} is RAS, give --source-axes ras"
+    assert register(line, "lps.ply", source) == 0 and (said in caplog.text) == (not is_known)
+    caplog.clear()
+    if not is_known:
+        assert register(f"{line} --source-axes lps", "lps.ply", source) == 0 and "in LPS: " not in caplog.text
+        assert register("--out p.txt", "lps.ply", source) == 0 and "in LPS: " not in caplog.text
+
+
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("turned", [True, False])
 def test_landmarks_that_lie_on_their_cloud_only_with_other_axes_are_warned_of(folder, caplog, which, turned):

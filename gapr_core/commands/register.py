@@ -64,7 +64,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     guess.add_argument("--initial", type=a_path, metavar="POSE", help="a first guess: a file as --out writes it")
     parser.add_argument("--targets", type=a_path, help="markups of a plan, target frame: the error to expect there")
     parser.add_argument("--out", type=a_path, help="the pose as pose.tfm or .h5 (LPS, ITK's direction) or 4x4 .txt")
-    parser.add_argument("--residuals", type=a_path, help="signed distance of every point, as .json or coloured .ply")
+    parser.add_argument(
+        "--residuals", type=a_path, help="signed distance of every point used, as .json or coloured .ply"
+    )
     parser.add_argument("--slicer", type=a_path, metavar="FOLDER", help="a scene for 3D Slicer")
     parser.add_argument("--report", type=a_path, metavar="FILE.html", help="one page with all of it, on refusals too")
     parser.add_argument("--rerun", type=a_path, metavar="FILE.rrd", help="a recording for rerun, on refusals too")
@@ -262,6 +264,9 @@ def _write_pose(args: Namespace, done: Registration) -> None:
         transforms.write(args.out, result.T_target_source)  # type: ignore[arg-type]
     if result.residuals is None:
         return
+    used, given = len(result.residuals.points), len(done.source)
+    if used < given and (args.residuals or args.slicer):
+        say(f"distances are of {used} of {given} points, those that were used: docs/formats.md")
     if args.residuals and args.residuals.suffix.lower() == ".json":
         files.write_json(args.residuals, scene.residuals_json(result.residuals))
     elif args.residuals:

@@ -219,6 +219,15 @@ def test_planned_targets_far_from_the_bone_are_warned_of_with_the_likely_cause(f
     assert not said or "2 of 2 points of plan.mrk.json are far from t.npy" in caplog.text
 
 
+@pytest.mark.parametrize("option", ["--residuals r.json", "--residuals r.ply", "--slicer scene", ""])
+def test_distances_of_fewer_points_than_the_source_has_are_said_to_be_so(folder, capsys, option):
+    """Of a million points 5924 had one, and the page said that every point had."""
+    np.save("more.npy", np.vstack([POINTS, POINTS]))
+    for source, is_said in (("s.npy", False), ("more.npy", bool(option))):
+        assert register(option, "lps.ply", source) == 0
+        assert ("distances are of 60 of 120 points" in capsys.readouterr().out) is is_said
+
+
 def test_one_file_for_source_and_target_is_warned_of(folder, caplog):
     (folder / "link.ply").symlink_to(folder / "bone.ply")
     assert register("", source="bone.ply", target="lps.ply") == 0 and "one file" not in caplog.text

@@ -71,7 +71,7 @@ def run(args: Namespace) -> int:
     _warn_of_units(args.points, touched.extent_mm)
     target = targets.prepare(bone, "mm", config.target, config.num_threads)
     found = check_points(touched.points, target, result, config, args.within)
-    _show(found, args.within)
+    _show(found, args.within, _labels(args.points, len(found.points)))
     if np.isnan(found.distance_mm).mean() > ELSEWHERE:
         _say_elsewhere(found.points, bone.points, result)
     if args.json:
@@ -86,16 +86,23 @@ def _warn_of_units(path: Path, extent_mm: float) -> None:
         log.warning("all points of %s are within %.2g mm: %s", path.name, extent_mm, how)
 
 
-def _show(found: PointCheck, within_mm: float) -> None:
+def _labels(path: Path, count: int) -> list[str]:
+    """What markups call their points, since some of a list may not be placed; nothing of other files."""
+    from gapr_core.formats import markups, reading
+
+    labels = markups.load(path).labels if reading.format_of(path) is reading.MARKUPS else ("",) * count
+    return [f" {name}:" if (name := " ".join(label.split())) else "" for label in labels]
+
+
+def _show(found: PointCheck, within_mm: float, labels: list[str]) -> None:
     """The answer in words, every point, and what to do."""
     from gapr_core.results import Verdict
 
     say(str(found))
-    for number, (distance, expected) in enumerate(zip(found.distance_mm, found.expected_mm, strict=True), 1):
-        if np.isnan(distance):
-            say(f"{number}. no surface is near")
-        else:
-            say(f"{number}. {distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)")
+    rows = zip(labels, found.distance_mm, found.expected_mm, strict=True)
+    for number, (label, distance, expected) in enumerate(rows, 1):
+        said = f"{distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)"
+        say(f"{number}.{label} {'no surface is near' if np.isnan(distance) else said}")
     if np.isnan(found.distance_mm).mean() > ELSEWHERE:
         return
     if found.verdict is Verdict.CONTRADICTED:

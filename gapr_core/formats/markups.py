@@ -102,7 +102,7 @@ def _of_json(content: Any) -> Markups:
         placed = [p for p in _objects(node, "controlPoints") if p.get("positionStatus", "defined") == "defined"]
         positions = np.array([_position(p) for p in placed], dtype=np.float64).reshape(-1, 3)
         points.append(axes.to_lps(positions * mm, space))
-        labels += [str(p.get("label", "")) for p in placed]
+        labels += [str(p.get("label") or "") for p in placed]
     if not points:
         raise ValueError("no markups in it")
     return Markups(np.vstack(points), tuple(labels))
@@ -124,7 +124,7 @@ def _objects(holder: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 def _position(point: dict[str, Any]) -> list[float]:
     position = point.get("position")
-    if isinstance(position, list) and len(position) == 3 and all(isinstance(value, int | float) for value in position):
+    if isinstance(position, list) and len(position) == 3 and all(type(value) in (int, float) for value in position):
         return [float(value) for value in position]
     raise ValueError("a position that is not x y z")
 

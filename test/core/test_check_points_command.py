@@ -88,6 +88,20 @@ def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, caps
     assert "are they in the frame of the source, and in its unit" in shown and "register again" not in shown
 
 
+def test_points_of_markups_are_called_as_there_though_some_were_not_placed(folder, capsys):
+    """The number of a point in the answer was not its place in the list: another one was touched again."""
+    points = np.loadtxt("touched.txt")[:4]
+    points[2] += [0.0, 40.0, 0.0]
+    markups.save("m.mrk.json", markups.Markups(points, ("head", "neck", " far\none ", "")))
+    content = json.loads((folder / "m.mrk.json").read_text())
+    content["markups"][0]["controlPoints"][0] |= {"positionStatus": "undefined"}
+    content["markups"][0]["controlPoints"][3]["label"] = None
+    (folder / "m.mrk.json").write_text(json.dumps(content))
+    run(points="m.mrk.json")
+    shown = [line for line in capsys.readouterr().out.splitlines() if line[:3] in ("1. ", "2. ", "3. ")]
+    assert [line.rpartition(":")[0] for line in shown] == ["1. neck", "2. far one", ""]
+
+
 @pytest.mark.parametrize(
     ("in_source", "said"),
     [

@@ -148,6 +148,7 @@ POINT = {"position": [1.0, 2.0, 3.0]}
     ({"markups": [{"coordinateSystem": "LPS", "controlPoints": [7]}]}, "`controlPoints` that is no list of objects"),
     ({"markups": [{"coordinateSystem": "LPS", "controlPoints": [{}]}]}, "a position that is not x y z"),
     ({"markups": [{"coordinateSystem": "LPS", "controlPoints": [POINT, {"position": ["a", 1, 2]}]}]}, "a position"),
+    ({"markups": [{"coordinateSystem": "LPS", "controlPoints": [{"position": [True, 1, 2]}]}]}, "a position"),
 ])  # fmt: skip
 @pytest.mark.parametrize("read", [reading.read, markups.load])
 def test_json_of_something_else_is_no_markups(tmp_path, content, said, read):

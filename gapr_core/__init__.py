@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gapr_core.clouds import load
     from gapr_core.config import RegistrarConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
+    from gapr_core.formats.options import ReadOptions
     from gapr_core.registration.accumulation import Accumulator
     from gapr_core.registration.check_points import check_points
     from gapr_core.registration.crop import crop_box, crop_to_pose
@@ -40,6 +41,7 @@ _HOMES = {
     "LookFit": "results",
     "Surface": "surface",
     "load": "clouds",
+    "ReadOptions": "formats.options",
     "check_points": "registration.check_points",
     "crop_box": "registration.crop",
     "crop_to_pose": "registration.crop",

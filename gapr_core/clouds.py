@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import columns, reading
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry.extent import BEYOND
@@ -52,7 +52,11 @@ def load(
     Raises:
         InvalidPointCloudError: unreadable file, unknown format, wrong shape, nothing finite, an extent that cannot be a
             bone in the unit named, or another unit in the names of its columns.
+        ConfigError: options that are no `ReadOptions`, or that the file cannot follow.
     """
+    if options is not None and not isinstance(options, ReadOptions):
+        how = "pass ReadOptions(axes=..., labels=...) of gapr_core"
+        raise ConfigError("options as ReadOptions", type(options).__name__, how)
     if isinstance(source, str | Path):
         name, surface = str(source), reading.read(Path(source), options)
         is_in_mm, how = reading.format_of(Path(source)).is_in_mm(options or ReadOptions()), OF_FILE

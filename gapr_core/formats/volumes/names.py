@@ -89,7 +89,7 @@ def _only(named: list[Segment], present: Present) -> Segment:
     if not segments:
         raise InvalidPointCloudError("a label map with a segment", "zeros only", "check the segmentation")
     given = f"{len(segments)} of them ({_present(named, present)})"
-    how = "name one with --label (--source-label of the source), labels= in Python, or model_label of the node"
+    how = "name one: --label (--source-label of the source), ReadOptions(labels=...) of load, model_label of the node"
     raise InvalidPointCloudError("one label", given, how)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from gapr_core import clouds
 from gapr_core.data.solid import is_closed, volume_mm3
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.options import ReadOptions
 from gapr_core.formats.volumes import names, nifti
 from gapr_core.formats.volumes.contour import surface_of
@@ -586,6 +586,23 @@ def test_a_label_map_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(t
     monkeypatch.setenv("GAPR_MAX_UNPACKED_MB", "0.1")
     with pytest.raises(InvalidPointCloudError, match="at most 0.1 MB of unpacked data"):
         clouds.load(path)
+
+
+@pytest.mark.parametrize("labels", ["12", 12, np.int64(12), ["12"], (12,), [np.uint8(12)]])
+def test_a_label_by_itself_and_a_number_are_labels(labels):
+    """Of a name by itself each letter was looked for, and of a number the file was to be exported again."""
+    assert ReadOptions(labels=labels) == ReadOptions(labels=("12",))
+
+
+@pytest.mark.parametrize("labels", [None, 1.5, [None], ["a", 2.0], [["a"]]])
+def test_labels_that_are_neither_names_nor_numbers_are_refused(labels):
+    with pytest.raises(ConfigError, match="expected labels that are names or whole numbers"):
+        ReadOptions(labels=labels)
+
+
+def test_options_in_a_dict_are_refused():
+    with pytest.raises(ConfigError, match=r"options as ReadOptions; got dict; pass ReadOptions\("):
+        clouds.load(np.eye(3) * 100.0, options={"axes": "ras"})
 
 
 @pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha"])

@@ -183,7 +183,7 @@ def test_a_source_in_a_label_map_has_a_label_of_its_own(tmp_path, femur, capsys)
     command = ["register", "--source", str(tmp_path / "scan.seg.nrrd"), "--target", str(tmp_path / "ct.nii.gz")]
     command += ["--method", "gapr_search", "--label", "76", "--out", str(tmp_path / "pose.txt")]
     assert main(command) == 1
-    assert "(Bone, Metal); name one with --label (--source-label of the source)" in capsys.readouterr().err
+    assert "(Bone, Metal); name one: --label (--source-label of the source)" in capsys.readouterr().err
     assert main([*command, "--source-label", "bone"]) == 0
     np.testing.assert_allclose(np.loadtxt(tmp_path / "pose.txt"), np.eye(4), atol=0.5)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +24,12 @@ from gapr_core.runtime.files import write_json
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 NUMBERED = {"0": "ras", "1": "lps", "ras": "ras", "lps": "lps"}  # Slicer before 4.11 wrote a number
 STATUS, PLACED = ("0", "1", "2", "3"), "2"  # of a position in .fcsv: undefined, preview, placed, missing
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001}
+LONGEST_TYPE = 20  # characters of a list's type that a warning shows
 SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
 
 
@@ -37,15 +40,21 @@ class Markups:
     Attributes:
         points: (N, 3) LPS, mm.
         labels: their N names.
+        lists: how many points of which type each list of a file has, such as "40 Fiducial"; empty lists are left out.
     """
 
     points: Array
     labels: tuple[str, ...]
+    lists: tuple[str, ...] = ()
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """The points alone, LPS mm."""
-    return Surface(_load(path, options.limits).points)
+    """The points alone, LPS mm; those of several lists are joined, with a warning."""
+    found = _load(path, options.limits)
+    if len(found.lists) > 1:
+        log.warning("%s: %d lists are joined (%s); save one by itself if they are not points of one bone",
+                    path.name, len(found.lists), ", ".join(found.lists))  # fmt: skip
+    return Surface(found.points)
 
 
 def load(path: Path) -> Markups:
@@ -93,7 +102,7 @@ def save(path: Path, markups: Markups, descriptions: list[str] | None = None) ->
 
 
 def _of_json(content: Any) -> Markups:
-    points, labels = [], []
+    points, labels, lists = [], [], []
     for node in _nodes(content):
         space = _space(node.get("coordinateSystem"))
         mm = _mm_per_unit(node.get("coordinateUnits", "mm"))
@@ -103,9 +112,10 @@ def _of_json(content: Any) -> Markups:
         positions = np.array([_position(p) for p in placed], dtype=np.float64).reshape(-1, 3)
         points.append(axes.to_lps(positions * mm, space))
         labels += [str(p.get("label") or "") for p in placed]
+        lists += [f"{len(placed)} {str(node.get('type', 'points'))[:LONGEST_TYPE]}"] if placed else []
     if not points:
         raise ValueError("no markups in it")
-    return Markups(np.vstack(points), tuple(labels))
+    return Markups(np.vstack(points), tuple(labels), tuple(lists))
 
 
 def _nodes(content: Any) -> list[dict[str, Any]]:

@@ -54,6 +54,19 @@ def test_axes_of_markups_are_never_guessed(tmp_path, said):
         reading.read(fcsv(tmp_path / "a.fcsv", said))
 
 
+def test_several_lists_of_a_file_are_joined_with_a_warning(tmp_path, caplog):
+    """The middle of a region of interest was a point on the bone."""
+    path = tmp_path / "a.mrk.json"
+    markups.save(path, markups.Markups(POINTS, ("a", "b", "c")))
+    content = json.loads(path.read_text())
+    region = {"type": "ROI", "coordinateSystem": "RAS", "controlPoints": [{"position": [1.0, 2.0, 3.0]}]}
+    empty = {"type": "Fiducial", "coordinateSystem": "LPS", "controlPoints": []}
+    for more, said in (([empty], None), ([empty, region], "a.mrk.json: 2 lists are joined (3 Fiducial, 1 ROI)")):
+        path.write_text(json.dumps({"markups": content["markups"] + more}))
+        assert len(clouds.load(path).points) == 2 + len(more)
+        assert (said in caplog.text) if said else not caplog.text
+
+
 def test_lists_of_other_axes_in_one_fcsv_file_are_refused(tmp_path):
     """Files that were joined: the points of the second were read in the axes of the first."""
     first, second = (fcsv(tmp_path / "a.fcsv", f"# CoordinateSystem = {s}\n").read_text() for s in ("LPS", "RAS"))

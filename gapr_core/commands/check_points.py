@@ -59,18 +59,19 @@ def run(args: Namespace) -> int:
     from gapr_core.results import Verdict
 
     config = options.registrar_config(args)
-    result = answer.read_json(args.pose)
     if args.json:
         inputs = [("--points", args.points), ("--target", args.target), ("--pose", args.pose)]
         checks.check_collisions(inputs, [("--json", args.json)])
         files.check_writable(args.json)
-    bone = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
-    how: dict[str, Any] = {"axes": args.points_axes, "tip_mm": args.tip, "tool": args.tool}
-    units = args.points_units or args.units
-    touched = options.load(args.points, units, of_bone=False, **how, reference=args.reference)
-    _warn_of_units(args.points, touched.extent_mm)
-    target = targets.prepare(bone, "mm", config.target, config.num_threads)
-    found = check_points(touched.points, target, result, config, args.within)
+    with checks.naming_old_files(args.json):
+        result = answer.read_json(args.pose)
+        bone = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
+        how: dict[str, Any] = {"axes": args.points_axes, "tip_mm": args.tip, "tool": args.tool}
+        units = args.points_units or args.units
+        touched = options.load(args.points, units, of_bone=False, **how, reference=args.reference)
+        _warn_of_units(args.points, touched.extent_mm)
+        target = targets.prepare(bone, "mm", config.target, config.num_threads)
+        found = check_points(touched.points, target, result, config, args.within)
     _show(found, args.within, _labels(args.points, len(found.points)))
     if np.isnan(found.distance_mm).mean() > ELSEWHERE:
         _say_elsewhere(found.points, bone.points, result)

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.errors import ConfigError, MethodUnavailableError
+from gapr_core.errors import ConfigError, GaprError, MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime import files
+from gapr_core.runtime.console import say
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Named = tuple[str, Path]  # an option, and what it names
 
+OF_EARLIER = ", and what is there is of an earlier run"
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
 FAR_PAIRS_MM = 20.0  # of landmarks under the pose that fits them best, more than anybody errs by as he touches them
 FAR_TARGETS = 0.5  # of the diagonal of the bone's box: a planned target is nearer to that box
@@ -108,6 +112,18 @@ def check_collisions(inputs: list[Named], outputs: list[Named]) -> None:
 def _is_same(path: Path, other: Path) -> bool:
     """By name, links followed, and by what is there: some file systems do not distinguish a from A."""
     return path.resolve() == other.resolve() or (path.exists() and other.exists() and path.samefile(other))
+
+
+@contextmanager
+def naming_old_files(*paths: Path | None) -> Iterator[None]:
+    """Say of outputs that an error leaves as they are: a script may take them for those of this run."""
+    try:
+        yield
+    except GaprError:
+        for path in paths:
+            if path and path.exists():
+                say(f"{path} is not written{OF_EARLIER}")
+        raise
 
 
 def check_method(args: Namespace) -> None:

@@ -102,13 +102,14 @@ def run(args: Namespace) -> int:
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
     method = methods.make(args.method, config)
-    plan, hints = _plan(args), _hints(args, method)
-    target, source = _read(args)
-    if args.viewpoint == "none" or source.joined or source.faces is not None:
-        method = method.of_bone_alone() if isinstance(method, Registrar | Tracker) else method
-    checks.warn_of_start(args, hints.get("initial"), source.points, target.points)
-    hints |= _seen(args, method, source)
-    result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
+    with checks.naming_old_files(args.out, args.residuals, args.slicer, args.json, args.report, args.rerun):
+        plan, hints = _plan(args), _hints(args, method)
+        target, source = _read(args)
+        if args.viewpoint == "none" or source.joined or source.faces is not None:
+            method = method.of_bone_alone() if isinstance(method, Registrar | Tracker) else method
+        checks.warn_of_start(args, hints.get("initial"), source.points, target.points)
+        hints |= _seen(args, method, source)
+        result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
     spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
     code = _show(args, result, errors)
@@ -211,8 +212,7 @@ def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]
     say(str(result))
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
-            earlier = ", and what is there is of an earlier run" if path.exists() else ""
-            say(f"no pose: {path} is not written{earlier}")
+            say(f"no pose: {path} is not written{checks.OF_EARLIER if path.exists() else ''}")
         return REFUSED
     if result.inferred_viewpoint is not None:
         x, y, z = result.inferred_viewpoint

@@ -143,6 +143,16 @@ def test_another_file_than_an_accepted_answer_is_one_line(folder, capsys, conten
     assert said in error and error.count("\n") == 1
 
 
+def test_an_answer_that_bad_input_leaves_is_named(folder, capsys):
+    assert run("--json", "found.json") == 0
+    capsys.readouterr()
+    assert run("--json", "found.json", points="none.txt") == 1
+    said = "found.json is not written, and what is there is of an earlier run\n"
+    assert capsys.readouterr().out == said
+    (folder / "pose.json").write_text(json.dumps(as_json(RegistrationResult(RegistrationStatus.AMBIGUOUS))))
+    assert run("--json", "found.json") == 1 and capsys.readouterr().out == said
+
+
 def test_the_answer_does_not_go_over_what_it_was_made_of(folder, capsys):
     assert run("--json", "pose.json") == 1
     assert "which belongs to --pose" in capsys.readouterr().err

@@ -219,6 +219,18 @@ def test_planned_targets_far_from_the_bone_are_warned_of_with_the_likely_cause(f
     assert not said or "2 of 2 points of plan.mrk.json are far from t.npy" in caplog.text
 
 
+def test_what_bad_input_leaves_of_an_earlier_run_is_named(folder, capsys):
+    """A script that looks at no exit code took the pose of the run before."""
+    line = "--out p.tfm --residuals r.json --slicer scene"
+    assert register(line, source="none.npy") == 1 and not capsys.readouterr().out
+    assert register(line, "lps.ply", "lps.ply") == 0
+    capsys.readouterr()
+    assert register(line, source="none.npy") == 1
+    shown = capsys.readouterr()
+    old = [f"{name} is not written, and what is there is of an earlier run" for name in ("p.tfm", "r.json", "scene")]
+    assert shown.out.splitlines() == old and shown.err.count("\n") == 1
+
+
 @pytest.mark.parametrize("option", ["--residuals r.json", "--residuals r.ply", "--slicer scene", ""])
 def test_distances_of_fewer_points_than_the_source_has_are_said_to_be_so(folder, capsys, option):
     """Of a million points 5924 had one, and the page said that every point had."""

@@ -50,7 +50,7 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
     names = [name.strip().lower() for name in columns.words(header, columns.delimiter_of(header) or ",")]
     if tracker.is_recording(names) and options.tip_mm is not None:
         poses = tracker.read_poses(path, options.limits, options.tool, options.reference)
-        return Surface(tracker.tips(poses, options.tip_mm), joined=True)
+        return Surface(tracker.touched(poses, options.tip_mm), joined=True)
     if tracker.is_recording(names):
         raise tracker.needs_tip(path)
     if (options.tip_mm, options.tool, options.reference) != (None, None, None):

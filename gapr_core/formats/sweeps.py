@@ -40,7 +40,7 @@ def read_igs(path: Path, options: ReadOptions) -> Surface:
     if options.tip_mm is None:
         raise tracker.needs_tip(path)
     poses = pose_of(recorded, options.tool, path, options.reference)
-    return Surface(tracker.tips(poses, options.tip_mm), joined=True)
+    return Surface(tracker.touched(poses, options.tip_mm), joined=True)
 
 
 def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: int | None = None) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +20,12 @@ from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.text import check_end
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 QUATERNION, ANGLES, PLACE = ("q0", "qx", "qy", "qz"), ("rz", "ry", "rx"), ("tx", "ty", "tz")
 COLUMNS = "columns Q0 Qx Qy Qz or Rz Ry Rx, then Tx Ty Tz"
 SEEN = ("ok", "enabled", "valid")
+TIP_MM = (1.0, 1000.0)  # from the marker of a pointer, by far; one in m is nearer
 FARTHEST_MM = 1e6  # of a tool, by far; systems write numbers such as -3.7e28 where they have none
 FEWEST_POSES = 10
 SMALLEST_TURN_DEG = 20.0
@@ -202,6 +205,16 @@ def _matrices(rotations: Array) -> Array:
 def tips(poses: Array, tip_mm: ArrayLike) -> Array:
     """(N, 3) where the tip was, in the frame of the poses."""
     return poses[:, :3, :3] @ np.asarray(tip_mm, dtype=np.float64) + poses[:, :3, 3]
+
+
+def touched(poses: Array, tip_mm: ArrayLike) -> Array:
+    """The tips (N, 3) of a pointer, with a warning where its tip is not as far from its marker as any is."""
+    length = float(np.linalg.norm(tip_mm))
+    if length and not TIP_MM[0] <= length <= TIP_MM[1]:
+        log.warning(
+            "the tip is %.3g mm from its marker, as of no pointer: is it in mm? (0,0,0: the tip is the origin)", length
+        )
+    return tips(poses, tip_mm)
 
 
 def pivot(poses: Array) -> Tip:

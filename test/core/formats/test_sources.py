@@ -344,6 +344,19 @@ def igs(path, poses, statuses):
     return path
 
 
+@pytest.mark.parametrize(("tip", "said"), [
+    (TIP, ""), (np.zeros(3), ""), (TIP / 1000.0, "the tip is 0.15 mm from its marker"), (TIP * 1000.0, "1.5e+05 mm"),
+])  # fmt: skip
+def test_a_tip_that_seems_to_be_in_another_unit_is_warned_of(tmp_path, caplog, tip, said):
+    """In metres it lay on the marker: a pointer that was hardly turned gave the right shape, 150 mm off."""
+    rows = "".join(f"OK,1,0,0,0,{x},{y},{z}\n" for x, y, z in POINTS)
+    (tmp_path / "a.csv").write_text(f"State,Q0,Qx,Qy,Qz,Tx,Ty,Tz\n{rows}")
+    for path in (tmp_path / "a.csv", igs(tmp_path / "a.igs.mha", turned_poses(3), ["OK"] * 3)):
+        caplog.clear()
+        assert len(reading.read(path, ReadOptions(tip_mm=tuple(tip))).points) == 3
+        assert (said in caplog.text and "is it in mm?" in caplog.text) if said else not caplog.text
+
+
 def test_poses_of_a_plus_sequence_are_read_where_they_are_valid(tmp_path):
     path = igs(tmp_path / "a.igs.mha", turned_poses(4), ["OK", "INVALID", "OK", "OK"])
     surface = reading.read(path, ReadOptions(tip_mm=tuple(TIP)))

@@ -25,6 +25,7 @@ FRAME = re.compile(r"^Seq_Frame(\d+)_(\w+?)(Transform|TransformStatus)\s*=\s*(.+
 FROM_TRACKER = re.compile("TrackerTo[A-Z]")  # the inverse of a tool's pose
 POSES = "poses.csv"
 NEAR_POSES = re.compile(r"(?<![a-z])poses?(?![a-z])")
+SMALLEST_SLICE_MM = 1.0  # of the largest slice of a folder, and of the way between their poses
 SLICE_ENDINGS = (".csv", ".txt", ".xyz", ".npy")
 
 
@@ -121,7 +122,8 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
 
     Raises:
         InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid; a slice that says
-            that it is in RAS or in another unit; DICOM files and no slices.
+            that it is in RAS or in another unit, or slices with poses that all are too small; DICOM files and no
+            slices.
         ValueError: no slices, or another number of poses.
     """
     files = [f for f in path.iterdir() if f.name != POSES and not f.name.startswith(".")]
@@ -142,6 +144,7 @@ def read_folder(path: Path, options: ReadOptions) -> Surface:
                     len(files), path.name, files[0].name, files[-1].name)  # fmt: skip
     if (path / POSES).is_file():
         _say_order(files)
+        _check_unit(slices)
         slices = _placed(slices, path / POSES, options)
     return Surface(np.vstack(slices), joined=True)
 
@@ -156,6 +159,14 @@ def _check_said(slices: list[Path]) -> None:
             how = "turn it to the frame of the others or of its pose, and take out what says so"
             given = f"{path.name}, which says that it is in RAS"
             raise InvalidPointCloudError("slices in the frame of a tracker or a probe", given, how)
+
+
+def _check_unit(slices: list[Array]) -> None:
+    """Raise for slices that all are too small for a bone's: in m, each would be one point at its pose."""
+    sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in slices if len(points) > 1]
+    if sizes and max(sizes) < SMALLEST_SLICE_MM:
+        given = f"slices that are {max(sizes):.2g} mm across at most"
+        raise InvalidPointCloudError("slices in mm", given, f"convert them if they are in m, and {POSES} as well")
 
 
 def _by_numbers(path: Path) -> tuple[list[str | int], str]:
@@ -177,6 +188,8 @@ def _placed(slices: list[Array], path: Path, options: ReadOptions) -> list[Array
         raise ValueError(f"{len(poses)} poses of {len(slices)} slices")
     for number, T in enumerate(poses, start=1):
         _check_rigid(T, number)
+    if 0.0 < (spread := float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))) < SMALLEST_SLICE_MM:
+        log.warning("all places in %s are within %.2g mm: are they in m? They are read as mm", POSES, spread)
     return [se3.apply(se3.nearest_rigid(T), points) for points, T in zip(slices, poses, strict=True)]
 
 

@@ -109,6 +109,22 @@ def test_an_empty_sequence_is_called_empty_before_a_tip_is_asked_for(tmp_path):
         reading.read(tmp_path / "a.igs.mha")
 
 
+def test_slices_in_metres_are_refused_and_poses_in_metres_warned_of(tmp_path, caplog):
+    """Each slice was one point at its pose: a wrong pose of the bone was accepted at .53."""
+    poses = np.array(turned_poses(3))
+    poses[:, :3, 3] += np.arange(3)[:, None] * 20.0
+    folder = slices_with_poses(tmp_path / "a", poses)
+    assert len(reading.read(folder).points) == 9 and "are they in m?" not in caplog.text
+    in_m = poses.copy()
+    in_m[:, :3, 3] /= 1000.0
+    np.savetxt(folder / "poses.csv", in_m.reshape(3, 16), delimiter=",")
+    assert len(reading.read(folder).points) == 9 and "all places in poses.csv are within" in caplog.text
+    for path in folder.glob("slice*"):
+        np.savetxt(path, np.loadtxt(path) / 1000.0)
+    with pytest.raises(InvalidPointCloudError, match=r"slices in mm; got a: slices that are .* mm across at most"):
+        reading.read(folder)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_huge_pose_of_slices_is_refused_without_a_warning_of_numpy(tmp_path):
     folder = slices_with_poses(tmp_path / "a", [np.diag([1e200, 1e200, 1e200, 1.0])])

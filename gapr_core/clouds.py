@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
 PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
-CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header"
+CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header, or convert it to mm"
 OF_ARRAY = "pass units={unit!r}, or convert it to {read_as}"
 OPTIONS = "--units {unit}; --source-units {unit}, of the source alone; model_unit of the node"
 OF_FILE = f"pass units={{unit!r}} ({OPTIONS}), or convert it to {{read_as}}"

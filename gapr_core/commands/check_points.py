@@ -112,6 +112,9 @@ def _show(found: PointCheck, within_mm: float, labels: list[str]) -> None:
         where = "({:.0f}, {:.0f}, {:.0f})".format(*found.next_point)
         say(f"an error of {found.unseen_mm:.1f} mm over the bone might not show, {within_mm:g} mm matters: "
             f"touch more points, the next one at {where} mm on the target")  # fmt: skip
+    elif (farthest := float(np.abs(found.distance_mm).max())) > within_mm:
+        say(f"a point is {farthest:.1f} mm off, and {within_mm:g} mm matters: the pose claims no better there; "
+            "register again with more of the bone")  # fmt: skip
 
 
 def _say_elsewhere(points: Array, bone: Array, result: RegistrationResult) -> None:

@@ -1,6 +1,7 @@
 """`gapr check-points`: from the answer of `gapr register --json` and touched points to a verdict."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,6 +46,17 @@ def test_a_right_pose_holds_with_exit_code_0(folder, capsys):
     assert shown.startswith("HOLDS  30 points") and "30. " in shown
     assert found["verdict"] == "HOLDS" and len(found["distance_mm"]) == len(found["expected_mm"]) == 30
     assert found["unseen_mm"] < 4.0 and found["tre95_mm"] < found["unseen_mm"]
+
+
+def test_a_vague_pose_that_holds_though_a_point_is_far_off_is_no_reason_to_go_on(folder, capsys):
+    """Of eight points with a bound of 7.9 mm one pose was 4.7 mm off over the bone: `HOLDS`, and not a word of it."""
+    vague = replace(OK, covariance=np.diag([25.0] * 3 + [1e-3] * 3))
+    (folder / "vague.json").write_text(json.dumps(as_json(vague)))
+    np.savetxt("moved.txt", np.loadtxt("touched.txt") + T[:3, :3].T @ [6.0, 0.0, 0.0])
+    run("--within", "2", points="moved.txt", pose="vague.json")
+    shown = capsys.readouterr().out
+    assert shown.startswith("HOLDS") and "and 2 mm matters: the pose claims no better there" in shown
+    assert run(pose="vague.json") == 0 and "claims no better" not in capsys.readouterr().out
 
 
 def test_points_that_say_little_name_the_next_place_and_exit_with_2(folder, capsys):

@@ -48,6 +48,8 @@ def read_json(path: Path) -> RegistrationResult:
         status = RegistrationStatus(found["status"])
         transform, covariance, centre = (found[key] for key in ("transform", "covariance", "centre_mm"))
         factor95, confidence = float(found["factor95"]), float(found.get("confidence", 0.0))
+        if not (0.0 < factor95 < np.inf and 0.0 <= confidence <= 1.0):
+            raise ValueError(f"factor95 {factor95:g} and confidence {confidence:g}")
     except (ValueError, KeyError, TypeError) as error:
         given = f"no {error} in it" if isinstance(error, KeyError) else str(error)
         raise ConfigError(f"the answer of a registration in {path}", given, how) from error

@@ -146,6 +146,9 @@ def test_most_points_far_from_the_bone_are_asked_for_their_frame_and_not_for_ano
         (json.dumps(as_json(OK) | {"centre_mm": ["a", 0, 0]}), "numbers (3,) in pose.json"),
         (json.dumps(as_json(OK) | {"confidence": None}), "the answer of a registration in pose.json"),
         (json.dumps(as_json(OK) | {"confidence": [0.9]}), "the answer of a registration in pose.json"),
+        (json.dumps(as_json(OK) | {"confidence": np.nan}), "got factor95 1.3 and confidence nan"),
+        (json.dumps(as_json(OK) | {"factor95": np.nan}), "got factor95 nan and confidence 0.93"),  # any point held
+        (json.dumps(as_json(OK) | {"factor95": 0.0}), "got factor95 0 and confidence 0.93"),
     ],
 )
 def test_another_file_than_an_accepted_answer_is_one_line(folder, capsys, content, said):

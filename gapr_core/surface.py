@@ -12,6 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.errors import InvalidPointCloudError
 
 Array = NDArray[np.float64]
+OF_OBJECTS = {  # an attribute of meshes and clouds of other libraries -> what to pass of them
+    "triangles": "of a mesh for `prepare`: Surface.from_open3d(mesh); of a cloud its points as an array",
+    "faces": "of a mesh for `prepare`: Surface(mesh.vertices, mesh.faces); of a cloud its points as an array",
+    "points": "pass its points: np.asarray(cloud.points)",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +121,9 @@ def as_points(array: ArrayLike) -> Array:
         how = "load it first: gapr_core.load(path).points"
         raise InvalidPointCloudError("an array of shape (N, 3)", f"the path {str(array)!r}", how)
     points = as_array(array, "an array of shape (N, 3)", "pass x y z in every row")
+    if points.ndim == 0 and points.dtype.kind == "O":
+        how = next((how for name, how in OF_OBJECTS.items() if hasattr(array, name)), "pass x y z in columns")
+        raise InvalidPointCloudError("an array of shape (N, 3)", f"a {type(array).__name__}", how)
     if points.dtype.kind not in "fiu":
         raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")
     if points.ndim != 2 or points.shape[1] != 3:

@@ -1,6 +1,7 @@
 import struct
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -147,6 +148,19 @@ def test_points_that_no_unit_helps_are_not_blamed_on_the_unit(tmp_path, monkeypa
     np.savetxt("a.xyz", np.array(points) / clouds.MM_PER_UNIT[unit])
     with pytest.raises(InvalidPointCloudError, match=said):
         clouds.load("a.xyz", units=unit)
+
+
+@pytest.mark.parametrize(("made", "said"), [
+    (lambda o3d: o3d.geometry.PointCloud(), "got a PointCloud; pass its points: np.asarray"),
+    (lambda o3d: o3d.geometry.TriangleMesh(), r"a TriangleMesh; of a mesh for `prepare`: Surface.from_open3d\("),
+    (lambda o3d: SimpleNamespace(vertices=VERTICES, faces=FACES), r"Surface\(mesh.vertices, mesh.faces\)"),
+    (lambda o3d: {"a": 1}, "shape .N, 3.; got a dict; pass x y z in columns"), (lambda o3d: None, "NoneType"),
+])  # fmt: skip
+def test_objects_of_other_libraries_are_named_with_what_to_pass_of_them(made, said):
+    """They were objects to be converted to float."""
+    o3d = pytest.importorskip("open3d", reason="open3d is optional: pip install '.[data]'")
+    with pytest.raises(InvalidPointCloudError, match=said):
+        clouds.load(made(o3d))
 
 
 def test_a_vertex_of_no_face_that_is_metres_away_is_named_and_not_the_unit():

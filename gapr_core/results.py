@@ -278,9 +278,9 @@ class RegistrationResult:
 class Verdict(str, Enum):
     """What the check points say of a pose."""
 
-    HOLDS = "HOLDS"  # they lie where they should, and an error that matters would have shown
+    HOLDS = "HOLDS"  # they lie where they should, and an error that matters would have shown, and did not
     SAYS_LITTLE = "SAYS_LITTLE"  # they lie where they should, but such an error might not show in them
-    CONTRADICTED = "CONTRADICTED"  # they lie farther off the bone than the pose's covariance allows
+    CONTRADICTED = "CONTRADICTED"  # they lie farther off than the pose's covariance allows, or show such an error
 
     def __str__(self) -> str:
         return self.value
@@ -298,8 +298,9 @@ class PointCheck:
             no surface is near.
         expected_mm: (N,) its standard deviation under a right pose; NaN with it.
         unseen_mm: 95 % bound of the error over the bone that these points alone leave open.
-        tre95_mm: 95 % bound of the error over the bone by registration and check points together, if the pose is right.
+        tre95_mm: 95 % bound of the pose's error over the bone by registration and check points together.
         next_point, next_normal: (3,) mm and unit, target frame: where another point lowers `unseen_mm` most.
+        shown_mm: error of the pose over the bone at which registration and check points together put it; in `tre95_mm`.
     """
 
     verdict: Verdict
@@ -311,6 +312,7 @@ class PointCheck:
     tre95_mm: float
     next_point: Array
     next_normal: Array
+    shown_mm: float = 0.0
 
     def __str__(self) -> str:
         return self.text()
@@ -324,5 +326,5 @@ class PointCheck:
             largest = none_near
         return (
             f"{self.verdict}  {count}, {largest}  probability {self.probability:.3f}  "
-            f"unseen {self.unseen_mm:.1f} mm  TRE 95 %: {self.tre95_mm:.1f} mm"
+            f"shown {self.shown_mm:.1f} mm  unseen {self.unseen_mm:.1f} mm  TRE 95 %: {self.tre95_mm:.1f} mm"
         )

@@ -107,14 +107,13 @@ def _show(found: PointCheck, within_mm: float, labels: list[str]) -> None:
     if np.isnan(found.distance_mm).mean() > ELSEWHERE:
         return
     if found.verdict is Verdict.CONTRADICTED:
-        say("the pose does not hold there: touch the farthest point again; if it stays, register again")
+        off = f", and is {found.shown_mm:.1f} mm off over the bone" if found.shown_mm > within_mm else ""
+        say(f"the pose does not hold there{off}: touch the farthest point again; if it stays, register again")
     elif found.verdict is Verdict.SAYS_LITTLE:
         where = "({:.0f}, {:.0f}, {:.0f})".format(*found.next_point)
-        say(f"an error of {found.unseen_mm:.1f} mm over the bone might not show, {within_mm:g} mm matters: "
+        open_mm = max(found.unseen_mm, found.tre95_mm)
+        say(f"an error of {open_mm:.1f} mm over the bone might not show, {within_mm:g} mm matters: "
             f"touch more points, the next one at {where} mm on the target")  # fmt: skip
-    elif (farthest := float(np.abs(found.distance_mm).max())) > within_mm:
-        say(f"a point is {farthest:.1f} mm off, and {within_mm:g} mm matters: the pose claims no better there; "
-            "register again with more of the bone")  # fmt: skip
 
 
 def _say_elsewhere(points: Array, bone: Array, result: RegistrationResult) -> None:
@@ -140,6 +139,7 @@ def _as_json(found: PointCheck) -> dict[str, Any]:
         "points": found.points.tolist(),
         "distance_mm": _numbers(found.distance_mm),
         "expected_mm": _numbers(found.expected_mm),
+        "shown_mm": found.shown_mm,
         "unseen_mm": found.unseen_mm,
         "tre95_mm": found.tre95_mm,
         "next_point_mm": found.next_point.tolist(),

@@ -6,22 +6,26 @@ Then d^T S^-1 d is chi-square with n degrees of freedom. That they are as small 
 of the pose would have shown: points on one side of a shaft never notice a slide along it. So the answer has the error
 over the bone that the points alone leave open, by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P, too, and where
 another point would lower it most (`precision` for errors over the bone).
+
+A pose with a wide covariance allows large distances, and yet they show that it is off: registration and points together
+put its error at C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. What that error is over the bone counts.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 from scipy.special import chdtrc, ndtr
 
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import distance_jacobian, mean_square
 from gapr_core.registration import kernels, precision, sensor
 from gapr_core.registration.bias_field import smooth_correlation
-from gapr_core.registration.registrar import check_call
+from gapr_core.registration.registrar import as_config, check_call
 from gapr_core.registration.sensor import Errors, offset_surface
 from gapr_core.registration.target import PreparedTarget
 from gapr_core.results import PointCheck, RegistrationResult, Verdict
@@ -32,6 +36,7 @@ SURPRISING = 0.01  # a right pose is contradicted so often
 LOOSE_MM, LOOSE_DEG = 20.0, 20.0  # standard deviations of a pose of which only the check points are known
 MOST_POINTS = 1000  # all pairs of them are looked at
 CANDIDATES = 500  # places of the bone that are compared for the next point
+SAME_MM = 1e-3  # from a point of the source: it is that point, and not another contact
 
 
 def check_points(
@@ -50,14 +55,18 @@ def check_points(
         result: the answer, `OK` and with a covariance.
         config: the sensor that measured the points (`sensor`), and how far the bone's model may be off
             (`covariance.model_mm`); the defaults when not given.
-        within_mm: an error over the bone that matters: a pose holds where the points alone would have shown it.
+        within_mm: an error over the bone that matters: a pose holds where the points alone would have shown it, and
+            with the registration bound it to less.
 
     Raises:
-        InvalidPointCloudError: no points, too many, a wrong shape or type, a target that is not prepared, or a result
-            without a pose or its covariance.
+        InvalidPointCloudError: no points, too many, a wrong shape or type, most of them points of the source; a target
+            that is not prepared, or a result without a pose or its covariance.
+        ConfigError: `within_mm` is not above 0, or something else than a `RegistrarConfig`.
     """
     check_call(target, None)
-    config = config or RegistrarConfig()
+    if not 0.0 < within_mm < np.inf:
+        raise ConfigError("an error that matters, mm, above 0", repr(within_mm), "pass within_mm=4.0")
+    config = RegistrarConfig() if config is None else as_config(config)
     points = finite_points(points)
     if not len(points):
         raise InvalidPointCloudError("check points", "none that is finite", "touch the bone and pass (N, 3), mm")
@@ -65,6 +74,7 @@ def check_points(
         how = "register a cloud of these; check with points that were touched"
         raise InvalidPointCloudError(f"at most {MOST_POINTS} check points", str(len(points)), how)
     T, covariance, centre = _accepted(result)
+    _check_new(points, result)
     surface = offset_surface(target, config.sensor)
     distance_mm, normals = _distances(T, points, surface)
     moved, near = se3.apply(T, points), ~np.isnan(distance_mm)
@@ -74,14 +84,18 @@ def check_points(
     expected_mm = np.full(len(points), np.nan)
     expected_mm[near] = np.sqrt(np.diag(S))
     probability = _probability(distance_mm[near], S) if near.all() else 0.0
-    information = J.T @ np.linalg.solve(R, J)
+    weighted = np.linalg.solve(R, J)
+    information = J.T @ weighted
     alone = np.linalg.inv(np.linalg.inv(_loose()) + information)
     unseen_mm = precision.bound_mm(alone, target.points, centre)
     together = np.linalg.inv(np.linalg.inv(covariance) + information)
+    error = together @ weighted.T @ distance_mm[near]
+    shown_mm = float(np.sqrt(error @ mean_square(target.points, centre) @ error))
+    tre95_mm = shown_mm + precision.bound_mm(together, target.points, centre)  # a mean square root is no larger
     best = _next(alone, target, centre, float(np.diag(R).mean()) if near.any() else 1.0)
     return PointCheck(
-        _verdict(probability, unseen_mm, within_mm), probability, points, distance_mm, expected_mm, unseen_mm,
-        precision.bound_mm(together, target.points, centre), target.points[best].copy(), target.normals[best].copy(),
+        _verdict(probability, shown_mm, max(unseen_mm, tre95_mm), within_mm), probability, points, distance_mm,
+        expected_mm, unseen_mm, tre95_mm, target.points[best].copy(), target.normals[best].copy(), shown_mm,
     )  # fmt: skip
 
 
@@ -100,7 +114,19 @@ def _accepted(result: RegistrationResult) -> tuple[Array, Array, Array]:
         )
     if not np.linalg.eigvalsh(covariance).min() > 0.0:
         raise InvalidPointCloudError("a positive definite covariance", "one that is not", "pass it as it was answered")
+    if not 0.0 < result.factor95 < np.inf:
+        raise InvalidPointCloudError("a factor95 above 0", f"{result.factor95}", "pass the result as it was answered")
     return T, result.factor95**2 * covariance, centre
+
+
+def _check_new(points: Array, result: RegistrationResult) -> None:
+    """Raise for points (N, 3) most of which the registration used: it laid them on the bone itself."""
+    if result.residuals is None:
+        return
+    known = cKDTree(result.residuals.points).query(points)[0] < SAME_MM
+    if 2 * known.sum() > len(points):
+        how = "touch places of the bone that the source did not show"
+        raise InvalidPointCloudError("points that took no part in the registration", f"{known.sum()} that did", how)
 
 
 def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
@@ -140,10 +166,11 @@ def _probability(distance_mm: Array, S: Array) -> float:
     return float(min(2.0 * min(together, farthest), 1.0))
 
 
-def _verdict(probability: float, unseen_mm: float, within_mm: float) -> Verdict:
-    if probability < SURPRISING:
+def _verdict(probability: float, shown_mm: float, open_mm: float, within_mm: float) -> Verdict:
+    """What points say that show one error over the bone, mm, and leave another one open, where one matters."""
+    if probability < SURPRISING or shown_mm > within_mm:
         return Verdict.CONTRADICTED
-    return Verdict.HOLDS if unseen_mm <= within_mm else Verdict.SAYS_LITTLE
+    return Verdict.HOLDS if open_mm <= within_mm else Verdict.SAYS_LITTLE
 
 
 def _loose() -> Array:

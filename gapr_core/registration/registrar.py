@@ -115,7 +115,7 @@ class Registrar:
         scene_calibration: Calibration | None = None,
         precision: Precision | None = None,
     ) -> None:
-        self.config = RegistrarConfig() if config is None else _as_config(config)
+        self.config = RegistrarConfig() if config is None else as_config(config)
         self.proposers: tuple[Proposer, ...] = (_search(self.config),) if proposers is None else tuple(proposers)
         if not self.proposers:
             raise ConfigError("at least one proposer", "an empty list", "leave `proposers` out for the search")
@@ -144,7 +144,7 @@ class Registrar:
             MethodUnavailableError: torch is not installed; `Registrar()` works without.
             ConfigError: no such device, or something else than a `RegistrarConfig`.
         """
-        config = RegistrarConfig() if config is None else _as_config(config)
+        config = RegistrarConfig() if config is None else as_config(config)
         return cls(config, (shipped_network(device), _search(config)))
 
     @cached_property
@@ -424,7 +424,7 @@ class Registrar:
         return assessment.reaches(config.sure_from) or (is_good and assessment.probability <= config.limits.most)
 
 
-def _as_config(config: object) -> RegistrarConfig:
+def as_config(config: object) -> RegistrarConfig:
     """The settings, if they are some."""
     if not isinstance(config, RegistrarConfig):
         how = "pass RegistrarConfig(...); weights of your own go into NetworkProposer.from_weights"

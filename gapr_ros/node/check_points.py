@@ -86,6 +86,7 @@ def status(
     values |= {
         "probability": found.probability,
         "largest_distance": units.to_metres(largest_mm),
+        "shown": units.to_metres(found.shown_mm),
         "unseen": units.to_metres(found.unseen_mm),
         "tre95": units.to_metres(found.tre95_mm),
         "next_point": " ".join(f"{value:.4f}" for value in units.to_metres(found.next_point)),

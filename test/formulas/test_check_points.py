@@ -10,13 +10,13 @@ from scipy.stats import chi2, norm
 from tiny import ellipsoid, on_ellipsoid, plane
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, SensorConfig
-from gapr_core.errors import InvalidPointCloudError
+from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration import check_points as module
 from gapr_core.registration import precision
 from gapr_core.registration.check_points import check_points as check
-from gapr_core.results import RegistrationResult, RegistrationStatus, Verdict
+from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals, Verdict
 
 EXACT = RegistrarConfig(
     sensor=SensorConfig(noise_mm=0.3, bias_mm=1e-3, scale=0.0, standoff_mm=0.0, known_standoff_mm=1e-3),
@@ -118,7 +118,8 @@ def test_information_adds_up():
     information = J.T @ J / 0.3**2
     loose = np.diag([1.0 / 400.0] * 3 + [1.0 / np.radians(20.0) ** 2] * 3)
     found = check(points, target, result, EXACT)
-    for bound, prior in ((found.unseen_mm, loose), (found.tre95_mm, np.linalg.inv(SMALL))):
+    together_mm = found.tre95_mm - found.shown_mm
+    for bound, prior in ((found.unseen_mm, loose), (together_mm, np.linalg.inv(SMALL))):
         wanted = precision.bound_mm(np.linalg.inv(prior + information), target.points, result.centre_mm)
         assert bound == pytest.approx(wanted, rel=1e-4)
 
@@ -147,6 +148,75 @@ def test_a_pose_that_is_off_by_more_than_it_says_is_contradicted_and_only_then()
     assert check(points, target, answer(shifted), EXACT).verdict is Verdict.CONTRADICTED
     assert check(points, target, answer(shifted, 400.0 * SMALL), EXACT).verdict is not Verdict.CONTRADICTED
     assert check(points, target, answer(), EXACT).verdict is not Verdict.CONTRADICTED
+
+
+def test_the_error_that_is_shown_is_the_likeliest_one():
+    """That e which makes e^T C^-1 e + (d - J e)^T R^-1 (d - J e) least, as a root mean square over the bone."""
+    target, points = ellipsoid(count=4000), on_ellipsoid(7, 4)
+    covariance = np.diag([3.0**2, 2.0**2, 1.0, 0.02**2, 0.03**2, 0.04**2])
+    result = answer(se3.exp(np.array([2.5, -1.0, 0.5, 0.01, 0.03, -0.02]), np.zeros(3)), covariance, factor95=1.2)
+    found = check(points, target, result, EXACT, within_mm=9.0)
+    moved = result.apply(points)
+    d, normals = module._distances(result.T_target_source, points, target)
+    J = np.hstack([normals, np.cross(moved - result.centre_mm, normals)])
+    rows = np.vstack([np.diag(1.0 / (1.2 * np.sqrt(np.diag(covariance)))), J / 0.3])
+    likeliest = np.linalg.lstsq(rows, np.concatenate([np.zeros(6), d / 0.3]), rcond=None)[0]
+    moves = likeliest[:3] + np.cross(likeliest[3:], target.points - result.centre_mm)
+    assert found.shown_mm == pytest.approx(np.sqrt((moves**2).sum(axis=1).mean()), rel=1e-3)
+    left = np.linalg.inv(rows.T @ rows)
+    assert found.tre95_mm == pytest.approx(
+        found.shown_mm + precision.bound_mm(left, target.points, result.centre_mm), rel=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("shown_mm", "open_mm", "verdict"),
+    [(3.9, 4.0, "HOLDS"), (3.9, 4.1, "SAYS_LITTLE"), (4.1, 4.2, "CONTRADICTED"), (0.0, 9.0, "SAYS_LITTLE")],
+)
+def test_a_pose_that_is_shown_to_be_off_does_not_hold_however_vague_it_is(shown_mm, open_mm, verdict):
+    assert module._verdict(1.0, shown_mm, open_mm, 4.0) is Verdict(verdict)
+    assert module._verdict(0.009, shown_mm, open_mm, 4.0) is Verdict.CONTRADICTED
+
+
+def test_a_vague_pose_is_contradicted_by_an_error_that_matters_alone():
+    """Of eight points with a bound of 7.9 mm one pose was 4.7 mm off over the bone: it held."""
+    target, points = ellipsoid(count=4000), on_ellipsoid(40, 5)
+    shifted = answer(se3.exp(np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.zeros(3)), 400.0 * SMALL)
+    found, right = (check(points, target, each, EXACT, 2.5) for each in (shifted, answer(covariance=400.0 * SMALL)))
+    assert found.shown_mm == pytest.approx(3.0, abs=0.2) and found.probability > 0.01
+    assert found.verdict is Verdict.CONTRADICTED and right.verdict is Verdict.HOLDS
+    assert check(points, target, shifted, EXACT, 4.0).verdict is Verdict.HOLDS
+
+
+@pytest.mark.parametrize(("known", "is_refused"), [(3, True), (2, False)])
+def test_points_of_the_source_check_nothing(known, is_refused):
+    """Of four points more than half are those that the pose was found with."""
+    source, touched = on_ellipsoid(20, 1), on_ellipsoid(4, 9)
+    touched[:known] = source[3 : 3 + known]
+    used = Residuals(source, np.zeros(20), np.ones(20, dtype=bool))
+    result = answer(residuals=used)
+    if is_refused:
+        with pytest.raises(InvalidPointCloudError, match="took no part in the registration; got 3 that did"):
+            check(touched, ellipsoid(count=4000), result, EXACT)
+    else:
+        assert check(touched, ellipsoid(count=4000), result, EXACT).verdict is not Verdict.CONTRADICTED
+
+
+@pytest.mark.parametrize("within_mm", [0.0, -1.0, np.nan, np.inf])
+def test_an_error_that_matters_is_a_length(within_mm):
+    with pytest.raises(ConfigError, match="an error that matters, mm, above 0"):
+        check(on_ellipsoid(4, 1), plane(), answer(), EXACT, within_mm)
+
+
+@pytest.mark.parametrize("factor95", [0.0, -1.0, np.nan, np.inf])
+def test_a_bound_s_factor_that_is_none_is_an_error(factor95):
+    with pytest.raises(InvalidPointCloudError, match="a factor95 above 0"):
+        check(on_ellipsoid(4, 1), plane(), answer(factor95=factor95), EXACT)
+
+
+def test_the_settings_are_those_of_a_registrar():
+    with pytest.raises(ConfigError, match="a RegistrarConfig"):
+        check(on_ellipsoid(4, 1), plane(), answer(), SensorConfig())
 
 
 def test_points_are_taken_from_the_frame_of_the_source():

@@ -19,6 +19,7 @@ THROTTLE_S = 5.0
 LATE_NS = 50_000_000  # a cloud that is so much older than a transform came late, or the clock was set back before it
 OUT_OF_ORDER_NS = 10_000_000  # a transform may be so much older than the newest of its frame, as where threads race
 
+UNIT = 0.01  # the squared length of a quaternion is within this of 1
 AFTER_A_STEP_S = 1.0  # of the clock: what comes may be of before it
 
 
@@ -29,8 +30,9 @@ class Heard:
     go forward among themselves are another round, and what was heard before is forgotten. So are two that go back and a
     third that is the newest of all: the step may have been a short one, and to forget is the safe side. Until it is
     clear which, nothing is looked up; nor is it where a frame was not heard for a while, as of a marker that was
-    hidden, jumps, or goes to and fro, as one that two nodes send. Frames through which nothing was looked up yet may be
-    out of order by a second; while there are others, theirs are left out then: they are no reason to forget the others.
+    hidden, jumps, is at the very origin where it jumped to, or goes to and fro, as one that two nodes send. Frames
+    through which nothing was looked up yet may be out of order by a second; while there are others, theirs are left out
+    then: they are no reason to forget the others.
 
     Args:
         buffer: of tf2.
@@ -59,6 +61,9 @@ class Heard:
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf."""
         child, stamp = plain_frame(transform.child_frame_id), stamp_ns(transform.header)
+        if why := _why_none(transform):
+            self._warn(f"a transform of '{child}' is left out: {why}")
+            return
         self._came_s[child] = time.monotonic()
         if self._is_future(stamp):
             if time.monotonic() - self._began_s < AFTER_A_STEP_S:
@@ -70,6 +75,9 @@ class Heard:
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
         """One that was heard on /tf_static: it holds at all times."""
+        if why := _why_none(transform):
+            self._warn(f"a transform of '{plain_frame(transform.child_frame_id)}' on /tf_static is left out: {why}")
+            return
         if changed := self._links.note_static(transform):
             frame = plain_frame(transform.child_frame_id)
             what = f"'{frame}' came on /tf_static once more, and {changed}: this holds now"
@@ -90,6 +98,8 @@ class Heard:
         for each in sorted(frames):
             if how := self._links.to_and_fro(each, stamp):
                 return f"'{each}' is not to be believed, {how}: do two nodes send it on /tf?"
+            if self._links.is_lost(each, stamp):
+                return f"'{each}' jumped to the very origin of its parent: does the tracker see its marker?"
             if jump := self._links.jump(each, stamp):
                 way = f"{1e3 * jump.metres:.1f} mm and {np.degrees(jump.radians):.1f} deg"
                 return f"'{each}' jumped by {way} around this stamp: tf2 would say a place at which it never was"
@@ -141,3 +151,20 @@ class Heard:
 
     def _warn(self, text: str) -> None:
         self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
+
+
+def _why_none(transform: TransformStamped) -> str:
+    """Why a transform is none, as tf2 judges, which would drop it and draw a line over the gap; empty where it is one.
+
+    Some trackers send such ones for as long as they do not see a marker.
+    """
+    p, q = transform.transform.translation, transform.transform.rotation
+    child, parent = plain_frame(transform.child_frame_id), plain_frame(transform.header.frame_id)
+    if not child or not parent or child == parent:
+        return f"its frames are '{parent}' and '{child}'"
+    norm_sq = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
+    if not np.isfinite([p.x, p.y, p.z, norm_sq]).all():
+        return "it is not finite; does the tracker see its marker?"
+    if abs(norm_sq - 1.0) >= UNIT:
+        return f"its quaternion has a length of {np.sqrt(norm_sq):.3g} and not of 1; does the tracker see its marker?"
+    return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
@@ -28,6 +29,7 @@ LEAST_PER_S = 0.15, np.radians(50.0)  # slowest, m/s and rad/s
 BACK = 0.25  # share of a way that may be left after it
 CALM = 0.25  # share of a jump that a frame moves by before and after it where it rests there
 REST_NS = 50_000_000  # looked at before and after, at least: over less the noise of a tracker looks like a motion
+ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # what some trackers send of a marker that they do not see
 
 
 class Jump(NamedTuple):
@@ -50,6 +52,7 @@ class Track:
     stamps: list[int] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
     parents: list[str] = field(default_factory=list)
+    lost: list[bool] = field(default_factory=list)  # at the very origin of its parent, where it jumped to and stays
 
     def insert(self, stamp: int, place: Place, parent: str) -> None:
         """One more; what is far behind the newest is forgotten."""
@@ -57,9 +60,11 @@ class Track:
         self.stamps.insert(at, stamp)
         self.places.insert(at, place)
         self.parents.insert(at, parent)
+        self.lost.insert(at, False)
+        self._note_lost(at)
         if self.stamps[0] < self.stamps[-1] - 2 * KEPT_NS:
             old = bisect_left(self.stamps, self.stamps[-1] - KEPT_NS)
-            del self.stamps[:old], self.places[:old], self.parents[:old]
+            del self.stamps[:old], self.places[:old], self.parents[:old], self.lost[:old]
 
     def near(self, stamp: int) -> tuple[Array, Array, list[str]]:
         """Seconds (N,), places (N, 7) and parents of those within a second of a stamp, ns; of 0 of the newest one."""
@@ -92,6 +97,26 @@ class Track:
             for kind in range(2)
         ]
         return Jump(*way, is_open) if any(is_jump) else None
+
+    def is_lost(self, stamp: int) -> bool:
+        """Whether a transform around a stamp, ns, of 0 the newest one, is what a tracker sends without its marker."""
+        stamp = stamp or self.stamps[-1]
+        after = bisect_left(self.stamps, stamp)
+        is_between = after < len(self.stamps) and self.stamps[after] != stamp
+        return any(self.lost[max(after - is_between, 0) : after + 1])
+
+    def _note_lost(self, last: int) -> None:
+        """Mark two in a row at the very origin, where the frame jumped to, or was lost before: it stays there."""
+        two = slice(max(last - 1, 0), last + 1)
+        if last < 1 or not all(tuple(map(abs, place)) == ORIGIN for place in self.places[two]):
+            return
+        if self.lost[last - 1] or (last > 1 and self._leaps(last - 2)):
+            self.lost[two] = [True, True]
+
+    def _leaps(self, before: int) -> bool:
+        """Whether the frame moves on farther and faster than what counts, from one transform to the next."""
+        way, took_s = self._largest_way(before, [before + 1]), 1e-9 * (self.stamps[before + 1] - self.stamps[before])
+        return any(way[kind] >= max(LEAST[kind], LEAST_PER_S[kind] * took_s) for kind in range(2))
 
     def _largest_way(self, start: int, to: Iterable[int]) -> tuple[float, float]:
         """From one place to the farthest of some others, metres and radians; those not heard yet are left out."""
@@ -167,6 +192,11 @@ class Links:
         with self._lock:
             return self._tracks[child].jump(stamp) if child in self._tracks else None
 
+    def is_lost(self, child: str, stamp: int) -> bool:
+        """Whether a frame is at the origin of its parent around a stamp, ns, since it jumped there."""
+        with self._lock:
+            return child in self._tracks and self._tracks[child].is_lost(stamp)
+
     def to_and_fro(self, child: str, stamp: int) -> str:
         """How a frame goes to and fro around a stamp, ns, as where two nodes send it; empty where it does not.
 
@@ -193,7 +223,8 @@ class Links:
 
 def _place(transform: TransformStamped) -> Place:
     p, q = transform.transform.translation, transform.transform.rotation
-    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)  # a little off 1 would pass for a turn
+    return p.x, p.y, p.z, q.x / norm, q.y / norm, q.z / norm, q.w / norm
 
 
 def _spikes(seconds: Array, places: Array) -> tuple[int, float]:

@@ -244,6 +244,64 @@ def test_nothing_is_interpolated_over_a_time_in_which_a_frame_was_not_heard(buff
     assert why_not(heard, 0.0) == "", "the newest transform there is"
 
 
+def broken(transform, how):
+    """What trackers send of a marker that they do not see, and other things that tf2 drops."""
+    moved = transform.transform
+    if how == "NaN":
+        moved.translation.y = np.nan
+    elif how == "infinite":
+        moved.translation.z = np.inf
+    elif how == "no rotation":
+        moved.rotation.w = 0.0
+    elif how == "half a rotation":
+        moved.rotation.z, moved.rotation.w = 0.5, 0.5
+    else:
+        transform.header.frame_id = {"itself": "/camera", "no parent": ""}[how]
+    return transform
+
+
+@pytest.mark.parametrize("how", ["NaN", "infinite", "no rotation", "half a rotation", "itself", "no parent"])
+def test_a_transform_that_tf2_drops_was_not_heard(buffer, how):
+    """A marker that is hidden while the camera is moved: over what is dropped tf2 draws a straight line."""
+    heard, hear, said = hears(buffer)
+    for i in range(60):
+        stamp_s, x = 999.9 + 0.02 * i, 0.02 * i
+        if 1000.0 < stamp_s < 1001.0:
+            heard.set_transform(broken(_transform(x, stamp_s), how), "the tracker")
+        else:
+            hear(stamp_s, x)
+    assert why_not(heard, 1000.5).startswith("'camera' was not heard for 1 s")
+    assert why_not(heard, 999.95) == why_not(heard, 1001.05) == ""
+    assert len(set(said)) == 1 and "is left out: it" in said[0]
+    heard.set_transform_static(broken(_transform(0.0), how), "the mount")
+    assert "on /tf_static is left out: it" in said[-1] and seen_at(buffer, 1001.06) is not None
+
+
+@pytest.mark.parametrize("seconds", [0.1, 3.0, 40.0])
+def test_a_frame_that_jumped_to_the_very_origin_is_not_believed_until_it_leaves_it(buffer, seconds):
+    """So do some trackers say that they do not see a marker."""
+    heard, hear, _ = hears(buffer)
+    back_s = 1000.0 + seconds
+    for i in range(round((seconds + 2.0) * 50.0)):
+        stamp_s = 999.0 + 0.02 * i
+        hear(stamp_s, 0.0 if 1000.0 < stamp_s < back_s else 0.5 + 0.1 * np.sin(stamp_s))
+        if 1000.03 < stamp_s < back_s:
+            assert "jumped to the very origin" in why_not(heard, stamp_s) == why_not(heard, stamp_s - 0.03), stamp_s
+            assert "jumped to the very origin" in why_not(heard, 0.0)
+    assert "jumped to the very origin" in why_not(heard, back_s - 0.01)
+    assert why_not(heard, back_s + 0.5) == why_not(heard, 0.0) == ""
+
+
+def test_a_frame_that_is_at_the_origin_from_the_start_or_comes_there_slowly_is_believed(buffer):
+    heard, hear, _ = hears(buffer)
+    for i in range(200):
+        hear(1000.0 + 0.02 * i, max(0.0, 0.1 - 0.002 * abs(i - 100)))
+        assert why_not(heard, 999.99 + 0.02 * i) == ""
+    for i in range(40):
+        hear(1004.0 + 0.02 * i, 0.05 * (10 - abs(i - 10)))
+        assert why_not(heard, 1003.95 + 0.02 * i) == "", "one that moves through it"
+
+
 def test_every_moving_frame_between_two_is_asked_and_no_other(buffer):
     heard, hear, _ = hears(buffer)
     for child, parent in (("lens", "camera"), ("/bed", "world")):

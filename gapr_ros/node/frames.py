@@ -38,6 +38,7 @@ class Frames:
         listen: look up from the start; else from the first `listen()`.
         note_sent: is given every transform that goes to /tf.
         is_future: whether the stamp, ns, of a transform that was heard is too far ahead of the clock.
+        moved: is called where a frame that was looked up through has another place on /tf_static now.
 
     Attributes:
         behind: the last transform was not sent, because buffers still hold those of another round.
@@ -50,8 +51,9 @@ class Frames:
         listen: bool,
         note_sent: Callable[[TransformStamped], None] | None = None,
         is_future: Callable[[int], bool] = lambda stamp: False,
+        moved: Callable[[str], None] = lambda frame: None,
     ) -> None:
-        self._node, self._note_sent, self._is_future = node, note_sent, is_future
+        self._node, self._note_sent, self._is_future, self._moved = node, note_sent, is_future, moved
         self._ahead_ns = 0  # stamp of the last transform that was left out as too far ahead of the clock
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
         self._newest_ns, self._any_older = -1, False  # stamp of the clouds of this round of time
@@ -72,7 +74,7 @@ class Frames:
         if self._tf2 is not None and self._buffer is None:
             self._buffer = self._tf2.Buffer(node=self._node)
             self._buffer.jump_handle.unregister()  # `start_over` clears it; that of Jazzy's first tf2_ros_py raises
-            self._heard = Heard(self._buffer, self._is_ahead, self._node)
+            self._heard = Heard(self._buffer, self._is_ahead, self._node, self._moved)
             self._listener = self._tf2.TransformListener(self._heard, self._node)
 
     def lookup(

@@ -38,13 +38,21 @@ class Heard:
         buffer: of tf2.
         is_future: whether a stamp, ns, is too far ahead of the clock.
         node: logs what is left out.
+        moved: is called where a frame through which something was looked up has another place on /tf_static now.
     """
 
-    def __init__(self, buffer: Any, is_future: Callable[[int], bool], node: Any) -> None:
-        self._buffer, self._is_future, self._node = buffer, is_future, node
+    def __init__(
+        self,
+        buffer: Any,
+        is_future: Callable[[int], bool],
+        node: Any,
+        moved: Callable[[str], None] = lambda frame: None,
+    ) -> None:
+        self._buffer, self._is_future, self._node, self._moved = buffer, is_future, node, moved
         self._back_ns: dict[str, list[int]] = {}  # by child frame: stamps in a row that went back
         self._came_s: dict[str, float] = {}  # when the last one came, `time.monotonic`
         self._links, self._needed = Links(), set[str]()  # frames through which something was looked up
+        self._asked: set[tuple[str, str]] = set()  # between which
         self._any_older: set[str] = set()
         self._began_s = -AFTER_A_STEP_S  # when the clock stepped last, `time.monotonic`
 
@@ -78,11 +86,13 @@ class Heard:
         if why := _why_none(transform):
             self._warn(f"a transform of '{plain_frame(transform.child_frame_id)}' on /tf_static is left out: {why}")
             return
-        if changed := self._links.note_static(transform):
-            frame = plain_frame(transform.child_frame_id)
+        changed, frame = self._links.note_static(transform), plain_frame(transform.child_frame_id)
+        self._buffer.set_transform_static(transform, authority)
+        if changed:
             what = f"'{frame}' came on /tf_static once more, and {changed}: this holds now"
             self._node.get_logger().warning(f"{what}; if two nodes send it, end one")
-        self._buffer.set_transform_static(transform, authority)
+            if any(self._links.leads(frame, *pair) for pair in list(self._asked)):
+                self._moved(frame)
 
     def why_not(self, frame: str, other: str, stamp: int, most_gap_s: float) -> str:
         """Why no transform between two frames at a stamp, ns, can be believed; empty where one can.
@@ -112,6 +122,7 @@ class Heard:
         """A frame between two whose stamps went back, and the next one will say why; empty without one."""
         frames = self._links.between(frame, other)
         self._needed |= frames
+        self._asked.add((frame, other))
         return min((each for each in frames if each in self._back_ns), default="")
 
     def is_final(self, frame: str, other: str, stamp: int, arrived_s: float) -> bool:

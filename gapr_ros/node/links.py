@@ -24,11 +24,12 @@ KEPT_NS = 10_000_000_000  # behind the newest stamp of a frame, as a tf2 buffer 
 # A frame goes to and fro as no tracker sees one thing move: ways there and back, one transform after the other
 NEAR_NS = 1_000_000_000  # looked for on either side of a stamp
 TO_AND_FRO = 2  # so many are not chance
-LEAST = LEAST_M, LEAST_RAD = 0.003, np.radians(2.0)  # shortest way that counts
+LEAST = 0.003, np.radians(2.0)  # shortest way that counts
 LEAST_PER_S = 0.15, np.radians(50.0)  # slowest, m/s and rad/s
 BACK = 0.25  # share of a way that may be left after it
 CALM = 0.25  # share of a jump that a frame moves by before and after it where it rests there
 REST_NS = 50_000_000  # looked at before and after, at least: over less the noise of a tracker looks like a motion
+SAME_M, SAME_RAD = 1e-4, np.radians(0.02)  # a static frame that moves by less is where it was
 ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # what some trackers send of a marker that they do not see
 
 
@@ -152,8 +153,8 @@ class Links:
         if before[0] != parent:
             return f"'{parent}' is its parent, and no longer '{before[0]}'"
         moved_m, turned_rad = _apart(np.array([before[1]]), np.array([now[1]]))
-        is_moved = moved_m[0] > LEAST_M or turned_rad[0] > LEAST_RAD
-        return f"it moved by {1e3 * moved_m[0]:.1f} mm, {np.degrees(turned_rad[0]):.1f} deg" if is_moved else ""
+        is_moved = moved_m[0] > SAME_M or turned_rad[0] > SAME_RAD
+        return f"it moved by {1e3 * moved_m[0]:.1f} mm, {np.degrees(turned_rad[0]):.2f} deg" if is_moved else ""
 
     def forget(self) -> None:
         """All that is not static."""
@@ -176,7 +177,12 @@ class Links:
     def between(self, frame: str, other: str) -> set[str]:
         """The moving frames whose transforms lead from one frame to the other."""
         with self._lock:
-            return (self._up_from(plain_frame(frame)) ^ self._up_from(plain_frame(other))) & self._tracks.keys()
+            return self._way(frame, other) & self._tracks.keys()
+
+    def leads(self, child: str, frame: str, other: str) -> bool:
+        """Whether the transform of a frame, moving or not, is one of those that lead from one frame to the other."""
+        with self._lock:
+            return plain_frame(child) in self._way(frame, other)
 
     def gap_ns(self, child: str, stamp: int) -> int:
         """How far apart the two transforms of a frame around a stamp, ns, are; 0 at one of them, and outside of all."""
@@ -211,6 +217,9 @@ class Links:
             return f"its parent is {' and '.join(repr(name) for name in sorted(set(parents)))} by turns"
         times, by_m = _spikes(seconds, places)
         return f"it goes to and fro by {1e3 * by_m:.1f} mm" if times >= TO_AND_FRO else ""
+
+    def _way(self, frame: str, other: str) -> set[str]:
+        return self._up_from(plain_frame(frame)) ^ self._up_from(plain_frame(other))
 
     def _up_from(self, frame: str) -> set[str]:
         """It and all above it."""

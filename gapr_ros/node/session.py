@@ -4,7 +4,7 @@ What an interruption forgets; all but the last two refuse the clouds that are on
 
 | event | collection | row of good poses | limits on jumps | initial pose | last cloud (`~/register`) | latched pose |
 |---|---|---|---|---|---|---|
-| reset, another clock or bone | forgotten | ends | off until a pose | none | outdated | withdrawn |
+| reset, another clock, bone, place on /tf_static | forgotten | ends | off until a pose | none | outdated | withdrawn |
 | `initialpose` | forgotten | ends | stay until a good pose | the new one | stays | stays |
 | pause | stays | ends | stay | stays | outdated | stays |
 | clouds are read in another way | forgotten | stays | stay | stays | stays | stays |
@@ -77,7 +77,7 @@ class Session:
         self._named = SharedName(host, self.conflicts)
         note_sent = self._shared.note_own if self._shared else None
         host.counters.forget_refusals()
-        self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future)
+        self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future, self._moved)
         self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
         self._publishers = Publishers(host, self._frames)
         self._registration = Registration(self._frames, self._situation, self._left)
@@ -267,6 +267,10 @@ class Session:
         why = CLOCK_CHANGED if is_another else CLOCK_WENT_BACK
         self._admission.start_over(why)
         self._clear(why)
+
+    def _moved(self, frame: str) -> None:
+        """A frame that clouds are moved through has another place: what was found so far is of the one before."""
+        self._clear(f"another place of '{frame}' on /tf_static")
 
     def look_at_file(self) -> None:
         """Say so while the bone's file is another one than the one that was read."""

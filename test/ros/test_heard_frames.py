@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
-from harness import node_in_thread, wait_until
+from harness import Collecting, node_in_thread, wait_until
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
@@ -100,7 +100,7 @@ def heard(monkeypatch, request):
         return buffer
 
     def listen(into, node):
-        buffer.hear = into.set_transform
+        buffer.hear, buffer.hear_static = into.set_transform, into.set_transform_static
         return SimpleNamespace(unregister=lambda: None)
 
     names = {"Buffer": make, "TransformListener": listen, "TransformException": Missing}
@@ -108,11 +108,11 @@ def heard(monkeypatch, request):
     return buffer
 
 
-def see(client, buffer, stamp_s, camera_x):
+def see(client, buffer, stamp_s, camera_x, frame="camera"):
     """Send a cloud between two transforms of its camera; the answer."""
     buffer.hear(_transform(camera_x, stamp_s - LATE_S), "the camera")
     received = int(client.values()["frames_received"])
-    stamp = client.send(GOOD, frame="camera", stamp_s=stamp_s)
+    stamp = client.send(GOOD, frame=frame, stamp_s=stamp_s)
     wait_until(lambda: int(client.values()["frames_received"]) > received)
     buffer.hear(_transform(camera_x, stamp_s + LATE_S), "the camera")
     return wait_until(lambda: client.values() if client.values()["cloud_stamp"] == stamp else None)
@@ -565,8 +565,30 @@ def test_a_place_on_tf_static_that_changes_is_said(buffer):
     for x, parent in ((0.1, "world"), (0.1, "/world"), (0.1 + 1e-6, "world"), (0.16, "world"), (0.16, "bed")):
         heard.set_transform_static(_transform(x, parent=parent), "the mount")
     assert len(said) == 2
-    assert "'camera' came on /tf_static once more, and it moved by 60.0 mm, 0.0 deg: this holds now" in said[0]
+    assert "'camera' came on /tf_static once more, and it moved by 60.0 mm, 0.00 deg: this holds now" in said[0]
     assert "'bed' is its parent, and no longer 'world'" in said[1]
+
+
+def test_another_place_on_tf_static_ends_what_was_collected_through_it(blob_path, client, heard):
+    """A hand-eye calibration that is corrected: clouds of before would be registered with those of now."""
+    method = Collecting()
+    with node_in_thread(
+        method, blob_path, output_frame="world", accumulate=50, tf_timeout=60.0, max_future=0.0
+    ) as node:
+        client.wait_for_state("active")
+        for x in (0.1, 0.1):
+            heard.hear_static(_transform(x, child="lens", parent="camera"), "the mount")
+            heard.hear_static(_transform(x, child="bed"), "the room")
+        for i in range(3):
+            assert see(client, heard, 1000.0 + i, camera_x=1.0, frame="lens")["level"] == 0
+        heard.hear_static(_transform(0.2, child="bed"), "the room")
+        assert see(client, heard, 1003.0, camera_x=1.0, frame="lens")["level"] == 0
+        assert len(method.kept) == 4, "of a frame that no cloud is moved through"
+        assert node.session._standing is not None
+        heard.hear_static(_transform(0.102, child="lens", parent="camera"), "the mount")
+        wait_until(lambda: not method.kept and node.session._standing is None)
+        assert see(client, heard, 1004.0, camera_x=1.0, frame="lens")["level"] == 0
+        assert len(method.kept) == 1
 
 
 def test_a_frame_that_nobody_looks_through_makes_nobody_forget_the_others(buffer):

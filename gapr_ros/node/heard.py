@@ -82,11 +82,15 @@ class Heard:
             self._buffer.set_transform(transform, authority)
 
     def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
-        """One that was heard on /tf_static: it holds at all times."""
+        """One that was heard on /tf_static: for tf2 it holds at all times, also where the frame came on /tf before."""
+        frame = plain_frame(transform.child_frame_id)
         if why := _why_none(transform):
-            self._warn(f"a transform of '{plain_frame(transform.child_frame_id)}' on /tf_static is left out: {why}")
+            self._warn(f"a transform of '{frame}' on /tf_static is left out: {why}")
             return
-        changed, frame = self._links.note_static(transform), plain_frame(transform.child_frame_id)
+        if frame in self._links.moving:
+            self._warn(f"'{frame}' came on /tf, and what /tf_static says of it is left out: let one node send it")
+            return
+        changed = self._links.note_static(transform)
         self._buffer.set_transform_static(transform, authority)
         if changed:
             what = f"'{frame}' came on /tf_static once more, and {changed}: this holds now"
@@ -110,6 +114,9 @@ class Heard:
                 return f"'{each}' is not to be believed, {how}: do two nodes send it on /tf?"
             if self._links.is_lost(each, stamp):
                 return f"'{each}' jumped to the very origin of its parent: does the tracker see its marker?"
+            if parents := self._links.parents_around(each, stamp):
+                old, new = parents
+                return f"the parent of '{each}' was '{old}' and is '{new}' after this stamp: tf2 has the place before"
             if jump := self._links.jump(each, stamp):
                 way = f"{1e3 * jump.metres:.1f} mm and {np.degrees(jump.radians):.1f} deg"
                 return f"'{each}' jumped by {way} around this stamp: tf2 would say a place at which it never was"

@@ -106,6 +106,14 @@ class Track:
         is_between = after < len(self.stamps) and self.stamps[after] != stamp
         return any(self.lost[max(after - is_between, 0) : after + 1])
 
+    def parents_around(self, stamp: int) -> tuple[str, str] | None:
+        """The parents before and after a stamp, ns, where they are two; tf2 has the place before it then."""
+        after = bisect_left(self.stamps, stamp)
+        if after in (0, len(self.stamps)) or self.stamps[after] == stamp:
+            return None
+        before, now = self.parents[after - 1 : after + 1]
+        return None if before == now else (before, now)
+
     def _note_lost(self, last: int) -> None:
         """Mark two in a row at the very origin, where the frame jumped to, or was lost before: it stays there."""
         two = slice(max(last - 1, 0), last + 1)
@@ -143,12 +151,14 @@ class Links:
             self._tracks.setdefault(child, Track()).insert(stamp, _place(transform), parent)
 
     def note_static(self, transform: TransformStamped) -> str:
-        """A transform of /tf_static; what it says otherwise than the last one of this frame did, empty if nothing."""
+        """A transform of /tf_static; what it says otherwise than the last one of this frame did, empty if nothing.
+
+        Of a frame that is not a moving one.
+        """
         child, parent = plain_frame(transform.child_frame_id), plain_frame(transform.header.frame_id)
         now = parent, _place(transform)
         with self._lock:
             self._parents[child] = parent
-            self._tracks.pop(child, None)
             before, self._static[child] = self._static.get(child, now), now
         if before[0] != parent:
             return f"'{parent}' is its parent, and no longer '{before[0]}'"
@@ -202,6 +212,11 @@ class Links:
         """Whether a frame is at the origin of its parent around a stamp, ns, since it jumped there."""
         with self._lock:
             return child in self._tracks and self._tracks[child].is_lost(stamp)
+
+    def parents_around(self, child: str, stamp: int) -> tuple[str, str] | None:
+        """The parents of a frame before and after a stamp, ns, where they are two."""
+        with self._lock:
+            return self._tracks[child].parents_around(stamp) if child in self._tracks else None
 
     def to_and_fro(self, child: str, stamp: int) -> str:
         """How a frame goes to and fro around a stamp, ns, as where two nodes send it; empty where it does not.

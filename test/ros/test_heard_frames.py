@@ -560,6 +560,34 @@ def test_a_frame_that_is_turned_to_and_fro_or_has_two_parents_by_turns_is_not_be
     assert heard.why_not("base", "arm", at, 0.25) == "", "a frame may be mounted elsewhere"
 
 
+def test_nothing_is_looked_up_while_a_frame_passes_from_one_parent_to_another(buffer):
+    """From one tracker to another: tf2 has the last place under the first one until the second one sends."""
+    heard, _, _ = hears(buffer)
+    for i in range(20):
+        stamp_s = 1000.0 + 0.2 * (i >= 10) + 0.02 * i
+        heard.set_transform(_transform(0.05 * i, stamp_s, parent="left" if i < 10 else "right"), "a tracker")
+        for parent in ("left", "right"):
+            heard.set_transform(_transform(0.0, stamp_s, child=parent), "the room")
+    text = "the parent of 'camera' was 'left' and is 'right' after this stamp: tf2 has the place before"
+    assert why_not(heard, 1000.3, most_gap_s=0.0) == text
+    assert why_not(heard, 1000.18) == why_not(heard, 1000.4) == why_not(heard, 1000.17) == ""
+
+
+def test_a_frame_that_comes_on_tf_stays_where_it_is_whatever_tf_static_says(buffer):
+    """The mount of the robot's description, and a tracker: tf2 would have the former for all stamps, until the next."""
+    heard, hear, said = hears(buffer)
+    heard.set_transform_static(_transform(7.0), "the description")
+    for i in range(10):
+        hear(1000.0 + 0.02 * i, 1.0)
+    heard.set_transform_static(_transform(7.0), "the description")
+    assert said == ["'camera' came on /tf, and what /tf_static says of it is left out: let one node send it"]
+    assert seen_at(buffer, 1000.05) == pytest.approx(1.0) and seen_at(buffer, 1000.3) is None
+    assert why_not(heard, 1000.05) == ""
+    heard.start_over()
+    heard.set_transform_static(_transform(7.0), "the description")
+    assert len(said) == 1 and not heard._links.moving, "another round"
+
+
 def test_a_place_on_tf_static_that_changes_is_said(buffer):
     heard, _, said = hears(buffer)
     for x, parent in ((0.1, "world"), (0.1, "/world"), (0.1 + 1e-6, "world"), (0.16, "world"), (0.16, "bed")):

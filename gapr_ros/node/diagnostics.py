@@ -130,6 +130,7 @@ class Snapshot:
         conflicts: what is wrong around the node.
         hardware_id: the bone's file.
         child_frame: what goes to /tf as child; empty when nothing does.
+        overdue_s: how long a cloud has been in hand, where that is longer than `tf_timeout` and `timeout`; else 0.
     """
 
     name: str
@@ -145,6 +146,7 @@ class Snapshot:
     conflicts: tuple[str, ...]
     hardware_id: str
     child_frame: str
+    overdue_s: float
 
 
 def registration_status(now: Snapshot) -> DiagnosticStatus:
@@ -177,6 +179,9 @@ def _level(now: Snapshot) -> tuple[bytes, str]:
         return DiagnosticStatus.WARN, f"{now.state}, {now.loading}" if now.loading else now.state
     if not now.enabled:
         return DiagnosticStatus.WARN, "disabled: clouds are dropped until ~/set_enabled"
+    if now.overdue_s:
+        how = "no pose comes before it ends; start the node again if it does not"
+        return DiagnosticStatus.WARN, f"a cloud has been registered for {now.overdue_s:.0f} s, beyond timeout: {how}"
     if now.counters.consecutive_refusals:
         return DiagnosticStatus.WARN, f"refused: {now.counters.last_refusal}"
     return DiagnosticStatus.OK, f"{now.state}, {now.counters.accepted} accepted, {now.counters.refused} refused"

@@ -75,7 +75,12 @@ class Reporter:
             conflicts=() if session is None else session.conflicts.texts,
             hardware_id=self._hardware_id(),
             child_frame=node.parameters.model_frame if node.parameters.publish_tf else "",
+            overdue_s=0.0 if session is None else self._overdue_s(session),
         )
+
+    def _overdue_s(self, session: Session) -> float:
+        busy_s, parameters = session.worker.busy_s, self._node.parameters
+        return busy_s if busy_s > parameters.timeout + parameters.tf_timeout else 0.0
 
     def _hardware_id(self) -> str:
         """The bone in use, which is not the one that the parameters name before it is read, or when it cannot be."""

@@ -52,6 +52,7 @@ class Worker:
         self._last: Job | None = None
         self._oldest = 0
         self._last_start = float("-inf")
+        self._since: float | None = None  # the job that is processed was taken, `time.monotonic`
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="registration", daemon=True)
         self._thread.start()
@@ -111,6 +112,12 @@ class Worker:
             waiting, self._slot, self._last = self._slot, None, None
         return waiting
 
+    @property
+    def busy_s(self) -> float:
+        """How long the cloud in hand has been processed; 0 while there is none."""
+        since = self._since
+        return 0.0 if since is None else time.monotonic() - since
+
     def stop(self, timeout_s: float = 0.0) -> bool:
         """End the thread after what it is doing and the tasks. False when that takes longer than `timeout_s`."""
         with self._wake:
@@ -147,4 +154,11 @@ class Worker:
         job, self._slot = self._slot, None
         assert job is not None
         self._last, self._last_start = job, time.monotonic()
-        return lambda: self._process(job)
+        return partial(self._run, job)
+
+    def _run(self, job: Job) -> None:
+        self._since = self._last_start
+        try:
+            self._process(job)
+        finally:
+            self._since = None

@@ -411,6 +411,20 @@ def test_another_frame_and_stamps_that_go_back_start_a_new_collection(blob_path,
         assert len(method.kept) == 1
 
 
+def test_a_registration_that_does_not_end_is_said_while_it_lasts(blob_path, client, method):
+    """The last pose stays latched meanwhile, and nothing else says that it is an old one."""
+    with node_in_thread(method, blob_path, timeout=0.3, tf_timeout=0.1):
+        client.wait_for_state("active")
+        assert client.ask(GOOD)["level"] == 0
+        method.gate.clear()
+        client.send(GOOD)
+        wait_until(lambda: "a cloud has been registered for 1 s, beyond timeout" in client.values()["message"])
+        assert client.values()["level"] == 1
+        method.gate.set()
+        wait_until(lambda: client.values()["message"].startswith("refused: timeout"))
+        assert client.ask(GOOD)["level"] == 0
+
+
 def test_clouds_that_the_middleware_pushes_out_are_counted_as_lost(live):
     node, client, method = live
     client.ask(GOOD)

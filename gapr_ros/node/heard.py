@@ -117,8 +117,10 @@ class Heard:
             if parents := self._links.parents_around(each, stamp):
                 old, new = parents
                 return f"the parent of '{each}' was '{old}' and is '{new}' after this stamp: tf2 has the place before"
+            if glitch := self._links.glitch(each, stamp):
+                return f"'{each}' was {_way(*glitch)} away for one transform alone around this stamp"
             if jump := self._links.jump(each, stamp):
-                way = f"{1e3 * jump.metres:.1f} mm and {np.degrees(jump.radians):.1f} deg"
+                way = _way(jump.metres, jump.radians)
                 return f"'{each}' jumped by {way} around this stamp: tf2 would say a place at which it never was"
         gap_s, child = max(((self._links.gap_ns(each, stamp) * 1e-9, each) for each in frames), default=(0.0, ""))
         if stamp == 0 or not 0.0 < most_gap_s < gap_s:
@@ -135,7 +137,7 @@ class Heard:
     def is_final(self, frame: str, other: str, stamp: int, arrived_s: float) -> bool:
         """False where a cloud has to wait for another transform, which shows what the last one meant.
 
-        One that came late: whether time went back. One around whose stamp a frame jumped: whether it moves on.
+        One that came late: whether time went back. One around whose stamp a frame jumped: whether it moves on, or back.
 
         Args:
             frame, other: names.
@@ -146,8 +148,11 @@ class Heard:
             return True
         frames = self._links.between(frame, other)
         late = [each for each in frames if self._links.newest_ns(each) > stamp + LATE_NS]
+        if any(self._came_s[each] <= arrived_s for each in late):
+            return False
         jumps = (self._links.jump(each, stamp) for each in frames)
-        return all(self._came_s[each] > arrived_s for each in late) and not any(jump and jump.is_open for jump in jumps)
+        is_open = any(jump and jump.is_open for jump in jumps)
+        return not is_open and not any(self._links.may_be_glitch(each, stamp) for each in frames)
 
     def _is_of_now(self, child: str, stamp: int) -> bool:
         newest, any_older = self._links.newest_ns(child), child in self._any_older
@@ -169,6 +174,10 @@ class Heard:
 
     def _warn(self, text: str) -> None:
         self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
+
+
+def _way(metres: float, radians: float) -> str:
+    return f"{1e3 * metres:.1f} mm and {np.degrees(radians):.1f} deg"
 
 
 def _why_none(transform: TransformStamped) -> str:

@@ -27,6 +27,9 @@ TO_AND_FRO = 2  # so many are not chance
 LEAST = 0.003, np.radians(2.0)  # shortest way that counts
 LEAST_PER_S = 0.15, np.radians(50.0)  # slowest, m/s and rad/s
 BACK = 0.25  # share of a way that may be left after it
+# ... one place off its way is enough where nothing that is tracked turns so fast
+GLITCH = 0.006, np.radians(3.0)
+GLITCH_PER_S2 = 30.0, 300.0  # m/s^2 and rad/s^2
 CALM = 0.25  # share of a jump that a frame moves by before and after it where it rests there
 REST_NS = 50_000_000  # looked at before and after, at least: over less the noise of a tracker looks like a motion
 SAME_M, SAME_RAD = 1e-4, np.radians(0.02)  # a static frame that moves by less is where it was
@@ -105,6 +108,34 @@ class Track:
         after = bisect_left(self.stamps, stamp)
         is_between = after < len(self.stamps) and self.stamps[after] != stamp
         return any(self.lost[max(after - is_between, 0) : after + 1])
+
+    def glitch(self, stamp: int) -> tuple[float, float] | None:
+        """How far away, metres and radians, the frame was for one transform alone, at a stamp, ns, or next to it."""
+        after = bisect_left(self.stamps, stamp)
+        is_at_one = after < len(self.stamps) and self.stamps[after] == stamp
+        return next(filter(None, map(self._glitch_at, range(after - (not is_at_one), after + 1))), None)
+
+    def may_be_glitch(self, stamp: int) -> bool:
+        """Whether the newest transform, after a stamp, ns, is farther away than what is tracked gets so fast."""
+        last = len(self.stamps) - 1
+        if last < 2 or not self.stamps[last - 1] < stamp < self.stamps[last]:
+            return False
+        before_s, took_s = (1e-9 * max(self.stamps[i] - self.stamps[i - 1], 1) for i in (last - 1, last))
+        before, way = self._largest_way(last - 2, [last - 1]), self._largest_way(last - 1, [last])
+        return any(
+            way[kind] >= GLITCH[kind] and way[kind] / took_s - before[kind] / before_s >= GLITCH_PER_S2[kind] * took_s
+            for kind in range(2)
+        )
+
+    def _glitch_at(self, at: int) -> tuple[float, float] | None:
+        if not 0 < at < len(self.stamps) - 1:
+            return None
+        took_s = 1e-9 * max(self.stamps[at] - self.stamps[at - 1], self.stamps[at + 1] - self.stamps[at])
+        there, away = self._largest_way(at, [at - 1]), self._largest_way(at, [at + 1])
+        back = self._largest_way(at - 1, [at + 1])
+        off = [0.5 * (there[kind] + away[kind] - back[kind]) for kind in range(2)]  # its way, at least
+        is_glitch = (off[kind] >= max(GLITCH[kind], 0.5 * GLITCH_PER_S2[kind] * took_s**2) for kind in range(2))
+        return there if any(is_glitch) else None
 
     def parents_around(self, stamp: int) -> tuple[str, str] | None:
         """The parents before and after a stamp, ns, where they are two; tf2 has the place before it then."""
@@ -212,6 +243,16 @@ class Links:
         """Whether a frame is at the origin of its parent around a stamp, ns, since it jumped there."""
         with self._lock:
             return child in self._tracks and self._tracks[child].is_lost(stamp)
+
+    def glitch(self, child: str, stamp: int) -> tuple[float, float] | None:
+        """How far away a frame was for one transform alone at a stamp, ns, or next to it; metres and radians."""
+        with self._lock:
+            return self._tracks[child].glitch(stamp) if child in self._tracks else None
+
+    def may_be_glitch(self, child: str, stamp: int) -> bool:
+        """Whether the newest transform of a frame, after a stamp, ns, may be one that no other is like."""
+        with self._lock:
+            return child in self._tracks and self._tracks[child].may_be_glitch(stamp)
 
     def parents_around(self, child: str, stamp: int) -> tuple[str, str] | None:
         """The parents of a frame before and after a stamp, ns, where they are two."""

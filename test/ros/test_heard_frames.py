@@ -298,7 +298,7 @@ def test_a_frame_that_is_at_the_origin_from_the_start_or_comes_there_slowly_is_b
         hear(1000.0 + 0.02 * i, max(0.0, 0.1 - 0.002 * abs(i - 100)))
         assert why_not(heard, 999.99 + 0.02 * i) == ""
     for i in range(40):
-        hear(1004.0 + 0.02 * i, 0.05 * (10 - abs(i - 10)))
+        hear(1004.0 + 0.02 * i, round(0.1 * np.sin(np.pi * i / 20.0), 9))
         assert why_not(heard, 1003.95 + 0.02 * i) == "", "one that moves through it"
 
 
@@ -465,6 +465,7 @@ def test_a_frame_that_one_tracker_follows_is_believed_however_it_turns_back(buff
         q.w = float(np.sqrt(1.0 - turn @ turn))
         heard.set_transform(transform, "the tracker")
         assert "to and fro" not in why_not(heard, stamp_s - 0.5 / rate_hz, most_gap_s=0.0)
+        assert "alone" not in why_not(heard, stamp_s - 1.5 / rate_hz, most_gap_s=0.0)
         assert "jumped" not in why_not(heard, stamp_s - 6.5 / rate_hz, most_gap_s=0.0)
 
 
@@ -558,6 +559,29 @@ def test_a_frame_that_is_turned_to_and_fro_or_has_two_parents_by_turns_is_not_be
     text = heard.why_not("stylus", "tip", at, 0.25)
     assert text.startswith("'tip' is not to be believed, its parent is 'probe' and 'stylus' by turns")
     assert heard.why_not("base", "arm", at, 0.25) == "", "a frame may be mounted elsewhere"
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30, 60])
+@pytest.mark.parametrize(("away_mm", "turned_deg"), [(400.0, 0.0), (0.0, 120.0)])
+def test_a_frame_that_was_elsewhere_for_one_transform_is_not_believed_next_to_it(buffer, rate_hz, away_mm, turned_deg):
+    """A marker whose balls are mixed up, or that was hidden, for one image."""
+    heard, _, _ = hears(buffer)
+    stamps_s = 1000.0 + np.arange(30) / rate_hz
+    for number, stamp_s in enumerate(stamps_s):
+        transform = _transform(0.005 * number + 1e-3 * away_mm * (number == 20), stamp_s)
+        half = np.radians(turned_deg * (number == 20)) / 2.0
+        transform.transform.rotation.z, transform.transform.rotation.w = np.sin(half), np.cos(half)
+        heard.set_transform(transform, "the tracker")
+        for back in (0.3, 1.0, 1.7):
+            at_s = stamps_s[20] - (back - 1.0) / rate_hz
+            is_final = heard.is_final("world", "camera", round(at_s * NS), -np.inf)
+            said = why_not(heard, at_s, most_gap_s=0.0)
+            if number > 20:
+                assert "deg away for one transform alone around this stamp" in said
+            elif number == 20 and seen_at(buffer, at_s) is not None and back != 1.0:
+                assert not is_final, "it waits for the next one"
+    elsewhere = [*stamps_s[:20], *stamps_s[21:], *(stamps_s[:19] + 0.5 / rate_hz), *(stamps_s[21:-1] + 0.5 / rate_hz)]
+    assert [why_not(heard, stamp_s, most_gap_s=0.0) for stamp_s in elsewhere] == [""] * len(elsewhere)
 
 
 def test_nothing_is_looked_up_while_a_frame_passes_from_one_parent_to_another(buffer):

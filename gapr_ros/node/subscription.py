@@ -9,7 +9,7 @@ from typing import Any
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
 from gapr_ros.node.conflicts import names_of
 from gapr_ros.node.diagnostics import Input
@@ -41,6 +41,7 @@ class Subscriptions:
         self._mismatch, self._closed, self._gaps = "", False, Gaps()
         self._taken: deque[tuple[int, int | None]] = deque(maxlen=REMEMBERED)
         self._needed_at, self._published_at = 0.0, time.monotonic()
+        self._waiting_since: float | None = time.monotonic()  # for the first cloud; None once it came
         first = ReliabilityPolicy.BEST_EFFORT if self._asked == "best_effort" else ReliabilityPolicy.RELIABLE
         self._clouds, self._second = self._subscribe(first), None
         self._initial_poses = host.ros.create_subscription(
@@ -59,7 +60,7 @@ class Subscriptions:
     def close(self) -> None:
         """Listen no more; who publishes is no conflict then."""
         self._closed = True
-        for about in ("type", "publishers", "nobody"):
+        for about in ("type", "publishers", "nobody", "latched"):
             self._session.conflicts.note(about, "")
         self._host.ros.destroy_timer(self._looking)
         for subscription in (self._clouds, self._second, self._initial_poses, self._check_points):
@@ -83,6 +84,7 @@ class Subscriptions:
         publishers = [each for each in publishers if each.topic_type == _type_name(kind)]
         text = f"{len(publishers)} publishers on {topic} ({names_of(publishers)}): a node follows one source of clouds"
         self._session.conflicts.note("publishers", text if len(publishers) > 1 else "")
+        self._note_latched(topic, publishers)
         if any(p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for p in publishers):
             self._needed_at = time.monotonic()
         elif time.monotonic() - self._needed_at > GRACE_S:
@@ -96,6 +98,14 @@ class Subscriptions:
         text = f"nobody publishes on {topic}: start the driver, or remap points (-r points:=TOPIC)"
         self._session.conflicts.note("nobody", text if now - self._published_at > ALONE_S else "")
 
+    def _note_latched(self, topic: str, publishers: list[Any]) -> None:
+        """Say so where no cloud has come yet and a publisher keeps one: no volatile listener gets that."""
+        is_long = self._waiting_since is not None and time.monotonic() - self._waiting_since > ALONE_S
+        latched = [p for p in publishers if p.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL]
+        how = "the one that it keeps for late listeners (transient local) does not: let it publish once more"
+        text = f"no cloud has come from the publisher of {topic} ({names_of(latched)}), and {how}"
+        self._session.conflicts.note("latched", text if is_long and latched else "")
+
     def _subscribe(self, reliability: ReliabilityPolicy) -> Any:
         depth = min(self._host.parameters.accumulate, MOST_QUEUED)  # every cloud counts where clouds are collected
         return self._host.ros.create_subscription(
@@ -106,6 +116,7 @@ class Subscriptions:
 
     @guarded
     def _on_cloud(self, data: bytes, info: dict[str, Any]) -> None:
+        self._waiting_since = None
         number = info["publication_sequence_number"]  # None where the middleware has none
         if self._is_taken((info["source_timestamp"], number)):
             return

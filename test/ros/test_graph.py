@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray, TransformStamped
-from harness import Client, Collecting, Spinner, StandIn, context, node_in_thread, wait_until
+from harness import LATCHED, Client, Collecting, Spinner, StandIn, context, node_in_thread, wait_until
 from lifecycle_msgs.msg import Transition
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -203,6 +203,21 @@ def test_a_topic_on_which_nobody_publishes_is_named_once_until_somebody_does(
         client.do(lambda: client.node.create_publisher(PointCloud2, "points", 1))
         wait_until(lambda: text not in client.values("input")["conflicts"])
     assert capfd.readouterr().err.count(text) == 1
+
+
+def test_a_publisher_that_keeps_its_only_cloud_is_named_until_one_comes(blob_path, client, method, monkeypatch):
+    """As one that loads a file: it published before the node listened, and seems to be silent."""
+    for name, seconds in (("ALONE_S", 0.3), ("LOOK_S", 0.1)):
+        monkeypatch.setattr(subscription, name, seconds)
+    client.forget(client.points)
+    client.points = client.do(lambda: client.node.create_publisher(PointCloud2, "points", LATCHED))
+    client.send(GOOD)
+    with node_in_thread(method, blob_path):
+        client.wait_for_state("active")
+        text = "no cloud has come from the publisher of /points (/client), and the one that it keeps"
+        wait_until(lambda: text in client.values("input")["conflicts"])
+        client.ask(GOOD)
+        wait_until(lambda: text not in client.values("input")["conflicts"])
 
 
 def test_simulated_time_without_a_clock_is_a_conflict_until_the_clock_comes(blob_path, client, method):

@@ -12,6 +12,7 @@ one that ~/register answered once more after the camera stopped; a bag that is p
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 
@@ -154,6 +155,8 @@ class TrustedPose(Node):
         there, why = self.buffer.can_transform(self.frame, cloud_frame, stamp, return_debug_tuple=True)
         if there and self.heard is not None:
             why = self.heard.why_not(self.frame, cloud_frame, stamp.nanoseconds, self.max_tf_gap)
+            if not why and not self.heard.is_final(self.frame, cloud_frame, stamp.nanoseconds, -math.inf):
+                why = "whether the last transform jumped is seen by the next one, which has not come"
         return "" if there and not why else f"no transform {self.frame} <- {cloud_frame}: {why}"
 
     def _at(self, transform: TransformStamped) -> TransformStamped:

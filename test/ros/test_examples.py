@@ -208,6 +208,39 @@ def test_no_pose_is_taken_into_another_frame_over_a_time_in_which_that_was_not_h
     assert done[1] == (101, 1.5)
 
 
+@pytest.mark.parametrize("next_comes", [True, False])
+def test_no_pose_is_taken_into_another_frame_before_it_is_clear_that_that_did_not_jump(consumer, next_comes):
+    node, done = consumer
+
+    class Buffer:
+        def can_transform(self, target, source, stamp, return_debug_tuple):
+            return True, ""
+
+        def set_transform(self, transform, authority):
+            """As tf2 does, it interpolates whatever comes."""
+
+    node.frame, node.buffer = "world", Buffer()
+    node.heard = Heard(node.buffer, lambda stamp: False, node)
+
+    def hear(i, x):
+        heard = transform_at(100, x, "camera")
+        heard.header.frame_id, heard.header.stamp.nanosec = "world", i * 20_000_000
+        node.heard.set_transform(heard, "the tracker")
+
+    for i in range(5):
+        hear(i, 0.02 * i + 0.12 * (i == 4))
+    pose, sure = transform_at(100, 0.5), status(100, SURE)
+    pose.header.stamp.nanosec = 70_000_000
+    sure.values = [KeyValue(key=v.key, value="100.070000000" if v.key == "stamp" else v.value) for v in sure.values]
+    node._on_transform(pose)
+    node._on_status(sure)
+    assert not done
+    if next_comes:
+        hear(5, 0.1)
+    wait_until(lambda: node._meet() or done)
+    assert ("for one transform alone" if next_comes else "is seen by the next one, which has not come") in done[0]
+
+
 def test_the_consumer_runs_as_a_program_against_the_real_node(client, tmp_path):
     bone = bones.bone()
     node = NodeProcess(tmp_path, model_path=bones.save(bone, tmp_path / "bone.npz"), model_unit="mm", timeout=60.0)

@@ -1,6 +1,7 @@
 """A scene registered: more and more regions of it propose, its lines of sight decide, until an answer is sure.
 
-In a stream the last pose and its rivals are compared first, and no region is asked where that is sure.
+Or until two in a row are hopeless: the rounds after them hardly ever have a pose that is accepted. In a stream the last
+pose and its rivals are compared first, and no region is asked where that is sure.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from gapr_core.runtime.clock import Clock
 
 Array = NDArray[np.float64]
 
+MOST_HOPELESS = 2  # rounds in a row
+
 
 def register(
     seen: Scene,
@@ -46,7 +49,7 @@ def register(
         rounds: of regions at most; `ClutterConfig.rounds` when not given.
     """
     settings, threads = replace(config.clutter, rounds=rounds or config.clutter.rounds), config.num_threads
-    assessment = None
+    assessment, hopeless = None, 0
     for number, scene in enumerate(clutter.in_rounds(seen, settings), 1):
         pool = clutter.propose(scene, target, poses, settings, threads)
         clock.lap("propose")
@@ -58,7 +61,8 @@ def register(
         clock.lap("verify")
         found = _assessed(candidates, scene, target, calibration, config, clock)
         assessment = replace(found, proposer=clutter.NAME, rounds=number)
-        if assessment.reaches(config.sure_from):
+        hopeless = hopeless + 1 if assessment.probability < settings.hopeless else 0
+        if assessment.reaches(config.sure_from) or hopeless == MOST_HOPELESS:
             break
     return assessment
 

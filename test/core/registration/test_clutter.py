@@ -285,6 +285,22 @@ def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
     assert tracker._tracking.scene_calibration is unbelieving and not tracker.register(scene[0], target).ok
 
 
+@pytest.mark.parametrize(
+    ("probabilities", "asked"),
+    [((0.09, 0.09, 0.9, 0.9), 2), ((0.5, 0.09, 0.09, 0.9), 3), ((0.09, 0.1, 0.09, 0.1), 4), ((0.96, 0.0, 0.0, 0.0), 1)],
+)
+def test_two_hopeless_rounds_in_a_row_are_the_last(target, scene, monkeypatch, probabilities, asked):
+    of_one, left = scene_rounds._assessed, list(probabilities)
+    monkeypatch.setattr(
+        scene_rounds, "_assessed", lambda *given: replace(of_one(*given), probability=left.pop(0), refusal=None)
+    )
+    config = RegistrarConfig(num_threads=1)
+    seen = scenes.prepared(scenes.split(scene[0], scene[1]), config)
+    model = Calibration.shipped(clutter.NAME)
+    found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), model, config, Clock())
+    assert found.rounds == asked == len(probabilities) - len(left)
+
+
 def test_a_wound_on_the_model_of_the_other_side_is_refused(femur, target, scene):
     """Only the mirrored scene, registered as one, shows it; three of 38 were accepted."""
     other = Surface(femur.points * [-1.0, 1.0, 1.0], femur.faces[:, ::-1])

@@ -368,7 +368,7 @@ class ClutterConfig(Settings):
     radii_mm: tuple[float, ...] = setting((30.0, 45.0), "radii of the regions that propose", low=5, unit="mm")
     seeds: tuple[int, ...] = setting((12, 6), "regions of each radius in a round", low=1, high=1000)
     rounds: int = setting(4, "rounds of other regions, until an answer is sure", low=1, high=100)
-    hopeless: float = setting(0.1, "or two in a row have an answer that is less probable", low=0, high=1)
+    hopeless: float = setting(0.1, "two in a row below, from a place that was inferred, are the last", low=0, high=1)
     smooth_neighbours: int = setting(8, "points, itself first, whose plane a point has and may share", low=3, high=200)
     bend_deg: float = setting(20.0, "larger angles between two planes are a fold", low=1, high=90, unit="deg")
     step_deg: float = setting(30.0, "neighbours farther above a plane are a step", low=1, high=90, unit="deg")

@@ -1,7 +1,7 @@
 """A scene registered: more and more regions of it propose, its lines of sight decide, until an answer is sure.
 
-Or until two in a row are hopeless: the rounds after them hardly ever have a pose that is accepted. In a stream the last
-pose and its rivals are compared first, and no region is asked where that is sure.
+Of what may be no scene also until two in a row are hopeless: the rounds after them hardly ever have a pose that is
+accepted. In a stream the last pose and its rivals are compared first, and no region is asked where that is sure.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def register(
         calibration: the confidence model of scenes.
         config: every setting.
         clock: of the call.
-        rounds: of regions at most; `ClutterConfig.rounds` when not given.
+        rounds: of regions at most, of what may be no scene; `ClutterConfig.rounds`, hopeless or not, when not given.
     """
     settings, threads = replace(config.clutter, rounds=rounds or config.clutter.rounds), config.num_threads
     assessment, hopeless = None, 0
@@ -62,7 +62,7 @@ def register(
         found = _assessed(candidates, scene, target, calibration, config, clock)
         assessment = replace(found, proposer=clutter.NAME, rounds=number)
         hopeless = hopeless + 1 if assessment.probability < settings.hopeless else 0
-        if assessment.reaches(config.sure_from) or hopeless == MOST_HOPELESS:
+        if assessment.reaches(config.sure_from) or (rounds is not None and hopeless == MOST_HOPELESS):
             break
     return assessment
 

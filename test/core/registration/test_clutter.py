@@ -286,10 +286,18 @@ def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
 
 
 @pytest.mark.parametrize(
-    ("probabilities", "asked"),
-    [((0.09, 0.09, 0.9, 0.9), 2), ((0.5, 0.09, 0.09, 0.9), 3), ((0.09, 0.1, 0.09, 0.1), 4), ((0.96, 0.0, 0.0, 0.0), 1)],
+    ("probabilities", "most", "asked"),
+    [
+        ((0.09, 0.09, 0.9, 0.9), 4, 2),
+        ((0.5, 0.09, 0.09, 0.9), 4, 3),
+        ((0.09, 0.1, 0.09, 0.1), 4, 4),
+        ((0.96, 0.0, 0.0, 0.0), 4, 1),
+        ((0.09, 0.09, 0.09, 0.09), None, 4),
+    ],
 )
-def test_two_hopeless_rounds_in_a_row_are_the_last(target, scene, monkeypatch, probabilities, asked):
+def test_two_hopeless_rounds_of_what_may_be_no_scene_are_the_last(
+    target, scene, monkeypatch, probabilities, most, asked
+):
     of_one, left = scene_rounds._assessed, list(probabilities)
     monkeypatch.setattr(
         scene_rounds, "_assessed", lambda *given: replace(of_one(*given), probability=left.pop(0), refusal=None)
@@ -297,7 +305,7 @@ def test_two_hopeless_rounds_in_a_row_are_the_last(target, scene, monkeypatch, p
     config = RegistrarConfig(num_threads=1)
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), config)
     model = Calibration.shipped(clutter.NAME)
-    found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), model, config, Clock())
+    found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), model, config, Clock(), most)
     assert found.rounds == asked == len(probabilities) - len(left)
 
 

@@ -302,7 +302,7 @@ def test_two_hopeless_rounds_of_what_may_be_no_scene_are_the_last(
     monkeypatch.setattr(
         scene_rounds, "_assessed", lambda *given: replace(of_one(*given), probability=left.pop(0), refusal=None)
     )
-    config = RegistrarConfig(num_threads=1)
+    config = RegistrarConfig(num_threads=1, clutter=ClutterConfig(seeds=(2, 1), middle_poses=50, final_poses=10))
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), config)
     model = Calibration.shipped(clutter.NAME)
     found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), model, config, Clock(), most)

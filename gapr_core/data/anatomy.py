@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import load
+from gapr_core.clouds import check_extent, load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.reading import ending_of
@@ -76,7 +76,7 @@ def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
     """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty.
 
     Raises:
-        InvalidPointCloudError: a file that cannot be read, or has other arrays.
+        InvalidPointCloudError: a file that cannot be read, has other arrays, or a subject twice.
     """
     return [_corresponded(path, bone) for path in sorted(Path(folder).glob(f"{bone}_*.npz"))]
 
@@ -92,6 +92,8 @@ def _corresponded(path: Path, bone: str) -> Corresponded:
         raise _unreadable(path, " ".join(str(error).split())) from error
     if points.ndim != 3 or points.shape[::2] != (len(person), 3) or faces.ndim != 2 or faces.shape[1] != 3:
         raise _unreadable(path, f"points {points.shape}, faces {faces.shape} and {len(person)} subjects")
+    if twice := sorted({name for name in person if person.count(name) > 1}):
+        raise _unreadable(path, f"{', '.join(twice)} more than once in `person`")
     return Corresponded(points, faces, person, bone, path.stem.removeprefix(f"{bone}_"))
 
 
@@ -112,7 +114,7 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
 
     Raises:
         ConfigError: no such folder or an unknown split.
-        InvalidPointCloudError: a damaged file of meshes.
+        InvalidPointCloudError: a damaged file of meshes, or a mesh of the split that is no bone in mm.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -121,7 +123,22 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
     specimens = [s for c in sets for s in c.specimens() if cohort in (None, c.cohort)]
     if cohort is not None and not specimens:
         specimens = _single_meshes(folder, bone, cohort)
-    return specimens if split == "all" else _of_split(specimens, split, splits(folder))
+    chosen = specimens if split == "all" else _of_split(specimens, split, splits(folder))
+    for specimen in chosen:
+        _check_mesh(specimen)
+    return chosen
+
+
+def _check_mesh(specimen: Specimen) -> None:
+    """Raise `InvalidPointCloudError` where a mesh has points or faces that are none, or is not in mm."""
+    points, faces = specimen.surface.points, specimen.surface.faces
+    name = f"{specimen.bone} of {specimen.person} ({specimen.cohort})"
+    if not np.isfinite(points).all():
+        raise InvalidPointCloudError("finite points", f"NaN or infinity in the {name}", "leave the subject out")
+    if faces is not None and len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
+        given = f"{faces.min()} to {faces.max()} for the {len(points)} points of the {name}"
+        raise InvalidPointCloudError("faces whose numbers are those of points, from 0", given, "write the file again")
+    check_extent(float(np.linalg.norm(np.ptp(points, axis=0))), "mm", f"the {name}", "convert it to mm")
 
 
 def _single_meshes(folder: Path, bone: str, cohort: str) -> list[Specimen]:

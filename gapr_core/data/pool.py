@@ -50,7 +50,7 @@ def specimens(
     """
     if meshes_folder is not None:
         return anatomy.meshes(meshes_folder, bone, split, units)
-    if anatomy_folder is not None and anatomy.surfaces(anatomy_folder, bone):
+    if anatomy_folder is not None and anatomy.corresponded(anatomy_folder, bone):
         return anatomy.surfaces(anatomy_folder, bone, split)
     return [parametric_specimen(bone, number) for number in parametric_people(split, people)]
 

@@ -38,13 +38,17 @@ class People:
     """Bones of one type: subjects of the split, and new ones from their shape model; parametric where there is none.
 
     Raises:
-        ConfigError: neither meshes of the split nor a parametric model.
+        ConfigError: neither meshes of the split nor a parametric model, or meshes of nobody in the split `train`.
     """
 
     def __init__(self, bone: str, folder: Path | None, split: str) -> None:
         self.bone, self.split = bone, split
         self.real = anatomy.surfaces(folder, bone, split) if folder else []
         known = anatomy.corresponded(folder, bone) if folder else []
+        if split == "train" and known and not self.real:
+            given = f"meshes of {', '.join(known[0].person[:3])} ... in {folder}, and none of them in train"
+            how = "correct the names in splits.json, or move the meshes away to train on parametric bones"
+            raise ConfigError(f"subjects of the split train with a {bone}", given, how)
         sets = [own for c in known if len((own := c.of({s.person for s in self.real})).points) > 2]
         self.models = [ShapeModel.of(c) for c in sets]
         self.model_subjects = [c.person for c in sets]

@@ -70,7 +70,7 @@ def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) 
     Raises:
         ConfigError: nobody is in it, or a protocol makes nothing that the network can see.
     """
-    bones = [b for b in train.bones if b in parametric.BONES or (folder and anatomy.surfaces(folder, b))]
+    bones = [b for b in train.bones if b in parametric.BONES or (folder and anatomy.corresponded(folder, b))]
     people = [subjects for bone in bones if (subjects := specimens(bone, "val", 3, folder))]
     if train.validation_pairs and not people:
         how = "move some subjects to val in splits.json, or set validation_pairs to 0"

@@ -83,6 +83,31 @@ def test_damaged_meshes_are_named(tmp_path):
             anatomy.surfaces(tmp_path, "femur")
 
 
+def test_a_mesh_that_is_no_bone_in_mm_is_refused_where_it_is_used_and_nowhere_else(tmp_path):
+    """The training went on with a bone of half a millimetre, and ended with "SVD did not converge" for NaN."""
+    write_set(tmp_path, "femur", "one", ["a", "b"])
+    write_splits(tmp_path, train=["a"], test=["b"])
+    with np.load(tmp_path / "femur_one.npz") as data:
+        points, faces, person = (data[name] for name in ("points", "faces", "person"))
+    damaged = {
+        "finite points; got NaN or infinity in the femur of b": (points * [[[1.0]], [[np.nan]]], faces),
+        "the femur of b .one. of .* it looks like m: convert it to mm": (points * [[[1.0]], [[1e-3]]], faces),
+        "faces whose numbers are those of points, from 0; got 1 to ": (points, faces + 1),
+    }
+    for message, (bones, corners) in damaged.items():
+        np.savez(tmp_path / "femur_one.npz", points=bones, faces=corners, person=person)
+        with pytest.raises(InvalidPointCloudError, match=message):
+            anatomy.surfaces(tmp_path, "femur", "test")
+        if corners is faces:
+            assert [s.person for s in anatomy.surfaces(tmp_path, "femur", "train")] == ["a"]
+
+
+def test_a_subject_that_stands_twice_in_one_set_is_refused(tmp_path):
+    write_set(tmp_path, "femur", "one", ["a", "b", "a"])
+    with pytest.raises(InvalidPointCloudError, match="femur_one.npz .a more than once in `person`"):
+        anatomy.corresponded(tmp_path, "femur")
+
+
 def test_label_maps_are_meshes_named_by_all_that_stands_before_their_ending_and_other_files_are_left_alone(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason="it writes the label maps to read: pip install nibabel")
     voxels = np.zeros((40, 40, 60), dtype=np.uint8)

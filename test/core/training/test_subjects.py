@@ -43,6 +43,14 @@ def test_a_training_that_draws_from_everybody_ends_with_an_error(settings, anato
         trainer.train(replace(settings, pairs=64), tmp_path, anatomy)
 
 
+def test_meshes_of_nobody_in_the_split_train_are_no_reason_to_train_on_parametric_bones(anatomy, tmp_path):
+    """One misspelt name after the other in splits.json, and the run had no real bone, without a word."""
+    (tmp_path / "femur_toy.npz").write_bytes((anatomy / "femur_toy.npz").read_bytes())
+    (tmp_path / "splits.json").write_text('{"train": ["P0", "P1"], "val": ["p5"], "test": []}')
+    with pytest.raises(ConfigError, match=r"train with a femur; got meshes of p0, p1, p2 \.\.\. in .*splits.json"):
+        dataset.People("femur", tmp_path, "train")
+
+
 def test_a_shape_model_counts_for_everybody_it_is_made_of_and_a_real_bone_for_its_own_subject(anatomy):
     people = dataset.People("femur", anatomy, "train")
     assert set(people.draw_of(0, 1.0, 0)[1]) == TRAIN

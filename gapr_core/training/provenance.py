@@ -43,27 +43,34 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
     Raises:
         ConfigError: the file there cannot be read.
     """
-    path = folder / FILE
-    entries = _read(path) if path.exists() else []
+    path, known = folder / FILE, entries(folder)
     begun_with = _digest([Path(config.initial).read_bytes()]) if config.initial and not step else None
     entry = {"step": step, **code(), **machine(), "processes": world, "data": data(config.bones, bones)}
-    entries.append(entry | {"initial": begun_with})
-    write_json(path, entries)
-    return list(entries)
+    known.append(entry | {"initial": begun_with})
+    write_json(path, known)
+    return known
+
+
+def entries(folder: Path) -> list[Entry]:
+    """All entries of a folder's provenance.json, the oldest first; none where there is no file.
+
+    Raises:
+        ConfigError: the file there cannot be read.
+    """
+    return _read(folder / FILE) if (folder / FILE).exists() else []
 
 
 def summary(folders: Iterable[Path]) -> list[str]:
     """One sentence for every kind of code, machine and data that these runs had, in order; none of runs not begun."""
-    files = [folder / FILE for folder in folders if (folder / FILE).exists()]
-    return list(dict.fromkeys(_sentence(entry) for file in files for entry in _read(file)))
+    return list(dict.fromkeys(_sentence(entry) for folder in folders for entry in entries(folder)))
 
 
 def _read(path: Path) -> list[Entry]:
     what, how = "the provenance of a training run", "restore it, or move it out of the folder"
-    entries = read_json(path, what, how)
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+    found = read_json(path, what, how)
+    if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
         raise ConfigError(what, f"{path} with other content", how)
-    return entries
+    return found
 
 
 def _sentence(entry: Entry) -> str:

@@ -15,12 +15,14 @@ from gapr_core.errors import ConfigError
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
 from gapr_core.runtime import files
+from gapr_core.runtime.settings import Settings
 from gapr_core.training import provenance
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.losses import Losses
 from gapr_core.training.validation import validate
 
 log = logging.getLogger(__name__)
+MOST_NAMED = 4  # settings that an error names
 
 
 def check(folder: Path, config: TrainConfig, model: ModelConfig) -> None:
@@ -34,8 +36,17 @@ def check(folder: Path, config: TrainConfig, model: ModelConfig) -> None:
     path = folder / "config.json"
     if path.exists():
         train, network = _begun_with(path)
-        if (replace(train, model=config.model), network) != (config, model):
-            raise ConfigError("the settings this folder was begun with", f"others for {folder}", "choose a new folder")
+        if others := [*_changes(replace(train, model=config.model), config), *_changes(network, model)]:
+            more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+            given = f"others for {folder}: {', '.join(others[:MOST_NAMED])}{more}"
+            raise ConfigError("the settings this folder was begun with", given, "give those, or choose a new folder")
+
+
+def _changes(begun: Settings, now: Settings) -> list[str]:
+    """`name now instead of begun` for every setting that differs; nothing of names alone."""
+    then = begun.to_dict()
+    return [f"{name} {value!r} instead of {then[name]!r}" for name, value in now.to_dict().items()
+            if value != then[name]]  # fmt: skip
 
 
 def _begun_with(path: Path) -> tuple[TrainConfig, ModelConfig]:
@@ -54,11 +65,33 @@ def claim(
     """Write the run's settings, if they are not there yet, and where it goes on; returns all of provenance.json.
 
     Only now, when nothing that the settings name was refused: the next try may have others.
+
+    Raises:
+        ConfigError: the run there had other real bones, or see `provenance.append`.
     """
     path = folder / "config.json"
+    _check_bones(folder, config, anatomy)
     if not path.exists():
         files.write_json(path, {"train": config.to_dict(), "model": model.to_dict()})
     return provenance.append(folder, config, anatomy, step, world)
+
+
+def _check_bones(folder: Path, config: TrainConfig, anatomy: Path | None) -> None:
+    """Raise `ConfigError` where a run had other real bones or train subjects: some may be held out."""
+    entries = provenance.entries(folder)
+    begun = entries[-1].get("data", {}) if entries else {}
+    if "anatomy" in begun and begun["anatomy"] != (now := provenance.data(config.bones, anatomy))["anatomy"]:
+        given = f"{_bones(now, anatomy)} where {folder} has had {_bones(begun, None)}"
+        how = "give --anatomy as it was, with the same meshes and subjects in train, or choose a new folder"
+        raise ConfigError("the bones that this folder was begun with", given, how)
+
+
+def _bones(data: dict[str, Any], folder: Path | None) -> str:
+    """The real bones of an entry of provenance.json in words."""
+    if data["anatomy"] is None:
+        return "parametric bones alone"
+    where = f" in {folder}" if folder else ""
+    return f"{data['train_people']} train subjects{where} (hash {data['anatomy']})"
 
 
 def log_row(state: dict[str, Any], config: TrainConfig, values: dict[str, float]) -> dict[str, Any]:

@@ -143,6 +143,38 @@ def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused
             run_folder.check(tmp_path, config, model)
 
 
+def test_a_refusal_of_other_settings_names_them(tmp_path):
+    """It said that some were others, of sixty."""
+    (tmp_path / "config.json").write_text(
+        json.dumps({"train": TrainConfig().to_dict(), "model": ModelConfig().to_dict()})
+    )
+    with pytest.raises(ConfigError, match="seed 1 instead of 0, heads 2 instead of 4; give those, or choose a new"):
+        run_folder.check(tmp_path, TrainConfig(seed=1), ModelConfig(heads=2))
+    with pytest.raises(ConfigError, match="pairs 8 instead of 24000, batch 4 instead of 8, .* and 1 more; give"):
+        run_folder.check(tmp_path, TrainConfig(pairs=8, batch=4, micro_batch=2, pool=9, seed=1), ModelConfig())
+
+
+def test_a_run_goes_on_with_the_bones_and_subjects_that_it_was_begun_with(tmp_path):
+    """Without --anatomy it went on with parametric bones; a test subject that had moved to train was learned from."""
+
+    def anatomy(name, people, mesh=b"mesh"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "femur_a.npz").write_bytes(mesh)
+        (tmp_path / name / "splits.json").write_text(json.dumps({"train": people, "val": ["v"], "test": []}))
+        return tmp_path / name
+
+    run, own = tmp_path / "run", anatomy("own", ["p", "q"])
+    for folder in (own, anatomy("moved", ["p", "q"])):
+        run_folder.claim(run, TrainConfig(), ModelConfig(), folder, 0, 1)
+    others = {"parametric bones alone where .* has had 2 train subjects": None,
+              "3 train subjects in .* has had 2": anatomy("leaks", ["p", "q", "t"]),
+              "2 train subjects in .* has had 2 train": anatomy("other", ["p", "q"], b"other")}  # fmt: skip
+    for message, folder in others.items():
+        with pytest.raises(ConfigError, match=message + ".*; give --anatomy as it was"):
+            run_folder.claim(run, TrainConfig(), ModelConfig(), folder, 7, 1)
+    assert len(provenance.entries(run)) == 2
+
+
 @pytest.mark.parametrize("content", ["{", "", "{}", "[1]"])
 def test_settings_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, content):
     """They ended `gapr train` with a traceback."""

@@ -72,16 +72,49 @@ def one_at_a_time(path: str | Path) -> Iterator[None]:
             os.close(lock)
 
 
-def _locked(folder: Path) -> int | None:
-    """An open file that holds the lock of a folder until it is closed; None where there is none."""
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """A folder in which no other process is in such a block; it is made if it is missing, and goes again if empty.
+
+    Raises:
+        ConfigError: another process is in such a block, or the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = _locked(folder, wait=False)
+    except BlockingIOError as error:
+        what, how = "a folder in which nothing runs yet", "wait for its end, stop it, or choose another folder"
+        raise ConfigError(what, f"{folder}, in which another process does", how) from error
+    except OSError as error:
+        raise unwritable(folder, error) from error
+    try:
+        yield
+    finally:
+        if lock is not None:
+            os.close(lock)
+        with suppress(OSError):  # there is something in it
+            folder.rmdir()
+
+
+def _locked(folder: Path, wait: bool = True) -> int | None:
+    """An open file that holds the lock of a folder until it is closed; None where there is none.
+
+    Raises:
+        BlockingIOError: another process has it, where this one does not `wait`.
+    """
     try:
         import fcntl
 
         lock = os.open(folder, os.O_RDONLY)
     except (ImportError, OSError):
         return None
-    with suppress(OSError):  # a file system without locks
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise
+    except OSError:  # a file system without locks
+        pass
     return lock
 
 

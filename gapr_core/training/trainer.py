@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import shutil
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tqdm import tqdm
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
+from gapr_core.runtime import files
 from gapr_core.training import distributed, run_folder
 from gapr_core.training.batches import bones_folder, micro_batches
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
@@ -48,7 +50,8 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
         The averaged weights, ready for `NetworkProposer`.
 
     Raises:
-        ConfigError: fewer pairs than one batch, another or a damaged run in `folder`, or see `start.begin`.
+        ConfigError: fewer pairs than one batch, another or a damaged run in `folder`, or one that another process
+            trains; or see `start.begin`.
         WeightsError: a damaged checkpoint, or see `start.begin`.
         FloatingPointError: step after step had gradients that are not finite.
     """
@@ -56,10 +59,11 @@ def train(config: TrainConfig, folder: Path, anatomy: Path | None, minutes: floa
         given = f"{config.pairs} pairs"
         raise ConfigError(f"a batch of {config.batch} or more", given, "raise --pairs, or lower batch and micro_batch")
     group = distributed.start(config.device)
-    run = Run(config, folder, anatomy, group, card or {})
-    run.go_on(minutes)
-    distributed.stop(group)
-    run.leave()
+    with files.alone_in(folder) if group.rank == 0 else nullcontext():
+        run = Run(config, folder, anatomy, group, card or {})
+        run.go_on(minutes)
+        distributed.stop(group)
+        run.leave()
     return run.weights
 
 

@@ -111,3 +111,17 @@ def test_a_name_may_be_as_long_as_the_file_system_allows_and_no_longer(tmp_path)
     for refused in (files.check_writable, lambda path: files.write_text(path, "new")):
         with pytest.raises(ConfigError, match="too long"):
             refused(tmp_path / ("a" * 252 + ".txt"))
+
+
+def test_a_folder_is_of_one_process_at_a_time_and_leaves_nothing(tmp_path):
+    run = tmp_path / "run"
+    with files.alone_in(run):
+        with (
+            pytest.raises(ConfigError, match="run, in which another process does; wait for its end"),
+            files.alone_in(run),
+        ):
+            pass
+        (run / "a.txt").write_text("kept")
+    with files.alone_in(run):
+        (run / "a.txt").unlink()
+    assert not run.exists()

@@ -22,6 +22,7 @@ from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.export import leaves
+from gapr_core.runtime import files
 from gapr_core.runtime.settings import load
 from gapr_core.surface import Surface
 from gapr_core.training import batches, curves, distributed, export, provenance, start, trainer, validation
@@ -164,6 +165,12 @@ def test_a_run_that_was_refused_leaves_its_folder_to_the_next_one(settings, anat
     trainer.train(settings, tmp_path / "run", anatomy, minutes=0.0)
     with pytest.raises(ConfigError, match="begun"):
         trainer.train(replace(settings, seed=1), tmp_path / "run", anatomy)
+
+
+def test_a_run_that_another_process_trains_is_refused(settings, anatomy, tmp_path):
+    """`nohup gapr train &` twice: both wrote the checkpoint, and the lines of the log were of either."""
+    with files.alone_in(tmp_path / "run"), pytest.raises(ConfigError, match="another process"):
+        trainer.train(settings, tmp_path / "run", anatomy)
 
 
 def test_a_run_of_less_than_one_step_is_refused(settings, anatomy, tmp_path):

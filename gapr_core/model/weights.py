@@ -39,9 +39,24 @@ def save(
         "card": json.dumps(card or {}),
         "sha256": digest,
     }
-    with files.replacing(path) as scratch:
-        save_file(tensors, str(scratch), metadata=header)
+    write_tensors(tensors, path, header)
     return digest
+
+
+def write_tensors(tensors: dict[str, Tensor], path: str | Path, header: dict[str, str]) -> None:
+    """Write a safetensors file, whole or not at all, with the permissions of any new file (the library has 0600).
+
+    Raises:
+        ConfigError: the file cannot be written: no such folder, no permission, a full disk.
+    """
+    with files.replacing(path) as scratch:
+        scratch.touch()
+        mode = scratch.stat().st_mode
+        try:
+            save_file(tensors, str(scratch), metadata=header)
+        except SafetensorError as error:
+            raise OSError(str(error).removeprefix("Error while serializing: ")) from error
+        scratch.chmod(mode)
 
 
 def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet, dict[str, Any]]:

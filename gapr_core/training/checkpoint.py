@@ -8,25 +8,27 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from gapr_core.errors import WeightsError
 from gapr_core.model.network import GAPRNet
-from gapr_core.runtime import files
+from gapr_core.model.weights import write_tensors
 
 
 def save_checkpoint(
     path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer, state: dict[str, Any]
 ) -> None:
-    """Write weights, averaged weights, moments of AdamW and `state`; the old file stays until the new one is whole."""
+    """Write weights, averaged weights, moments of AdamW and `state`; the old file stays until the new one is whole.
+
+    Raises:
+        ConfigError: the file cannot be written, see `write_tensors`.
+    """
     tensors = {f"network.{name}": t for name, t in network.state_dict().items()}
     tensors |= {f"ema.{name}": t for name, t in ema.state_dict().items()}
     for index, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": t for name, t in moments.items()}
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
-    with files.replacing(path) as new:
-        save_file(contiguous, str(new), metadata={"state": json.dumps(state)})
+    write_tensors(contiguous, path, {"state": json.dumps(state)})
 
 
 def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer) -> dict[str, Any]:

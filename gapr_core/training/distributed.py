@@ -63,7 +63,14 @@ class Group:
 
 
 def start(device: str) -> Group:
-    """Join the group that `torchrun` has made; alone without it."""
+    """Join the group that `torchrun` has made; alone without it.
+
+    Raises:
+        ConfigError: `device` is cuda, and torch sees none.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        how = "set device to auto or cpu, or install a torch with CUDA and its driver"
+        raise ConfigError("a GPU that torch can use", f"none, with torch {torch.__version__}", how)
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     cuda = torch.cuda.is_available() if device == "auto" else device == "cuda"
     own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")

@@ -14,7 +14,6 @@ from pathlib import Path
 from gapr_core.errors import ConfigError
 from gapr_core.runtime.arguments import above_zero, at_least_one
 from gapr_core.runtime.console import say
-from gapr_core.runtime.settings import load
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -41,10 +40,10 @@ def run(args: Namespace) -> int:
         return plot(args.plot, args.out)
     if args.out is None:
         raise ConfigError("--out DIR", "none", "name the folder of the run")
-    from gapr_core.training.config import TrainConfig  # torch takes seconds to load
+    from gapr_core.training.config import read_config  # torch takes seconds to load
     from gapr_core.training.trainer import train
 
-    config = load(TrainConfig, args.config, args.set)
+    config = read_config(args.config, args.set)
     options = {name: getattr(args, name) for name in ("model", "initial", "pairs", "workers")}
     given = {name: value for name, value in options.items() if value is not None}
     written = train(replace(config, **given), args.out, args.anatomy, args.minutes)

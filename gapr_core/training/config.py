@@ -11,7 +11,7 @@ from typing import Any
 
 from gapr_core.errors import ConfigError
 from gapr_core.model.config import ModelConfig
-from gapr_core.runtime.settings import Settings, read_yaml, setting
+from gapr_core.runtime.settings import Settings, load, read_yaml, setting
 
 ONE_SIDED = {"L1": 0.15, "L2": 0.25, "L3": 0.2, "L2-region": 0.05, "L3-region": 0.05, "sweep": 0.1}
 MIX = ONE_SIDED | {"paper": 0.12, "incomplete": 0.08}
@@ -55,7 +55,7 @@ class TrainConfig(Settings):
     seed: int = setting(0, "of weights, bones, pairs and patches", low=0)
     workers: int = setting(0, "processes that make pairs; 0: the training process makes them", low=0)
     precision: str = setting("float32", "of the forward pass", choices=("float32", "bfloat16"))
-    device: str = setting("auto", "auto, cpu or cuda")
+    device: str = setting("auto", "what computes; auto: a GPU if there is one", choices=("auto", "cpu", "cuda"))
     checkpoint_minutes: float = setting(3.0, "between two checkpoints", low=0, unit="min")
     validate_minutes: float = setting(10.0, "between two validations", low=0, unit="min")
     log_steps: int = setting(1, "steps between two lines of log.csv; on a GPU every line waits for it", low=1)
@@ -71,6 +71,29 @@ class TrainConfig(Settings):
     def network(self) -> ModelConfig:
         """What is trained: `model` with `model_settings` over it."""
         return network_of(self.model, self.model_settings)
+
+
+def read_config(path: Path | None, assignments: Sequence[str] = ()) -> TrainConfig:
+    """The settings in a yaml, with `name=value` over them.
+
+    `model` and `initial` are paths from the working folder, or from a folder above the yaml: config/train_paper.yaml
+    names config/model/NAME.yaml, and means it wherever it is called from.
+
+    Raises:
+        ConfigError: the file cannot be read, or has other settings.
+    """
+    config = load(TrainConfig, path, assignments)
+    if path is None:
+        return config
+    return replace(config, model=_found(config.model, path), initial=_found(config.initial, path))
+
+
+def _found(named: str, path: Path) -> str:
+    """A path in a yaml, from the working folder: as it stands, or in a folder above the yaml if it is only there."""
+    if not named or Path(named).exists():
+        return named
+    places = (folder / named for folder in path.resolve().parents)
+    return next((os.path.relpath(place) for place in places if place.exists()), named)
 
 
 def network_of(model: str | Path, settings: Mapping[str, Any]) -> ModelConfig:

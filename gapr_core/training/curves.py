@@ -142,12 +142,11 @@ def figure(runs: Sequence[Run]) -> Figure:
     one = len(runs) == 1
     drawn = Figure(figsize=(13.0, 7.2), layout="constrained")
     top, bottom = drawn.subplots(2, 3, sharex=True)
-    _panel(top[0], "Loss (running mean)", "loss")
+    _panel(top[0], "Loss: running mean" + (" (thin: each step)" if one else ""), "loss")
     _panel(top[1], "Learning rate of AdamW", "learning rate × 1000")
     _panel(top[2], "Inliers, all protocols", "share of matches that are right", True)
     for axes, (recall, title) in zip(bottom, RECALLS.items(), strict=True):
         _panel(axes, title, "share of pairs", True)
-        axes.set_xlabel("training pairs")
         _recalls(axes, runs, recall)
     for run, colour in zip(runs, _colours(len(runs)), strict=True):
         _losses(top[0], run, colour, one, reach=_reach(run, max(r.steps["pairs"][-1] for r in runs)))
@@ -181,6 +180,7 @@ def _colours(count: int) -> list[str]:
 
 def _panel(axes: Axes, title: str, y: str, share: bool = False) -> None:
     axes.set_title(title, loc="left", fontsize=10.5)
+    axes.set_xlabel("training pairs")
     axes.set_ylabel(y)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
@@ -215,7 +215,7 @@ def _inliers(axes: Axes, run: Run, colour: str, one: bool) -> None:
 
 
 def _recalls(axes: Axes, runs: Sequence[Run], recall: str) -> None:
-    """One run: a line a protocol, all of them in black. Several: a line a run, over all protocols."""
+    """One run: a line a protocol, all of several in black. Several runs: a line a run, over all protocols."""
     if len(runs) > 1:
         lines = [(run.name, run.scores.get(ALL, {}), colour, "-", 1.8) for run, colour in
                  zip(runs, _colours(len(runs)), strict=True)]  # fmt: skip
@@ -223,7 +223,8 @@ def _recalls(axes: Axes, runs: Sequence[Run], recall: str) -> None:
         apart = sorted(protocol for protocol in runs[0].scores if protocol != ALL)
         colours = _colours(len(apart))
         lines = [(p, runs[0].scores[p], colours[k], palette.dash(k), 1.4) for k, p in enumerate(apart)]
-        lines += [("all protocols", runs[0].scores[ALL], "#111111", "-", 2.6)] if ALL in runs[0].scores else []
+        of_all = runs[0].scores.get(ALL) if len(apart) > 1 else None  # of one protocol it would lie on its line
+        lines += [("all protocols", of_all, "#111111", "-", 2.6)] if of_all else []
     for name, scores, colour, style, width in lines:
         axes.plot(scores.get("pairs", []), scores.get(recall, []), marker="o", ms=3.5, lw=width, color=colour, ls=style,
                   label=name)  # fmt: skip

@@ -28,7 +28,7 @@ from gapr_core.model.config import ModelConfig
 from gapr_core.runtime import files
 from gapr_core.training import run_folder
 from gapr_core.training.bone_cache import PooledBone
-from gapr_core.training.config import TrainConfig
+from gapr_core.training.config import TrainConfig, read_config
 from gapr_core.training.dataset import OWN_TARGET, TrainingPairs
 from gapr_core.training.targets import TrainingPair
 from gapr_core.training.trainer import learning_rate
@@ -85,7 +85,7 @@ def main(description: str, checkout: type[Checkout], teacher: Teacher) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run")
     args = parser.parse_args()
     try:
-        config = replace(TrainConfig.from_yaml(args.config), pairs=args.pairs)
+        config = replace(read_config(args.config), pairs=args.pairs)
         code = checkout.at(args.checkout)
         args.out.mkdir(parents=True, exist_ok=True)
         train(code, teacher, config, args.anatomy, args.out)

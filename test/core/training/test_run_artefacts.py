@@ -12,15 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 
 from gapr_core import cli
 from gapr_core.errors import ConfigError, WeightsError
+from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
-from gapr_core.training import curves, provenance, run_folder
+from gapr_core.training import curves, distributed, provenance, run_folder
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
-from gapr_core.training.config import TrainConfig
+from gapr_core.training.config import TrainConfig, read_config
 
 PNG = b"\x89PNG\r\n"
 LOG = "step,pairs,seconds,rate,norm,loss,coarse,fine,early\n"
@@ -49,7 +51,13 @@ def test_the_curves_of_a_run_show_what_its_files_say(run):
     assert set(recall) == {"L1", "paper", "all protocols"}
     np.testing.assert_allclose(recall["L1"].get_xydata(), [[160, 0.25], [320, 0.25]])
     np.testing.assert_allclose(rate.get_xydata(), [[8 * s, 0.5] for s in range(1, 41)])
-    assert all(axes.get_ylabel() and axes.get_title(loc="left") for axes in drawn.axes)
+    assert all(axes.get_xlabel() and axes.get_ylabel() and axes.get_title(loc="left") for axes in drawn.axes)
+
+
+def test_the_line_of_one_protocol_is_not_below_that_of_all(run):
+    text = (run / "validation.csv").read_text().splitlines(keepends=True)
+    (run / "validation.csv").write_text("".join(line for line in text if ",paper," not in line))
+    assert [line.get_label() for line in lines(curves.figure([curves.read(run, "run")]), 3)] == ["L1"]
 
 
 def test_curves_are_drawn_from_files_that_are_half_written_and_say_so(run, tmp_path, caplog):
@@ -204,6 +212,45 @@ def test_a_checkpoint_that_is_damaged_is_refused_by_its_name(toy, tmp_path, dama
         save_file({"a": torch.zeros(1)}, path)
     with pytest.raises(WeightsError, match="a checkpoint of this configuration; got .*checkpoint.safetensors: .*; re"):
         load_checkpoint(path, network, ema, optimizer)
+
+
+def test_a_checkpoint_on_a_full_disk_is_one_sentence_and_the_one_before_stays(
+    toy, tmp_path, monkeypatch
+):
+    network, ema = (GAPRNet(toy.small_config(superpoints=(10, 20), width=8, global_width=16)) for _ in range(2))
+    optimizer, path = torch.optim.AdamW(network.parameters()), tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, network, ema, optimizer, {"step": 1})
+    (tmp_path / "other.txt").touch()
+    assert path.stat().st_mode == (tmp_path / "other.txt").stat().st_mode  # it was 0600: nobody else could read weights
+
+    def full(tensors, name, metadata):
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(weights, "save_file", full)
+    with pytest.raises(ConfigError, match=r"checkpoint.safetensors \(I/O error: No space left .*free some space"):
+        save_checkpoint(path, network, ema, optimizer, {"step": 2})
+    assert load_checkpoint(path, network, ema, optimizer) == {"step": 1}
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_what_a_yaml_names_is_found_from_any_working_folder(tmp_path, monkeypatch):
+    """`gapr train --config /a/checkout/config/train_paper.yaml` knew its network in the checkout alone."""
+    root = Path(__file__).parents[3]
+    monkeypatch.chdir(tmp_path)
+    paper, head = (read_config(root / "config" / name) for name in ("train_paper.yaml", "train_bone_head.yaml"))
+    assert paper.network() == ModelConfig.from_yaml(root / "config" / "model" / "faithful_small.yaml")
+    assert Path(head.initial).samefile(root / "gapr_core" / "weights" / "gapr_net.safetensors")
+    monkeypatch.chdir(root)
+    assert read_config(Path("config/train_paper.yaml")).model == "config/model/faithful_small.yaml"
+
+
+def test_a_device_that_is_not_there_is_named(monkeypatch):
+    """`device: cuda` without a GPU ended with a traceback, `device: gpu` trained on the CPU."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="a GPU that torch can use; got none, with torch .*; set device to auto"):
+        distributed.start("cuda")
+    with pytest.raises(ConfigError, match="device one of auto, cpu, cuda"):
+        TrainConfig(device="gpu")
 
 
 @pytest.mark.parametrize(("resume", "is_right"), [(None, True), ("", True), ("first", True), ("frist", False)])

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+import gapr_core
 from gapr_core import cli
 from gapr_core.benchmark import methods
 from gapr_core.commands import evaluate
@@ -29,6 +30,11 @@ def files(tmp_path, pair):
     np.save(tmp_path / "partial.npy", pair.source)
     np.save(tmp_path / "full.npy", pair.target)
     return ["--source", str(tmp_path / "partial.npy"), "--target", str(tmp_path / "full.npy")]
+
+
+def test_the_package_runs_as_the_command():
+    done = subprocess.run([sys.executable, "-m", "gapr_core", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.strip().endswith(gapr_core.__version__)
 
 
 def test_register_prints_a_pose_and_writes_it_as_json(tmp_path, files, pair, capsys):

@@ -1,6 +1,6 @@
 """Turn the weights of a run into the file that ships: half precision, with a card in its header.
 
-python -m gapr_core.training.export runs/best --out gapr_core/weights/gapr_net.safetensors
+python -m gapr_core.training.export runs/best --licences config/licences.yaml --out NEW.safetensors
 python -m gapr_core.training.export runs/bone_head --under OLD.safetensors --out gapr_core/weights/gapr_net.safetensors
 python -m gapr_core.training.export runs/probes --mean-with OLD.safetensors --out gapr_core/weights/gapr_net.safetensors
 """
@@ -17,13 +17,10 @@ from gapr_core.errors import WeightsError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
 from gapr_core.runtime.console import exit_code, say
+from gapr_core.runtime.settings import read_yaml
 
-LICENCES = {
-    "femur, tibia, pelvis (llp26)": "MAP client plug-in fieldworklowerlimb2sidegenerationstep, Apache-2.0",
-    "pelvis (jhu40)": "Atlas-of-Pelvis-Segmentation-and-Trajectory-Planning, CC BY 4.0",
-    "femur surfaces (gias2)": "gias2, MPL-2.0",
-    "thoracic cartilage": "parametric, of this project, Apache-2.0",
-}
+PARAMETRIC = "parametric bones of GAPR, Apache-2.0"
+NOT_STATED = "of the real subjects not stated"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,6 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--mean-with", type=Path, nargs="+", default=[], help="weights of the same network: all average"
     )
+    parser.add_argument("--licences", type=Path, help="yaml: data that it was trained on, and its licence, a line each")
     parser.add_argument("--out", required=True, type=Path, help="*.safetensors")
     args = parser.parse_args(arguments)
     network, trained = weights.load(args.run / "weights.safetensors")
@@ -41,15 +39,21 @@ def main(arguments: list[str] | None = None) -> int:
     others = [weights.load(path) for path in args.mean_with]
     network = mean_of([network, *(other for other, _ in others)])
     averaged = {"mean_with": [its_card for _, its_card in others]} if others else {}
-    digest = weights.save(network, args.out, card(trained) | under | averaged, torch.float16)
+    digest = weights.save(network, args.out, card(trained, args.licences) | under | averaged, torch.float16)
     say(f"{args.out}: {args.out.stat().st_size / 1e6:.1f} MB, sha256 of the tensors {digest}")
     return 0
 
 
-def card(trained: dict[str, Any]) -> dict[str, Any]:
-    """What the header says about the weights: the run's own card, data, licences and split."""
-    people = "train subjects of splits.json only, their shape models, and parametric bones"
-    return {**trained, "data": people, "licences": LICENCES, "precision": "float16"}
+def card(trained: dict[str, Any], licences: Path | None = None) -> dict[str, Any]:
+    """What the header says about the weights: the run's own card, its data, and the licences that are stated.
+
+    Raises:
+        ConfigError: `licences` is no yaml with a mapping.
+    """
+    real = max((entry["data"]["train_people"] for entry in trained.get("provenance", [])), default=0)
+    data = f"{real} train subjects of splits.json, their shape models, and parametric bones" if real else PARAMETRIC
+    stated = read_yaml(licences) if licences else {"licences": NOT_STATED} if real else {"all bones": PARAMETRIC}
+    return {**trained, "data": data, "licences": stated, "precision": "float16"}
 
 
 def card_under(network: GAPRNet, path: Path) -> dict[str, Any]:

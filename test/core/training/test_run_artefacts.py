@@ -20,7 +20,7 @@ from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
-from gapr_core.training import curves, distributed, provenance, run_folder
+from gapr_core.training import curves, distributed, export, provenance, run_folder
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.config import TrainConfig, read_config
 
@@ -214,9 +214,7 @@ def test_a_checkpoint_that_is_damaged_is_refused_by_its_name(toy, tmp_path, dama
         load_checkpoint(path, network, ema, optimizer)
 
 
-def test_a_checkpoint_on_a_full_disk_is_one_sentence_and_the_one_before_stays(
-    toy, tmp_path, monkeypatch
-):
+def test_a_checkpoint_on_a_full_disk_is_one_sentence_and_the_one_before_stays(toy, tmp_path, monkeypatch):
     network, ema = (GAPRNet(toy.small_config(superpoints=(10, 20), width=8, global_width=16)) for _ in range(2))
     optimizer, path = torch.optim.AdamW(network.parameters()), tmp_path / "checkpoint.safetensors"
     save_checkpoint(path, network, ema, optimizer, {"step": 1})
@@ -242,6 +240,19 @@ def test_what_a_yaml_names_is_found_from_any_working_folder(tmp_path, monkeypatc
     assert Path(head.initial).samefile(root / "gapr_core" / "weights" / "gapr_net.safetensors")
     monkeypatch.chdir(root)
     assert read_config(Path("config/train_paper.yaml")).model == "config/model/faithful_small.yaml"
+
+
+def test_the_card_of_an_export_states_no_licence_of_data_that_the_run_did_not_have(tmp_path):
+    """Every export named the data behind the shipped weights, whatever it was trained on."""
+
+    def of(people):
+        return {"provenance": [{"data": {"train_people": people}}]}
+
+    assert export.card(of(0))["licences"] == {"all bones": export.PARAMETRIC}
+    assert export.card(of(9))["licences"] == {"licences": export.NOT_STATED} and "9 train" in export.card(of(9))["data"]
+    (tmp_path / "own.yaml").write_text("scans: CC BY 4.0\n")
+    assert export.card(of(9), tmp_path / "own.yaml")["licences"] == {"scans": "CC BY 4.0"}
+    assert len(export.card(of(48), Path(__file__).parents[3] / "config" / "licences.yaml")["licences"]) == 4
 
 
 def test_a_device_that_is_not_there_is_named(monkeypatch):

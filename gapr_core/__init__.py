@@ -61,3 +61,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'gapr_core' has no attribute {name!r}")
     return getattr(import_module(f"gapr_core.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """What a notebook offers after `gapr_core.`: the public names, those not loaded yet among them."""
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

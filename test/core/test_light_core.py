@@ -70,3 +70,9 @@ def test_a_report_without_its_libraries_names_the_extra(files, tmp_path):
     done = run("benchmark", "--pairs", tmp_path, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "gapr: " in done.stderr and "pip install 'gapr_ros[reports]'" in done.stderr
+
+
+def test_a_notebook_offers_the_public_names_before_they_are_used():
+    asked = "import gapr_core, sys; print('Registrar' in dir(gapr_core), 'numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"]

@@ -16,6 +16,19 @@ from gapr_core.pages.report import Image, Report
 from gapr_core.pages.sections import LEGEND, Section, sections, where_beaten
 from gapr_core.runtime import files
 
+CAPTIONS = {  # of the plots: what a reader must know who sees nothing else
+    "recall_threshold": "Share of the pairs within x mm and 1.25 x degrees; a refusal is none. Grey: 1, 2 and 4 mm.",
+    "recall_overlap": "Share of the pairs within 4 mm and 5°, over how much of the bone the source covers; a dot is "
+    "the mean of a bin.",
+    "recall_noise": "Share of the pairs within 4 mm and 5°, over the standard deviation of the source's noise; a dot "
+    "is the mean of a bin.",
+    "reliability": "Of the poses with about this confidence, the share that is right. A dot is as large as the share "
+    "of poses in its bin; on the grey line the confidence is honest, below it is too high.",
+    "risk_coverage": "Share of wrong poses among the surest ones. At the dot the method refuses the rest.",
+    "error_ellipsoids": "Dots are errors of right answers. The ellipses hold 95 %: as found, as the covariances say, "
+    "and as the noise alone allows.",
+}
+
 
 def write(
     out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]
@@ -31,7 +44,7 @@ def write(
         _add_table(report, section)
     report.paragraph(LEGEND)
     report.heading("Plots")
-    report.images([Image(_saved(out, name, figure), name) for name, figure in _plots(records, plan)])
+    report.images([Image(_saved(out, name, figure), name, CAPTIONS[name]) for name, figure in _plots(records, plan)])
     worst = pictures.worst(records, plan.ours)
     report.heading(f"The worst {len(worst)} cases of {plan.ours}")
     report.images([_case(out, number, record, plan) for number, record in enumerate(worst, 1)])

@@ -104,6 +104,13 @@ def test_errors_are_drawn_along_the_axes_of_the_bone_with_their_mean_in_the_elli
     assert max(ellipse.get_width(), ellipse.get_height()) == pytest.approx(2.0 * np.sqrt(5.991 * longest))
 
 
+def test_lines_that_lie_on_each_other_have_other_dashes():
+    """Two methods without a right answer were one line."""
+    records = some_records()
+    lines = plots.recall_against_threshold(records, ["a", "b"]).axes[0].lines
+    assert len({line.get_linestyle() for line in lines if line.get_label() in ("a", "b")}) == 2
+
+
 def test_the_worst_cases_begin_with_the_most_confident_false_accept():
     worst = pictures.worst(some_records(), "a")
     assert [r.accepted for r in worst] == [True, False, True]
@@ -133,6 +140,13 @@ def report(tmp_path_factory):
     found = [*found[:-2], refused, found[-1]]
     benchmark_report.write(folder, found, table.rows(found, ["a", "b"]), plan, {"commit": "c0ffee"}, ["One <note>."])
     return folder
+
+
+def test_every_plot_of_the_report_has_its_caption(report):
+    """Nothing said what a large dot or a grey line is."""
+    text = re.sub(r"data:image/png;base64,[^\"]*", "", (report / "report.html").read_text(encoding="utf-8"))
+    plots_of_it = re.findall(r'<figure><img alt="(?:recall|reliab|risk|error)[^>]*><figcaption>([^<]*)<', text)
+    assert len(plots_of_it) > 2 and all(plots_of_it)
 
 
 def test_the_report_needs_nothing_but_itself(report):

@@ -202,7 +202,9 @@ def _from_module(module: str, factory: str) -> RegistrationMethod:
     except GaprError:
         raise
     except Exception as error:  # whatever a module does when it is imported, and a factory when it is called
-        raise ConfigError("module:factory of a method", f"{module}:{factory} ({error})", "check the name") from error
+        is_missing = isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]
+        how = "put the folder of its file on PYTHONPATH, or correct the name" if is_missing else "check the name"
+        raise ConfigError("module:factory of a method", f"{module}:{factory} ({error})", how) from error
     if not isinstance(method, RegistrationMethod):
         raise ConfigError("a method with name, prepare and register", repr(method), "return one from the factory")
     return method

@@ -281,3 +281,10 @@ def test_a_source_that_looks_like_the_target_is_said(folder, caplog):
     caplog.clear()
     run("register --source cloud.npy --target bone.npz --method icp")
     assert "exchange" not in caplog.text
+
+
+def test_a_method_whose_module_is_not_found_is_answered_with_where_to_put_it(folder, capsys):
+    """`gapr` does not look into the working folder, as `python -m` does: the name was right."""
+    words = ["register", "--source", "cloud.npy", "--target", "cloud.npy", "--method", "mine_alone:make"]
+    assert cli.main(words) == cli.BAD_INPUT
+    assert "put the folder of its file on PYTHONPATH" in capsys.readouterr().err

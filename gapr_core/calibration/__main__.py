@@ -29,6 +29,7 @@ from gapr_core.calibration.fit import (
     of_unseen_people,
 )
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
+from gapr_core.data.anatomy import SPLITS
 from gapr_core.errors import ConfigError
 from gapr_core.registration.additive import FORMAT, Additive, as_dict
 from gapr_core.registration.confidence import CALIBRATIONS
@@ -75,7 +76,8 @@ def _parser() -> ArgumentParser:
         "--streams", type=int, default=0, help="streams of frames, half of them of others (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the pairs (default: %(default)s)")
-    parser.add_argument("--split", default="train", help="subjects to learn from (default: %(default)s)")
+    parser.add_argument("--split", default="train", choices=[split for split in SPLITS if split != "test"],
+                        help="subjects to learn from (default: %(default)s)")  # fmt: skip
     parser.add_argument("--jobs", type=at_least_one, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--dask", metavar="ADDRESS", help=cluster.ARGUMENT)
     return parser

@@ -118,3 +118,11 @@ def test_too_few_pairs_for_a_fit_are_one_sentence(answers, judged_by):
 def test_a_calibration_without_pairs_is_one_sentence(tmp_path, line):
     with pytest.raises(ConfigError, match="pairs, scenes or streams"):
         calibration.main(["--anatomy", str(tmp_path), "--out", str(tmp_path / "out"), *line.split()])
+
+
+@pytest.mark.parametrize("split", ["test", "all", "trian"])
+def test_nothing_is_fitted_to_test_subjects(tmp_path, capsys, split):
+    """`--split test` learned from those that the results are counted on, without a word."""
+    with pytest.raises(SystemExit):
+        calibration.main(["--anatomy", str(tmp_path), "--out", str(tmp_path / "out"), "--split", split])
+    assert "train" in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -17,7 +17,7 @@ from gapr_core.pages.sections import LEGEND, Section, sections, where_beaten
 from gapr_core.runtime import files
 
 CAPTIONS = {  # of the plots: what a reader must know who sees nothing else
-    "recall_threshold": "Share of the pairs within x mm and 1.25 x degrees; a refusal is none. Grey: 1, 2 and 4 mm.",
+    "recall_threshold": "Share of the pairs within x mm and 1.25 x degrees; refusals are misses. Grey: 1, 2 and 4 mm.",
     "recall_overlap": "Share of the pairs within 4 mm and 5°, over how much of the bone the source covers; a dot is "
     "the mean of a bin.",
     "recall_noise": "Share of the pairs within 4 mm and 5°, over the standard deviation of the source's noise; a dot "

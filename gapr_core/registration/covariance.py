@@ -55,6 +55,10 @@ class PoseUncertainty:
     smooth_mm: float
     short_mm: float
 
+    def with_more(self, covariance: Array) -> PoseUncertainty:
+        """The same with a further independent error, (6, 6), of the pose."""
+        return replace(self, covariance=self.covariance + covariance)
+
     @property
     def weakest_turn(self) -> Array:
         """(3,) unit axis, target frame, about which the rotation is least certain."""

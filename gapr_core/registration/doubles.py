@@ -91,9 +91,8 @@ def _with_copy(assessment: Assessment, copy: Assessment, share: float) -> Assess
     """The same with the way to a copy in its covariance, and no more probable than its share of both one's points."""
     a = assessment
     twist = error_twist(copy.fit.T, a.fit.T, a.source.points)
-    covariance = a.uncertainty.covariance + np.outer(twist, twist)
+    uncertainty = a.uncertainty.with_more(np.outer(twist, twist))
     deformed = {NAME: se3.rms_apart_mm(copy.fit.T, a.fit.T, a.source.points), **a.deformed}
-    uncertainty = replace(a.uncertainty, covariance=covariance)
     return replace(a.capped(share, NAME), uncertainty=uncertainty, deformed=deformed, most=min(a.most, share))
 
 

@@ -115,14 +115,15 @@ def allowing_for_deformation(assessment: Assessment, config: RegistrarConfig) ->
     found = {name: each for name, each in of_deformations(a.fit.rests_on, config.rigidity).items() if each.is_shown}
     if not found:
         return a
-    covariance = a.uncertainty.covariance
+    uncertainty = a.uncertainty
     for each in found.values():
-        covariance = covariance + covariance_added_by(a.fit, each.finding.size_mm * each.changes, config.covariance)
+        added = covariance_added_by(a.fit, each.finding.size_mm * each.changes, config.covariance)
+        uncertainty = uncertainty.with_more(added)
         if each.in_halves:
-            covariance = covariance + covariance_of_half(a.fit, each.finding.size_mm)
+            uncertainty = uncertainty.with_more(covariance_of_half(a.fit, each.finding.size_mm))
     surest = sorted(found.items(), key=lambda item: -item[1].finding.log_ratio)
     deformed = {name: each.finding.size_mm for name, each in surest}
-    return replace(a, uncertainty=replace(a.uncertainty, covariance=covariance), deformed=deformed)
+    return replace(a, uncertainty=uncertainty, deformed=deformed)
 
 
 def allowing_for_looks(
@@ -135,8 +136,7 @@ def allowing_for_looks(
     found = None if look is None else of_looks(fit, look, config.rigidity)
     if found is None or not found.is_shown:
         return uncertainty
-    added = covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance)
-    return replace(uncertainty, covariance=uncertainty.covariance + added)
+    return uncertainty.with_more(covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance))
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:

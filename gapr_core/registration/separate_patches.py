@@ -53,7 +53,7 @@ def allowing_for_a_patch(assessment: Assessment, config: RegistrarConfig) -> Ass
     if without.sigma_mm >= FALLS_TO * whole.sigma_mm or moved_mm <= MOVES_MM:
         return a
     twist = error_twist(without.T, whole.T, points)
-    uncertainty = replace(a.uncertainty, covariance=a.uncertainty.covariance + np.outer(twist, twist))
+    uncertainty = a.uncertainty.with_more(np.outer(twist, twist))
     return replace(a, uncertainty=uncertainty, deformed={NAME: moved_mm, **a.deformed})
 
 

@@ -74,7 +74,7 @@ def _is_known_scene(assessment: Assessment) -> bool:
 def full_image_margin(assessment: Assessment, config: RegistrarConfig, register: Register) -> float:
     """As `mirror.image_margin`, with the mirror image of the source registered in full; infinite without a pose."""
     a = assessment
-    flipped = sources.prepare(a.source.whole * mirror.FLIP.diagonal()[:3], config.source, config.num_threads)
+    flipped = sources.prepare(mirror.flipped(a.source.whole), config.source, config.num_threads)
     image = None if isinstance(flipped, Refusal) else register(flipped, a.target)
     if image is None:
         return np.inf

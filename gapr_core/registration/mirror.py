@@ -30,6 +30,11 @@ LEAST_MM = 0.1
 FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
+def flipped(points: Array) -> Array:
+    """Points (N, 3) under `FLIP`."""
+    return points * FLIP.diagonal()[:3]
+
+
 def margin(
     T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
 ) -> float:
@@ -72,7 +77,7 @@ def image_margin(T: Array, source: PreparedSource, target: PreparedTarget, confi
     some = source.subset(config.verification.middle_points)
     sigmas_mm = [
         evaluate(pose, points, target, config.refinement).sigma_mm
-        for pose, points in ((poses[0], some * FLIP.diagonal()[:3]), (T, some))
+        for pose, points in ((poses[0], flipped(some)), (T, some))
     ]
     return Misfit(float(scores[0]), sigmas_mm[0]).log_ratio(Misfit(own_mm2, sigmas_mm[1]))
 
@@ -83,10 +88,9 @@ def is_symmetric(target: PreparedTarget, config: RegistrarConfig) -> bool:
     if image is None:
         return False
     if key not in target.cache:
-        points, verification = _some_of(target), config.verification
-        flipped, limits_mm = points * FLIP.diagonal()[:3], np.linspace(*verification.middle_limits_mm)
-        T = refine_many((image @ FLIP)[None], flipped, target, limits_mm, config.num_threads)[0][0]
-        target.cache[key] = bool(np.median(distances_mm(T, flipped, target)) < SYMMETRIC_MM)
+        points, limits_mm = flipped(_some_of(target)), np.linspace(*config.verification.middle_limits_mm)
+        T = refine_many((image @ FLIP)[None], points, target, limits_mm, config.num_threads)[0][0]
+        target.cache[key] = bool(np.median(distances_mm(T, points, target)) < SYMMETRIC_MM)
     return bool(target.cache[key])
 
 
@@ -127,7 +131,7 @@ def _refined_images(
     """
     some, limits_mm = source.subset(config.middle_points), np.linspace(*config.middle_limits_mm)
     own = refine_many(T[None], some, target, limits_mm, num_threads)[1][0]
-    poses, scores = refine_many(reflections @ T @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
+    poses, scores = refine_many(reflections @ T @ FLIP, flipped(some), target, limits_mm, num_threads)
     return poses, scores, float(own)
 
 
@@ -151,10 +155,9 @@ def _some_of(target: PreparedTarget) -> Array:
 
 def _own_image(target: PreparedTarget, config: VerificationConfig, num_threads: int) -> Array | None:
     """(4, 4) motion with a reflection that lays the bone on itself, target frame; None where there is none."""
-    some = _some_of(target)
-    limits_mm = np.linspace(*config.middle_limits_mm)
+    some, limits_mm = flipped(_some_of(target)), np.linspace(*config.middle_limits_mm)
     planes = np.array([_reflection(normal, target.centre_mm) for normal in target.main_axes])
-    poses, scores = refine_many(planes @ FLIP, some * FLIP.diagonal()[:3], target, limits_mm, num_threads)
+    poses, scores = refine_many(planes @ FLIP, some, target, limits_mm, num_threads)
     images = [poses[number] @ FLIP for number in np.argsort(scores)]
     return next((image for image in images if _is_own_image(image, target)), None)
 

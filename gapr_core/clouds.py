@@ -57,32 +57,31 @@ def load(
     if options is not None and not isinstance(options, ReadOptions):
         how = "pass ReadOptions(axes=..., labels=...) of gapr_core"
         raise ConfigError("options as ReadOptions", type(options).__name__, how)
+    path = None
     if isinstance(source, str | Path):
-        name, surface = str(source), reading.read(Path(source), options)
-        is_in_mm, how = reading.format_of(Path(source)).is_in_mm(options or ReadOptions()), OF_FILE
+        path = Path(source)
+        name, surface, how = str(source), reading.read(path, options), OF_FILE
+    elif isinstance(source, Surface):
+        name, surface, how = "array", _checked(source), OF_ARRAY
     else:
-        name, surface = "array", _checked(source) if isinstance(source, Surface) else Surface(as_points(source))
-        is_in_mm, how = False, OF_ARRAY
+        name, surface, how = "array", Surface(as_points(source)), OF_ARRAY
     surface = _drop_non_finite(surface, name)
     if of_bone:
         _check_apart(surface, name)
     if surface.faces is not None and len(surface.faces):
         _check_faces(surface, name)
-    if is_in_mm:
-        if of_bone:
-            _check_size(surface, "mm", name, OF_HEADER)
-        _warn_of_several_bones(surface, name)
-        return surface
-    if isinstance(source, str | Path):
-        units = _agreed(units, columns.unit(Path(source)), name)
-        _warn_of_columns(Path(source), surface)
+    if path is not None and reading.format_of(path).is_in_mm(options or ReadOptions()):
+        units, how = "mm", OF_HEADER
+    elif path is not None:
+        units = _agreed(units, columns.unit(path), name)
+        _warn_of_columns(path, surface)
     units = _known(surface, units, name)
     if of_bone:
         _check_size(surface, units, name, how)
     scale = MM_PER_UNIT[units]
     camera = None if surface.camera is None else surface.camera * scale
     surface = replace(surface, points=surface.points * scale, camera=camera)
-    if isinstance(source, str | Path):
+    if path is not None:
         _warn_of_several_bones(surface, name)
     return surface
 
@@ -208,7 +207,7 @@ def _check_apart(surface: Surface, name: str) -> None:
 
 
 def _drop_non_finite(surface: Surface, name: str) -> Surface:
-    finite = np.asarray((np.abs(surface.points) < BEYOND).all(axis=1))
+    finite = is_point(surface.points)
     if not finite.any():
         raise InvalidPointCloudError(
             "points", f"{name} with {len(finite)} points, none finite", "check how it was made"

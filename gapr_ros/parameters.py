@@ -133,14 +133,19 @@ class NodeParameters(Settings):
     covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation", unit="rad", low=1e-9)
 
     @property
+    def collects(self) -> bool:
+        """Whether several clouds are registered as one."""
+        return self.accumulate > 1
+
+    @property
     def names_a_place(self) -> bool:
         """Whether every cloud is registered as what a camera saw from a place that is known."""
-        return self.viewpoint not in NO_FRAME and (self.accumulate <= 1 or self.sensor not in TOGETHER)
+        return self.viewpoint not in NO_FRAME and not (self.collects and self.sensor in TOGETHER)
 
     @property
     def collects_looks(self) -> bool:
         """Whether clouds that are registered as one are looks of a camera, each from a place of its own."""
-        return self.accumulate > 1 and self.names_a_place
+        return self.collects and self.names_a_place
 
 
 FIELDS: Mapping[str, Field] = {f.name: f for f in fields(NodeParameters)}
@@ -181,18 +186,18 @@ def remarks(parameters: NodeParameters) -> list[str]:
         sentences.append(f"an error of the whole cloud's place, such as a tracker's, is in tre95 only {stated}")
     if parameters.max_tre == 0.0:
         sentences.append("max_tre is 0: a pose goes out however large its tre95 over the bone is")
-    if sensor in TOGETHER and parameters.accumulate > 1:
+    if sensor in TOGETHER and parameters.collects:
         sentences.append(f"sensor {sensor}: the last {parameters.accumulate} clouds are registered as one")
     elif sensor in TOGETHER and not parameters.output_frame:
         why = "output_frame is empty: name the frame of the reference that is fixed to the bone"
         sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
-    if parameters.accumulate > 1 and not parameters.output_frame:
+    if parameters.collects and not parameters.output_frame:
         sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
     if parameters.collects_looks:
         count = min(parameters.accumulate, MOST_LOOKS)
         most = f", {MOST_LOOKS} at most" if parameters.accumulate > MOST_LOOKS else ""
         sentences.append(f"the last {count} looks are registered as one, each from another direction{most}")
-    elif parameters.viewpoint not in NO_FRAME and parameters.accumulate > 1:
+    elif parameters.viewpoint not in NO_FRAME and parameters.collects:
         sentences.append(f"viewpoint is not used: sensor {sensor} sees nothing from afar")
     if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
         sentences.append(f"assess_every is not used: {why}")
@@ -234,7 +239,7 @@ def why_all_assessed(parameters: NodeParameters) -> str:
     """Why no cloud can be followed with these parameters, whatever `assess_every` is; empty where some can."""
     if not parameters.track:
         return "track is off, so there is no pose to follow"
-    if parameters.accumulate > 1:
+    if parameters.collects:
         return "a cloud that is registered with others says little alone"
     if parameters.viewpoint not in NO_FRAME:
         return "with a viewpoint nobody knows which part of a cloud is bone before it is assessed"

@@ -77,9 +77,9 @@ def take_in(cloud: Any, model_extent_mm: float, parameters: NodeParameters, crop
     for crop in crops:
         points = crop(points)
     left_out = _left_out(len(whole), len(in_range), len(points))
-    check_count(len(points), 1 if parameters.accumulate > 1 else parameters.min_points, left_out)
+    check_count(len(points), 1 if parameters.collects else parameters.min_points, left_out)
     points = thin(points, parameters.max_points, parameters.seed)
-    if parameters.accumulate <= 1:
+    if not parameters.collects:
         check_unit(points, model_extent_mm, parameters.cloud_unit)
     check_spread(points, model_extent_mm, parameters.cloud_unit)
     return points
@@ -90,7 +90,7 @@ def seen_from(cloud: Any, parameters: NodeParameters) -> Array | None:
 
     Organised clouds show it in any frame, others in that of their camera (`geometry.pinhole`); None where neither does.
     """
-    if parameters.viewpoint != "auto" or parameters.accumulate > 1:
+    if parameters.viewpoint != "auto" or parameters.collects:
         return None
     kind = INPUTS[parameters.cloud_type]
     grid = kind.grid(cloud)

@@ -46,7 +46,7 @@ class ShippedMethod:
             self._settings = settings
         registrar = Registrar.from_pretrained(configured(self._settings, parameters), parameters.device)
         method = Tracker(registrar) if parameters.track else registrar
-        if parameters.accumulate <= 1:
+        if not parameters.collects:
             return method
         if parameters.collects_looks:
             return LookAccumulator(method, min(parameters.accumulate, MOST_LOOKS))

@@ -99,7 +99,7 @@ class Registration:
         points_mm = self._points_mm(outcome, now)
         self._watch_frame(outcome.header.frame_id, now)
         outcome.points_used, self._newest_collected = len(points_mm), None
-        if now.parameters.accumulate > 1:
+        if now.parameters.collects:
             self._late.take(now.parameters.tf_timeout)  # the transform of this cloud has come: so have those of before
             self._check_together(points_mm, outcome, now)
         is_to_be_assessed = outcome.job.urgent or outcome.seen_from is not None
@@ -183,8 +183,8 @@ class Registration:
 
     def _viewpoint_mm(self, outcome: Outcome, now: Situation) -> Array | None:
         """(3,) where the camera was, in the frame of the answer; None where it is not known, or not one place."""
-        frame, together = now.parameters.viewpoint, now.parameters.accumulate > 1
-        if (frame in NO_FRAME and outcome.seen_from is None) or (together and not now.parameters.collects_looks):
+        frame, is_probe = now.parameters.viewpoint, now.parameters.collects and not now.parameters.collects_looks
+        if is_probe or (frame in NO_FRAME and outcome.seen_from is None):
             return None
         T_frame_cloud = self._lookup(outcome.header.frame_id, outcome, now)
         if outcome.seen_from is not None:

@@ -122,12 +122,9 @@ class Session:
         self._put(Job(data, self.course.epoch, now_ns))
 
     def _put(self, job: Job) -> None:
-        pushed_out = self.worker.put(job, leave=self._registration.collect if self._accumulates else None)
-        self._host.counters.dropped += pushed_out and not self._accumulates
-
-    @property
-    def _accumulates(self) -> bool:
-        return self._host.parameters.accumulate > 1
+        collects = self._host.parameters.collects
+        pushed_out = self.worker.put(job, leave=self._registration.collect if collects else None)
+        self._host.counters.dropped += pushed_out and not collects
 
     def take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
@@ -290,7 +287,7 @@ class Session:
             self._forget_clouds("clouds are read in another way")
         if self._changes.in_limits(now):
             self.course.forget_place()
-            if self._accumulates:
+            if self._host.parameters.collects:
                 self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)
         self.worker.wake()
@@ -333,7 +330,7 @@ class Session:
             outcome = Outcome(waiting)
             outcome.refuse(Reason.SUPERSEDED_BY_RESET, why)
             outcome.answer_waiters()
-        if self._accumulates:
+        if self._host.parameters.collects:
             if waiting is not None:
                 self.worker.run(partial(self._registration.collect, waiting))
             return

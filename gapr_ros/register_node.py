@@ -77,7 +77,7 @@ def spin(node: RegisterNode, executor: Executor) -> None:
     """Run the node until it is asked to stop; no exception of a callback ends it."""
     from rclpy.executors import ExternalShutdownException
 
-    from gapr_ros.node.guard import describe
+    from gapr_ros.node.guard import THROTTLE_S, describe
 
     executor.add_node(node)
     while node.context.ok():
@@ -86,7 +86,7 @@ def spin(node: RegisterNode, executor: Executor) -> None:
         except (KeyboardInterrupt, ExternalShutdownException):
             break
         except Exception as error:
-            node.get_logger().error(f"a callback failed: {describe(error)}", throttle_duration_sec=5.0)
+            node.get_logger().error(f"a callback failed: {describe(error)}", throttle_duration_sec=THROTTLE_S)
 
 
 def _run(node: RegisterNode, executor: Executor) -> int:

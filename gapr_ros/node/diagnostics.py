@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from gapr_ros.node import timeline, units
+from gapr_ros.node.guard import THROTTLE_S
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Outcome
 from gapr_ros.node.refusal import Reason
 
 SILENCE_S = 2.0
 LARGE = "; by best effort clouds of more than 0.5 MB may never come: let their publisher be reliable"
-THROTTLE_S = 5.0
 LOST_FOR_S = 5.0  # after a cloud was lost the input is not well
 
 
@@ -93,7 +93,7 @@ class Input:
 
 
 class RefusalLog:
-    """Writes a refusal when the last line of its reason is 5 s old, with the number of those in between."""
+    """Writes a refusal when the last line of its reason is `THROTTLE_S` old, with the number of those in between."""
 
     def __init__(self, write: Callable[[str], None]) -> None:
         self._write = write

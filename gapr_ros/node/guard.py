@@ -10,7 +10,7 @@ from typing import Any
 
 from rclpy.lifecycle import TransitionCallbackReturn
 
-THROTTLE_S = 5.0
+THROTTLE_S = 5.0  # between two lines of one kind in the log
 
 
 def guarded(callback: Callable[..., Any]) -> Callable[..., Any]:

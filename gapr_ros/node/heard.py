@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gapr_ros.node.guard import THROTTLE_S
 from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.links import Links
 from gapr_ros.node.timeline import BACK_NS, RESTART_AFTER, stamp_ns
@@ -15,7 +16,6 @@ from gapr_ros.node.timeline import BACK_NS, RESTART_AFTER, stamp_ns
 if TYPE_CHECKING:
     from geometry_msgs.msg import TransformStamped
 
-THROTTLE_S = 5.0
 LATE_NS = 50_000_000  # a cloud that is so much older than a transform came late, or the clock was set back before it
 OUT_OF_ORDER_NS = 10_000_000  # a transform may be so much older than the newest of its frame, as where threads race
 

@@ -30,8 +30,9 @@ from gapr_ros.node.changes import Changes
 from gapr_ros.node.collection import forget
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.node.course import Course
-from gapr_ros.node.diagnostics import THROTTLE_S, RefusalLog
+from gapr_ros.node.diagnostics import RefusalLog
 from gapr_ros.node.frames import Frames
+from gapr_ros.node.guard import THROTTLE_S
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model, Ready
 from gapr_ros.node.outcome import Outcome

@@ -21,18 +21,18 @@ class Late:
 
     Args:
         collect: has the method keep a cloud; raises what is wrong with it.
-        left: is called for every cloud: whether it was collected, and why not.
+        report: is called for every cloud: whether it was collected, and why not.
     """
 
-    def __init__(self, collect: Callable[[Job], None], left: Callable[[bool, str], None]) -> None:
-        self._collect, self._left = collect, left
+    def __init__(self, collect: Callable[[Job], None], report: Callable[[bool, str], None]) -> None:
+        self._collect, self._report = collect, report
         self._jobs: deque[tuple[float, Job]] = deque()  # with the time of the first try
 
     def add(self, job: Job) -> None:
         """One more; the oldest goes when there are too many."""
         if len(self._jobs) == MOST_LATE:
             self._jobs.popleft()
-            self._left(False, f"more than {MOST_LATE} clouds wait for their transforms")
+            self._report(False, f"more than {MOST_LATE} clouds wait for their transforms")
         self._jobs.append((time.monotonic(), job))
 
     def take(self, wait_s: float) -> None:
@@ -44,7 +44,7 @@ class Late:
         """Drop those that wait."""
         jobs, self._jobs = self._jobs, deque()
         for _ in jobs:
-            self._left(False, why)
+            self._report(False, why)
 
     def _is_done(self, since: float, job: Job, wait_s: float) -> bool:
         try:
@@ -52,11 +52,11 @@ class Late:
         except RefusedError as refusal:
             if refusal.reason is Reason.TF_MISSING and time.monotonic() - since < wait_s:
                 return False
-            self._left(False, str(refusal))
+            self._report(False, str(refusal))
         except Exception as error:  # whatever is wrong with it, it is counted as dropped
-            self._left(False, describe(error))
+            self._report(False, describe(error))
         else:
-            self._left(True, "")
+            self._report(True, "")
         return True
 
 

@@ -41,13 +41,13 @@ class Counters:
     last_cloud_at: float = field(default_factory=time.monotonic)
     last_lost_at: float = float("-inf")
 
-    def lose(self, count: int) -> None:
+    def count_lost(self, count: int) -> None:
         """So many clouds more were sent and never came; fewer than none where some were missed by mistake."""
         self.lost += count
         if count > 0:
             self.last_lost_at = time.monotonic()
 
-    def receive(self) -> None:
+    def count_received(self) -> None:
         """A cloud came."""
         self.received += 1
         self.last_cloud_at = time.monotonic()
@@ -56,17 +56,17 @@ class Counters:
         """Nothing was refused yet of what comes now; the counts go on."""
         self.consecutive_refusals, self.last_refusal = 0, ""
 
-    def leave(self, merged: bool) -> None:
+    def count_pushed_out(self, merged: bool) -> None:
         """A cloud that was pushed out is registered with a newer one, or could not be."""
         self.merged += merged
         self.dropped += not merged
 
-    def show(self, shown: bool) -> None:
+    def count_followed(self, shown: bool) -> None:
         """A cloud was followed; where its pose may not be shown any more, it is dropped."""
         self.followed += shown
         self.dropped += not shown
 
-    def answered(self, outcome: Outcome) -> None:
+    def count_answer(self, outcome: Outcome) -> None:
         """A cloud was answered."""
         if outcome.ok:
             self.accepted += 1

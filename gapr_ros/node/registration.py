@@ -44,12 +44,14 @@ class Registration:
         situation: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
             when there is such a pose, and with `accumulate` it has `collect` and `together_with` as an `Accumulator`,
             or where `viewpoint` names a place as a `LookAccumulator`.
-        left: is called for every cloud of `collect`, now or later: whether it was collected, and why not.
+        report_collected: is called for every cloud of `collect`, now or later: whether it was collected, and why not.
     """
 
-    def __init__(self, frames: Frames, situation: Callable[[], Situation], left: Callable[[bool, str], None]) -> None:
+    def __init__(
+        self, frames: Frames, situation: Callable[[], Situation], report_collected: Callable[[bool, str], None]
+    ) -> None:
         self._frames, self._situation = frames, situation
-        self._late = Late(self._collect, left)
+        self._late = Late(self._collect, report_collected)
         self._following, self._initial_poses = Following(), InitialPoses()
         self._newest_collected: Job | None = None  # since a cloud was registered; it alone may change the frame
         self._frame = ""  # of the last answer; what the method remembers holds there only

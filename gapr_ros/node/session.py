@@ -81,7 +81,7 @@ class Session:
         self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future, self._moved)
         self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
         self._publishers = Publishers(host, self._frames)
-        self._registration = Registration(self._frames, self._situation, self._left)
+        self._registration = Registration(self._frames, self._situation, self._report_collected)
         self.worker = Worker(self._work, self._held, self._period_s)
         self.parameters_changed()  # a limit may have been set while the bone was read
 
@@ -107,7 +107,7 @@ class Session:
     def take_cloud(self, data: bytes, alone: bool = False) -> None:
         """A serialised cloud, from the only publisher or not: into the mailbox, unless time or frame is refused."""
         counters, now_ns = self._host.counters, self._host.now_ns()
-        counters.receive()
+        counters.count_received()
         if not self.enabled:
             counters.dropped += 1
             return
@@ -178,9 +178,9 @@ class Session:
     def _work(self, job: Job) -> None:
         self._host.call_soon(partial(self._conclude, self._registration.process(job)))
 
-    def _left(self, collected: bool, why: str) -> None:
+    def _report_collected(self, collected: bool, why: str) -> None:
         """A cloud that a newer one pushed out of the mailbox is registered with it, or could not be."""
-        self._host.call_soon(partial(self._count_left, collected, why))
+        self._host.call_soon(partial(self._count_collected, collected, why))
 
     def _situation(self) -> Situation:
         host, ready, course = self._host, self._ready, self.course
@@ -202,8 +202,8 @@ class Session:
 
     # --- out: the executor's thread again ---
 
-    def _count_left(self, collected: bool, why: str) -> None:
-        self._host.counters.leave(collected)
+    def _count_collected(self, collected: bool, why: str) -> None:
+        self._host.counters.count_pushed_out(collected)
         if not collected:
             self._warn(f"a cloud is not registered with the newer ones: {why}")
 
@@ -219,7 +219,7 @@ class Session:
         """Send a pose that was followed where what it rests on still stands. It is no answer and changes nothing."""
         stands = self.course.may_show(T_frame_model, outcome, self.model, self._host.parameters)
         shown = stands and not self._closed
-        self._host.counters.show(shown)
+        self._host.counters.count_followed(shown)
         if shown:
             self._publishers.send_followed(T_frame_model, outcome.header)
         self._host.report()
@@ -229,7 +229,7 @@ class Session:
         self.last_outcome = outcome
         self._guesses = self._guesses if outcome.reason is Reason.SUPERSEDED_BY_RESET else 0
         self._standing = outcome if outcome.ok else self._standing
-        self._host.counters.answered(outcome)
+        self._host.counters.count_answer(outcome)
         if not outcome.ok:
             self._log_refusal(outcome)
         try:

@@ -122,7 +122,7 @@ class Subscriptions:
             return
         publishers = self._host.ros.count_publishers(self._clouds.topic_name)
         if number is not None:
-            self._host.counters.lose(self._gaps.note(number, publishers))
+            self._host.counters.count_lost(self._gaps.note(number, publishers))
         self._session.take_cloud(data, alone=publishers == 1)
 
     def _is_taken(self, key: tuple[int, int | None]) -> bool:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.timer import Timer
 
 from gapr_ros.node.diagnostics import Counters
 from gapr_ros.parameters import NodeParameters
@@ -38,3 +41,8 @@ class Host(Protocol):
     def report(self) -> None:
         """Send the diagnostics now; in the executor's thread."""
         ...
+
+
+def steady_timer(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
+    """A timer that does not stop with simulated time."""
+    return node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))

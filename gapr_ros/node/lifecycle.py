@@ -16,7 +16,7 @@ from typing import Any
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
+from rclpy.clock import ClockChange, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -29,6 +29,7 @@ from gapr_ros import parameters
 from gapr_ros.node import frames
 from gapr_ros.node.diagnostics import Counters
 from gapr_ros.node.guard import RosLogHandler, guarded, transition
+from gapr_ros.node.host import steady_timer
 from gapr_ros.node.loader import Loader
 from gapr_ros.node.method import ShippedMethod
 from gapr_ros.node.model import make_ready
@@ -71,7 +72,7 @@ class RegisterNode(LifecycleNode):
         self._reporter = Reporter(self, self._loader)
         self._services_offered = Services(self, self._loader, lambda: self.state, lambda: self.session)
         self._load_before_configuring()
-        self._diagnosing = self.create_timer(self.parameters.diagnostics_period, self.report, clock=_steady_clock())
+        self._diagnosing = steady_timer(self, self.parameters.diagnostics_period, self.report)
         if self.parameters.autostart:
             self.call_soon(self._autostart)
         else:
@@ -297,8 +298,3 @@ class RegisterNode(LifecycleNode):
     @guarded
     def _run_call(self, call: Callable[[], None]) -> None:
         call()
-
-
-def _steady_clock() -> Clock:
-    """For diagnostics, which must not stop with simulated time."""
-    return Clock(clock_type=ClockType.STEADY_TIME)

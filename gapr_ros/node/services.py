@@ -8,14 +8,13 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
 from gapr_ros.node.guard import describe
-from gapr_ros.node.host import Host
+from gapr_ros.node.host import Host, steady_timer
 from gapr_ros.node.loader import Loader
 from gapr_ros.node.session import Session
 
@@ -69,7 +68,7 @@ class Answers:
     def _line_up(self, turn: Future) -> None:
         self._waiting.append(turn)
         if self._pause is None and self._host.ros.context.ok():  # a node that ends answers nobody
-            self._pause = self._host.ros.create_timer(PACE_S, self._next, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self._pause = steady_timer(self._host.ros, PACE_S, self._next)
             self._next()
 
     def _next(self) -> None:

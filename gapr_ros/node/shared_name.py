@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
-
 from gapr_ros.node.conflicts import Conflicts, names_of
 from gapr_ros.node.guard import guarded
-from gapr_ros.node.host import Host
+from gapr_ros.node.host import Host, steady_timer
 
 KIND = "own topics"
 TOPICS = ("~/pose", "~/status")
@@ -28,7 +26,7 @@ class SharedName:
         self._host, self._conflicts = host, conflicts
         self._topics = [host.ros.resolve_topic_name(name) for name in TOPICS]
         self._seen = 0
-        self._looking = host.ros.create_timer(LOOK_S, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._looking = steady_timer(host.ros, LOOK_S, self.look)
 
     def get_logger(self) -> Any:
         """The node's logger (for `guarded`)."""

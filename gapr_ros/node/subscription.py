@@ -7,7 +7,6 @@ from collections import deque
 from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
@@ -15,7 +14,7 @@ from gapr_ros.node.conflicts import names_of
 from gapr_ros.node.diagnostics import Input
 from gapr_ros.node.gaps import Gaps
 from gapr_ros.node.guard import guarded
-from gapr_ros.node.host import Host
+from gapr_ros.node.host import Host, steady_timer
 from gapr_ros.node.session import Session
 from msg_adapters import INPUTS
 
@@ -48,7 +47,7 @@ class Subscriptions:
             PoseWithCovarianceStamped, INITIAL_POSES, self._on_initial_pose, 1
         )
         self._check_points = host.ros.create_subscription(PoseArray, CHECK_POINTS, self._on_check_points, 10)
-        self._looking = host.ros.create_timer(LOOK_S, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._looking = steady_timer(host.ros, LOOK_S, self.look)
 
     def describe(self) -> Input:
         """For /diagnostics."""

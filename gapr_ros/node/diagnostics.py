@@ -78,7 +78,7 @@ class Counters:
 
 
 @dataclass
-class Input:
+class CloudTopic:
     """What is known about the topic of the clouds.
 
     Attributes:
@@ -125,7 +125,7 @@ class Snapshot:
         counters: what became of every cloud.
         model: the bone, when there is one.
         last: what became of the last cloud.
-        source: what is known about the topic of the clouds.
+        topic: of the clouds, what is known about it.
         listening: whether it is subscribed to.
         conflicts: what is wrong around the node.
         hardware_id: the bone's file.
@@ -141,7 +141,7 @@ class Snapshot:
     counters: Counters
     model: Model | None
     last: Outcome | None
-    source: Input
+    topic: CloudTopic
     listening: bool
     conflicts: tuple[str, ...]
     hardware_id: str
@@ -152,7 +152,7 @@ class Snapshot:
 def registration_status(now: Snapshot) -> DiagnosticStatus:
     """The state of the registration."""
     level, message = _level(now)
-    counters, source = now.counters, now.source
+    counters, topic = now.counters, now.topic
     path, points = ("", 0) if now.model is None else (now.model.path, len(now.model.target.points))
     values = {
         "state": now.state,
@@ -166,7 +166,7 @@ def registration_status(now: Snapshot) -> DiagnosticStatus:
         "frames_accepted": counters.accepted, "frames_refused": counters.refused, "frames_merged": counters.merged,
         "frames_followed": counters.followed, "frames_lost": counters.lost,
         "consecutive_refusals": counters.consecutive_refusals, "last_refusal": counters.last_refusal,
-        "cloud_qos": source.qos, "publishers_on_points": source.publishers,
+        "cloud_qos": topic.qos, "publishers_on_points": topic.publishers,
     }  # fmt: skip
     return status_message(level, f"{now.name}: registration", now.hardware_id, message, values)
 
@@ -195,8 +195,8 @@ def input_status(now: Snapshot) -> DiagnosticStatus:
         "frames_received": now.counters.received,
         "frames_lost": now.counters.lost,
         "seconds_since_last": silent_s,
-        "publishers_on_points": now.source.publishers,
-        "cloud_qos": now.source.qos,
+        "publishers_on_points": now.topic.publishers,
+        "cloud_qos": now.topic.qos,
         "conflicts": "; ".join(now.conflicts),
     }
     return status_message(level, f"{now.name}: input", now.hardware_id, message, values)
@@ -205,15 +205,15 @@ def input_status(now: Snapshot) -> DiagnosticStatus:
 def _level_of_input(now: Snapshot, silent_s: float) -> tuple[bytes, str]:
     if not now.listening:
         return DiagnosticStatus.OK, "not listening"
-    if now.source.mismatch:
-        return DiagnosticStatus.ERROR, now.source.mismatch
+    if now.topic.mismatch:
+        return DiagnosticStatus.ERROR, now.topic.mismatch
     if now.last is not None and now.last.reason is Reason.BAD_FIELDS:
         return DiagnosticStatus.ERROR, f"{now.last.reason}: {now.last.text}"
     if now.conflicts:
         return DiagnosticStatus.WARN, "; ".join(now.conflicts)
-    if not now.source.publishers:
+    if not now.topic.publishers:
         return DiagnosticStatus.WARN, "nobody publishes clouds"
-    may_be_large = LARGE if "best_effort" in now.source.qos else ""
+    may_be_large = LARGE if "best_effort" in now.topic.qos else ""
     if time.monotonic() - now.counters.last_lost_at < LOST_FOR_S:
         how = f"crop or thin clouds before they are sent, or send fewer{may_be_large}"
         return DiagnosticStatus.WARN, f"{now.counters.lost} clouds were sent and never came: {how}"

@@ -8,7 +8,7 @@ from typing import Protocol
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 
-from gapr_ros.node.diagnostics import Input, Snapshot, input_status, registration_status
+from gapr_ros.node.diagnostics import CloudTopic, Snapshot, input_status, registration_status
 from gapr_ros.node.guard import guarded
 from gapr_ros.node.host import Host
 from gapr_ros.node.loader import Loader
@@ -70,7 +70,7 @@ class Reporter:
             counters=node.counters,
             model=None if session is None else session.model,
             last=None if session is None else session.last_outcome,
-            source=Input() if listening is None else listening.describe(),
+            topic=CloudTopic() if listening is None else listening.describe(),
             listening=listening is not None,
             conflicts=() if session is None else session.conflicts.texts,
             hardware_id=self._hardware_id(),

@@ -11,7 +11,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
 from gapr_ros.node.conflicts import names_of
-from gapr_ros.node.diagnostics import Input
+from gapr_ros.node.diagnostics import CloudTopic
 from gapr_ros.node.gaps import Gaps
 from gapr_ros.node.guard import guarded
 from gapr_ros.node.host import Host, steady_timer
@@ -49,12 +49,12 @@ class Subscriptions:
         self._check_points = host.ros.create_subscription(PoseArray, CHECK_POINTS, self._on_check_points, 10)
         self._looking = steady_timer(host.ros, LOOK_S, self.look)
 
-    def describe(self) -> Input:
+    def describe(self) -> CloudTopic:
         """For /diagnostics."""
         publishers = self._host.ros.count_publishers(self._clouds.topic_name)
         mismatch = self._mismatch if publishers else ""
         qos = "best_effort" if self._asked == "best_effort" else "reliable"
-        return Input(qos if self._second is None else "reliable and best_effort", publishers, mismatch)
+        return CloudTopic(qos if self._second is None else "reliable and best_effort", publishers, mismatch)
 
     def close(self) -> None:
         """Listen no more; who publishes is no conflict then."""

@@ -206,7 +206,7 @@ def test_where_clouds_of_a_best_effort_publisher_do_not_come_they_may_be_too_lar
     now_s = time.monotonic()
     for lost_s, text in ((60.0, "no cloud for 9 s"), (1.0, "2 clouds were sent and never came: crop or thin clouds")):
         counters = SimpleNamespace(received=received, lost=2, last_cloud_at=now_s - 9.0, last_lost_at=now_s - lost_s)
-        now = SimpleNamespace(counters=counters, source=diagnostics.Input(qos, 1), listening=True, last=None,
+        now = SimpleNamespace(counters=counters, topic=diagnostics.CloudTopic(qos, 1), listening=True, last=None,
                               conflicts=(), name="node", hardware_id="")  # fmt: skip
         said = diagnostics.input_status(now).message
         assert said.startswith(text) and said.endswith(diagnostics.LARGE) == may_be_lost

@@ -478,21 +478,17 @@ class RegistrarConfig(Settings):
         0, "seed of proposers that draw (ransac); other draws are always the same", low=0, high=2**31 - 1
     )
 
-    # What a probability has to reach, from low to high; what caps it stands in `limits` and `rules`.
-
     @property
     def worth_checking(self) -> float:
-        """What the costly checks are asked of: a stream raises a source's probability p to sqrt(p) at most."""
+        """Probability from which on the costly checks are asked: a stream raises it to its root at most."""
         return self.min_confidence**2
-
-    # Accepted is what reaches `min_confidence`.
 
     @property
     def accepted_if_inferred(self) -> float:
-        """What a pose has to reach that rests on an inferred viewpoint, whatever was seen before."""
+        """Probability from which on a pose is accepted that rests on an inferred viewpoint; else `min_confidence`."""
         return max(self.min_confidence, self.clutter.inferred_least)
 
     @property
     def sure_from(self) -> float:
-        """From here on nothing more is asked for a pose."""
+        """Probability from which on nothing more is tried."""
         return max(self.sure, self.min_confidence)

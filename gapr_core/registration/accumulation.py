@@ -137,7 +137,7 @@ class Accumulator:
         kept, before = self._kept, self._new
         self.collect(source)
         try:
-            result = self.method.register(_together(self._last()), target, initial)
+            result = self.method.register(_together(self._registered_together()), target, initial)
         except Exception:
             self._new = before if self._kept is kept else []  # or the collection restarted with this source
             raise
@@ -145,8 +145,8 @@ class Accumulator:
         self._accepted = found if found.ok else self._accepted
         return found
 
-    def _last(self) -> list[Array]:
-        """The sources that are registered together, the newest last."""
+    def _registered_together(self) -> list[Array]:
+        """The sources that are registered as one, the newest last."""
         return (self._kept + self._new)[-self.most :]
 
     def _decide_on_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
@@ -158,7 +158,7 @@ class Accumulator:
         if T is None:  # it says nothing of any source, nor of a row of those off the bone
             for source in self._new:
                 self._join_small_ones(source)
-            self._kept, self._new = self._last(), []
+            self._kept, self._new = self._registered_together(), []
             return result
         new, off = self._new, self._update_row_off_the_bone(T, target)
         self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
@@ -220,11 +220,11 @@ class Accumulator:
         return replace(result, covariance=covariance, tre_mm=tre_mm, tre95_mm=tre95_mm)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
-        """The sources that lie off the bone under a pose (4, 4), mm, by the new ones; the row of them goes on or ends.
+        """Which sources lie off the bone under a pose (4, 4), mm: of the new ones, and of small ones judged with them.
 
-        What has too few points to be judged does neither.
+        Each of them prolongs the row of those off the bone, each other one ends it. One of too few points does neither.
         """
-        everything, seen = _together(self._last()), offset_surface(target, self.config.sensor)
+        everything, seen = _together(self._registered_together()), offset_surface(target, self.config.sensor)
         off: list[Array] = []
         for source in self._new:
             judged = self._join_small_ones(source)
@@ -273,7 +273,7 @@ class Accumulator:
 
         A large source may pull the pose that it shares with those before along, and lie on the bone then.
         """
-        before, last = self._last()[: -len(self._new)], self._accepted
+        before, last = self._registered_together()[: -len(self._new)], self._accepted
         if not before or last is None:
             return False
         T, covariance, centre_mm = last.T_target_source, last.covariance, last.centre_mm

@@ -198,7 +198,7 @@ class LookAccumulator:
             found = replace(found.refused(REFUSED_FOR[said], said.value), confidence=ruled_out)
         if said is Newest.IS_UNCONFIRMED:
             found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
-        return replace(found, reason=found.reason + self._after(said, found, newest, before, asked))
+        return replace(found, reason=found.reason + self._update_looks(said, found, newest, before, asked))
 
     def _of_those_that_fit(
         self, target: PreparedTarget, initial: ArrayLike | None
@@ -226,7 +226,7 @@ class LookAccumulator:
             return Newest.SHOWS_NOTHING
         if not result.ok:
             return Newest.IS_REFUSED
-        said = self._alone(asked, result, target)
+        said = self._of_newest_alone(asked, result, target)
         is_sure = said is Newest.AGREES and result.confidence > self.config.limits.most
         if said in STANDING and not is_sure and self._is_another(result):
             return Newest.CONTRADICTS
@@ -238,7 +238,7 @@ class LookAccumulator:
             return False
         return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
 
-    def _alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
+    def _of_newest_alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
         """What the newest look alone says of the pose of all: its own is right if that one is, or it has none.
 
         Others from where it was taken confirm nothing.
@@ -258,7 +258,7 @@ class LookAccumulator:
         is_from_elsewhere = any(_apart_deg(_direction(each), own) >= self.apart_deg for each in asked[:-1])
         return Newest.AGREES if is_from_elsewhere else Newest.IS_UNCONFIRMED
 
-    def _after(
+    def _update_looks(
         self,
         said: Newest,
         result: RegistrationResult,
@@ -283,10 +283,10 @@ class LookAccumulator:
             return ""
         if said in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
-            return self._after_one_elsewhere(self._off_in_a_row, before)
+            return self._update_row_elsewhere(self._off_in_a_row, before)
         if said is Newest.CONTRADICTS:
             self._another_in_a_row = [*self._another_in_a_row, newest]
-            return self._after_one_elsewhere(self._another_in_a_row, before)
+            return self._update_row_elsewhere(self._another_in_a_row, before)
         if said is not Newest.IS_REFUSED:
             self._looks = before
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
@@ -294,8 +294,8 @@ class LookAccumulator:
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
         return "" if said is Newest.IS_REFUSED else "; left out"
 
-    def _after_one_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
-        """As `_after`, for the last of a row of looks with which the bone is elsewhere than before."""
+    def _update_row_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
+        """As `_update_looks`, for the last of a row of looks with which the bone is elsewhere than before."""
         if len(row) < self.config.accumulation.most_off:
             self._looks = before
             return "; left out"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
+from gapr_core.config import ClutterConfig, SearchConfig, VerificationConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.specimen import Specimen
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -58,6 +59,14 @@ def specimen(femur):
 @pytest.fixture(scope="session")
 def registrar():
     return Registrar.from_pretrained(RegistrarConfig(num_threads=1))
+
+
+@pytest.fixture(scope="session")
+def quick():
+    """A registrar that tries little, eight times as fast: where the test is about what happens around it."""
+    search, few = SearchConfig(references=2, spins=12, keep=100), VerificationConfig(middle_poses=20)
+    clutter = ClutterConfig(infer_viewpoint=False)
+    return Registrar(RegistrarConfig(num_threads=1, search=search, verification=few, clutter=clutter))
 
 
 @pytest.fixture(scope="session")

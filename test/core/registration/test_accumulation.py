@@ -48,8 +48,8 @@ def test_pieces_that_say_little_alone_determine_the_pose_together(registrar, fra
     assert len(accumulator.collected) == sum(len(pair.source) for pair in frames)
 
 
-def test_only_the_newest_sources_are_kept(registrar, frames):
-    accumulator = Accumulator(registrar, most=3)
+def test_only_the_newest_sources_are_kept(quick, frames):
+    accumulator = Accumulator(quick, most=3)
     for pair in frames[:5]:
         accumulator.collect(pair.source)
     np.testing.assert_array_equal(accumulator.collected, np.concatenate([pair.source for pair in frames[2:5]]))
@@ -60,12 +60,12 @@ def test_only_the_newest_sources_are_kept(registrar, frames):
     with pytest.raises(ConfigError, match="a Registrar or a Tracker; got 'gapr'"):
         Accumulator("gapr", most=3)
     with pytest.raises(ConfigError, match="at least 1"):
-        Accumulator(registrar, most=0)
+        Accumulator(quick, most=0)
 
 
 @pytest.mark.parametrize("tracked", [False, True])
-def test_a_call_that_cannot_be_answered_loses_nothing(registrar, frames, prepared, tracked):
-    accumulator = Accumulator(Tracker(registrar) if tracked else registrar, most=20)
+def test_a_call_that_cannot_be_answered_loses_nothing(quick, frames, prepared, tracked):
+    accumulator = Accumulator(Tracker(quick) if tracked else quick, most=20)
     accumulator.register(frames[0].source, prepared)
     for target, initial in ((frames[0].target, None), (prepared, np.zeros((4, 4)))):
         with pytest.raises(InvalidPointCloudError):
@@ -85,8 +85,8 @@ def test_what_was_seen_from_several_places_has_no_camera(registrar, frames, prep
     assert not registrar.register(np.vstack([refused, refused + 0.1, refused - 0.1]), prepared).ok and asked
 
 
-def test_a_source_that_is_empty_or_there_already_changes_nothing(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=2)
+def test_a_source_that_is_empty_or_there_already_changes_nothing(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=2)
     for pair in frames[:2]:
         accumulator.register(pair.source, prepared)
     kept = accumulator.collected
@@ -96,8 +96,8 @@ def test_a_source_that_is_empty_or_there_already_changes_nothing(registrar, fram
         np.testing.assert_array_equal(accumulator.collected, kept)
 
 
-def test_a_source_that_cannot_be_registered_is_not_kept(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=5)
+def test_a_source_that_cannot_be_registered_is_not_kept(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=5)
     accumulator.collect(frames[0].source)
     far = np.vstack([frames[1].source, [[9e3, 0.0, 0.0]]])
     with pytest.raises(InvalidPointCloudError):
@@ -105,8 +105,8 @@ def test_a_source_that_cannot_be_registered_is_not_kept(registrar, frames, prepa
     np.testing.assert_array_equal(accumulator.collected, frames[0].source)
 
 
-def test_sources_that_are_metres_apart_are_not_kept_together(registrar, frames, prepared, caplog):
-    accumulator = Accumulator(registrar, most=5)
+def test_sources_that_are_metres_apart_are_not_kept_together(quick, frames, prepared, caplog):
+    accumulator = Accumulator(quick, most=5)
     own, other = (pair.source for pair in frames[:2])
     with pytest.raises(InvalidPointCloudError, match="2500 mm"):
         accumulator.collect(np.vstack([other, [[9e3, 0.0, 0.0]]]))
@@ -117,13 +117,13 @@ def test_sources_that_are_metres_apart_are_not_kept_together(registrar, frames, 
         np.testing.assert_array_equal(accumulator.collected, own)
     assert not caplog.text
     moved = own + [5e3, 0.0, 0.0]
-    assert accumulator.register(moved, prepared).status == registrar.register(moved, prepared).status
+    assert accumulator.register(moved, prepared).status == quick.register(moved, prepared).status
     np.testing.assert_array_equal(accumulator.collected, moved)
     assert "restarts" in caplog.text
 
 
-def test_a_single_source_that_is_metres_away_does_not_end_a_collection(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=5)
+def test_a_single_source_that_is_metres_away_does_not_end_a_collection(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=5)
     own, other, third = (pair.source for pair in frames[:3])
     for source in (own, other, third):
         with pytest.raises(InvalidPointCloudError, match="near the others"):
@@ -132,8 +132,8 @@ def test_a_single_source_that_is_metres_away_does_not_end_a_collection(registrar
     np.testing.assert_array_equal(accumulator.collected, own)
 
 
-def test_sources_that_are_metres_away_restart_a_collection_only_in_a_row(registrar, frames):
-    accumulator = Accumulator(registrar, most=5)
+def test_sources_that_are_metres_away_restart_a_collection_only_in_a_row(quick, frames):
+    accumulator = Accumulator(quick, most=5)
     for pair in frames[:3]:
         accumulator.collect(pair.source)
         with pytest.raises(InvalidPointCloudError, match="near the others"):
@@ -141,8 +141,8 @@ def test_sources_that_are_metres_away_restart_a_collection_only_in_a_row(registr
     np.testing.assert_array_equal(accumulator.collected, np.concatenate([pair.source for pair in frames[:3]]))
 
 
-def test_a_source_that_is_metres_away_is_not_kept_with_those_that_have_left_the_bone(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=len(frames))
+def test_a_source_that_is_metres_away_is_not_kept_with_those_that_have_left_the_bone(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=len(frames))
     for pair in frames[:-1]:
         accumulator.collect(pair.source)
     assert accumulator.register(frames[-1].source, prepared).ok
@@ -155,15 +155,15 @@ def test_a_source_that_is_metres_away_is_not_kept_with_those_that_have_left_the_
     np.testing.assert_array_equal(accumulator.collected, np.concatenate(off))
 
 
-def test_another_target_starts_a_new_collection(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=5)
+def test_another_target_starts_a_new_collection(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=5)
     accumulator.register(frames[0].source, prepared)
-    accumulator.register(frames[1].source, registrar.prepare(frames[0].target))
+    accumulator.register(frames[1].source, quick.prepare(frames[0].target))
     np.testing.assert_array_equal(accumulator.collected, frames[1].source)
 
 
-def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=len(frames))  # full: a distant one must not cost a good one
+def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=len(frames))  # full: a distant one must not cost a good one
     for pair in frames[:-1]:
         accumulator.collect(pair.source)
     before = accumulator.register(frames[-1].source, prepared)
@@ -182,9 +182,9 @@ def test_a_distant_source_is_left_out_and_after_three_the_bone_has_moved(registr
     np.testing.assert_array_equal(accumulator.collected, np.concatenate(distant))
 
 
-def test_an_answer_that_fits_two_poses_leaves_out_what_lies_off_the_bone_too(registrar, frames, prepared, monkeypatch):
+def test_an_answer_that_fits_two_poses_leaves_out_what_lies_off_the_bone_too(quick, frames, prepared, monkeypatch):
     """As after a knock: else the collection would hold the bone twice until the old sources have gone."""
-    accumulator = Accumulator(registrar, most=20)
+    accumulator = Accumulator(quick, most=20)
     for pair in frames[:4]:
         accumulator.collect(pair.source)
     best = (Hypothesis(frames[0].T_target_source, 0.4),)
@@ -195,7 +195,7 @@ def test_an_answer_that_fits_two_poses_leaves_out_what_lies_off_the_bone_too(reg
     distant = [se3.apply(se3.exp([0.0, 25.0, 10.0 * n, 0.0, 0.0, 0.0]), frames[4].source) for n in (1, 2)]
     for (status, answer), source in zip(answers.items(), distant, strict=True):
         before = len(accumulator.collected)
-        monkeypatch.setattr(type(registrar), "register", lambda *_, answer=answer: answer)
+        monkeypatch.setattr(type(quick), "register", lambda *_, answer=answer: answer)
         found, is_kept = accumulator.register(source, prepared), status is RegistrationStatus.DEGENERATE
         assert not found.ok and ("left out" in found.reason) is not is_kept
         assert len(accumulator.collected) - before == (len(source) if is_kept else 0)
@@ -203,9 +203,9 @@ def test_an_answer_that_fits_two_poses_leaves_out_what_lies_off_the_bone_too(reg
 
 @pytest.mark.parametrize(("new", "off", "row"), [("ab", "ab", "xab"), ("ab", "b", "b"), ("ab", "a", ""), ("", "", "x"),
                                                  ("xa", "xa", "xa")])  # fmt: skip
-def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(registrar, prepared, new, off, row):
+def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(quick, prepared, new, off, row):
     sources = {name: np.full((30, 3), float(number)) for number, name in enumerate("abx")}
-    accumulator = Accumulator(registrar, most=9)
+    accumulator = Accumulator(quick, most=9)
     accumulator._off_in_a_row, accumulator._new = [sources["x"]], [sources[name] for name in new]
     accumulator._lies_off = lambda points, *_: any(np.array_equal(points, sources[name]) for name in off)
     found = accumulator._update_row_off_the_bone(np.eye(4), prepared)
@@ -213,34 +213,34 @@ def test_a_source_on_the_bone_ends_the_row_of_those_off_it_wherever_it_stands(re
     assert [source[0, 0] for source in accumulator._off_in_a_row] == [sources[name][0, 0] for name in row]
 
 
-def test_one_viewpoint_for_clouds_of_many_views_is_refused(registrar, frames, prepared):
+def test_one_viewpoint_for_clouds_of_many_views_is_refused(quick, frames, prepared):
     with pytest.raises(ConfigError, match="without a viewpoint"):
-        Accumulator(registrar, most=3).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])
+        Accumulator(quick, most=3).register(frames[0].source, prepared, viewpoint=[0.0, 0.0, 500.0])
 
 
-def test_a_source_that_cannot_be_registered_costs_no_older_one(registrar, frames, prepared, monkeypatch):
+def test_a_source_that_cannot_be_registered_costs_no_older_one(quick, frames, prepared, monkeypatch):
     """Where the collection is full the oldest had gone for it, and did not come back."""
-    accumulator = Accumulator(registrar, most=2)
+    accumulator = Accumulator(quick, most=2)
     for frame in frames[:2]:
         accumulator.collect(frame.source)
     kept = accumulator.collected
-    monkeypatch.setattr(type(registrar), "register", lambda *_: 1 / 0)
+    monkeypatch.setattr(type(quick), "register", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         accumulator.register(frames[2].source, prepared)
     np.testing.assert_array_equal(accumulator.collected, kept)
 
 
-def test_a_collection_that_restarted_with_a_source_that_fails_is_empty(registrar, frames, prepared, monkeypatch):
-    accumulator = Accumulator(registrar, most=5)
+def test_a_collection_that_restarted_with_a_source_that_fails_is_empty(quick, frames, prepared, monkeypatch):
+    accumulator = Accumulator(quick, most=5)
     accumulator.collect(frames[0].source)
-    monkeypatch.setattr(type(registrar), "register", lambda *_: 1 / 0)
+    monkeypatch.setattr(type(quick), "register", lambda *_: 1 / 0)
     for error in (InvalidPointCloudError, InvalidPointCloudError, ZeroDivisionError):
         with pytest.raises(error):
             accumulator.register(frames[1].source + [5e3, 0.0, 0.0], prepared)
     assert not len(accumulator.collected)
 
 
-def test_a_reset_reaches_the_tracker_of_the_collection(registrar):
+def test_a_reset_reaches_the_tracker_of_the_collection(quick):
     class Counting(Tracker):
         resets = 0
 
@@ -248,16 +248,16 @@ def test_a_reset_reaches_the_tracker_of_the_collection(registrar):
             super().reset()
             self.resets += 1
 
-    tracker = Counting(registrar)
+    tracker = Counting(quick)
     accumulator, given = Accumulator(tracker, most=2), tracker.resets
     before = accumulator.method.resets
     accumulator.reset()
     assert accumulator.method.resets == before + 1 and tracker.resets == given
 
 
-def test_a_tracker_given_to_a_collection_goes_on_with_its_own_stream(registrar, frames, prepared):
+def test_a_tracker_given_to_a_collection_goes_on_with_its_own_stream(quick, frames, prepared):
     """It took its sources for one source from then on, and the poses of the collection for its own."""
-    alone, used = Tracker(registrar), Tracker(registrar)
+    alone, used = Tracker(quick), Tracker(quick)
     for tracker in (alone, used):
         tracker.register(frames[0].source, prepared)
     collected = Accumulator(used, most=3)
@@ -266,11 +266,11 @@ def test_a_tracker_given_to_a_collection_goes_on_with_its_own_stream(registrar, 
         collected.register(frame.source, prepared)
     answers = [tracker.register(frames[1].source, prepared) for tracker in (alone, used)]
     assert answers[0].confidence == answers[1].confidence and answers[0].features == answers[1].features
-    assert used.registrar is registrar
+    assert used.registrar is quick
 
 
-def test_a_source_without_a_finite_point_gets_no_answer_from_what_was_collected_before(registrar, femur_cloud):
-    accumulator, target = Accumulator(registrar, most=3), registrar.prepare(femur_cloud)
+def test_a_source_without_a_finite_point_gets_no_answer_from_what_was_collected_before(quick, femur_cloud):
+    accumulator, target = Accumulator(quick, most=3), quick.prepare(femur_cloud)
     piece = femur_cloud[femur_cloud[:, 2] > np.quantile(femur_cloud[:, 2], 0.5)]
     assert accumulator.register(piece, target).ok
     for nothing in (np.full((50, 3), np.nan), np.empty((0, 3))):
@@ -309,8 +309,8 @@ def test_a_source_is_compared_where_a_sensor_with_a_stand_off_sees_the_bone(femu
 
 @pytest.mark.parametrize(("sizes", "judged"), [((19,), 0), ((20,), 20), ((7, 7), 0), ((7, 7, 7), 21), ((9, 1, 19), 20),
                                                ((19, 20, 1), 0), ((1,) * 30, 20)])  # fmt: skip
-def test_a_source_of_few_points_is_judged_with_those_just_before_it(registrar, sizes, judged):
-    collected = Accumulator(registrar, most=50)
+def test_a_source_of_few_points_is_judged_with_those_just_before_it(quick, sizes, judged):
+    collected = Accumulator(quick, most=50)
     assert collected.config.accumulation.fewest_points == 20
     for size in sizes:
         found = collected._join_small_ones(np.zeros((size, 3)))
@@ -319,10 +319,10 @@ def test_a_source_of_few_points_is_judged_with_those_just_before_it(registrar, s
 
 @pytest.mark.parametrize("size", [1, 6])
 @pytest.mark.timeout(400)  # seventy registrations
-def test_a_bone_that_moved_is_noticed_where_every_source_is_a_few_points(registrar, frames, prepared, size):
+def test_a_bone_that_moved_is_noticed_where_every_source_is_a_few_points(quick, frames, prepared, size):
     """As a pointer sends them. One of fewer than 20 points was never looked at, and old poses went out at .99."""
     rng, points = np.random.default_rng(3), np.concatenate([frame.source for frame in frames])
-    accumulator = Accumulator(registrar, most=240 // size)
+    accumulator = Accumulator(quick, most=240 // size)
     for _ in range(240 // size):
         accumulator.collect(points[rng.choice(len(points), size, replace=False)])
     assert accumulator.register(points[:size], prepared).ok
@@ -340,9 +340,9 @@ def test_a_bone_that_moved_is_noticed_where_every_source_is_a_few_points(registr
     assert len(accumulator.collected) <= 100
 
 
-def test_a_source_too_small_to_be_judged_neither_ends_a_row_nor_gets_a_pose_within_it(registrar, prepared):
+def test_a_source_too_small_to_be_judged_neither_ends_a_row_nor_gets_a_pose_within_it(quick, prepared):
     accepted = RegistrationResult(RegistrationStatus.OK, np.eye(4))
-    collected = Accumulator(registrar, most=20)
+    collected = Accumulator(quick, most=20)
     collected._lies_off = lambda *_: True
     answers = []
     for size in (30, 10, 30, 30):
@@ -353,9 +353,9 @@ def test_a_source_too_small_to_be_judged_neither_ends_a_row_nor_gets_a_pose_with
 
 
 @pytest.mark.parametrize(("times", "lies_off"), [(0.9, False), (1.1, True)])
-def test_what_lies_within_the_least_noise_of_a_perfect_collection_is_on_the_bone(registrar, prepared, times, lies_off):
+def test_what_lies_within_the_least_noise_of_a_perfect_collection_is_on_the_bone(quick, prepared, times, lies_off):
     """All others lie on the bone to the last bit: then the least noise of the refinement stands for theirs."""
-    collected = Accumulator(registrar, most=20)
+    collected = Accumulator(quick, most=20)
     config = collected.config
     limit_mm = times * config.accumulation.off * config.refinement.smallest_sigma_mm
     some = slice(0, 50)
@@ -363,12 +363,12 @@ def test_what_lies_within_the_least_noise_of_a_perfect_collection_is_on_the_bone
     assert collected._lies_off(source, prepared.points, np.eye(4), prepared) is lies_off
 
 
-def creeping(registrar, target, femur, step_mm, creeps, count=9, size=150, tracked=False):
+def creeping(quick, target, femur, step_mm, creeps, count=9, size=150, tracked=False):
     """So many sources of 150 points all over the upper half, each so much farther along y; the last answer."""
-    accumulation = replace(registrar.config.accumulation, most_off=100, off=100.0)
-    rigidity = replace(registrar.config.rigidity, creeps=creeps)
-    config = replace(registrar.config, accumulation=accumulation, rigidity=rigidity)
-    method = Registrar(config, registrar.proposers, registrar.calibrations)
+    accumulation = replace(quick.config.accumulation, most_off=100, off=100.0)
+    rigidity = replace(quick.config.rigidity, creeps=creeps)
+    config = replace(quick.config, accumulation=accumulation, rigidity=rigidity)
+    method = Registrar(config, quick.proposers, quick.calibrations)
     accumulator = Accumulator(Tracker(method) if tracked else method, count)
     half, answer = np.median(femur.points[:, 2]), None
     for number in range(count):
@@ -388,10 +388,10 @@ def creeping(registrar, target, femur, step_mm, creeps, count=9, size=150, track
     [(0.3, 6.0, 9, True), (0.0, 6.0, 9, False), (0.3, np.inf, 9, False), (0.5, 6.0, 5, False)],
 )
 def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
-    registrar, target, femur, step_mm, creeps, count, is_refused
+    quick, target, femur, step_mm, creeps, count, is_refused
 ):
     """Only this rule refuses: without it, and of five sources, the same answer is accepted."""
-    accumulator, result = creeping(registrar, target, femur, step_mm, creeps, count)
+    accumulator, result = creeping(quick, target, femur, step_mm, creeps, count)
     assert ("the bone moves against the frame of the sources" in result.reason) is is_refused
     assert result.ok is not is_refused and (result.T_target_source is None) is is_refused
     kept = accumulator.collected
@@ -399,9 +399,9 @@ def test_a_bone_that_creeps_is_refused_and_only_the_last_sources_stay(
 
 
 @pytest.mark.parametrize(("log_ratio", "is_refused"), [(5.9, False), (6.1, True)])
-def test_a_motion_is_believed_from_the_setting_on(registrar, target, femur, monkeypatch, log_ratio, is_refused):
+def test_a_motion_is_believed_from_the_setting_on(quick, target, femur, monkeypatch, log_ratio, is_refused):
     monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(log_ratio, 1.0)))
-    accumulator, result = creeping(registrar, target, femur, 0.0, 6.0)
+    accumulator, result = creeping(quick, target, femur, 0.0, 6.0)
     assert ("the bone moves against the frame" in result.reason) is is_refused and result.ok is not is_refused
     assert len(accumulator.collected) == (150 * 3 if is_refused else 150 * 9)
 
@@ -410,23 +410,23 @@ def test_a_motion_is_believed_from_the_setting_on(registrar, target, femur, monk
     (0.9, 6.0, 9, 1.0), (1.1, 6.0, 9, 0.89), (99.0, 6.0, 3, 0.89), (99.0, 6.0, 2, 0.9), (99.0, np.inf, 9, 1.0),
 ])  # fmt: skip
 def test_where_a_motion_is_hardly_excluded_no_pose_is_sure(
-    registrar, target, femur, monkeypatch, log_ratio, creeps, count, most
+    quick, target, femur, monkeypatch, log_ratio, creeps, count, most
 ):
     """Only this keeps it from being sure. Of two sources nobody knows; without the rule on motions nobody asks."""
     monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(log_ratio, 1.0)))
-    _, result = creeping(registrar, target, femur, 0.0, creeps, count)
+    _, result = creeping(quick, target, femur, 0.0, creeps, count)
     assert result.ok and result.confidence <= most and (count < 9 or (result.confidence > 0.9) is (most == 1.0))
     assert ("hardly exclude that the bone moves" in why_no_surer(result.contributions)) is (most == 0.89)
 
 
-def test_what_the_bone_may_have_moved_by_is_in_the_covariance(registrar, target, femur, monkeypatch):
+def test_what_the_bone_may_have_moved_by_is_in_the_covariance(quick, target, femur, monkeypatch):
     monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(0.9, 4.0)))
-    _, at_rest = creeping(registrar, target, femur, 0.0, 6.0)
+    _, at_rest = creeping(quick, target, femur, 0.0, 6.0)
     monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(1.1, 4.0)))
-    _, result = creeping(registrar, target, femur, 0.0, 6.0)
+    _, result = creeping(quick, target, femur, 0.0, 6.0)
     motion = np.diag([2.0**2] * 3 + [0.02**2] * 3)
     about = np.array([30.0, -10.0, 5.0])
-    widened = Accumulator(registrar, most=3)._widened(at_rest, motion, about, target).covariance - at_rest.covariance
+    widened = Accumulator(quick, most=3)._widened(at_rest, motion, about, target).covariance - at_rest.covariance
     assert widened == pytest.approx(covariance_about(at_rest.centre_mm - about, motion)), "about the answer's centre"
     added = result.covariance - at_rest.covariance
     assert np.linalg.eigvalsh(added).min() > -1e-9 and np.diag(added)[:3].min() >= 0.99 * 2.0**2
@@ -434,14 +434,14 @@ def test_what_the_bone_may_have_moved_by_is_in_the_covariance(registrar, target,
     assert result.tre_mm == pytest.approx(predicted_rmse_mm(result.covariance, target.points, result.centre_mm))
     bound_mm = precision.bound_mm(result.covariance, target.points, result.centre_mm)
     assert result.tre95_mm == pytest.approx(result.factor95 * bound_mm) and result.tre95_mm > at_rest.tre95_mm + 2.0
-    exact = Registrar(replace(registrar.config, max_tre_mm=3.0), registrar.proposers, registrar.calibrations)
+    exact = Registrar(replace(quick.config, max_tre_mm=3.0), quick.proposers, quick.calibrations)
     _, refused = creeping(exact, target, femur, 0.0, 6.0)
     assert refused.status is RegistrationStatus.IMPRECISE and refused.covariance is None
 
 
-def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(registrar, target, femur, monkeypatch):
+def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(quick, target, femur, monkeypatch):
     monkeypatch.setattr(creep, "of_motion", lambda *_: creep.Motion(creep.Finding(1.1, 1.0)))
-    strict = Registrar(replace(registrar.config, min_confidence=0.9), registrar.proposers, registrar.calibrations)
+    strict = Registrar(replace(quick.config, min_confidence=0.9), quick.proposers, quick.calibrations)
     _, result = creeping(strict, target, femur, 0.0, 6.0)
     assert (
         result.status is RegistrationStatus.LOW_CONFIDENCE
@@ -452,9 +452,9 @@ def test_a_pose_that_may_move_is_refused_where_more_is_asked_for_than_that(regis
 
 @pytest.mark.parametrize(("step_mm", "is_refused"), [(0.005, True), (0.0, False)])
 def test_a_bone_that_creeps_under_a_pointer_of_single_points_is_refused_by_a_tracker_too(
-    registrar, target, femur, step_mm, is_refused
+    quick, target, femur, step_mm, is_refused
 ):
-    accumulator, result = creeping(registrar, target, femur, step_mm, 6.0, 600, 1, tracked=True)
+    accumulator, result = creeping(quick, target, femur, step_mm, 6.0, 600, 1, tracked=True)
     assert ("the bone moves against the frame of the sources" in result.reason) is is_refused
     assert result.ok is not is_refused
     assert len(accumulator.collected) == (200 if is_refused else 600)
@@ -471,7 +471,7 @@ def test_a_tracker_grows_surer_of_a_collection_that_grows(registrar, frames, pre
     ("sigma_mm", "factor95", "is_refused"), [(1.0, 1.0, True), (1.0, 4.0, False), (8.0, 1.0, False)]
 )
 def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_along(
-    registrar, target, femur, sigma_mm, factor95, is_refused
+    quick, target, femur, sigma_mm, factor95, is_refused
 ):
     points, normals = femur.sample(4000, np.random.default_rng(0))
     near = np.argsort(np.linalg.norm(points - points[0], axis=1))
@@ -481,7 +481,7 @@ def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_
     poses = iter([np.eye(4), se3.exp(np.r_[-away, 0.0, 0.0, 0.0], np.zeros(3))])
 
     class Pulled:
-        config = registrar.config
+        config = quick.config
 
         def register(self, source, target, initial):
             T = next(poses)
@@ -495,8 +495,8 @@ def test_a_source_off_the_pose_before_is_left_out_though_it_pulls_the_next_pose_
     assert len(accumulator.collected) == (100 if is_refused else 500)
 
 
-def test_where_each_source_is_registered_by_itself_the_pose_before_says_nothing_of_it(registrar, frames, prepared):
-    accumulator = Accumulator(registrar, most=1)
+def test_where_each_source_is_registered_by_itself_the_pose_before_says_nothing_of_it(quick, frames, prepared):
+    accumulator = Accumulator(quick, most=1)
     whole = np.concatenate([pair.source for pair in frames])
     for source in (whole, whole + [0.0, 9.0, 0.0]):
         assert accumulator.register(source, prepared).ok

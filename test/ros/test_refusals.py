@@ -375,21 +375,21 @@ def test_a_seed_in_a_frame_that_nobody_knows_is_named(live):
     expect_good(live)
 
 
-def test_a_seed_whose_frame_does_not_come_is_given_up_and_no_cloud_is_registered_with_it(live):
+def test_a_seed_whose_frame_does_not_come_is_given_up_and_no_cloud_is_registered_with_it(live, monkeypatch):
     node, client, method = live
     wait_until(client.seeds.get_subscription_count)
     client.seeds.publish(PoseWithCovarianceStamped(header=Header(frame_id="map")))
     wait_until(lambda: node.session.course.initial_pose)
     registered = len(method.calls)
     expect_refusal(live, GOOD, Reason.TF_MISSING, "given up if that lasts 2 s; remap it if it is of another node")
-    time.sleep(initial_pose.PATIENCE_S)
+    monkeypatch.setattr(initial_pose, "PATIENCE_S", 0.0)  # it has lasted
     assert len(method.calls) == registered
     expect_good(live)
     assert [call["initial"] for call in method.calls[registered:]] == [None]
 
 
 @pytest.mark.parametrize(("frame", "is_a_jump"), [("probe", False), ("map", True)])
-def test_a_jump_is_none_where_the_pose_was_found_from_a_seed_and_only_there(live, frame, is_a_jump):
+def test_a_jump_is_none_where_the_pose_was_found_from_a_seed_and_only_there(live, monkeypatch, frame, is_a_jump):
     node, client, method = live
     node.set_parameters_atomically([Parameter("max_jump_translation", value=0.01)])
     expect_good(live)
@@ -399,7 +399,7 @@ def test_a_jump_is_none_where_the_pose_was_found_from_a_seed_and_only_there(live
     method.answer = accepted(pose_mm([0, 0, 0], [30.0, 0, 0]))
     if is_a_jump:
         assert client.ask(GOOD)["last_refusal"].startswith("tf_missing: the initialpose is in map")
-        time.sleep(initial_pose.PATIENCE_S)
+        monkeypatch.setattr(initial_pose, "PATIENCE_S", 0.0)  # it has lasted
         client.poses.clear()
         assert client.ask(GOOD)["last_refusal"].startswith("jump: moved 0.03 m") and not client.poses
     else:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import ConfigError
 from gapr_ros.node import missing
 from gapr_ros.node.heard import Heard
+from gapr_ros.node.intake import plain_frame
 from gapr_ros.node.refusal import Reason, RefusedError
 from gapr_ros.node.timeline import BACK_NS
 from gapr_ros.parameters import NodeParameters
@@ -188,7 +189,7 @@ def check_names(parameters: NodeParameters) -> None:
     for name in ("model_frame", "output_frame"):
         value = getattr(parameters, name)
         if value.startswith("/"):
-            raise ConfigError(f"{name} without a leading slash", f"'{value}'", f"write {value.lstrip('/')}")
+            raise ConfigError(f"{name} without a leading slash", f"'{value}'", f"write {plain_frame(value)}")
     if not parameters.model_frame:
         raise ConfigError("a model_frame", "an empty one", "give the bone's frame a name, such as femur_preop")
     if not parameters.viewpoint:
@@ -203,7 +204,7 @@ def _check_not_the_bones(parameters: NodeParameters) -> None:
         why["crop_frame"] = "the bone's frame is not known before its pose; crop_to_track crops near its last one"
         why["viewpoint"] = "the bone's frame is not known before its pose; name the frame of the camera"
     for name, text in why.items():
-        if getattr(parameters, name).lstrip("/") == parameters.model_frame:
+        if plain_frame(getattr(parameters, name)) == parameters.model_frame:
             raise ConfigError(f"another {name} than model_frame", f"'{parameters.model_frame}' for both", text)
 
 

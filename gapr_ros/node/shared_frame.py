@@ -12,6 +12,7 @@ from geometry_msgs.msg import TransformStamped
 from gapr_ros.node.conflicts import Conflicts
 from gapr_ros.node.guard import guarded
 from gapr_ros.node.host import Host
+from gapr_ros.node.intake import plain_frame
 
 KIND = "child frame"
 LASTS_S = 5.0  # a conflict that is not seen again for so long is over
@@ -61,7 +62,7 @@ class SharedFrame:
     @guarded
     def _on_tf(self, message: Any) -> None:
         for transform in message.transforms:
-            if transform.child_frame_id.lstrip("/") == self._frame and _key(transform) not in self._sent:
+            if plain_frame(transform.child_frame_id) == self._frame and _key(transform) not in self._sent:
                 self._note(f"another node, as child of '{transform.header.frame_id}',", has_name=False)
 
     def _note(self, who: str, has_name: bool) -> None:

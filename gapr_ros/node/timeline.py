@@ -78,9 +78,9 @@ def check_age(stamp: int, now_ns: int, max_age_s: float) -> None:
     Raises:
         RefusedError: stale.
     """
-    age_s = (now_ns - stamp) * 1e-9
-    if max_age_s > 0.0 and now_ns > 0 and stamp > 0 and age_s > max_age_s:
-        raise RefusedError(Reason.STALE, f"the cloud is {age_s:.3g} s old, max_cloud_age is {max_age_s:g} s")
+    age = age_s(stamp, now_ns)
+    if max_age_s > 0.0 and age is not None and age > max_age_s:
+        raise RefusedError(Reason.STALE, f"the cloud is {age:.3g} s old, max_cloud_age is {max_age_s:g} s")
 
 
 class Timeline:

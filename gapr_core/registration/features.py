@@ -103,13 +103,10 @@ def of_the_fit(
 
 
 def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
-    """The most, mm, that a point may be off its neighbours' plane by, less what the bone is where the point lies on it.
+    """Noise of a point, mm, as its neighbours show it: the upper end of what it may be.
 
-    Neighbours do not lie in a plane since they are noisy, and since the bone is curved: of a thinned cloud's, which are
-    centimetres apart, mostly that. Their foot points show the second alone, and variances add up. What is left is small
-    compared with both there, and of few points little is known: the noise counts as the upper end of what it may be,
-    so that residuals exceed it only where that is seen. Its median has the standard error of one of as many independent
-    patches.
+    Neighbours are off their plane by noise, and since the bone is curved. Their foot points show the second alone, and
+    variances add up. The median of what is left has the standard error of one of as many independent patches.
     """
     curved_mm = fit_planes(fit.rests_on.feet, source.patches)[1]
     left_mm2 = flatness_mm**2 - curved_mm**2

@@ -38,7 +38,7 @@ LIMITS_MM = (8.0, 2.0, 8)  # Tukey's, the first, the last and how many steps
 FEWEST_POINTS, MOST_POINTS = 40, 600  # of a look, that are laid on it
 
 
-class Own(NamedTuple):
+class LookShares(NamedTuple):
     """What one look says by itself, as shares of the target's surface.
 
     Attributes:
@@ -127,7 +127,7 @@ def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarC
         return [LookFit.FITS]
     signed, _, aside, _ = kernels.residuals_at(T, scene.source.points, *target.kernel_view, 0.0)
     close = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < REACH_MM
-    found = [_own(T, number, close, scene, target, config) for number in range(len(scene.images))]
+    found = [_shares_of_look(T, number, close, scene, target, config) for number in range(len(scene.images))]
     widest = max(each.compared for each in found)
     blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in found])
     seeing = [each for each, is_blind in zip(found, blind, strict=True) if not is_blind]
@@ -139,7 +139,7 @@ def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarC
     ]
 
 
-def is_apart(look: Own, near: float, on: float) -> bool:
+def is_apart(look: LookShares, near: float, on: float) -> bool:
     """True where a look fits far better elsewhere, saw through the bone, or agrees far less than the best one does.
 
     Args:
@@ -158,9 +158,9 @@ def _refusal(answers: tuple[LookAnswer, ...]) -> Refusal:
     return Refusal(RegistrationStatus.AMBIGUOUS, f"{why}: {how}")
 
 
-def _own(
+def _shares_of_look(
     T: Array, number: int, is_close: NDArray[np.bool_], scene: Scene, target: PreparedTarget, config: RegistrarConfig
-) -> Own:
+) -> LookShares:
     """Look `number` of a scene under the common pose (4, 4), and laid on the bone by its points (N,) close to it."""
     source, close = scene.source, np.flatnonzero((scene.look == number) & is_close)
     own, settings, threads = T, config.clutter, config.num_threads
@@ -175,4 +175,4 @@ def _own(
     )
     away_mm = se3.rms_apart_mm(own, T, source.points[close]) if len(close) else 0.0
     (compared, own_compared), (on_it, own_on) = near.compared.tolist(), on.explained.tolist()
-    return Own(compared, on_it, float(near.explained[0]), float(on.violating[0]), own_compared, own_on, away_mm)
+    return LookShares(compared, on_it, float(near.explained[0]), float(on.violating[0]), own_compared, own_on, away_mm)

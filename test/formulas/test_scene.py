@@ -15,7 +15,7 @@ from gapr_core.registration import scene as scenes
 from gapr_core.registration import source as sources
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.free_space import Visible
-from gapr_core.registration.look_agreement import Own
+from gapr_core.registration.look_agreement import LookShares
 from gapr_core.registration.scene import MOST_PLACES, Look, Places, Scene
 from gapr_core.results import LookFit, Refusal, RegistrationStatus
 
@@ -153,8 +153,8 @@ def test_every_place_counts_alike(monkeypatch):
     assert found == pytest.approx([0.3, 0.05, 0.7])
 
 
-HERE = Own(compared=0.2, on=0.12, near=0.18, seen_through=0.0, own_compared=0.2, own_on=0.13, away_mm=0.5)
-NOTHING = Own(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+HERE = LookShares(compared=0.2, on=0.12, near=0.18, seen_through=0.0, own_compared=0.2, own_on=0.13, away_mm=0.5)
+NOTHING = LookShares(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("changes", "is_apart"), [
@@ -175,7 +175,7 @@ FIT, APART, BLIND = LookFit.FITS, LookFit.APART, LookFit.BLIND
 
 
 def fits(monkeypatch, *found):
-    monkeypatch.setattr(look_agreement, "_own", lambda T, number, *rest: found[number])
+    monkeypatch.setattr(look_agreement, "_shares_of_look", lambda T, number, *rest: found[number])
     scene = SimpleNamespace(images=found, source=tiny.ellipsoid())
     return look_agreement.look_fits(np.eye(4), scene, tiny.ellipsoid(), CONFIG)
 
@@ -279,11 +279,11 @@ def test_each_look_is_laid_on_the_bone_by_its_own_points_near_it():
     first, second = points[::2], points[1::2] + shift
     scene = scenes.prepared([Look(first, EYES[0]), Look(second, EYES[0] + [1.0, 0.0, 0.0])], CONFIG)
     close = np.ones(len(scene.look), dtype=bool)
-    here, moved = (look_agreement._own(np.eye(4), number, close, scene, target, CONFIG) for number in (0, 1))
+    here, moved = (look_agreement._shares_of_look(np.eye(4), number, close, scene, target, CONFIG) for number in (0, 1))
     assert here.away_mm < 0.5 and moved.away_mm == pytest.approx(3.0, abs=0.5)
     assert moved.own_on > moved.on + 0.02 and here.compared > 0.1 and here.near >= here.on
-    far = look_agreement._own(np.eye(4), 1, ~close, scene, target, CONFIG)
+    far = look_agreement._shares_of_look(np.eye(4), 1, ~close, scene, target, CONFIG)
     assert far.away_mm == 0.0 and far.own_on == far.on
     aside = replace(scene, look=np.where(scene.look == 1, 5, scene.look))
-    gone = look_agreement._own(np.eye(4), 1, close, aside, target, CONFIG)
+    gone = look_agreement._shares_of_look(np.eye(4), 1, close, aside, target, CONFIG)
     assert gone.away_mm == 0.0 and gone.own_on == gone.on

@@ -146,6 +146,7 @@ class Tracker:
         return isinstance(self._misfit, NoMisfit)
 
     def _forget_track(self) -> None:
+        self._memory.place = None
         self._has_track = False  # there are poses to follow
         self._since_full = 0  # sources since the last full registration
         self._is_sure = self._was_sure = False  # this source is, as answered; the one before was
@@ -243,7 +244,7 @@ class Tracker:
     def _is_no_view(self, assessment: Assessment) -> bool:
         """True for an answer as bone alone that is refused, where the last one accepted was of a camera's view."""
         was_view, is_view = self._memory.place is not None, assessment.seen is not None
-        return self._has_track and was_view and not is_view and not assessment.reaches(self.config.min_confidence)
+        return was_view and not is_view and not assessment.reaches(self.config.min_confidence)
 
     def _with_evidence(self, assessment: Assessment, cloud: Fingerprint) -> Assessment:
         """The probability p in the light of the frames before, at most sqrt(p), and at most p after a jump.

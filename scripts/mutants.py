@@ -9,7 +9,8 @@ A run that was stopped goes on where it was: what is in `--out` of the same code
 A mutant that was killed stays killed as long as its file, the test that failed and what stands around the tests do.
 
 cosmic-ray finds and makes the mutations. Each runs in a forked process that has loaded the tests already
-(`mutants_session`); no file changes. Kernels run without Numba's compiler, so that theirs count, too.
+(`mutants_session`); no file changes. The tests of a file with kernels run without Numba's compiler, so that theirs
+count, too.
 Numbers given to constants in capital letters are settings, not formulas: they are listed apart, as are the mutants of
 `mutants_equivalent.txt`, which change nothing.
 """
@@ -34,21 +35,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 os.environ |= {
-    "NUMBA_DISABLE_JIT": "1",
+    "NUMBA_NUM_THREADS": "1",  # threads do not outlive a fork
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MPLBACKEND": "Agg",
     "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
 }
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
-from mutants_session import NO_TEST, OPTIONS, Session, function_around  # noqa: E402
+from mutants_session import NO_TEST, OPTIONS, Session, compile_kernels_unless, function_around  # noqa: E402
 
 LIMIT_S = 60  # of processor time, loading included: a mutant that takes longer hangs, and the tests noticed
 sys.setrecursionlimit(10_000)  # a tree of syntax is deep
 
 SKIPPED = ("BitOr", "BitAnd", "BitXor", "RShift", "LShift", "FloorDiv", "_Mod", "Mod_")  # no formula has them
 REPLACED = ("core/Number", "core/ReplaceTrue", "core/ReplaceFalse", "core/RemoveDecorator")
-FORMULAS = "test/formulas"
+FORMULAS, CORE = "test/formulas", "test/core/registration"
 REGISTRATION, METRICS, GEOMETRY = "gapr_core/registration/", "gapr_core/metrics/", "gapr_core/geometry/"
 TESTS = {
     REGISTRATION + "kernels.py": [f"{FORMULAS}/test_kernels.py"],
@@ -65,9 +66,25 @@ TESTS = {
     REGISTRATION + "explained.py": [f"{FORMULAS}/test_explained.py"],
     REGISTRATION + "features.py": [f"{FORMULAS}/test_features.py"],
     REGISTRATION + "sensor.py": [f"{FORMULAS}/test_sensor.py"],
-    REGISTRATION + "confidence.py": ["test/core/registration/test_confidence.py"],
-    REGISTRATION + "covariance.py": ["test/core/registration/test_covariance.py"],
+    REGISTRATION + "confidence.py": [f"{CORE}/test_confidence.py"],
+    REGISTRATION + "covariance.py": [f"{CORE}/test_covariance.py"],
     REGISTRATION + "evidence.py": [f"{FORMULAS}/test_evidence.py"],
+    REGISTRATION + "limits.py": [f"{FORMULAS}/test_rules.py", f"{CORE}/test_limits.py"],
+    REGISTRATION + "checks.py": [f"{CORE}/test_growth.py", f"{CORE}/test_mirrored.py", f"{CORE}/test_standoff.py"],
+    REGISTRATION + "mirror.py": [f"{FORMULAS}/test_rules.py", f"{CORE}/test_mirrored.py"],
+    REGISTRATION + "other_size.py": [f"{CORE}/test_growth.py"],
+    REGISTRATION + "standoff.py": [f"{CORE}/test_standoff.py"],
+    REGISTRATION + "doubles.py": [f"{CORE}/test_doubles.py"],
+    REGISTRATION + "separate_patches.py": [f"{FORMULAS}/test_separate_patches.py"],
+    REGISTRATION + "rigidity.py": [f"{FORMULAS}/test_rigidity.py"],
+    REGISTRATION + "further_unknowns.py": [f"{FORMULAS}/test_rigidity.py", f"{FORMULAS}/test_explained.py"],
+    REGISTRATION + "creep.py": [f"{FORMULAS}/test_rigidity.py"],
+    REGISTRATION + "shared_misfit.py": [f"{FORMULAS}/test_shared_misfit.py"],
+    REGISTRATION + "look_agreement.py": [f"{FORMULAS}/test_scene.py"],
+    REGISTRATION + "look_accumulation.py": [f"{FORMULAS}/test_look_accumulation.py"],
+    REGISTRATION + "check_points.py": [f"{FORMULAS}/test_check_points.py"],
+    REGISTRATION + "precision_model.py": [f"{CORE}/test_precision_model.py"],
+    REGISTRATION + "additive.py": [f"{CORE}/test_confidence.py", f"{CORE}/test_precision_model.py"],
     GEOMETRY + "twists.py": ["test/core/test_twists.py"],
     GEOMETRY + "se3.py": ["test/core/test_se3.py", "test/core/metrics/test_pose_metrics.py"],
     GEOMETRY + "extent.py": ["test/core/test_extent.py"],
@@ -212,6 +229,7 @@ def _run_tests(file: str, text: str, tests: list[str]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(1, 2)
         sys.meta_path.insert(0, _Mutated(file, text))
+        compile_kernels_unless(text)
         code = int(pytest.main([*OPTIONS, "-m", "not slow", *(str(ROOT / test) for test in tests)]))
     finally:
         os._exit(1 if code else 0)
@@ -255,7 +273,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "mutants.jsonl", help="every mutant and its fate")
     parser.add_argument("--least", type=float, default=0.85, help="share that must be killed")
     args = parser.parse_args()
-    import numba  # noqa: F401  loaded once, before the forks
+    import numba  # noqa: F401  all of these are loaded once, before the forks
     import pytest  # noqa: F401
     import scipy.spatial.transform
     import scipy.stats  # noqa: F401

@@ -23,6 +23,7 @@ import types
 from collections.abc import Generator, Mapping, Sequence
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -75,6 +76,13 @@ def function_around(source: str, line: int) -> range:
     return range(0)
 
 
+def compile_kernels_unless(text: str) -> None:
+    """Switch Numba's compiler off for tests of a module that has kernels: a compiled one would stay what it was."""
+    import numba
+
+    numba.config.DISABLE_JIT = "numba.njit" in text
+
+
 def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
     """In the forked process; never returns."""
 
@@ -103,6 +111,7 @@ def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(1, 2)
+        compile_kernels_unless(Path(f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
         pytest.main([*OPTIONS, "-m", "not slow", *tests], plugins=[Loop()])
     finally:
         os._exit(0)

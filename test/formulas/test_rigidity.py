@@ -12,7 +12,7 @@ from gapr_core.geometry import se3
 from gapr_core.registration import further_unknowns, rigidity
 from gapr_core.registration.assessment import Assessment
 from gapr_core.registration.covariance import PoseUncertainty, covariance_added_by
-from gapr_core.registration.creep import of_motion
+from gapr_core.registration.creep import of_motion, step_times
 from gapr_core.registration.further_unknowns import BIASES_MM, SHARED_MM, SIZES_MM, Blocks, blocks, findings
 from gapr_core.registration.refinement import Fit
 from gapr_core.registration.rigidity import of_deformations
@@ -367,6 +367,20 @@ def test_a_step_is_found_and_what_was_measured_since_is_named(seen, first, rests
     assert found.rests_from == rests_from
     later = of_motion(fit_of(points, normals, noise(2400) + off), order + 7, CONFIG)
     assert later.rests_from == rests_from + 7
+
+
+def test_a_step_is_as_large_as_what_moved_and_may_have_been_between_any_two_groups(seen):
+    points, normals, order = drawn_along(seen)
+    fit = fit_of(points, normals, noise(2400) + np.where(order < 4, 0.0, 4.0)[:, None] * [0.0, 0.0, 1.0])
+    steps = step_times(6)
+    np.testing.assert_allclose(12.0 * steps, [2.0, 4.0, 6.0, 8.0, 10.0, 11.0])
+    change = (order / 11.0 >= steps[1])[:, None] * further_unknowns.motions(fit)
+    (same,) = findings(
+        blocks(fit, fit.jacobian, [change], np.searchsorted(steps, order / 11.0, "right"), CONFIG), CONFIG
+    )
+    found = of_motion(fit, order, CONFIG).finding
+    assert found.size_mm == pytest.approx(same.size_mm, rel=1e-6)
+    assert found.log_ratio == pytest.approx(same.log_ratio - np.log(6.0))
 
 
 def looks_that_err(seen, size_mm, count=2400):

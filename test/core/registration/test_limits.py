@@ -12,7 +12,7 @@ from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import LimitsConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import limits
-from gapr_core.results import Refusal
+from gapr_core.results import Refusal, RegistrationResult
 
 SURE = 0.97
 TIGHT = np.diag([0.01] * 3 + [np.radians(0.1) ** 2] * 3)
@@ -276,3 +276,19 @@ def test_the_limit_that_held_says_what_helps_and_features_say_nothing():
     assert limits.why_no_surer({"margin": -2.0, "scale_z": 1.0}) == ""
     for limit in limits.LIMITS:
         assert limits.why_no_surer({"margin": -2.0, limit.name: -1.5}) == limit.why
+
+
+def test_an_answer_is_no_surer_than_what_several_sources_leave_open(registrar):
+    """The log odds of its contributions sum up to its confidence still."""
+    config = registrar.config
+    sure = RegistrationResult(
+        RegistrationStatus.OK, np.eye(4), confidence=SURE, contributions={"margin": float(logit(SURE))}
+    )
+    found = limits.no_surer(sure, limits.MOVING, config)
+    assert found.ok and found.confidence == 0.89
+    assert sum(found.contributions.values()) == pytest.approx(logit(0.89))
+    assert limits.no_surer(found, limits.DOUBTED, config) is found
+    refused = limits.no_surer(sure, limits.MOVING, replace(config, min_confidence=0.9))
+    assert refused.status is RegistrationStatus.LOW_CONFIDENCE and "collect more" in refused.reason
+    assert limits.no_surer(sure, limits.MOVING, replace(config, min_confidence=0.89)).ok
+    assert limits.no_surer(refused, limits.MOVING, config) is refused

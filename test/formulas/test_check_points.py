@@ -77,6 +77,16 @@ def test_expected_distances_are_those_of_drawn_poses_and_errors():
     assert found.probability == pytest.approx(min(1.0, 2.0 * together), abs=0.02)
 
 
+def test_what_near_points_alone_share_counts_for_each_of_them():
+    """0.3 mm of a slice that the tracker puts elsewhere."""
+    known = {"noise_mm": 0.4, "bias_mm": 0.1, "scale": 0.0, "standoff_mm": 0.0, "known_standoff_mm": 0.1}
+    alone, sliced = (
+        check(on_ellipsoid(5, 3), ellipsoid(count=4000), answer(), replace(EXACT, sensor=SensorConfig(kind, **known)))
+        for kind in ("pointer", "ultrasound")
+    )
+    assert sliced.expected_mm**2 - alone.expected_mm**2 == pytest.approx(0.3**2)
+
+
 def test_the_probability_is_even_under_a_right_pose_and_one_far_point_among_many_shows():
     rng = np.random.default_rng(1)
     S = np.diag(rng.uniform(0.1, 2.0, 8))

@@ -31,7 +31,7 @@ FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
 def flipped(points: Array) -> Array:
-    """Points (N, 3) under `FLIP`."""
+    """Points (N, 3), or one, under `FLIP`."""
     return points * FLIP.diagonal()[:3]
 
 

@@ -277,8 +277,9 @@ class Registrar:
             return None if found is None else self._checked_and_corrected(found, clock, never)
 
         def mirrored() -> Assessment | None:
-            flip = mirror.FLIP.diagonal()[:3]
-            image = scenes.prepared([Look(look.points * flip, look.viewpoint * flip) for look in seen], self.config)
+            image = scenes.prepared(
+                [Look(mirror.flipped(look.points), mirror.flipped(look.viewpoint)) for look in seen], self.config
+            )
             return (
                 None if isinstance(image, Refusal) else self._in_scene(image, target, NO_POSES, clock, MIRRORED_ROUNDS)
             )

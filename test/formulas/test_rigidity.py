@@ -417,3 +417,15 @@ def test_of_one_look_and_of_few_points_nothing_is_said(seen):
     assert not rigidity.of_looks(fit, look, CONFIG).is_shown
     fit, look = looks_that_err(seen, 1.5, 400)
     assert not rigidity.of_looks(fit, np.zeros_like(look), CONFIG).is_shown
+
+
+def test_what_looks_err_by_against_each_other_is_added_to_the_covariance_and_nothing_where_none_shows(seen):
+    fit, look = looks_that_err(seen, 1.5)
+    uncertainty, config = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), RegistrarConfig()
+    wider = rigidity.allowing_for_looks(uncertainty, fit, look, config)
+    found = rigidity.of_looks(fit, look, config.rigidity)
+    added = covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance)
+    np.testing.assert_allclose(wider.covariance, np.eye(6) + added)
+    assert np.trace(added[:3, :3]) > 0.1
+    assert rigidity.allowing_for_looks(uncertainty, fit, None, config) is uncertainty
+    assert rigidity.allowing_for_looks(uncertainty, fit, np.zeros_like(look), config) is uncertainty

@@ -15,6 +15,7 @@ The order in which an answer comes about, with the function of each step:
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import replace
@@ -65,6 +66,8 @@ from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
 
+log = logging.getLogger(__name__)
+
 Own = TypeVar("Own", bound="Registrar")
 Array = NDArray[np.float64]
 
@@ -95,7 +98,8 @@ class Registrar:
     Args:
         config: every setting.
         proposers: where hypotheses come from; the weight-free search when not given.
-        calibrations: the confidence model of each round; the shipped ones when not given.
+        calibrations: the confidence model of each round; the shipped ones when not given, with a warning for a network
+            of other weights than those they were fitted to.
         scene_calibration: the confidence model of a source with a viewpoint; the shipped one when not given.
         precision: what corrects the predicted errors; the shipped one when not given.
 
@@ -120,7 +124,7 @@ class Registrar:
         if not self.proposers:
             raise ConfigError("at least one proposer", "an empty list", "leave `proposers` out for the search")
         if calibrations is None:
-            calibrations = [Calibration.shipped(proposer.name) for proposer in self.proposers]
+            calibrations = [_shipped_calibration(proposer) for proposer in self.proposers]
         self.calibrations = tuple(calibrations)
         self._scene_calibration = scene_calibration
         if len(self.calibrations) != len(self.proposers):
@@ -446,6 +450,15 @@ def shipped_network(device: str = "cpu") -> Proposer:
         how = "run: pip install 'gapr_ros[network]', or do without: Registrar(), or --method gapr_search"
         raise MethodUnavailableError("torch and safetensors for GAPR-Net", str(error), how) from error
     return NetworkProposer.from_weights(device=device)
+
+
+def _shipped_calibration(proposer: Proposer) -> Calibration:
+    if not getattr(proposer, "is_shipped", True):
+        log.warning(
+            "the shipped confidence was fitted to the shipped weights, and this network has others: do not rely on it; "
+            "fit one with python -m gapr_core.calibration and pass calibrations=[...]"
+        )
+    return Calibration.shipped(proposer.name)
 
 
 def check_call(target: object, initial: ArrayLike | None) -> None:

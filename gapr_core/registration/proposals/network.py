@@ -45,6 +45,7 @@ class NetworkProposer:
             raise ConfigError(f"method one of {', '.join(METHODS)}", repr(method), "choose one of these")
         self.network, self.method, self.count = network.eval(), method, count
         self.name = "network"
+        self.is_shipped = False  # its weights are those that the shipped confidence was fitted to
         self._key = "network", weights_name or network  # the network itself: an id may come again
         _survive_forks()
 
@@ -60,7 +61,9 @@ class NetworkProposer:
 
         network = weights.load(path, _available(device))[0]
         name = f"{weights.checksum(dict(network.state_dict()))} {json.dumps(network.config.to_dict())}"
-        return cls(network, weights_name=name, **options)
+        proposer = cls(network, weights_name=name, **options)
+        proposer.is_shipped = Path(path) == SHIPPED
+        return proposer
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """Distinct poses, best first; none where the source is too small or too large for the network."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gapr_core import Registrar
 from gapr_core.config import SourceConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
@@ -11,6 +12,7 @@ from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
+from gapr_core.registration.confidence import Calibration
 from gapr_core.registration.proposals.network import NetworkProposer
 
 
@@ -72,6 +74,16 @@ def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
         for p in (one, NetworkProposer.from_weights(tmp_path / "w.safetensors"))
     )
     assert np.array_equal(first.poses, second.poses)
+
+
+def test_of_other_weights_than_the_shipped_ones_it_is_said_that_no_confidence_was_fitted_to_them(toy, tmp_path, caplog):
+    weights.save(proposer(toy).network, tmp_path / "w.safetensors")
+    own = NetworkProposer.from_weights(tmp_path / "w.safetensors")
+    Registrar(proposers=[NetworkProposer.from_weights()])
+    Registrar(proposers=[own], calibrations=[Calibration.shipped("network")])
+    assert not caplog.messages
+    Registrar(proposers=[own])
+    assert "fitted to the shipped weights, and this network has others" in caplog.text
 
 
 def test_an_unknown_method_is_refused(toy):

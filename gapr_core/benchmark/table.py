@@ -33,6 +33,36 @@ def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
     return table
 
 
+def differences(records: Sequence[Record], methods: Sequence[str], ours: str) -> list[Row]:
+    """How much more often ours is right than each other method, on the same pairs: one per protocol and method.
+
+    Paired, so that what is hard for both says nothing. A refusal is not right; pairs without a truth are left out.
+
+    Returns:
+        Rows with `protocol`, `method`, `pairs` that both have, how many `ours_alone` and `other_alone` have right, and
+        `difference` of the recall at 4 mm and 5 deg, -1 to 1, with its 95 % bootstrap interval by subject.
+    """
+    judged = [r for r in records if r.has_truth]
+    own, found = {r.pair: r for r in judged if r.method == ours}, []
+    protocols = sorted({r.protocol for r in own.values()})
+    for protocol in [*protocols, ALL] if len(protocols) > 1 else protocols:
+        for method in (m for m in methods if m != ours):
+            both = [(own[r.pair], r) for r in judged
+                    if r.method == method and r.pair in own and protocol in (ALL, r.protocol)]  # fmt: skip
+            if both:
+                found.append({"protocol": protocol, "method": method, **_difference(both)})
+    return found
+
+
+def _difference(both: Sequence[tuple[Record, Record]]) -> Row:
+    """Of pairs that ours and another method have judged."""
+    more = [int(own.within_4_5) - int(other.within_4_5) for own, other in both]
+    low, high = metrics.interval(more, people([own for own, _ in both]))
+    counts = {"pairs": len(more), "ours_alone": more.count(1), "other_alone": more.count(-1)}
+    ends = {"difference_low": _rounded(low), "difference_high": _rounded(high)}
+    return counts | {"difference": _rounded(np.mean(more))} | ends
+
+
 def summary(records: Sequence[Record]) -> Row:
     """Every number of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
     row: Row = {"pairs": len(records), "persons": len({r.person for r in records} - {""})}

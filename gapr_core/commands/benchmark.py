@@ -185,11 +185,12 @@ def write(out: Path, plan: Plan) -> list[Row]:
         raise ConfigError("results", f"none in {out}", "this shard has no pairs: use fewer shards")
     conditions = records.conditions(found)
     rows, notes = table.rows(found, plan.methods), _notes(found, plan, conditions)
+    apart = table.differences(found, plan.methods, plan.ours)
     ran = {name: " and ".join(values) for name, values in conditions.items()}
-    writers.write_json(out / "table.json", rows, plan, ran)
+    writers.write_json(out / "table.json", rows, apart, plan, ran)
     writers.write_csv(out / "table.csv", rows)
-    writers.write_markdown(out / "table.md", rows, plan, ran, notes)
-    benchmark_report.write(out, found, rows, plan, ran, notes)
+    writers.write_markdown(out / "table.md", rows, apart, plan, ran, notes)
+    benchmark_report.write(out, found, rows, apart, plan, ran, notes)
     return rows
 
 

@@ -13,7 +13,7 @@ from gapr_core.benchmark.records import Plan
 from gapr_core.benchmark.table import Row
 from gapr_core.pages import pictures, plots
 from gapr_core.pages.report import Image, Report
-from gapr_core.pages.sections import LEGEND, Section, sections, where_beaten
+from gapr_core.pages.sections import LEGEND, Section, compared, sections, where_beaten
 from gapr_core.runtime import files
 
 CAPTIONS = {  # of the plots: what a reader must know who sees nothing else
@@ -31,7 +31,13 @@ CAPTIONS = {  # of the plots: what a reader must know who sees nothing else
 
 
 def write(
-    out: Path, records: Sequence[Record], rows: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]
+    out: Path,
+    records: Sequence[Record],
+    rows: Sequence[Row],
+    apart: Sequence[Row],
+    plan: Plan,
+    ran: Mapping[str, str],
+    notes: Sequence[str],
 ) -> None:
     """`report.html` and the folder `plots` with its pictures as PNG."""
     report = Report("Benchmark", f"{len(plan.pairs)} pairs, {len(plan.methods)} methods.")
@@ -40,7 +46,7 @@ def write(
     report.heading(f"Where another method beats {plan.ours}")
     report.bullets(where_beaten(rows, plan.ours))
     report.heading("Tables")
-    for section in sections(rows):
+    for section in [*sections(rows), *compared(apart, plan.ours)]:
         _add_table(report, section)
     report.paragraph(LEGEND)
     report.heading("Plots")

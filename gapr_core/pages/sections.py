@@ -104,7 +104,8 @@ LEGEND = (
     "over that error. s: median "
     "register time without reading files and without preparing the target, which is apart. The confidence of a "
     "baseline is its share of source points within 5 mm, not calibrated. R²(R) is no measure of accuracy: Euler "
-    "angles wrap around. Definitions: docs/metrics.md."
+    "angles wrap around. Pair by pair: an interval that holds 0 does not show which method is better. Definitions: "
+    "docs/metrics.md."
 )
 
 
@@ -122,6 +123,23 @@ def sections(rows: Sequence[Row]) -> list[Section]:
             found.append(_section(f"{name}: accuracy", with_truth, ACCURACY, paper=protocol))
         found.append(_section(f"{name}: safety, uncertainty, time", chosen, SAFETY))
     return found
+
+
+def compared(differences: Sequence[Row], ours: str) -> list[Section]:
+    """Ours against each other method, pair by pair (`table.differences`); nothing where it is alone."""
+    if not differences:
+        return []
+    header = ["protocol", "method", "pairs", f"{ours} alone is right", "the method alone is right",
+              f"RR % 4 mm/5°: {ours} less the method"]  # fmt: skip
+    cells = [[row["protocol"], row["method"], str(row["pairs"]), str(row["ours_alone"]), str(row["other_alone"]),
+              _signed(row)] for row in differences]  # fmt: skip
+    return [Section(f"{ours} and the others, pair by pair", header, cells, set())]
+
+
+def _signed(row: Row) -> str:
+    """A difference of shares in percent with its interval."""
+    middle, low, high = (100.0 * row[f"difference{end}"] for end in ("", "_low", "_high"))
+    return f"{middle:+.1f} [{low:+.0f} to {high:+.0f}]"
 
 
 def where_beaten(rows: Sequence[Row], ours: str) -> list[str]:

@@ -10,13 +10,13 @@ from pathlib import Path
 from gapr_core.benchmark.records import Plan
 from gapr_core.benchmark.table import Row
 from gapr_core.pages import markdown
-from gapr_core.pages.sections import LEGEND, sections, where_beaten
+from gapr_core.pages.sections import LEGEND, compared, sections, where_beaten
 from gapr_core.runtime import files
 
 
-def write_json(path: Path, rows: Sequence[Row], plan: Plan, ran: Mapping[str, str]) -> None:
-    """Rows, and what made them: the plan, and what ran, and on what."""
-    files.write_json(path, {"run": asdict(plan) | dict(ran), "rows": list(rows)})
+def write_json(path: Path, rows: Sequence[Row], apart: Sequence[Row], plan: Plan, ran: Mapping[str, str]) -> None:
+    """Rows, differences pair by pair, and what made them: the plan, and what ran, and on what."""
+    files.write_json(path, {"run": asdict(plan) | dict(ran), "rows": list(rows), "differences": list(apart)})
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -27,10 +27,12 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows(rows)
 
 
-def write_markdown(path: Path, rows: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]) -> None:
-    """The table as Markdown."""
+def write_markdown(
+    path: Path, rows: Sequence[Row], apart: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]
+) -> None:
+    """The tables as Markdown."""
     parts = ["# Benchmark", *(f"> {note}" for note in notes)]
-    for section in sections(rows):
+    for section in [*sections(rows), *compared(apart, plan.ours)]:
         body = [[f"**{c}**" if (i, j) in section.best else c for j, c in enumerate(line)]
                 for i, line in enumerate(section.cells)]  # fmt: skip
         parts += [f"## {section.title}", markdown.table(section.header, body)]

@@ -109,6 +109,26 @@ def test_rows_do_not_depend_on_the_order_of_the_pairs_within_a_group():
     assert table.rows(found, ["a", "b"]) == table.rows(sorted(found, key=lambda r: r.pair), ["a", "b"])
 
 
+def test_methods_are_compared_on_the_pairs_that_both_have_and_subjects_are_drawn_whole():
+    pairs = [replace(make_pair(number), person=f"p{number // 2}") for number in range(6)]
+    a = [ok(shifted(pair, 1.0 if number < 5 else 9.0)) for number, pair in enumerate(pairs)]
+    b = [ok(shifted(pair, 9.0 if number < 2 else 1.0)) for number, pair in enumerate(pairs[:4])]
+    refused = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE)
+    found = [record(pair, answer, "a") for pair, answer in zip(pairs, a, strict=True)]
+    found += [record(pair, answer, "b") for pair, answer in zip(pairs, [*b, refused], strict=False)]
+    found += [record(make_pair(9, "wrong"), refused, name) for name in "ab"]
+    (row,) = table.differences(found, ["b", "a"], "a")
+    assert (row["protocol"], row["method"]) == ("L1", "b")
+    assert (row["pairs"], row["ours_alone"], row["other_alone"], row["difference"]) == (5, 3, 0, 0.6)
+    assert (row["difference_low"], row["difference_high"]) == (0.0, 1.0)
+    (other,) = table.differences(found, ["b", "a"], "b")
+    assert (other["ours_alone"], other["other_alone"], other["difference"]) == (0, 3, -0.6)
+    assert table.differences(found[:6], ["a"], "a") == []
+    (section,) = sections.compared([row], "a")
+    assert section.cells == [["L1", "b", "5", "3", "0", "+60.0 [+0 to +100]"]]
+    assert sections.compared([], "a") == []
+
+
 def test_the_table_says_where_another_method_is_better_and_only_there():
     lines = sections.where_beaten(table.rows(some_records(), ["a", "b"]), "a")
     assert any(line.startswith("L1, RR % 4 mm/5°: b 100.0") and line.endswith("a 33.3 [0–100]") for line in lines)

@@ -138,7 +138,10 @@ def report(tmp_path_factory):
     found = some_records()
     refused = record(pairs[3], RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="<b>two</b> poses"), "a")
     found = [*found[:-2], refused, found[-1]]
-    benchmark_report.write(folder, found, table.rows(found, ["a", "b"]), plan, {"commit": "c0ffee"}, ["One <note>."])
+    apart = table.differences(found, ["a", "b"], "a")
+    benchmark_report.write(
+        folder, found, table.rows(found, ["a", "b"]), apart, plan, {"commit": "c0ffee"}, ["One <note>."]
+    )
     return folder
 
 

@@ -76,8 +76,11 @@ def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
     """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty.
 
     Raises:
+        ConfigError: no such folder.
         InvalidPointCloudError: a file that cannot be read, has other arrays, or a subject twice.
     """
+    if not Path(folder).is_dir():
+        raise ConfigError("a folder with anatomy", f"{folder}, which does not exist", "name it with --anatomy")
     return [_corresponded(path, bone) for path in sorted(Path(folder).glob(f"{bone}_*.npz"))]
 
 
@@ -117,8 +120,6 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
         InvalidPointCloudError: a damaged file of meshes, or a mesh of the split that is no bone in mm.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise ConfigError("a folder with anatomy", f"{folder}, which does not exist", "name it with --anatomy")
     sets = corresponded(folder, bone)
     specimens = [s for c in sets for s in c.specimens() if cohort in (None, c.cohort)]
     if cohort is not None and not specimens:

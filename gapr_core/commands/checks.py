@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.clouds import MM_PER_UNIT
 from gapr_core.errors import ConfigError, GaprError, MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
@@ -26,7 +27,6 @@ OF_EARLIER = ", and what is there is of an earlier run"
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
 FAR_PAIRS_MM = 20.0  # of landmarks under the pose that fits them best, more than anybody errs by as he touches them
 FAR_TARGETS = 0.5  # of the diagonal of the bone's box: a planned target is nearer to that box
-MM_PER_M = 1000.0
 MUCH_NEARER = 0.3  # share of that distance that is left with the axes turned, or to the other cloud, and it was wrong
 
 
@@ -272,7 +272,7 @@ def _warn_of_targets(args: Namespace, source: Array, target: Array) -> None:
     cause = ""
     if is_far.any() and not _is_far(points * axes.LPS_RAS, target).any():
         cause = "with x and y negated they are near: is one of the files RAS, and read as LPS?"
-    elif is_far.any() and not _is_far(points * MM_PER_M, target).any():
+    elif is_far.any() and not _is_far(points * MM_PER_UNIT["m"], target).any():
         cause = "times 1000 they are near: are they in m, and said to be in mm?"
     if not cause and _is_elsewhere(args.targets, target, source):
         near = f"{args.targets.name} is near {args.source.name}, and far from {args.target.name}"

@@ -46,20 +46,22 @@ class Errors:
 LEAST_STANDOFF_MM = 0.1  # standard deviation: that of the surest kind
 STATED = ("noise_mm", "bias_mm", "scale", "tracking_mm", "tracking_deg")  # that the user may know better
 KINDS = {
+    # pictures of unknown making are wrong by .3 % of their size
     "unknown": Errors(offset_mm=0.0, standoff_mm=0.5, noise_mm=0.5, bias_mm=0.1, scale=0.003),
+    # a real one lies .34 to .62 mm outside
     "pointer": Errors(offset_mm=0.5, standoff_mm=0.35, noise_mm=0.4, bias_mm=0.15, scale=0.0),
+    # sound is 1 to 3 % faster or slower than assumed, and a tracked slice lies .1 to .5 mm off
     "ultrasound": Errors(
         offset_mm=0.0, standoff_mm=0.6, noise_mm=0.5, bias_mm=0.2, scale=0.02, local_mm=0.3, along_beam=True
     ),
+    # its range is wrong by 1 %, and light enters wet bone before it comes back
     "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.01),
     "laser": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.15, bias_mm=0.15, scale=0.002),
+    # a tracked scanner is placed to a fifth of a millimetre
     "structured_light": Errors(
         offset_mm=0.0, standoff_mm=0.1, noise_mm=0.2, bias_mm=0.15, scale=0.001, tracking_mm=0.2, tracking_deg=0.2
     ),
 }
-"""What is usual: a real pointer lies .34 to .62 mm outside, sound is 1 to 3 % faster or slower than assumed, a tracked
-slice lies .1 to .5 mm off, light enters wet bone before it comes back, a tracked scanner is placed to a fifth of a
-millimetre, a depth camera's range is wrong by 1 %, pictures of unknown making are wrong by .3 % of their size."""
 
 
 def errors(sensor: SensorConfig, points: int) -> Errors:

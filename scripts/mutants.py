@@ -71,7 +71,7 @@ TESTS = {
     REGISTRATION + "evidence.py": [f"{FORMULAS}/test_evidence.py"],
     REGISTRATION + "limits.py": [f"{FORMULAS}/test_rules.py", f"{CORE}/test_limits.py"],
     REGISTRATION + "checks.py": [f"{CORE}/test_growth.py", f"{CORE}/test_mirrored.py", f"{CORE}/test_standoff.py"],
-    REGISTRATION + "mirror.py": [f"{FORMULAS}/test_rules.py", f"{CORE}/test_mirrored.py"],
+    REGISTRATION + "mirror.py": [f"{CORE}/test_features.py", f"{CORE}/test_mirrored.py"],
     REGISTRATION + "other_size.py": [f"{CORE}/test_growth.py"],
     REGISTRATION + "standoff.py": [f"{CORE}/test_standoff.py"],
     REGISTRATION + "doubles.py": [f"{CORE}/test_doubles.py"],

@@ -252,3 +252,23 @@ def test_the_image_of_a_known_scene_is_registered_as_one(
 
 def test_a_mirrored_scene_without_a_pose_fits_no_better():
     assert checks.scene_image_margin(SimpleNamespace(), None) == np.inf
+
+
+def test_a_source_is_mirrored_at_planes_along_the_bone_and_at_its_own(target, pelvis):
+    points, T = seen(pelvis), np.diag([1.0, -1.0, -1.0, 1.0])
+    found = mirror._reflections(T, points, target)
+    long_axis = target.main_axes[0]
+    of_bone, own = found[: mirror.PLANES], found[mirror.PLANES :]
+    normals = [np.linalg.svd(np.eye(3) - H[:3, :3])[0][:, 0] for H in found]
+    assert len(own) == 3
+    for H, normal in zip(found, normals, strict=True):
+        np.testing.assert_allclose(H[:3, :3], np.eye(3) - 2.0 * np.outer(normal, normal), atol=1e-9)
+    for H in of_bone:
+        np.testing.assert_allclose(H[:3, :3] @ long_axis, long_axis, atol=1e-9)
+        np.testing.assert_allclose(H[:3, :3] @ target.centre_mm + H[:3, 3], target.centre_mm, atol=1e-9)
+    turned = np.abs(np.array(normals[: mirror.PLANES]) @ normals[0])
+    np.testing.assert_allclose(turned, np.abs(np.cos(np.arange(mirror.PLANES) * np.pi / mirror.PLANES)), atol=1e-9)
+    middle = (points * [1.0, -1.0, -1.0]).mean(axis=0)
+    for H in own:
+        np.testing.assert_allclose(H[:3, :3] @ middle + H[:3, 3], middle, atol=1e-9)
+    assert abs(np.linalg.det(np.array(normals[mirror.PLANES :]))) == pytest.approx(1.0)

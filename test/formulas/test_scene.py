@@ -187,6 +187,15 @@ def test_each_look_is_compared_with_the_widest_and_the_best(monkeypatch):
     assert fits(monkeypatch, poor, poor) == [FIT, FIT]
 
 
+def test_what_lies_more_than_10_mm_off_the_bone_is_not_laid_on_it(monkeypatch):
+    asked = []
+    monkeypatch.setattr(look_agreement, "_shares_of_look", lambda T, number, close, *_: asked.append(close) or HERE)
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -9.0], [0.0, 0.0, 11.0], [0.0, 900.0, 0.0]])
+    scene = SimpleNamespace(images=(0, 1), source=SimpleNamespace(points=points))
+    assert look_agreement.look_fits(np.eye(4), scene, tiny.plane(), CONFIG) == [FIT, FIT]
+    assert [each.tolist() for each in asked] == 2 * [[True, True, False, False]]
+
+
 def test_a_blind_look_is_the_measure_of_none(monkeypatch):
     half = HERE._replace(near=0.09, on=0.05, own_on=0.05)
     found = fits(monkeypatch, half, half, half, NOTHING._replace(compared=0.001, near=0.001, on=0.001))
@@ -224,7 +233,7 @@ def alone(x_mm, deg=0.0, probability=0.8, refusal=None):
 
 @pytest.mark.parametrize(("fits", "is_refused"), [
     ([FIT] * 4, False), ([FIT, APART, FIT, FIT], True), ([FIT, BLIND, FIT], False), ([FIT, BLIND, BLIND, FIT], True),
-    ([FIT, BLIND], True), ([FIT, FIT, FIT, BLIND], False),
+    ([FIT, BLIND], True), ([FIT, FIT, FIT, BLIND], False), ([BLIND, FIT, BLIND, BLIND], True),
 ])  # fmt: skip
 def test_a_pose_stands_where_no_look_is_apart_and_less_than_half_of_them_are_blind(monkeypatch, fits, is_refused):
     found = agreed(monkeypatch, fits)

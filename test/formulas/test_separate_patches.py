@@ -96,6 +96,15 @@ def test_both_the_residuals_and_the_pose_have_to_change(monkeypatch, sigma_mm, m
     assert (allowing_for_a_patch(before, CONFIG) is not before) is is_found
 
 
+def test_each_of_five_patches_is_left_out_in_turn(monkeypatch):
+    points = np.concatenate([SPOTS, spot(25, 120.0), spot(25, 160.0)])
+    asked = refined(monkeypatch, [1.0, 0.9, 0.9, 0.9, 0.9, 0.5], [0.0, 9.0, 9.0, 9.0, 9.0, 4.0])
+    found = allowing_for_a_patch(assessed(points), CONFIG)
+    assert found.deformed[NAME] == pytest.approx(4.0)
+    assert [len(each) for each in asked] == [125] + [100] * 5
+    assert all(len(np.unique(each[:, 0].round(-1))) < len(np.unique(points[:, 0].round(-1))) for each in asked[1:])
+
+
 @pytest.mark.parametrize("change", [{"points": SPOTS[:50]}, {"seen": SimpleNamespace()}])
 def test_two_patches_and_scenes_are_not_asked(monkeypatch, change):
     asked = refined(monkeypatch, [1.0] + [0.1] * 3, [0.0] + [9.0] * 3)

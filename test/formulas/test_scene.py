@@ -291,6 +291,10 @@ def test_each_look_is_laid_on_the_bone_by_its_own_points_near_it():
     here, moved = (look_agreement._shares_of_look(np.eye(4), number, close, scene, target, CONFIG) for number in (0, 1))
     assert here.away_mm < 0.5 and moved.away_mm == pytest.approx(3.0, abs=0.5)
     assert moved.own_on > moved.on + 0.02 and here.compared > 0.1 and here.near >= here.on
+    settings = CONFIG.clutter
+    spread = look_agreement.clutter.spread(target, settings.final_target_points)
+    common = scene.each[1].compare(np.eye(4)[None], *spread, settings.middle_on_mm, settings.front_mm, 1)
+    assert (moved.compared, moved.near) == pytest.approx((common.compared[0], common.explained[0]), abs=1e-12)
     far = look_agreement._shares_of_look(np.eye(4), 1, ~close, scene, target, CONFIG)
     assert far.away_mm == 0.0 and far.own_on == far.on
     aside = replace(scene, look=np.where(scene.look == 1, 5, scene.look))

@@ -93,6 +93,9 @@ class LookAccumulator:
     reference has moved, and only these three are kept, whatever their directions; so after three poses in a row that
     are another. After ten refusals from one direction only the last look is kept.
 
+    What all looks share shows in none of them, such as the error of a hand-eye calibration: state it as `tracking_mm`
+    of the sensor (`SensorConfig`).
+
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
         most: how many looks are kept, the newest among them; each costs time.

@@ -69,7 +69,7 @@ def load(
     if of_bone:
         _check_apart(surface, name)
     if surface.faces is not None and len(surface.faces):
-        _check_faces(surface, name)
+        check_faces(surface, name)
     if path is not None and reading.format_of(path).is_in_mm(options or ReadOptions()):
         units, how = "mm", OF_HEADER
     elif path is not None:
@@ -238,8 +238,12 @@ def _warn_of_several_bones(surface: Surface, name: str) -> None:
         )  # fmt: skip
 
 
-def _check_faces(surface: Surface, name: str) -> None:
-    """Triangles, of vertices that there are, with some area."""
+def check_faces(surface: Surface, name: str) -> None:
+    """Refuse faces that are no triangles, that point beyond the vertices, or that have no area at all.
+
+    Raises:
+        InvalidPointCloudError: they do.
+    """
     faces, count = np.asarray(surface.faces), len(surface.points)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         given = f"faces of shape {faces.shape} and type {faces.dtype} in {name}"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import check_extent, load
+from gapr_core.clouds import check_extent, check_faces, is_point, load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.reading import ending_of
@@ -132,14 +132,12 @@ def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | No
 
 def _check_mesh(specimen: Specimen) -> None:
     """Raise `InvalidPointCloudError` where a mesh has points or faces that are none, or is not in mm."""
-    points, faces = specimen.surface.points, specimen.surface.faces
-    name = f"{specimen.bone} of {specimen.person} ({specimen.cohort})"
-    if not np.isfinite(points).all():
+    surface, name = specimen.surface, f"{specimen.bone} of {specimen.person} ({specimen.cohort})"
+    if not is_point(surface.points).all():
         raise InvalidPointCloudError("finite points", f"NaN or infinity in the {name}", "leave the subject out")
-    if faces is not None and len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
-        given = f"{faces.min()} to {faces.max()} for the {len(points)} points of the {name}"
-        raise InvalidPointCloudError("faces whose numbers are those of points, from 0", given, "write the file again")
-    check_extent(float(np.linalg.norm(np.ptp(points, axis=0))), "mm", f"the {name}", "convert it to mm")
+    if surface.faces is not None and len(surface.faces):
+        check_faces(surface, f"the {name}")
+    check_extent(surface.extent_mm, "mm", f"the {name}", "convert it to mm")
 
 
 def _single_meshes(folder: Path, bone: str, cohort: str) -> list[Specimen]:

@@ -62,7 +62,7 @@ class NetworkProposer:
         network = weights.load(path, _available(device))[0]
         name = f"{weights.checksum(dict(network.state_dict()))} {json.dumps(network.config.to_dict())}"
         proposer = cls(network, weights_name=name, **options)
-        proposer.is_shipped = Path(path) == SHIPPED
+        proposer.is_shipped = Path(path).resolve() == SHIPPED.resolve()
         return proposer
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:

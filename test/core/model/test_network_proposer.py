@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.registration import source as sources
 from gapr_core.registration import target as targets
 from gapr_core.registration.confidence import Calibration
-from gapr_core.registration.proposals.network import NetworkProposer
+from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,8 @@ def test_saved_weights_propose_what_the_network_proposed(toy, pair, tmp_path):
 def test_of_other_weights_than_the_shipped_ones_it_is_said_that_no_confidence_was_fitted_to_them(toy, tmp_path, caplog):
     weights.save(proposer(toy).network, tmp_path / "w.safetensors")
     own = NetworkProposer.from_weights(tmp_path / "w.safetensors")
-    Registrar(proposers=[NetworkProposer.from_weights()])
+    for path in (SHIPPED, os.path.relpath(SHIPPED)):
+        Registrar(proposers=[NetworkProposer.from_weights(path)])
     Registrar(proposers=[own], calibrations=[Calibration.shipped("network")])
     assert not caplog.messages
     Registrar(proposers=[own])

@@ -25,10 +25,10 @@ from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.geometry import se3
 from gapr_core.metrics import auroc
 from gapr_core.pages import markdown
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
 from gapr_core.runtime.console import say
 
 Array = NDArray[np.float64]

@@ -29,7 +29,7 @@ from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import sampling, se3
 from gapr_core.pages import markdown
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.results import Verdict
 from gapr_core.runtime.console import say
 

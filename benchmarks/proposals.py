@@ -22,13 +22,13 @@ from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.geometry import se3
 from gapr_core.pages import markdown
-from gapr_core.registration import source as sources
+from gapr_core.registration.fit.refinement import refine_fully
+from gapr_core.registration.fit.verification import verify
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.network import NetworkProposer
-from gapr_core.registration.refinement import refine_fully
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
-from gapr_core.registration.verification import verify
 from gapr_core.runtime.console import say
 
 CONFIG = RegistrarConfig(num_threads=1)

@@ -40,7 +40,7 @@ from gapr_core.data.twins import most_similar
 from gapr_core.geometry import se3
 from gapr_core.metrics.confidence import SURE
 from gapr_core.pages import markdown
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.runtime import origin
 from gapr_core.runtime.console import say
 from gapr_core.runtime.parallel import end_with_parent

@@ -34,7 +34,7 @@ from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.pages import markdown
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 from gapr_core.results import RegistrationResult
 from gapr_core.runtime.console import say
 from gapr_core.runtime.memory import allocated_mb

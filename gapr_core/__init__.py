@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from gapr_core.config import RegistrarConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
     from gapr_core.formats.options import ReadOptions
-    from gapr_core.registration.accumulation import Accumulator
     from gapr_core.registration.check_points import check_points
-    from gapr_core.registration.crop import crop_box, crop_to_pose
-    from gapr_core.registration.following import FollowedPose
-    from gapr_core.registration.look_accumulation import LookAccumulator
+    from gapr_core.registration.problem.crop import crop_box, crop_to_pose
+    from gapr_core.registration.problem.target import PreparedTarget
     from gapr_core.registration.registrar import Registrar
-    from gapr_core.registration.target import PreparedTarget
-    from gapr_core.registration.tracking import Tracker
+    from gapr_core.registration.streams.accumulator import Accumulator
+    from gapr_core.registration.streams.following import FollowedPose
+    from gapr_core.registration.streams.look_accumulator import LookAccumulator
+    from gapr_core.registration.streams.tracker import Tracker
     from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
     from gapr_core.surface import Surface
 
@@ -30,12 +30,12 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "Registrar": "registration.registrar",
-    "Tracker": "registration.tracking",
-    "Accumulator": "registration.accumulation",
-    "LookAccumulator": "registration.look_accumulation",
-    "FollowedPose": "registration.following",
+    "Tracker": "registration.streams.tracker",
+    "Accumulator": "registration.streams.accumulator",
+    "LookAccumulator": "registration.streams.look_accumulator",
+    "FollowedPose": "registration.streams.following",
     "RegistrarConfig": "config",
-    "PreparedTarget": "registration.target",
+    "PreparedTarget": "registration.problem.target",
     "RegistrationResult": "results",
     "RegistrationStatus": "results",
     "LookFit": "results",
@@ -43,8 +43,8 @@ _HOMES = {
     "load": "clouds",
     "ReadOptions": "formats.options",
     "check_points": "registration.check_points",
-    "crop_box": "registration.crop",
-    "crop_to_pose": "registration.crop",
+    "crop_box": "registration.problem.crop",
+    "crop_to_pose": "registration.problem.crop",
     "GaprError": "errors",
     "InvalidPointCloudError": "errors",
     "ConfigError": "errors",

@@ -144,7 +144,7 @@ def _check_ascending(sizes_mm: tuple[float, ...]) -> None:
         raise ConfigError("two or more ascending sizes_mm", str(sizes_mm), "name the smallest size first")
 
 
-# Each has an entry in `KINDS` of registration/sensor.py.
+# Each has an entry in `KINDS` of registration/problem/sensor.py.
 SENSOR_KINDS = ("unknown", "pointer", "ultrasound", "depth_camera", "laser", "structured_light")
 
 
@@ -184,7 +184,7 @@ class ScaleConfig(Settings):
 
 @dataclass(frozen=True)
 class SmoothBiasConfig(Settings):
-    """The smooth bias that an accepted pose is corrected for (`gapr_core.registration.smooth_bias`)."""
+    """The smooth bias that an accepted pose is corrected for (`gapr_core.registration.uncertainty.smooth_bias`)."""
 
     correlation_mm: float = setting(20.0, "l of its correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm")
     centres: int = setting(60, "points that span it", low=1, high=10_000)
@@ -236,7 +236,7 @@ class RulesConfig(Settings):
 
 @dataclass(frozen=True)
 class LimitsConfig(Settings):
-    """What no pose can be sure of (`gapr_core.registration.limits`)."""
+    """What no pose can be sure of (`gapr_core.registration.checks.limits`)."""
 
     most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
     few_points: int = setting(250, "fewer near points show neither whose bone nor what size it is", low=0, high=10**6)
@@ -281,7 +281,7 @@ class AccumulationConfig(Settings):
 
 @dataclass(frozen=True)
 class RigidityConfig(Settings):
-    """Whether what was measured is one rigid piece (`gapr_core.registration.rigidity`)."""
+    """Whether what was measured is one rigid piece (`gapr_core.registration.checks.rigidity`)."""
 
     creeps: float = setting(
         6.0, "log likelihood ratio above which collected sources show that the bone moves; infinity: never", low=0
@@ -308,7 +308,7 @@ class RigidityConfig(Settings):
 
 @dataclass(frozen=True)
 class EvidenceConfig(Settings):
-    """How the frames of a stream are combined (`gapr_core.registration.evidence`)."""
+    """How the frames of a stream are combined (`gapr_core.registration.streams.evidence`)."""
 
     correlation: float = setting(0.8, "of two frames: 0 independent, 1 the same again", low=0, high=1)
     memory: float = setting(10.0, "frames after which a frame's weight has fallen to about 1/e", low=1)
@@ -320,7 +320,7 @@ class EvidenceConfig(Settings):
 
 @dataclass(frozen=True)
 class FollowingConfig(Settings):
-    """How far a pose is followed without an assessment (`gapr_core.registration.following`)."""
+    """How far a pose is followed without an assessment (`gapr_core.registration.streams.following`)."""
 
     points: int = setting(1000, "points of a source that are refined", low=100, high=1_000_000)
     most_sources: int = setting(5, "sources in a row that are followed; then one is assessed", low=0, high=1000)

@@ -50,6 +50,55 @@ class Refusal:
     asks_standoff: bool = False
 
 
+class Effect(str, Enum):
+    """How a finding changes an answer."""
+
+    REFUSE = "REFUSE"  # there is no pose
+    WIDEN = "WIDEN"  # the covariance, and with it the bound, is larger
+    ASK = "ASK"  # a question to the user; the answer stays
+
+    def __str__(self) -> str:
+        return self.value
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check that spoke: its statistic beyond its threshold, and the effect on the answer.
+
+    Attributes:
+        check: name of the check, a row of `docs/checks.md`.
+        effect: REFUSE, WIDEN or ASK.
+        statistic: measured value.
+        threshold: the value that it passed.
+        status: status of a refusal; `OK` for the other effects.
+        text: one sentence for users.
+        advice: one sentence: the next step.
+    """
+
+    check: str
+    effect: Effect
+    statistic: float
+    threshold: float
+    status: RegistrationStatus
+    text: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class ResultWarning:
+    """A caveat that belongs to an accepted pose, shown wherever the result is.
+
+    Attributes:
+        code: short stable name, such as "sensor_unknown".
+        text: one sentence: the caveat.
+        advice: one sentence: the next step.
+    """
+
+    code: str
+    text: str
+    advice: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """One distinct pose that was refined and compared.
@@ -191,6 +240,11 @@ class RegistrationResult:
             alone and nobody said it; None where it was given or is not needed.
         looks: of a camera's several looks, how each fits the pose; () of one. A pose can be accepted although some,
             fewer than half of those with enough points, saw nothing of the bone.
+        pose_probability: probability, 0 to 1, of a pose within 4 mm and 5 deg, given that this is the right bone; None
+            where a method does not say.
+        bone_evidence: log10 likelihood ratio of this bone to another subject's; None where a method does not say.
+        findings: the checks that spoke, in the order in which they apply; a refusal by a check is among them.
+        warnings: caveats of this result, each with a text and the next step.
     """
 
     status: RegistrationStatus
@@ -214,6 +268,10 @@ class RegistrationResult:
     inferred_viewpoint: Array | None = None
     factor95: float = 1.0
     looks: tuple[LookAnswer, ...] = ()
+    pose_probability: float | None = None
+    bone_evidence: float | None = None
+    findings: tuple[Finding, ...] = ()
+    warnings: tuple[ResultWarning, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.status is RegistrationStatus.OK) != (self.T_target_source is not None):

@@ -31,9 +31,9 @@ from gapr_core.calibration.fit import (
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
 from gapr_core.data.anatomy import SPLITS
 from gapr_core.errors import ConfigError
-from gapr_core.registration.additive import FORMAT, Additive, as_dict
-from gapr_core.registration.confidence import CALIBRATIONS
-from gapr_core.registration.precision_model import PRECISION_FEATURES
+from gapr_core.registration.confidence.additive import FORMAT, Additive, as_dict
+from gapr_core.registration.confidence.classifier import CALIBRATIONS
+from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATURES
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import exit_code, say

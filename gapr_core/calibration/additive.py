@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from gapr_core.registration.additive import Additive, Curve
+from gapr_core.registration.confidence.additive import Additive, Curve
 
 Array = NDArray[np.float64]
 Loss = Callable[[Array], tuple[float, Array]]  # of the model's values (N,): the mean loss, and its gradient (N,)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gapr_core.calibration.pairs import first_of_twins
 from gapr_core.errors import ConfigError
-from gapr_core.registration.features import FEATURES_OF
+from gapr_core.registration.confidence.features import FEATURES_OF
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -28,20 +28,20 @@ from gapr_core.data.pair import Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.sampling import random_directions
-from gapr_core.registration import clutter
-from gapr_core.registration import source as sources
-from gapr_core.registration.additive import Additive
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.confidence import Calibration
-from gapr_core.registration.features import FEATURES_OF, STREAM
-from gapr_core.registration.memory import Memory
-from gapr_core.registration.precision_model import Precision
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.confidence.additive import Additive
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.confidence.features import FEATURES_OF, STREAM
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposals, Proposer
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.registrar import Registrar
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.scenes import clutter
+from gapr_core.registration.streams.memory import Memory
+from gapr_core.registration.uncertainty.error_calibration import Precision
 from gapr_core.results import Hypothesis, Refusal
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.files import write_text

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from gapr_core.calibration.additive import fit_centre
 from gapr_core.calibration.answers import Answers, of_models_that_saw_neither, of_models_that_saw_no_subject
-from gapr_core.registration.additive import Additive
-from gapr_core.registration.precision_model import PRECISION_FEATURES, SCALE_LIMITS
+from gapr_core.registration.confidence.additive import Additive
+from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATURES, SCALE_LIMITS
 
 Array = NDArray[np.float64]
 MEDIAN_NEES = 5.348  # of chi square with six degrees of freedom

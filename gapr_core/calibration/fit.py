@@ -13,9 +13,9 @@ from gapr_core.calibration.answers import Answers, of_models_that_saw_neither, o
 from gapr_core.calibration.pairs import HELD_OUT
 from gapr_core.config import RegistrarConfig
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
-from gapr_core.registration.additive import Additive
-from gapr_core.registration.confidence import LARGEST_LOG_ODDS
-from gapr_core.registration.features import SIGNS
+from gapr_core.registration.confidence.additive import Additive
+from gapr_core.registration.confidence.classifier import LARGEST_LOG_ODDS
+from gapr_core.registration.confidence.features import SIGNS
 
 Array = NDArray[np.float64]
 ACCEPTED = RegistrarConfig.min_confidence

@@ -18,11 +18,11 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.geometry.sampling import log_uniform
-from gapr_core.registration.additive import Additive, Curve
-from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
-from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.confidence.additive import Additive, Curve
+from gapr_core.registration.confidence.classifier import LARGEST_LOG_ODDS, Calibration
+from gapr_core.registration.confidence.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.registrar import Registrar
-from gapr_core.registration.tracking import Tracker
+from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.results import RegistrationResult
 
 FRAMES = 12

@@ -54,8 +54,8 @@ def run(args: Namespace) -> int:
     Raises:
         GaprError: options or files that cannot be used.
     """
-    from gapr_core.registration import target as targets
     from gapr_core.registration.check_points import check_points
+    from gapr_core.registration.problem import target as targets
     from gapr_core.results import Verdict
 
     config = options.registrar_config(args)

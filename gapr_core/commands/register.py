@@ -95,7 +95,7 @@ def run(args: Namespace) -> int:
     """
     from gapr_core import Registrar, Tracker
     from gapr_core.benchmark import methods
-    from gapr_core.registration.limits import why_no_surer
+    from gapr_core.registration.checks.limits import why_no_surer
 
     checks.check_outputs(args)
     checks.check_method(args)
@@ -126,7 +126,7 @@ def run(args: Namespace) -> int:
 
 
 def _say_what_the_bound_leaves_out(sensor: SensorConfig) -> None:
-    from gapr_core.registration.sensor import errors
+    from gapr_core.registration.problem.sensor import errors
 
     known = errors(sensor, 0)
     if sensor.kind == "unknown":

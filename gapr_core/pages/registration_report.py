@@ -20,7 +20,7 @@ from gapr_core.pages import palette
 from gapr_core.pages.guidance import GuidedStep, guidance_figure
 from gapr_core.pages.registration import Registration
 from gapr_core.pages.report import Report, Step, alignment_figure
-from gapr_core.registration.words import WORDS
+from gapr_core.registration.checks.feature_labels import WORDS
 from gapr_core.results import Patch, RegistrationResult, confidence_text
 from gapr_core.runtime import origin
 

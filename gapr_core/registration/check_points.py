@@ -23,11 +23,13 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import distance_jacobian, mean_square
-from gapr_core.registration import kernels, precision, sensor
-from gapr_core.registration.bias_field import smooth_correlation
+from gapr_core.registration.fit import kernels
+from gapr_core.registration.problem import sensor
+from gapr_core.registration.problem.sensor import Errors, offset_surface
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import as_config, check_call
-from gapr_core.registration.sensor import Errors, offset_surface
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.uncertainty import target_error as precision
+from gapr_core.registration.uncertainty.linear_model import smooth_correlation
 from gapr_core.results import PointCheck, RegistrationResult, Verdict
 
 Array = NDArray[np.float64]

@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from gapr_core.config import GuidanceConfig
 from gapr_core.geometry import sampling, se3
 from gapr_core.geometry.twists import distance_jacobian
-from gapr_core.registration import precision
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.refinement import distances_mm
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.fit.refinement import distances_mm
+from gapr_core.registration.problem.target import PreparedTarget
+from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Guidance, Hypothesis, Patch
 
 Array = NDArray[np.float64]

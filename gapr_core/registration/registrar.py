@@ -29,38 +29,33 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
-from gapr_core.registration import (
-    checks,
-    clutter,
-    cortices,
-    doubles,
-    explained,
-    inputs,
-    limits,
-    look_agreement,
-    mirror,
-    rules,
-    scene_rounds,
-)
-from gapr_core.registration import scene as scenes
-from gapr_core.registration import source as sources
-from gapr_core.registration import target as targets
-from gapr_core.registration.assessment import Assessment, answer, assess_fit
-from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.checks import cortices, limits, rules
+from gapr_core.registration.checks import costly as checks
+from gapr_core.registration.checks import second_copy as doubles
+from gapr_core.registration.checks.assessment import Assessment, answer, assess_fit
+from gapr_core.registration.checks.rigidity import allowing_for_deformation
+from gapr_core.registration.checks.separate_patches import allowing_for_a_patch
+from gapr_core.registration.checks.standoff import asking_the_standoff, unless_off_the_bone
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.fit import mirror
+from gapr_core.registration.fit.refinement import refine_fully, rest_on_whole
+from gapr_core.registration.fit.verification import support, verify
 from gapr_core.registration.guidance import guide
-from gapr_core.registration.precision_model import Precision
+from gapr_core.registration.problem import inputs
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem import target as targets
+from gapr_core.registration.problem.sensor import offset_surface
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
-from gapr_core.registration.refinement import refine_fully, rest_on_whole
-from gapr_core.registration.rigidity import allowing_for_deformation
-from gapr_core.registration.scene import Look, Scene, Viewpoint
-from gapr_core.registration.sensor import offset_surface
-from gapr_core.registration.separate_patches import allowing_for_a_patch
-from gapr_core.registration.smooth_bias import bias_corrected
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.standoff import asking_the_standoff, unless_off_the_bone
-from gapr_core.registration.target import PreparedTarget
-from gapr_core.registration.verification import support, verify
+from gapr_core.registration.scenes import clutter, look_agreement
+from gapr_core.registration.scenes import rounds as scene_rounds
+from gapr_core.registration.scenes import scene as scenes
+from gapr_core.registration.scenes import scene_fit as explained
+from gapr_core.registration.scenes.scene import Look, Scene, Viewpoint
+from gapr_core.registration.uncertainty.error_calibration import Precision
+from gapr_core.registration.uncertainty.smooth_bias import bias_corrected
 from gapr_core.results import Refusal, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
@@ -164,7 +159,7 @@ class Registrar:
 
     @single_threaded_libraries
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Everything static about a target, the proposers' share included; see `registration.target.prepare`."""
+        """Everything static about a target, the proposers' share included; see `problem.target`."""
         prepared = targets.prepare(target, units, self.config.target, self.config.num_threads)
         for proposer in self.proposers:
             proposer.prepare(prepared)  # `both_cortices` gets its share when a source first follows both

@@ -28,7 +28,7 @@ from gapr_core.geometry import se3
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.encoding import TRANSFORMERS
 from gapr_core.model.network import GAPRNet
-from gapr_core.registration import sensor
+from gapr_core.registration.problem import sensor
 from gapr_core.results import RegistrationStatus
 from gapr_ros.demo.act import write_stl
 from gapr_ros.node.refusal import Reason

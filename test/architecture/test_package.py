@@ -159,7 +159,7 @@ def test_a_build_without_a_compiler_is_whole_and_says_what_it_lacks(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert run.returncode == 0 and "the loops are not compiled" in run.stdout + run.stderr
-    assert (tmp_path / "built/gapr_core/registration/kernels.py").is_file()
+    assert (tmp_path / "built/gapr_core/registration/fit/kernels.py").is_file()
     assert not list((tmp_path / "built").rglob("*.nbc"))
 
 

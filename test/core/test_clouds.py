@@ -8,7 +8,7 @@ import pytest
 
 from gapr_core import Registrar, RegistrarConfig, clouds
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.registration import target
+from gapr_core.registration.problem import target
 from gapr_core.surface import Surface, as_points
 
 VERTICES = np.array([[0, 0, 0], [40, 0, 0], [0, 30, 0], [0, 0, 20]], dtype=float)

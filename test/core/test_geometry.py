@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import TargetConfig
 from gapr_core.geometry import distance_field, quadrics, sampling, visibility
-from gapr_core.registration import target as targets
+from gapr_core.registration.problem import target as targets
 
 
 def sphere(count=4000, radius=30.0):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import tiny
 
-from gapr_core.registration.accumulation import _typical_distance_mm
+from gapr_core.registration.streams.accumulator import _typical_distance_mm
 
 
 def test_what_lies_beyond_the_end_of_the_surface_is_as_far_off_it_as_what_lies_above():

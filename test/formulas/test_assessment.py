@@ -10,14 +10,14 @@ from scipy.special import logit
 
 from gapr_core.config import RegistrarConfig, RulesConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import assessment as assessments
-from gapr_core.registration.additive import Additive, Curve
-from gapr_core.registration.assessment import Assessment, answer, judge, shared_probability
-from gapr_core.registration.confidence import Calibration
-from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.precision_model import Precision
-from gapr_core.registration.refinement import Fit
-from gapr_core.registration.verification import Candidates
+from gapr_core.registration.checks import assessment as assessments
+from gapr_core.registration.checks.assessment import Assessment, answer, judge, shared_probability
+from gapr_core.registration.confidence.additive import Additive, Curve
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.fit.verification import Candidates
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty
+from gapr_core.registration.uncertainty.error_calibration import Precision
 from gapr_core.results import Refusal, RegistrationStatus
 
 POINTS = np.array([[10.0, 0.0, 0.5], [-10.0, 0.0, 0.2], [0.0, 10.0, -0.1], [0.0, -10.0, 0.4]])

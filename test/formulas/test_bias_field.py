@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
-from gapr_core.registration import bias_field
-from gapr_core.registration.bias_field import (
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.uncertainty import linear_model as bias_field
+from gapr_core.registration.uncertainty.linear_model import (
     NormalEquations,
     equations_of,
     fields,
     root_mean_square,
     smooth_correlation,
 )
-from gapr_core.registration.refinement import Fit
 
 COUNT, FIELDS, SIGMA_MM = 24, 4, 0.6
 

@@ -14,8 +14,8 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration import check_points as module
-from gapr_core.registration import precision
 from gapr_core.registration.check_points import check_points as check
+from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals, Verdict
 
 EXACT = RegistrarConfig(

@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, SourceConfig
 from gapr_core.geometry import sampling, se3
-from gapr_core.registration import clutter, free_space
-from gapr_core.registration import source as sources
-from gapr_core.registration.clutter import Pool
-from gapr_core.registration.scene import Scene
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.scenes import clutter, free_space
+from gapr_core.registration.scenes.clutter import Pool
+from gapr_core.registration.scenes.scene import Scene
 
 CONFIG = ClutterConfig(
     same_pose_mm=2.0, markers=5, middle_poses=3, final_poses=2, kept_poses=2, levelled_by=4, region_points=12,

@@ -5,8 +5,8 @@ import pytest
 import tiny
 
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter_kernels as kernels
-from gapr_core.registration.kernels import residuals_at
+from gapr_core.registration.fit.kernels import residuals_at
+from gapr_core.registration.scenes import kernels
 
 SAME = 0.6
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import expit, logit
 
 from gapr_core.config import EvidenceConfig
-from gapr_core.registration.evidence import Evidence
+from gapr_core.registration.streams.evidence import Evidence
 
 
 def test_a_single_frame_keeps_its_probability():

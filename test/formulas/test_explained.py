@@ -9,15 +9,17 @@ import tiny
 
 from gapr_core.config import ClutterConfig, PartConfig, RegistrarConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import explained, features, rigidity
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.explained import Explained
-from gapr_core.registration.features import OTHER_BONE, SCENE_FEATURES
-from gapr_core.registration.free_space import Visible
-from gapr_core.registration.further_unknowns import Finding
-from gapr_core.registration.refinement import Fit
-from gapr_core.registration.verification import Candidates
+from gapr_core.registration.checks import rigidity
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.unknowns import Finding
+from gapr_core.registration.confidence import features
+from gapr_core.registration.confidence.features import OTHER_BONE, SCENE_FEATURES
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.fit.verification import Candidates
+from gapr_core.registration.scenes import scene_fit as explained
+from gapr_core.registration.scenes.free_space import Visible
+from gapr_core.registration.scenes.scene_fit import Explained
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty
 from gapr_core.results import Refusal, RegistrationStatus
 
 CONFIG = RegistrarConfig(

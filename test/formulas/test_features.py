@@ -8,13 +8,13 @@ import pytest
 
 from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import features
-from gapr_core.registration import source as sources
-from gapr_core.registration.bias_field import equations_of
-from gapr_core.registration.confidence import Calibration
-from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.refinement import Fit
-from gapr_core.registration.verification import Candidates
+from gapr_core.registration.confidence import features
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.fit.verification import Candidates
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty
+from gapr_core.registration.uncertainty.linear_model import equations_of
 
 COUNT = 40
 AXIS = np.array([0.0, 0.0, 1.0])

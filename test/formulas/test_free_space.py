@@ -8,7 +8,7 @@ import pytest
 from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.free_space import DepthImage, Visible, _looking_at, _pixels, compare, see
+from gapr_core.registration.scenes.free_space import DepthImage, Visible, _looking_at, _pixels, compare, see
 
 EYE = np.array([0.0, 0.0, 400.0])
 ON_MM, FRONT_MM = 2.0, 4.0

@@ -6,7 +6,7 @@ import tiny
 from scipy.spatial.transform import Rotation
 
 from gapr_core.geometry import se3
-from gapr_core.registration import kernels, surface_kernels
+from gapr_core.registration.fit import kernels, surface_kernels
 
 RNG = np.random.default_rng(0)
 T = se3.exp([1.0, -2.0, 0.5, 0.2, -0.1, 0.3])

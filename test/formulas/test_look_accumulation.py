@@ -8,8 +8,8 @@ import tiny
 
 from gapr_core import ConfigError, InvalidPointCloudError, LookAccumulator, Registrar, Tracker
 from gapr_core.geometry import se3
-from gapr_core.registration.look_accumulation import STUCK
-from gapr_core.registration.scene import Look, Places
+from gapr_core.registration.scenes.scene import Look, Places
+from gapr_core.registration.streams.look_accumulator import STUCK
 from gapr_core.results import LookAnswer, LookFit, RegistrationResult, RegistrationStatus
 
 OK = RegistrationResult(RegistrationStatus.OK, np.eye(4))

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from gapr_core.geometry.twists import predicted_rmse_mm
-from gapr_core.registration import precision
+from gapr_core.registration.uncertainty import target_error as precision
 
 
 def random_covariance(rng):

@@ -10,8 +10,8 @@ import tiny
 
 from gapr_core.config import RefinementConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import fit_kernels, kernels, refinement
-from gapr_core.registration.refinement import Fit
+from gapr_core.registration.fit import fit_kernels, kernels, refinement
+from gapr_core.registration.fit.refinement import Fit
 
 CONFIG = RefinementConfig()
 RNG = np.random.default_rng(0)

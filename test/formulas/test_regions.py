@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gapr_core.config import ClutterConfig, SourceConfig
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 from gapr_core.registration.proposals import regions
 
 SPACING_MM = 2.0

@@ -9,13 +9,14 @@ from scipy.stats import multivariate_normal
 from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
-from gapr_core.registration import further_unknowns, rigidity
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.covariance import PoseUncertainty, covariance_added_by
-from gapr_core.registration.creep import of_motion, step_times
-from gapr_core.registration.further_unknowns import BIASES_MM, SHARED_MM, SIZES_MM, Blocks, blocks, findings
-from gapr_core.registration.refinement import Fit
-from gapr_core.registration.rigidity import of_deformations
+from gapr_core.registration.checks import rigidity
+from gapr_core.registration.checks import unknowns as further_unknowns
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.rigidity import of_deformations
+from gapr_core.registration.checks.unknowns import BIASES_MM, SHARED_MM, SIZES_MM, Blocks, blocks, findings
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.streams.motion_test import of_motion, step_times
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty, covariance_added_by
 
 CONFIG = RigidityConfig()
 SMALL = RigidityConfig(cells=12, groups=2)

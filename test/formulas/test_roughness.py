@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from gapr_core.registration import bias_field, roughness
-from gapr_core.registration.refinement import Fit
+from gapr_core.registration.confidence import roughness
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.uncertainty import linear_model as bias_field
 
 UP = np.array([0.0, 0.0, 1.0])
 

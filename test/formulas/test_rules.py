@@ -10,12 +10,14 @@ import tiny
 
 from gapr_core.config import RegistrarConfig, SourceConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import limits, mirror, refinement, rules, words
-from gapr_core.registration import source as sources
-from gapr_core.registration.assessment import shared_probability
-from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.features import FEATURES, SCENE_FEATURES, STREAM_FEATURES
-from gapr_core.registration.verification import Candidates
+from gapr_core.registration.checks import feature_labels as words
+from gapr_core.registration.checks import limits, rules
+from gapr_core.registration.checks.assessment import shared_probability
+from gapr_core.registration.confidence.features import FEATURES, SCENE_FEATURES, STREAM_FEATURES
+from gapr_core.registration.fit import mirror, refinement
+from gapr_core.registration.fit.verification import Candidates
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty
 from gapr_core.results import RegistrationStatus
 
 CONFIG = RegistrarConfig(num_threads=1)

@@ -10,13 +10,13 @@ import tiny
 from gapr_core.config import ClutterConfig, FreeSpaceConfig, RegistrarConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration import free_space, look_agreement
-from gapr_core.registration import scene as scenes
-from gapr_core.registration import source as sources
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.free_space import Visible
-from gapr_core.registration.look_agreement import LookShares
-from gapr_core.registration.scene import MOST_PLACES, Look, Places, Scene
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.scenes import free_space, look_agreement
+from gapr_core.registration.scenes import scene as scenes
+from gapr_core.registration.scenes.free_space import Visible
+from gapr_core.registration.scenes.look_agreement import LookShares
+from gapr_core.registration.scenes.scene import MOST_PLACES, Look, Places, Scene
 from gapr_core.results import LookFit, Refusal, RegistrationStatus
 
 EYES = np.array([[0.0, 0.0, 300.0], [0.0, 0.0, -300.0]])

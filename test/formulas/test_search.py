@@ -8,7 +8,7 @@ import tiny
 
 from gapr_core.config import SearchConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 from gapr_core.registration.proposals import search
 
 RNG = np.random.default_rng(3)

@@ -7,7 +7,8 @@ import pytest
 import tiny
 
 from gapr_core.config import SENSOR_KINDS, SensorConfig
-from gapr_core.registration import kernels, sensor
+from gapr_core.registration.fit import kernels
+from gapr_core.registration.problem import sensor
 
 
 @pytest.mark.parametrize(("points", "share"), [(1, 1.0), (2000, 1.0), (2001, 2000 / 2001), (4000, 0.5), (8000, 0.25)])

@@ -9,10 +9,10 @@ import tiny
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist
-from gapr_core.registration import separate_patches
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.covariance import PoseUncertainty
-from gapr_core.registration.separate_patches import FALLS_TO, MOVES_MM, NAME, allowing_for_a_patch, patches
+from gapr_core.registration.checks import separate_patches
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.separate_patches import FALLS_TO, MOVES_MM, NAME, allowing_for_a_patch, patches
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty
 
 CONFIG = RegistrarConfig(num_threads=1)
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from test_roughness import UP, feet_of, field, plane_fit
 
-from gapr_core.registration import roughness, shared_misfit
-from gapr_core.registration.shared_misfit import SharedMisfit
+from gapr_core.registration.confidence import roughness
+from gapr_core.registration.streams import shared_misfit
+from gapr_core.registration.streams.shared_misfit import SharedMisfit
 
 FOUR = np.array([[0.0, 0, 0], [5.0, 0, 0], [0.0, 15.0, 0], [5.0, 15.0, 0]])
 MEMORY = 1e9

@@ -8,9 +8,9 @@ import pytest
 
 from gapr_core.config import RegistrarConfig, SensorConfig, SmoothBiasConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import smooth_bias
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.refinement import Fit
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.uncertainty import smooth_bias
 
 COUNT = 12
 CONFIG = SmoothBiasConfig(fewest_points=10, iterations=3, sizes_mm=(0.5, 1.0), largest_move=22.5)

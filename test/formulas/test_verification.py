@@ -6,9 +6,9 @@ import tiny
 
 from gapr_core.config import SourceConfig, VerificationConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import source as sources
-from gapr_core.registration import verification
-from gapr_core.registration.refinement import refine_many
+from gapr_core.registration.fit import verification
+from gapr_core.registration.fit.refinement import refine_many
+from gapr_core.registration.problem import source as sources
 
 CONFIG = VerificationConfig(
     coarse_points=20, coarse_limits_mm=(6.0, 5.0, 2), middle_points=24, middle_poses=5, middle_limits_mm=(5.0, 4.0, 2),

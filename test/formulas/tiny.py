@@ -5,8 +5,8 @@ from scipy.spatial import cKDTree
 
 from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.geometry.sampling import fibonacci_directions
-from gapr_core.registration.surface_kernels import padded
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.fit.surface_kernels import padded
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.surface import Surface
 
 CELL_MM, REACH_MM = 2.0, 8.0

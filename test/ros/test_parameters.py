@@ -13,7 +13,7 @@ from harness import NodeProcess, StandIn, context, node_in_thread, wait_until
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
-from gapr_core.registration.scene import MOST_PLACES
+from gapr_core.registration.scenes.scene import MOST_PLACES
 from gapr_ros import parameters
 from gapr_ros.node.lifecycle import RegisterNode
 from gapr_ros.parameters import FIELDS, NodeParameters, ParameterError

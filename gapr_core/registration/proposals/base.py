@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,10 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import Frame, build_cloud, target_frame
 from gapr_core.model.types import Cloud, Features, Matches
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.consensus import Correspondences, local_to_global, ransac
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 METHODS = ("local_to_global", "ransac")

@@ -21,10 +21,10 @@ from scipy.spatial import cKDTree
 from gapr_core.config import ClutterConfig, SearchConfig
 from gapr_core.geometry import sampling
 from gapr_core.geometry.planes import fit_planes
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.search import NormalAlignedSearch
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from gapr_core.config import SearchConfig
 from gapr_core.geometry import quadrics, sampling
 from gapr_core.geometry.distance_field import FARTHEST, DistanceField
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.source import PreparedSource
-from gapr_core.registration.target import PreparedTarget
 from gapr_core.runtime.parallel import in_threads
 
 Array = NDArray[np.float64]

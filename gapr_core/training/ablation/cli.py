@@ -35,10 +35,10 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
-from gapr_core.registration import target
+from gapr_core.registration.fit.refinement import refine_fully
+from gapr_core.registration.problem import target
 from gapr_core.registration.proposals.consensus import sharpened
 from gapr_core.registration.proposals.network import METHODS, consensus, correspondences_mm
-from gapr_core.registration.refinement import refine_fully
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import above_zero, at_least_one, names
 from gapr_core.runtime.console import say

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gapr_core.calibration.answers import Answers
-from gapr_core.registration.features import FEATURES
+from gapr_core.registration.confidence.features import FEATURES
 
 
 def made_answers(count=1500, seed=0, error_scale=1.0, people=40):

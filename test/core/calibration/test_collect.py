@@ -17,10 +17,10 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
-from gapr_core.registration import clutter
-from gapr_core.registration.features import FEATURES, FEATURES_OF
-from gapr_core.registration.memory import Memory
+from gapr_core.registration.confidence.features import FEATURES, FEATURES_OF
 from gapr_core.registration.proposals.base import Proposals
+from gapr_core.registration.scenes import clutter
+from gapr_core.registration.streams.memory import Memory
 from gapr_core.results import Hypothesis, Refusal, RegistrationStatus
 from gapr_core.runtime import origin
 
@@ -131,7 +131,7 @@ def test_simulated_models_are_exact_in_the_fit_and_others_are_not(truth):
 
 def test_records_know_nothing_of_the_models_that_ship(truth, monkeypatch):
     for model in (
-        "gapr_core.registration.confidence.Calibration.shipped",
+        "gapr_core.registration.confidence.classifier.Calibration.shipped",
         "gapr_core.registration.registrar.Precision.load",
     ):
         monkeypatch.setattr(model, lambda *_: pytest.fail("a model that ships was asked for"))

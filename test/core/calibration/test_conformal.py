@@ -6,8 +6,8 @@ from answer_cases import made_answers
 from scipy.stats import chi2
 
 from gapr_core.calibration import conformal
-from gapr_core.registration.features import FEATURES
-from gapr_core.registration.precision_model import SCALE_LIMITS
+from gapr_core.registration.confidence.features import FEATURES
+from gapr_core.registration.uncertainty.error_calibration import SCALE_LIMITS
 
 
 def test_the_conformal_quantile_covers_the_next_score_as_often_as_it_says():

@@ -11,8 +11,8 @@ from gapr_core.calibration import fit as fits
 from gapr_core.calibration.answers import answers_of, together
 from gapr_core.calibration.pairs import HELD_OUT, TWINS
 from gapr_core.errors import ConfigError
-from gapr_core.registration.additive import Additive, Curve
-from gapr_core.registration.features import FEATURES
+from gapr_core.registration.confidence.additive import Additive, Curve
+from gapr_core.registration.confidence.features import FEATURES
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from gapr_core.data.pair import Pair
 from gapr_core.data.smooth_bias import SMOOTH_BIASES
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.geometry import se3
-from gapr_core.registration.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.confidence.features import STREAM, STREAM_FEATURES
 from gapr_core.results import Hypothesis, RegistrationResult
 
 TASK = Task("folder", "train", 0, 5, STREAM)

@@ -19,7 +19,7 @@ from gapr_core import clouds
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
-from gapr_core.registration.target import prepare
+from gapr_core.registration.problem.target import prepare
 
 PCD = "VERSION .7\nFIELDS {}\nSIZE {}\nTYPE {}\nCOUNT {}\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\nDATA {how}\n"
 XYZ = ("x y z", "4 4 4", "F F F", "1 1 1")

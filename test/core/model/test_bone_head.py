@@ -16,8 +16,8 @@ from gapr_core.model import weights
 from gapr_core.model.bone_head import BelieveAll, ancestors
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
-from gapr_core.registration import source as sources
-from gapr_core.registration import target as targets
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem import target as targets
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.losses import bone_loss, compute_losses

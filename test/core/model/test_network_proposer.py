@@ -12,9 +12,9 @@ from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
-from gapr_core.registration import source as sources
-from gapr_core.registration import target as targets
-from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem import target as targets
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 
 

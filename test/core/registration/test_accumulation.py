@@ -12,8 +12,10 @@ from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
-from gapr_core.registration import clutter, creep, precision
-from gapr_core.registration.limits import why_no_surer
+from gapr_core.registration.checks.limits import why_no_surer
+from gapr_core.registration.scenes import clutter
+from gapr_core.registration.streams import motion_test as creep
+from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Hypothesis, RegistrationResult
 
 STILL = Motion(frames=12, share=0.03, points=150, step_mm=0.0, step_deg=0.0)

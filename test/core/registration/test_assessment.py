@@ -10,8 +10,8 @@ from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import rules
-from gapr_core.registration.assessment import answer
+from gapr_core.registration.checks import rules
+from gapr_core.registration.checks.assessment import answer
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.network import NetworkProposer
 

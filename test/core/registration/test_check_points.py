@@ -5,7 +5,7 @@ import pytest
 
 from gapr_core import RegistrarConfig, check_points
 from gapr_core.config import SensorConfig
-from gapr_core.registration import sensor
+from gapr_core.registration.problem import sensor
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
 

@@ -10,16 +10,19 @@ from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import ClutterConfig, RulesConfig, SensorConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
-from gapr_core.registration import checks, clutter, limits, scene_rounds
-from gapr_core.registration import scene as scenes
-from gapr_core.registration import source as sources
-from gapr_core.registration.additive import Additive, Curve
-from gapr_core.registration.confidence import Calibration
-from gapr_core.registration.features import SCENE_FEATURES
-from gapr_core.registration.memory import Memory, MemoryFirst
-from gapr_core.registration.repeats import fingerprint
-from gapr_core.registration.sensor import offset_surface
-from gapr_core.registration.source import prepare
+from gapr_core.registration.checks import costly as checks
+from gapr_core.registration.checks import limits
+from gapr_core.registration.confidence.additive import Additive, Curve
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.confidence.features import SCENE_FEATURES
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.sensor import offset_surface
+from gapr_core.registration.problem.source import prepare
+from gapr_core.registration.scenes import clutter
+from gapr_core.registration.scenes import rounds as scene_rounds
+from gapr_core.registration.scenes import scene as scenes
+from gapr_core.registration.streams.duplicate_clouds import fingerprint
+from gapr_core.registration.streams.memory import Memory, MemoryFirst
 from gapr_core.results import Refusal
 from gapr_core.runtime.clock import Clock
 from gapr_core.surface import Surface

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gapr_core.errors import MethodUnavailableError, WeightsError
-from gapr_core.registration.additive import Additive, Curve, as_dict
-from gapr_core.registration.confidence import CALIBRATIONS, Calibration
-from gapr_core.registration.features import FEATURES, FEATURES_OF
+from gapr_core.registration.confidence.additive import Additive, Curve, as_dict
+from gapr_core.registration.confidence.classifier import CALIBRATIONS, Calibration
+from gapr_core.registration.confidence.features import FEATURES, FEATURES_OF
 
 
 @pytest.fixture

@@ -9,8 +9,10 @@ import pytest
 from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import covariance_about, error_twist, nees
-from gapr_core.registration import bias_field, covariance, refinement
-from gapr_core.registration.sensor import Errors
+from gapr_core.registration.fit import refinement
+from gapr_core.registration.problem.sensor import Errors
+from gapr_core.registration.uncertainty import covariance
+from gapr_core.registration.uncertainty import linear_model as bias_field
 
 CONFIG = CovarianceConfig(model_mm=0.0)
 NO_COMMON_BIAS = replace(CONFIG, long_share=0.0, linear_share=0.0)

@@ -6,8 +6,8 @@ import pytest
 from gapr_core.config import SourceConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.crop import crop_box, crop_to_pose
-from gapr_core.registration.source import prepare, without_isolated
+from gapr_core.registration.problem.crop import crop_box, crop_to_pose
+from gapr_core.registration.problem.source import prepare, without_isolated
 
 
 def test_a_box_is_read_in_its_own_frame():

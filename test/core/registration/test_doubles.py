@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core import Registrar, Tracker
 from gapr_core.geometry import se3
-from gapr_core.registration import doubles
-from gapr_core.registration.assessment import Assessment
-from gapr_core.registration.limits import applied
+from gapr_core.registration.checks import second_copy as doubles
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.limits import applied
 from gapr_core.results import RegistrationStatus
 
 STEP = np.array([5.0, -2.0, 4.0, 0.02, 0.03, -0.02])

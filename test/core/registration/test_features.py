@@ -8,11 +8,11 @@ import pytest
 
 from gapr_core.config import RegistrarConfig, SensorConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import mirror, other_size
-from gapr_core.registration import source as sources
-from gapr_core.registration import target as targets
-from gapr_core.registration.features import FEATURES_OF, SIGNS, of_another_bone, scale_of
-from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.confidence.features import FEATURES_OF, SIGNS, of_another_bone, scale_of
+from gapr_core.registration.fit import mirror, other_size
+from gapr_core.registration.fit.refinement import refine_fully
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem import target as targets
 
 CONFIG = RegistrarConfig(num_threads=1)
 

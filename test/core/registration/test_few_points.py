@@ -6,7 +6,7 @@ import pytest
 from gapr_core import RegistrationStatus
 from gapr_core.config import SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 from gapr_core.results import Refusal
 
 

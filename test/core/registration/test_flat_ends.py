@@ -10,7 +10,7 @@ from gapr_core.config import TargetConfig
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_core.geometry.flat_ends import OF_POINT, flat_ends
-from gapr_core.registration import target as targets
+from gapr_core.registration.problem import target as targets
 
 UP = np.array([0.0, 0.0, 1.0])
 KEEP = TargetConfig(flat_end_mm2=0.0)

@@ -11,8 +11,8 @@ from gapr_core.data.specimen import Specimen
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.following import FollowedPose, Follower, PartialFit
-from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.fit.refinement import refine_fully
+from gapr_core.registration.streams.following import FollowedPose, Follower, PartialFit
 
 MOTION = Motion(frames=6, share=0.35, points=2000, swing_deg=10.0)
 ELSEWHERE = se3.exp([90.0, -60.0, 40.0, 1.2, -0.8, 2.0])
@@ -91,7 +91,7 @@ def test_a_source_of_many_points_is_refined_on_a_part_of_it(sure, frames, prepar
         counts.append(len(points))
         return refine_fully(T, points, *given)
 
-    monkeypatch.setattr("gapr_core.registration.following.refine_fully", counted)
+    monkeypatch.setattr("gapr_core.registration.streams.following.refine_fully", counted)
     many = np.concatenate([frames[1].source + 0.01 * k for k in range(15)])
     assert sure.follow(many, prepared) is not None
     most = sure.registrar.config.following.points

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 torch.set_num_threads(2)
 from gapr_core.data.parametric import make_bone
-from gapr_core.registration import source as sources
-from gapr_core.registration import target as targets
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem import target as targets
 from gapr_core.registration.proposals.search import NormalAlignedSearch
-from gapr_core.registration.refinement import refine_fully
+from gapr_core.registration.fit.refinement import refine_fully
 from gapr_core.registration.registrar import shipped_network
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration.verification import verify
+from gapr_core.registration.fit.verification import verify
 
 rng, config = np.random.default_rng(0), RegistrarConfig(num_threads=2)
 points = make_bone("femur", 3).sample(6000, rng)[0]

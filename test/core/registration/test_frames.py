@@ -8,7 +8,7 @@ from gapr_core import Accumulator, Registrar, RegistrarConfig, Tracker, check_po
 from gapr_core.config import SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import landmarks, se3
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 from gapr_core.results import Refusal
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.registration.free_space import compare, see
+from gapr_core.registration.scenes.free_space import compare, see
 
 EYE = np.array([0.0, 0.0, 400.0])
 

@@ -8,8 +8,10 @@ import pytest
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.config import RulesConfig, SensorConfig
-from gapr_core.registration import checks, other_size, rules
-from gapr_core.registration import source as sources
+from gapr_core.registration.checks import costly as checks
+from gapr_core.registration.checks import rules
+from gapr_core.registration.fit import other_size
+from gapr_core.registration.problem import source as sources
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,11 @@ import pytest
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import GuidanceConfig, SensorConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import guidance, precision
-from gapr_core.registration import target as targets
+from gapr_core.registration import guidance
 from gapr_core.registration.guidance import guide, information
-from gapr_core.registration.sensor import offset_surface
+from gapr_core.registration.problem import target as targets
+from gapr_core.registration.problem.sensor import offset_surface
+from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Hypothesis
 
 CONFIG = GuidanceConfig(patches=120)

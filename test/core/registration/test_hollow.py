@@ -12,8 +12,8 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import quadrics, se3, visibility
-from gapr_core.registration import cortices
-from gapr_core.registration.stream_misfit import NoMisfit
+from gapr_core.registration.checks import cortices
+from gapr_core.registration.streams.stream_misfit import NoMisfit
 
 WALL_MM = 4.0
 

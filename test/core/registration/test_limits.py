@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.config import LimitsConfig, SensorConfig
 from gapr_core.geometry import se3
-from gapr_core.registration import limits
+from gapr_core.registration.checks import limits
 from gapr_core.results import Refusal, RegistrationResult
 
 SURE = 0.97

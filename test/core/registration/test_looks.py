@@ -8,7 +8,7 @@ from gapr_core.config import ClutterConfig
 from gapr_core.data import pool, protocols
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration import look_agreement
+from gapr_core.registration.scenes import look_agreement
 
 SUBJECT, SEED = 0, 5
 MOTION = [4.0, -3.0, 3.0, 0.02, 0.03, -0.02]  # 6 mm and 2.4 deg

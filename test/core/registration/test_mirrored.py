@@ -9,9 +9,10 @@ import pytest
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import SensorConfig, SourceConfig
 from gapr_core.data.parametric import make_bone
-from gapr_core.registration import checks, mirror
-from gapr_core.registration import source as sources
-from gapr_core.registration.sensor import offset_surface
+from gapr_core.registration.checks import costly as checks
+from gapr_core.registration.fit import mirror
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.results import RegistrationStatus
 
 CONFIG = RegistrarConfig(num_threads=1)

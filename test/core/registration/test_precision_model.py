@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gapr_core.errors import WeightsError
-from gapr_core.registration.additive import Additive, Curve, as_dict
-from gapr_core.registration.features import FEATURES
-from gapr_core.registration.precision_model import PRECISION_FEATURES, SCALE_LIMITS, Precision
+from gapr_core.registration.confidence.additive import Additive, Curve, as_dict
+from gapr_core.registration.confidence.features import FEATURES
+from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATURES, SCALE_LIMITS, Precision
 
 
 def curves(name, knots, adds):

@@ -6,8 +6,9 @@ import pytest
 from gapr_core.config import CovarianceConfig, RefinementConfig
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import predicted_rmse_mm
-from gapr_core.registration import covariance, kernels, refinement
-from gapr_core.registration.target import prepare
+from gapr_core.registration.fit import kernels, refinement
+from gapr_core.registration.problem.target import prepare
+from gapr_core.registration.uncertainty import covariance
 
 CONFIG = RefinementConfig()
 

@@ -14,10 +14,11 @@ from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import checks, mirror
 from gapr_core.registration import registrar as registrars
-from gapr_core.registration.additive import Additive
-from gapr_core.registration.confidence import Calibration
+from gapr_core.registration.checks import costly as checks
+from gapr_core.registration.confidence.additive import Additive
+from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.fit import mirror
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.network import NetworkProposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch

@@ -13,12 +13,12 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.scenes.things import BOX_FACES
 from gapr_core.data.specimen import Specimen
-from gapr_core.registration import rules
-from gapr_core.registration import source as sources
-from gapr_core.registration import target as targets
-from gapr_core.registration.covariance import estimate
-from gapr_core.registration.refinement import Fit, refine_fully
-from gapr_core.registration.verification import Candidates
+from gapr_core.registration.checks import rules
+from gapr_core.registration.fit.refinement import Fit, refine_fully
+from gapr_core.registration.fit.verification import Candidates
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem import target as targets
+from gapr_core.registration.uncertainty.covariance import estimate
 from gapr_core.results import RegistrationStatus
 from gapr_core.surface import Surface
 

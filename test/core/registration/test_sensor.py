@@ -7,8 +7,9 @@ from gapr_core import RegistrarConfig
 from gapr_core.config import SENSOR_KINDS, SensorConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry.sampling import fibonacci_directions
-from gapr_core.registration import refinement, sensor
-from gapr_core.registration import target as targets
+from gapr_core.registration.fit import refinement
+from gapr_core.registration.problem import sensor
+from gapr_core.registration.problem import target as targets
 
 
 @pytest.fixture(scope="module")

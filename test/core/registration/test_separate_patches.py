@@ -7,7 +7,7 @@ from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import SensorConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.registration import registrar as registrars
-from gapr_core.registration.separate_patches import NAME, patches
+from gapr_core.registration.checks.separate_patches import NAME, patches
 
 RADIUS_MM, APART_MM = 18.0, 60.0
 

@@ -4,11 +4,11 @@ import pytest
 from gapr_core.config import CovarianceConfig, RefinementConfig, RegistrarConfig, SmoothBiasConfig, SourceConfig
 from gapr_core.data.degradation import bias_along_normals
 from gapr_core.geometry import se3
-from gapr_core.registration import source as sources
-from gapr_core.registration.bias_field import NormalEquations
-from gapr_core.registration.covariance import estimate
-from gapr_core.registration.refinement import refine_fully, rest_on_whole
-from gapr_core.registration.smooth_bias import believed_size_mm, corrected_fit
+from gapr_core.registration.fit.refinement import refine_fully, rest_on_whole
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.uncertainty.covariance import estimate
+from gapr_core.registration.uncertainty.linear_model import NormalEquations
+from gapr_core.registration.uncertainty.smooth_bias import believed_size_mm, corrected_fit
 
 REFINEMENT, CONFIG = RefinementConfig(), SmoothBiasConfig()
 

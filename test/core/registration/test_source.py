@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from gapr_core.config import SourceConfig
 from gapr_core.geometry import quadrics, sampling
 from gapr_core.geometry.planes import fit_planes
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 
 CONFIG = SourceConfig(isolated_mm=1.0)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gapr_core.config import SourceConfig
-from gapr_core.registration import source as sources
+from gapr_core.registration.problem import source as sources
 
 
 def test_points_at_the_border_of_a_patch_are_none_of_the_first():

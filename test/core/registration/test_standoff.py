@@ -11,8 +11,8 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_core.registration import registrar as registrars
-from gapr_core.registration import standoff
-from gapr_core.registration.sensor import offset_surface
+from gapr_core.registration.checks import standoff
+from gapr_core.registration.problem.sensor import offset_surface
 
 REFUSING = RegistrarConfig(num_threads=1, min_confidence=1.0)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapr_core.geometry.sampling import fibonacci_directions
-from gapr_core.registration import target as targets
+from gapr_core.registration.problem import target as targets
 
 
 @pytest.mark.parametrize(("outer", "inner", "is_shell"), [(4000, 2500, True), (2500, 4000, False)])

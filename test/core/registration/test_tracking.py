@@ -11,13 +11,13 @@ from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-from gapr_core.registration.additive import Additive, Curve
-from gapr_core.registration.confidence import LARGEST_LOG_ODDS, Calibration
-from gapr_core.registration.features import STREAM, STREAM_FEATURES
-from gapr_core.registration.memory import Memory
-from gapr_core.registration.precision_model import Precision
+from gapr_core.registration.confidence.additive import Additive, Curve
+from gapr_core.registration.confidence.classifier import LARGEST_LOG_ODDS, Calibration
+from gapr_core.registration.confidence.features import STREAM, STREAM_FEATURES
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.repeats import fingerprint
+from gapr_core.registration.streams.duplicate_clouds import fingerprint
+from gapr_core.registration.streams.memory import Memory
+from gapr_core.registration.uncertainty.error_calibration import Precision
 
 MOTION = Motion(frames=4, share=0.35, points=2000)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar
-from gapr_core.registration import rules
+from gapr_core.registration.checks import rules
 from gapr_core.results import Refusal, RegistrationStatus
 
 LINE = Refusal(RegistrationStatus.DEGENERATE, "the source is a line")

@@ -1,0 +1,1 @@
+"""Checks of a pose, and the answer that they lead to."""

@@ -1,0 +1,26 @@
+"""Hollow bones: a model with an inner and an outer cortex, and sources that follow both.
+
+No probe sees the inner cortex, so a source is registered to the outer one alone. A source that was cut out of such a
+model follows both; the residuals show it.
+"""
+
+from __future__ import annotations
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.fit.refinement import evaluate
+
+
+def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
+    """True when the inner cortex explains what the outer one leaves open, down to the noise of the source.
+
+    Two nearby sheets shrink the residuals of any bad fit, such as that of another subject's bone; only a source that
+    lies on both leaves nothing but its noise.
+    """
+    both = assessment.target.both_cortices
+    if both is None:
+        return False
+    fit = evaluate(assessment.fit.T, assessment.source.points, both, config.refinement)
+    limits, noise_mm = config.cortices, max(assessment.source.noise_mm, config.refinement.smallest_sigma_mm)
+    explains = fit.sigma_mm < limits.share * assessment.fit.sigma_mm
+    return explains and fit.sigma_mm < limits.noise * noise_mm

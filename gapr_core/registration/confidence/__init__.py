@@ -1,0 +1,1 @@
+"""The probability that a pose is right: its features and the classifier."""

@@ -1,0 +1,93 @@
+"""The misfit that changes within centimetres: a sign of another bone, or of a wrong pose.
+
+What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wrong for all of it: residuals 12 to 16 mm
+apart are nearly as alike as those of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the
+covariance of the residuals at short range, less that at longer range, tells the two apart (an empirical covariogram;
+Matheron 1963). Noise takes no part: it is independent from point to point. Large residuals are damped: a few of them
+would decide. What counts is the upper end of what the difference may be: few pairs say little, and a misfit that nobody
+could see is not a small one.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.geometry import sampling
+from gapr_core.registration.fit.refinement import Fit
+
+Array = NDArray[np.float64]
+
+NEAR_MM, FAR_MM = (0.0, 6.0), (12.0, 16.0)  # between foot points on the bone; how they were chosen: docs/log.md
+LIMITS_MM = np.array([NEAR_MM, FAR_MM])
+CENTRES = 600  # inliers, evenly spread, of which each is compared with all
+LARGEST_SIGMAS = 4.0  # a residual of so many standard deviations counts as none
+SURE_SIGMAS = 1.645  # above what is measured: the difference is larger in 5 % of the cases
+DIGITS = 6  # of a foot point, mm: what is less must not decide which points are near
+
+
+def rough_misfit_mm(fit: Fit) -> float:
+    """Root, mm, of the most by which the covariance over less than 6 mm exceeds that over 12 to 16 mm; with its sign.
+
+    A product of two independent residuals of variance s^2 has a standard deviation of s^2, a mean of m of them
+    s^2 / sqrt(m); `products_mm2` counts a pair of two centres twice. The most is s^2: it is all that is known where no
+    two inliers are so near, or none so far apart.
+    """
+    feet, damped = on_the_bone(fit)
+    largest_mm2 = float((damped**2).mean()) if len(damped) else fit.sigma_mm**2
+    chosen = sampling.thin(feet, CENTRES)
+    total, count = products_mm2(feet[chosen], damped[chosen], feet, damped, LIMITS_MM, chosen)
+    if not count.all():
+        return float(np.sqrt(largest_mm2))
+    near_mm2, far_mm2 = total / count
+    possible_mm2 = near_mm2 - far_mm2 + SURE_SIGMAS * largest_mm2 * np.sqrt((2.0 / count).sum())
+    return signed_root(min(possible_mm2, largest_mm2))
+
+
+def on_the_bone(fit: Fit) -> tuple[Array, Array]:
+    """(M, 3) foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm.
+
+    Foot points: noise must not decide which points are near. Rounded: nor must the last bits of a pose.
+    """
+    inlier = fit.weights > 0.0
+    signed = fit.signed_mm[inlier]
+    damped = signed * np.maximum(1.0 - (signed / (LARGEST_SIGMAS * fit.sigma_mm)) ** 2, 0.0)
+    return fit.feet[inlier].round(DIGITS), damped
+
+
+def signed_root(difference_mm2: float) -> float:
+    """Root, mm, of the size of a difference of covariances, with its sign."""
+    return float(np.sign(difference_mm2) * np.sqrt(abs(difference_mm2)))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def products_mm2(points, residuals, others, other_residuals, limits_mm, own):  # type: ignore[no-untyped-def]
+    """Products of two residuals, one of the points (N, 3) and one of the others (M, 3), by their distance.
+
+    The inner loops have no branch, and read memory in order: compilers turn them into wide instructions.
+
+    Returns:
+        (K,) sums and (K,) counts of those within limits (K, 2), mm; `own` (N,) says which of the others is the point
+        itself and takes no part, -1 where none is.
+    """
+    total, count = np.zeros(len(limits_mm)), np.zeros(len(limits_mm))
+    squared, apart = limits_mm**2, np.empty(len(others))
+    beyond = squared.max() + 1.0  # infinity is no number to compare with where mathematics is fast
+    x, y, z = others[:, 0].copy(), others[:, 1].copy(), others[:, 2].copy()
+    for i in range(len(points)):
+        px, py, pz = points[i]
+        for j in range(len(others)):
+            apart[j] = (px - x[j]) ** 2 + (py - y[j]) ** 2 + (pz - z[j]) ** 2
+        if own[i] >= 0:
+            apart[own[i]] = beyond
+        for k in range(len(limits_mm)):
+            low, high = squared[k]
+            residual, pairs = 0.0, 0.0
+            for j in range(len(others)):
+                is_within = (apart[j] >= low) & (apart[j] < high)
+                residual += other_residuals[j] if is_within else 0.0
+                pairs += 1.0 if is_within else 0.0
+            total[k] += residuals[i] * residual
+            count[k] += pairs
+    return total, count

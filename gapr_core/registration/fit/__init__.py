@@ -1,0 +1,1 @@
+"""Poses compared and refined on the target, and the same for changed sources."""

@@ -1,0 +1,206 @@
+"""Robust point-to-surface refinement: many poses coarsely, a few to the end.
+
+Point-to-plane (Chen and Medioni 1992) with second-order surface elements, Tukey's biweight at a scale that follows
+the residuals, and the offset that noise causes on curved surfaces taken away (see `kernels`). In the end
+elements that fit their surroundings badly weigh less, and a patch of the source that is off as a whole weighs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.config import RefinementConfig, SourceConfig
+from gapr_core.geometry import se3
+from gapr_core.geometry.twists import distance_jacobian
+from gapr_core.registration.fit import fit_kernels, kernels
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
+from gapr_core.runtime.parallel import in_pieces
+
+Array = NDArray[np.float64]
+
+SD_OF_MEDIAN = 1.4826  # standard deviation of normal residuals over the median of their absolute values
+FAR_SIGMAS = 3.0  # beyond so many standard deviations lies an outlier, or noise with a long tail
+WORTH_A_THREAD = 100_000  # points moved, some 3 ms: a second thread costs more than it saves below that
+PATCH_POINTS = SourceConfig().normal_neighbours  # of a source that was not prepared
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A pose and how the source lies on the target under it.
+
+    Attributes:
+        T: (4, 4) T_target_source, mm.
+        sigma_mm: robust standard deviation of the residuals.
+        signed_mm: (N,) signed distances to the surface, NaN where none is near.
+        weights: (N,) of the points in the normal equations, 0 for outliers.
+        gradients: (N, 3) unit surface normals at the foot points, target frame.
+        elements: (N,) indices of the nearest target points, -1 where none is near.
+        moved: (N, 3) source points in the target frame.
+        bias_mm: standard deviation of the smooth bias for which the pose is corrected; 0 for plain least squares.
+        whole: the same pose with all points of a source of which only some are here; None where all are.
+    """
+
+    T: Array
+    sigma_mm: float
+    signed_mm: Array
+    weights: Array
+    gradients: Array
+    elements: NDArray[np.int64]
+    moved: Array
+    bias_mm: float = 0.0
+    whole: Fit | None = None
+
+    @property
+    def rests_on(self) -> Fit:
+        """The same pose with all points that it rests on."""
+        return self.whole or self
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(N, 6) derivative of the residuals by x y z rx ry rz about the moved source's centroid."""
+        return distance_jacobian(self.moved, self.gradients, self.moved.mean(axis=0))
+
+    @cached_property
+    def feet(self) -> Array:
+        """(N, 3) foot points on the surface, target frame; the points themselves where no surface is near."""
+        return self.moved - np.nan_to_num(self.signed_mm)[:, None] * self.gradients
+
+
+def refine_many(
+    poses: Array, points: Array, target: PreparedTarget, limits_mm: Array, num_threads: int = 0
+) -> tuple[Array, Array]:
+    """Iterate Gauss-Newton from every pose on the same few source points.
+
+    Args:
+        poses: (K, 4, 4) T_target_source, mm.
+        points: (N, 3) source points, mm.
+        target: the prepared target.
+        limits_mm: (iterations,) scale of Tukey's biweight in each iteration, mm, usually falling.
+        num_threads: 0 for all cores.
+
+    Returns:
+        (K, 4, 4) refined poses and (K,) mean squared distances truncated at the last limit, mm^2 (small is good).
+    """
+    variances, trust = np.zeros_like(limits_mm), np.ones(len(points))
+
+    def work(piece: Array) -> tuple[Array, Array]:
+        return kernels.refine_batch(piece, points, trust, *target.kernel_view, limits_mm, variances)
+
+    is_little = len(poses) * len(points) * len(limits_mm) < WORTH_A_THREAD
+    pieces = in_pieces(work, np.ascontiguousarray(poses), 1 if is_little else num_threads)
+    refined, scores = zip(*pieces, strict=True)
+    return np.concatenate(refined), np.concatenate(scores)
+
+
+def refine_fully(
+    T: Array,
+    points: Array,
+    target: PreparedTarget,
+    config: RefinementConfig,
+    neighbours: NDArray[np.int64] | None = None,
+) -> Fit:
+    """Refine one pose on all points until it rests; the scale of the weights follows the residuals.
+
+    Args:
+        T: (4, 4) T_target_source within the basin, mm.
+        points: (N, 3) source points, mm.
+        target: the prepared target.
+        config: iterations and scales.
+        neighbours: (N, k) of each point, itself among them, that make its patch, as `PreparedSource.neighbours`; looked
+            up when None.
+    """
+    if neighbours is None:
+        neighbours = cKDTree(points).query(points, k=list(range(1, min(PATCH_POINTS, len(points)) + 1)))[1]
+    fit = evaluate(T, points, target, config)
+    for number in range(config.rounds):
+        trust = patch_trust(fit, neighbours, config) if number >= config.free_rounds else np.ones(len(points))
+        limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
+        variances = np.full_like(limits, fit.sigma_mm**2)
+        poses, _ = kernels.refine_batch(fit.T[None], points, trust, *target.kernel_view, limits, variances)
+        step = se3.apply(poses[0], points) - fit.moved
+        fit = evaluate(poses[0], points, target, config)
+        if number >= config.free_rounds and np.abs(step).max() < config.rest_mm:
+            break
+    return evaluate_with_patches(fit.T, points, target, config, neighbours)
+
+
+def rest_on_whole(fit: Fit, source: PreparedSource, target: PreparedTarget, config: RefinementConfig) -> Fit:
+    """The fit of a source of which only some points are fitted, moved to where all rest: their noise averages out."""
+    if not source.is_part:
+        return fit
+    limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
+    variances, trust = np.full_like(limits, fit.sigma_mm**2), trust_of_whole(fit, source, config)
+    poses, _ = kernels.refine_batch(fit.T[None], source.whole, trust, *target.kernel_view, limits, variances)
+    some = evaluate_with_patches(poses[0], source.points, target, config, source.neighbours)
+    return replace(some, whole=evaluate_trusted(poses[0], source.whole, target, config, trust))
+
+
+def trust_of_whole(fit: Fit, source: PreparedSource, config: RefinementConfig) -> Array:
+    """(M,) `patch_trust` of all points of a source: the mean over the patches that each is in, 0 for one in none."""
+    trust = patch_trust(fit, source.neighbours, config)
+    return np.asarray(fit_kernels.shared_out(trust, source.patches, len(source.whole)))
+
+
+def distances_mm(T: Array, points: Array, target: PreparedTarget) -> Array:
+    """(N,) distances of points (N, 3) to the surface under a pose; infinite where none is near, or beyond its end."""
+    signed, _, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
+    return np.hypot(np.nan_to_num(signed, nan=np.inf), aside)
+
+
+def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
+    """Residuals, scale and weights of a pose as it is; no patch is distrusted."""
+    signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
+    sigma_mm = _robust_sigma(signed, config)
+    limit_mm = tukey_limit(signed, sigma_mm, config)
+    signed, gradients, aside, elements = kernels.residuals_at(T, points, *target.kernel_view, sigma_mm**2)
+    weights = fit_kernels.weights(signed, aside, elements, target.elements, sigma_mm**2, limit_mm)
+    return Fit(T, sigma_mm, signed, weights, gradients, elements, se3.apply(T, points))
+
+
+def evaluate_trusted(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, trust: Array) -> Fit:
+    """`evaluate` of a pose, made exactly rigid, with a known trust (N,) of the points in the weights."""
+    fit = evaluate(se3.nearest_rigid(T), points, target, config)
+    return replace(fit, weights=fit.weights * trust)
+
+
+def evaluate_with_patches(
+    T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, neighbours: NDArray[np.int64]
+) -> Fit:
+    """`evaluate` of a pose, made exactly rigid, with the patches' trust in the weights."""
+    fit = evaluate(se3.nearest_rigid(T), points, target, config)
+    return replace(fit, weights=fit.weights * patch_trust(fit, neighbours, config))
+
+
+def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfig) -> Array:
+    """(N,) Tukey weights of the patches' mean residuals, whose scale is their own median.
+
+    A dent, a filled hole or soft tissue takes a patch off the surface as a whole by less than its points' noise: what
+    no point shows alone its neighbours show together.
+    """
+    means = fit_kernels.patch_means(fit.signed_mm, fit.weights, neighbours)
+    by_noise = fit.sigma_mm / np.sqrt(neighbours.shape[1])
+    limit_mm = config.patch_scale * max(SD_OF_MEDIAN * _median_size(means), by_noise)
+    return np.clip(1.0 - (means / limit_mm) ** 2, 0.0, 1.0) ** 2
+
+
+def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
+    """From the median absolute residual, those without a surface near counted as large; within the limits set."""
+    spread = SD_OF_MEDIAN * _median_size(signed)
+    return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
+
+
+def _median_size(residuals: Array) -> float:
+    """Median of the absolute values of (N,) residuals; NaN, where no surface is near, counts as infinitely large."""
+    return float(np.median(np.nan_to_num(np.abs(residuals), nan=np.inf, posinf=np.inf)))
+
+
+def tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
+    """Where Tukey's weight ends, mm: far out, and so more efficient, where almost no residual is beyond."""
+    beyond = fit_kernels.share_beyond(signed, FAR_SIGMAS * sigma_mm)
+    return sigma_mm * (config.clean_tukey_scale if beyond < config.clean_share else config.tukey_scale)

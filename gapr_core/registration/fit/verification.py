@@ -1,0 +1,84 @@
+"""From many hypotheses to a few distinct, refined and ranked poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapr_core.config import VerificationConfig
+from gapr_core.registration.fit.kernels import distinct
+from gapr_core.registration.fit.refinement import refine_many
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Distinct poses that explain the source, best first.
+
+    Attributes:
+        poses: (K, 4, 4) T_target_source, mm.
+        scores: (K,) small is good: mean squared distance of the drawn source points, truncated, mm^2; of a camera's
+            cloud 1 / the score of lines of sight (`clutter.small_is_good`).
+        support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
+    """
+
+    poses: Array
+    scores: Array
+    support: Array
+
+
+def verify(
+    poses: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+) -> Candidates:
+    """Refine all on a few points, the distinct best on more, the best of those on all that were drawn.
+
+    Args:
+        poses: (K, 4, 4) hypotheses T_target_source, mm, K >= 1.
+        source: the prepared source.
+        target: the prepared target.
+        config: how many survive each stage.
+        num_threads: 0 for all cores.
+    """
+    few, some = source.subset(config.coarse_points), source.subset(config.middle_points)
+    poses, scores = refine_many(poses, few, target, np.linspace(*config.coarse_limits_mm), num_threads)
+    poses = _distinct(poses, scores, source, config, config.middle_poses)[0]
+    poses, scores = refine_many(poses, some, target, np.linspace(*config.middle_limits_mm), num_threads)
+    crowd = poses
+    poses = _distinct(poses, scores, source, config, config.final_poses)[0]
+    poses, scores = refine_many(poses, source.points, target, np.linspace(*config.final_limits_mm), num_threads)
+    poses, scores = _distinct(poses, scores, source, config, config.final_poses)
+    return Candidates(poses, scores, support(poses, crowd, source, config.markers, config.same_pose_mm))
+
+
+def mean_square_mm2(
+    T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
+) -> float:
+    """What `verify` would score a pose (4, 4) with, mm^2, whatever it was chosen by."""
+    scores = refine_many(T[None], source.points, target, np.linspace(*config.final_limits_mm), num_threads)[1]
+    return float(scores[0])
+
+
+def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same_pose_mm: float) -> Array:
+    """(K,) share of the crowd (M, 4, 4) within `same_pose_mm` of each pose (K, 4, 4), over `count` markers."""
+    ends, others = (markers(T, source, count) for T in (poses, crowd))
+    gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
+    return np.asarray((np.sqrt((gaps**2).mean(axis=2)) < same_pose_mm).mean(axis=1))
+
+
+def _distinct(
+    poses: Array, scores: Array, source: PreparedSource, config: VerificationConfig, most: int
+) -> tuple[Array, Array]:
+    """The best poses, none within `same_pose_mm` (root mean square over the markers) of a better one."""
+    ranked = np.argsort(scores, kind="stable")
+    kept = distinct(markers(poses, source, config.markers), ranked, config.same_pose_mm, most)
+    return poses[kept], scores[kept]
+
+
+def markers(poses: Array, source: PreparedSource, count: int) -> Array:
+    """(K, min(count, N), 3) the same spread points of a source (N, 3) under poses (K, 4, 4), mm, target frame."""
+    return np.asarray(np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(count)) + poses[:, None, :3, 3])

@@ -1,0 +1,1 @@
+"""What is registered to what: source, target, sensor, and the checks of inputs."""

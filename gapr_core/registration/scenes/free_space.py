@@ -1,0 +1,178 @@
+"""Light travels straight: what a camera saw says where the bone is and where it cannot be.
+
+Between the camera and a measured point there is nothing. A pose that puts bone there is impossible, whatever else it
+explains; bone behind a measured point may be hidden, and outside the image nothing is known. So each point of the
+target's surface is compared with what was measured on its own line of sight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import minimum_filter
+from scipy.spatial import cKDTree
+
+from gapr_core.config import FreeSpaceConfig
+from gapr_core.errors import InvalidViewpointError
+from gapr_core.geometry import quadrics, se3
+from gapr_core.registration.scenes.kernels import compare_with_image
+from gapr_core.runtime.parallel import in_pieces
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """The source as its camera saw it: a pinhole image that looks at the middle of the cloud.
+
+    Attributes:
+        T_camera_source: (4, 4), mm; the camera looks along its z.
+        pixels: (rows, columns, 6) float32: unit normal (3) of the measured surface towards the camera and its offset
+            n . p, depth z of the measured point, smallest depth of the 3 x 3 pixels around. Camera frame, mm; the depth
+            is 0 where nothing was measured.
+        origin: (2,) x / z and y / z of the middle of pixel (0, 0).
+        pixel: edge of a pixel as a difference of x / z.
+        config: how poses are compared with it.
+    """
+
+    T_camera_source: Array
+    pixels: NDArray[np.float32]
+    origin: Array
+    pixel: float
+    config: FreeSpaceConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Visible:
+    """How poses explain an image, as shares of the target's surface.
+
+    Attributes:
+        explained: (K,) share that faces the camera and lies on what was measured.
+        violating: (K,) share that lies clearly in front of what was measured.
+        compared: (K,) share that faces the camera and could have been seen: neither outside the image nor hidden.
+        config: what the score takes off for each.
+    """
+
+    explained: Array
+    violating: Array
+    compared: Array
+    config: FreeSpaceConfig
+
+    @property
+    def score(self) -> Array:
+        """(K,) explained share, less what the camera saw otherwise and, dearer, what it saw through.
+
+        Large is good: 1 at most, and below 0 where the camera saw more against the pose than for it.
+        """
+        otherwise = np.maximum(self.compared - self.explained, 0.0)
+        return np.asarray(
+            self.explained - self.config.misfit_costs * otherwise - self.config.violation_costs * self.violating
+        )
+
+
+def average(seen: Sequence[Visible]) -> Visible:
+    """The mean of the shares of several images, each of which counts alike."""
+    names = ("explained", "violating", "compared")
+    explained, violating, compared = (np.mean([getattr(each, name) for each in seen], axis=0) for name in names)
+    return Visible(explained, violating, compared, seen[0].config)
+
+
+def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceConfig | None = None) -> DepthImage:
+    """The image of a cloud.
+
+    Args:
+        points: (N, 3), mm, source frame.
+        normals: (N, 3), unit; the sign does not matter.
+        viewpoint: (3,), mm, source frame.
+        config: of the image, and of what is compared with it.
+
+    Raises:
+        InvalidViewpointError: when the viewpoint lies in the middle of the points, so that no camera sees them.
+    """
+    config = config or FreeSpaceConfig()
+    eye = np.asarray(viewpoint, dtype=np.float64)
+    T = _looking_at(eye, points)
+    seen = se3.apply(T, points)
+    in_view = seen[:, 2] > config.widest_cos * np.linalg.norm(seen, axis=1)
+    if in_view.sum() < min(quadrics.FEWEST_NEIGHBOURS, len(points)):
+        raise InvalidViewpointError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
+    seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
+    turned = quadrics.orient(turned, -seen)
+    rays = seen[:, :2] / seen[:, 2:]
+    nearest, origin, pixel = _nearest_rays(rays, config)
+    return DepthImage(T, _pixels(nearest, seen, turned), origin, pixel, config)
+
+
+def _nearest_rays(rays: Array, config: FreeSpaceConfig) -> tuple[NDArray[np.int64], Array, float]:
+    """Of an image of all rays (N, 2), x / z and y / z: (rows, columns) the ray of each pixel, N for none.
+
+    And (2,) the middle of its first pixel, and the edge of a pixel: that of the rays' spacing, within the limits set.
+    """
+    tree, origin, size = cKDTree(rays), rays.min(axis=0), np.ptp(rays, axis=0)
+    pixel = max(config.smallest_pixel, float(np.median(tree.query(rays, k=2)[0][:, 1])))
+    pixel = max(pixel, float(np.sqrt(np.prod(size) / config.most_pixels)))
+    columns, rows = (int(n) for n in np.ceil(size / pixel) + 1)
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    centres = origin + pixel * np.stack([x.ravel(), y.ravel()], axis=1)
+    _, nearest = tree.query(centres, distance_upper_bound=max(config.reach, 1.5 * pixel))
+    return nearest.reshape(rows, columns), origin, pixel
+
+
+def _looking_at(eye: Array, points: Array) -> Array:
+    """T_camera_source of a camera at `eye` that looks at the middle of the points."""
+    ahead = points.mean(axis=0) - eye
+    length = float(np.linalg.norm(ahead))
+    ahead = ahead / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    R = np.concatenate([quadrics.tangent_basis(ahead[None])[0], ahead[None]])
+    return se3.from_rotation_translation(R, -R @ eye)
+
+
+def _pixels(nearest: NDArray[np.int64], points: Array, normals: Array) -> NDArray[np.float32]:
+    """Pixels (rows, columns, 6) from the index of each one's point; the index behind the last one means none."""
+    offsets = np.einsum("ni,ni->n", points, normals)
+    rows = np.vstack([np.column_stack([normals, offsets, points[:, 2], points[:, 2]]), np.zeros(6)])
+    pixels = rows[nearest].astype(np.float32)
+    depth = np.where(pixels[..., 4] > 0.0, pixels[..., 4], np.inf)
+    pixels[..., 5] = np.where(pixels[..., 4] > 0.0, minimum_filter(depth, size=3), 0.0)
+    return pixels
+
+
+def compare(
+    poses: Array,
+    points: Array,
+    normals: Array,
+    image: DepthImage,
+    on_mm: float,
+    front_mm: float,
+    num_threads: int = 0,
+) -> Visible:
+    """Compare a target under many poses with an image.
+
+    Args:
+        poses: (K, 4, 4) T_target_source, mm.
+        points: (M, 3) of the target, evenly spread, mm.
+        normals: (M, 3) unit, outward.
+        image: what the camera saw.
+        on_mm: how far from a measured surface a point is explained by it.
+        front_mm: how far in front of what was measured there can be no bone.
+        num_threads: 0 for all cores.
+    """
+    inverse = poses[:, :3, :3].transpose(0, 2, 1)
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = inverse, -np.einsum("kij,kj->ki", inverse, poses[:, :3, 3])
+    T = (image.T_camera_source @ T)[:, :3].astype(np.float32)
+    cloud = np.hstack([points, normals]).astype(np.float32)
+    view = image.pixels, np.float32(image.origin[0]), np.float32(image.origin[1]), np.float32(1.0 / image.pixel)
+
+    config = image.config
+    limits = on_mm, front_mm, config.facing_cos, config.hidden_mm, config.slant_mm, config.same_surface_cos
+    limits32 = tuple(map(np.float32, limits))
+
+    def work(piece: NDArray[np.float32]) -> NDArray[np.float32]:
+        return compare_with_image(piece, cloud, *view, *limits32)  # type: ignore[no-any-return]
+
+    explained, violating, compared = np.concatenate(in_pieces(work, T, num_threads)).astype(np.float64).T
+    return Visible(explained, violating, compared, config)

@@ -1,0 +1,194 @@
+"""A scene: what a camera saw, from one place or from several.
+
+One image shows one side of a wound, with one set of errors. The camera moves a little, and it shows more bone, what hid
+it, and other errors. The images are one cloud in one frame in which the bone rests; each keeps its lines of sight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.clouds import finite_points, is_point
+from gapr_core.config import RegistrarConfig
+from gapr_core.errors import InvalidPointCloudError
+from gapr_core.registration.problem import inputs
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.proposals.regions import Region
+from gapr_core.registration.scenes import free_space
+from gapr_core.registration.scenes.free_space import DepthImage, Visible
+from gapr_core.results import Refusal
+from gapr_core.surface import as_array, as_points
+
+Array = NDArray[np.float64]
+
+MOST_PLACES = 16  # an image of its own is compared for each
+HOW = "pass x, y, z in mm: where the camera was, or where it was for each point"
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What was seen from one place.
+
+    Attributes:
+        points: (N, 3), mm, source frame.
+        viewpoint: (3,), mm, source frame: where the camera was.
+    """
+
+    points: Array
+    viewpoint: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where a camera was for each point of a cloud; two of the places may be the same.
+
+    Attributes:
+        viewpoints: (K, 3), mm, source frame.
+        look: (N,) index of the place that each point was seen from.
+    """
+
+    viewpoints: Array
+    look: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, seen: Sequence[Look]) -> Places:
+        """Those of looks whose points follow each other in one cloud."""
+        viewpoints = np.reshape([look.viewpoint for look in seen], (-1, 3))
+        return cls(viewpoints, np.repeat(np.arange(len(seen)), [len(look.points) for look in seen]))
+
+
+Viewpoint = ArrayLike | Places  # (3,) or (N, 3) mm, or places by their numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a camera saw from K places.
+
+    Attributes:
+        source: the cloud, with normals towards the camera.
+        images: the same as its camera saw it, one for each place.
+        viewpoints: (K, 3) mm, source frame: the places.
+        look: (N,) index of the place that each point of the source was seen from.
+        regions: parts of it that may be bone alone.
+        each: what was seen from each place, as a scene of its own; () of a single one.
+        names: (K,) number of each place among those that were given.
+        given: (G, 3) mm, source frame: the places that were given; from some of them too few points were seen.
+    """
+
+    source: PreparedSource
+    images: tuple[DepthImage, ...]
+    viewpoints: Array
+    look: NDArray[np.int64]
+    regions: Sequence[Region] = ()
+    each: tuple[Scene, ...] = ()
+    names: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+    given: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def viewpoint(self) -> Array:
+        """(3,) mm, the middle of the places."""
+        return np.asarray(self.viewpoints.mean(axis=0))
+
+    def part(self, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
+        """Some of its points as a source of its own, its normals towards the camera."""
+        part = sources.describe(self.source.points[members], config.source)
+        return part.facing(self.viewpoints[self.look[members]])
+
+    def compare(
+        self, poses: Array, points: Array, normals: Array, on_mm: float, front_mm: float, num_threads: int = 0
+    ) -> Visible:
+        """What the camera saw of a target under poses (K, 4, 4), the mean over its places; see `free_space.compare`."""
+        how = points, normals
+        seen = [free_space.compare(poses, *how, image, on_mm, front_mm, num_threads) for image in self.images]
+        return free_space.average(seen)
+
+
+def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
+    """A cloud (N, 3) by where its camera was: one place for all, or one for each point; mm.
+
+    Points that are not finite are dropped, and what was said of where they were seen from with them.
+
+    Raises:
+        InvalidPointCloudError: a viewpoint of another shape, or one that is not finite; more than `MOST_PLACES` places.
+    """
+    if isinstance(viewpoint, Places):
+        points, places, look = np.asarray(source, dtype=np.float64), viewpoint.viewpoints, viewpoint.look
+    elif as_array(viewpoint, "a viewpoint", HOW).ndim < 2:
+        return [Look(finite_points(source), inputs.numbers(viewpoint, (3,), "viewpoint", HOW))]
+    else:
+        points, places, look = _by_place(source, viewpoint)
+    if len(places) > MOST_PLACES:
+        how = "pass the last images, or those from places that differ most"
+        raise InvalidPointCloudError(f"at most {MOST_PLACES} places of a camera", f"{len(places)}", how)
+    found = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
+    return found or [Look(points, np.zeros(3))]  # of no point at all
+
+
+def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+    """The finite points (N, 3) of a cloud, the different places (K, 3), sorted, and (N,) the place of each point."""
+    points, of_points = as_points(source), as_array(viewpoint, "a viewpoint", HOW)
+    usable = is_point(points)
+    if of_points.shape == points.shape and of_points.dtype.kind == "f":
+        of_points = np.where(usable[:, None], of_points, 0.0)
+    of_points = inputs.numbers(of_points, points.shape, "viewpoint", HOW)[usable]
+    begins = np.append(True, (np.diff(of_points, axis=0) != 0.0).any(axis=1))[: len(of_points)]  # runs from one place
+    places, of_run = np.unique(of_points[begins], axis=0, return_inverse=True)
+    return points[usable], places, of_run.reshape(-1)[np.cumsum(begins) - 1]
+
+
+def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
+    """The scene of looks, but for those of too few points; the first one's refusal where all are.
+
+    With others a look needs the points of a region (`ClutterConfig.region_fewest_points`): an image of a few is all
+    holes.
+
+    Raises:
+        InvalidViewpointError: a viewpoint in the middle of what was seen from it.
+    """
+    found = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
+    seen = {name: source for name, source in enumerate(found) if isinstance(source, PreparedSource)}
+    if not seen:
+        return next(source for source in found if isinstance(source, Refusal))
+    fewest = config.clutter.region_fewest_points
+    seen = {name: source for name, source in seen.items() if len(source.points) >= fewest} or seen
+    each = [scene_from(source, looks[name].viewpoint, config) for name, source in seen.items()]
+    scene = each[0] if len(each) == 1 else _together(each, config)
+    if isinstance(scene, Refusal):
+        return scene
+    return replace(scene, names=np.array(list(seen)), given=np.array([look.viewpoint for look in looks]))
+
+
+def scene_from(source: PreparedSource, viewpoint: Array, config: RegistrarConfig) -> Scene:
+    """The scene that a camera saw from one viewpoint (3,), mm, source frame; no regions yet.
+
+    Raises:
+        InvalidViewpointError: a viewpoint in the middle of what was seen from it.
+    """
+    settings, seen = config.clutter, source.facing(viewpoint)
+    image = free_space.see(_levelled(seen, settings.levelled_by), seen.normals, viewpoint, settings.free_space)
+    return Scene(seen, (image,), viewpoint[None], np.zeros(len(seen.points), dtype=np.int64))
+
+
+def _together(each: Sequence[Scene], config: RegistrarConfig) -> Scene | Refusal:
+    """Scenes of one place each, in one frame, as a scene of several; a refusal where they are no body together."""
+    viewpoints = np.concatenate([scene.viewpoints for scene in each])
+    points = np.concatenate([scene.source.points for scene in each])
+    together = sources.prepare(points, config.source, config.num_threads, in_scene=True)
+    if isinstance(together, Refusal):
+        return together
+    of_point = np.repeat(np.arange(len(each)), [len(scene.source.points) for scene in each])
+    look = of_point[cKDTree(points).query(together.points)[1]]
+    images = tuple(scene.images[0] for scene in each)
+    return Scene(together.facing(viewpoints[look]), images, viewpoints, look, each=tuple(each))
+
+
+def _levelled(source: PreparedSource, count: int) -> Array:
+    """(N, 3) points, mm, moved along their normals to the mean of `count` neighbours: the noise is averaged."""
+    around = source.points[source.neighbours[:, :count]].mean(axis=1) - source.points
+    return source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]

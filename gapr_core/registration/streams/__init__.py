@@ -1,0 +1,1 @@
+"""Sources that follow one another: tracked, accumulated, looked at from several places."""

@@ -1,0 +1,377 @@
+"""The last looks of a camera registered together: a wound seen from several places, in a frame in which it rests."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gapr_core.clouds import finite_points
+from gapr_core.errors import ConfigError
+from gapr_core.geometry import se3
+from gapr_core.registration.checks import limits
+from gapr_core.registration.problem import inputs
+from gapr_core.registration.problem.target import PreparedTarget
+from gapr_core.registration.registrar import Registrar, check_call
+from gapr_core.registration.scenes.scene import HOW, MOST_PLACES, Look, Places
+from gapr_core.registration.streams.outlier_clouds import FarInARow
+from gapr_core.registration.streams.tracker import Tracker
+from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
+from gapr_core.runtime.clock import Clock
+from gapr_core.runtime.parallel import single_threaded_libraries
+from gapr_core.surface import Surface
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+STUCK = 10  # refusals in a row from one direction; what the looks before show may be gone
+
+
+class Newest(Enum):
+    """What the newest look says of the pose of all."""
+
+    AGREES = "alone it has the same pose"
+    IS_UNCONFIRMED = "alone it has no pose, or there is no other"
+    IS_DOUBTFUL = "the newest look alone gives no pose, and the one before showed the bone elsewhere"
+    IS_REFUSED = "with the others it gives no pose"
+    IS_TOO_SMALL = "the newest look has too few points for an image"
+    SHOWS_NOTHING = (
+        "the newest look shows nothing of the bone where the others have it: something is in the way, or it moved"
+    )
+    IS_APART = "it shows the bone elsewhere, or most others do"
+    DIFFERS = "the newest look alone has another pose than all together: the bone moved, or its reference"
+    CONTRADICTS = "the pose is another one than the last, in a frame in which the bone rests, and it is not sure"
+
+
+STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # the pose stands
+ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS)
+REFUSED_FOR = {
+    Newest.DIFFERS: RegistrationStatus.AMBIGUOUS,
+    Newest.CONTRADICTS: RegistrationStatus.AMBIGUOUS,
+    Newest.SHOWS_NOTHING: RegistrationStatus.AMBIGUOUS,
+    Newest.IS_DOUBTFUL: RegistrationStatus.AMBIGUOUS,
+    Newest.IS_TOO_SMALL: RegistrationStatus.TOO_FEW_POINTS,
+}
+
+
+class Direction(NamedTuple):
+    """Where a look was taken: the camera (3,) and the middle (3,) of what it saw, mm."""
+
+    camera: Array
+    middle: Array
+
+
+@dataclass(frozen=True, eq=False)
+class KeptLook(Look):
+    """A look of the collection.
+
+    Attributes:
+        first: the direction of the first of those whose place it took, one after the other; else its own. A camera
+            that moves on slowly would else push each look out by the next one, and keep one alone.
+    """
+
+    first: Direction
+
+
+class LookAccumulator:
+    """Registers each look of a camera together with those before it.
+
+    A single image of a wound shows little of the bone, with one set of errors. A few from places some ten degrees apart
+    show more of it and of what hid it. All must be in one frame in which the bone rests, such as that of a reference
+    fixed to it, and the camera's place must be known for each. A look takes the place of one from nearly the same
+    direction, so that those of a video do not push out all others; of a camera that moves on some stay.
+
+    Older looks that show the bone elsewhere than the newest and most others are left out, and the others are asked
+    again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
+    pose, and so is a pose that is not sure and another one than the last. Where the newest alone has none, or there is
+    none from elsewhere, the answer is not sure (`limits`). After three in a row that show the bone elsewhere it or its
+    reference has moved, and only these three are kept, whatever their directions; so after three poses in a row that
+    are another. After ten refusals from one direction only the last look is kept.
+
+    What all looks share shows in none of them, such as the error of a hand-eye calibration: state it as `tracking_mm`
+    of the sensor (`SensorConfig`).
+
+    Args:
+        method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
+        most: how many looks are kept, the newest among them; each costs time.
+        apart_deg: between the direction of a look and those of the others whose place it does not take.
+
+    Raises:
+        ConfigError: `most` is no whole number from 1 to 16, `apart_deg` no angle from 0 to 90; a method that takes no
+            viewpoint.
+    """
+
+    name = "gapr_looks"
+
+    def __init__(self, method: Registrar | Tracker, most: int = 4, apart_deg: float = 8.0) -> None:
+        if not isinstance(most, int | np.integer) or not 1 <= most <= MOST_PLACES:
+            how = "1 registers each by itself"
+            raise ConfigError(f"a whole number of looks to keep, 1 to {MOST_PLACES}", repr(most), how)
+        if not 0.0 <= apart_deg <= 90.0:
+            raise ConfigError("an angle between looks, 0 to 90 deg", repr(apart_deg), "0 keeps all of them")
+        if not isinstance(method, Registrar | Tracker):
+            raise ConfigError("a Registrar or a Tracker", repr(method), "pass Registrar.from_pretrained()")
+        self.method = method.sharing_points() if isinstance(method, Tracker) else method
+        self.most, self.apart_deg, self.config = most, apart_deg, method.config
+        self._target: PreparedTarget | None = None
+        self._far_away = FarInARow(self.config.accumulation.most_off, "look")
+        self.reset()
+
+    @property
+    def collected(self) -> Array:
+        """(N, 3) all points that are kept, mm."""
+        return _together(self._looks)
+
+    def together_with(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> Array:
+        """(N, 3) mm, what `register` would register with a look: those kept, and itself; as `collect`."""
+        newest = _look(source, viewpoint)
+        return _together(self._with(newest)[1] if self._is_enough(newest) else self._looks)
+
+    def reset(self) -> None:
+        """Forget all looks, and the track of a `Tracker`."""
+        self._looks: list[KeptLook] = []
+        self._off_in_a_row: list[KeptLook] = []  # newest ones that show the bone elsewhere than those before
+        self._another_in_a_row: list[KeptLook] = []  # newest ones with which the pose is another than the last
+        self._refused_in_a_row: list[KeptLook] = []  # from nearly one direction, since a pose
+        self._last: Array | None = None  # (4, 4) the last pose that was given
+        self._far_away.reset()
+        if isinstance(self.method, Tracker):
+            self.method.reset()
+
+    def collect(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> None:
+        """Keep a look (N, 3), mm, and where its camera was (3,), without registering.
+
+        It takes the place of those from nearly the same direction; beyond `most` the oldest goes. A look of fewer
+        points than a pose needs changes nothing. One that is metres away from the others is left out, and the third in
+        a row restarts the collection.
+
+        Raises:
+            ConfigError: no viewpoint.
+            InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
+        """
+        newest = _look(source, viewpoint)
+        if self._is_enough(newest):
+            self._add(newest)
+
+    def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
+        """Everything static about a target; see `Registrar.prepare`."""
+        return self.method.prepare(target, units)
+
+    @single_threaded_libraries
+    def register(
+        self,
+        source: ArrayLike,
+        target: PreparedTarget,
+        initial: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
+    ) -> RegistrationResult:
+        """As `Registrar.register`, of all looks that are kept, this one included.
+
+        Another target than before starts a new collection. A look of fewer points than a pose needs is refused: those
+        before say nothing about it. A look with which the others cannot be registered is not kept.
+
+        Raises:
+            ConfigError, InvalidPointCloudError: as `collect` and `Registrar.register`.
+        """
+        check_call(target, initial)
+        look = _look(source, viewpoint)
+        if self._target is not None and self._target is not target:
+            self.reset()
+        self._target = target
+        if not self._is_enough(look):
+            reason = f"the look has {len(look.points)} finite points, a pose needs {self.config.source.fewest_points}"
+            return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=reason, method=self.name)
+        newest, before = self._add(look)
+        try:
+            result, asked = self._of_those_that_fit(target, initial)
+        except Exception:
+            self._looks = before
+            raise
+        clock = Clock()
+        said = self._of_newest(result, asked, target)
+        clock.lap("compare")
+        found = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
+        if said in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
+            ruled_out = min(found.confidence, self.config.rules.ruled_out)
+            found = replace(found.refused(REFUSED_FOR[said], said.value), confidence=ruled_out)
+        if said is Newest.IS_UNCONFIRMED:
+            found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
+        return replace(found, reason=found.reason + self._update_looks(said, found, newest, before, asked))
+
+    def _of_those_that_fit(
+        self, target: PreparedTarget, initial: ArrayLike | None
+    ) -> tuple[RegistrationResult, list[KeptLook]]:
+        """The answer to all looks but older ones that show the bone elsewhere than the newest and most; and these."""
+        stage_ms: dict[str, float] = {}
+        asked = self._looks
+        while True:
+            result = self.method.register(_together(asked), target, initial, Places.of(asked))
+            stage_ms = _added(stage_ms, result.stage_ms)
+            apart = [look.fit is LookFit.APART for look in result.looks] or [False] * len(asked)
+            if apart[-1] or not any(apart) or 2 * sum(apart) >= len(asked):
+                return replace(result, stage_ms=stage_ms), asked
+            asked = [look for look, is_apart in zip(asked, apart, strict=True) if not is_apart]
+
+    def _of_newest(self, result: RegistrationResult, asked: list[KeptLook], target: PreparedTarget) -> Newest:
+        """What the newest of the looks that were asked says of the answer."""
+        fits = [look.fit for look in result.looks] or [LookFit.FITS]
+        may_be_there = result.status in (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)
+        if LookFit.APART in fits:
+            return Newest.IS_APART
+        if fits[-1] is LookFit.TOO_SMALL:
+            return Newest.IS_TOO_SMALL
+        if fits[-1] is LookFit.BLIND and may_be_there:
+            return Newest.SHOWS_NOTHING
+        if not result.ok:
+            return Newest.IS_REFUSED
+        said = self._of_newest_alone(asked, result, target)
+        is_sure = said is Newest.AGREES and result.confidence > self.config.limits.most
+        if said in STANDING and not is_sure and self._is_another(result):
+            return Newest.CONTRADICTS
+        return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said
+
+    def _is_another(self, result: RegistrationResult) -> bool:
+        """Whether the pose is another one than the last that was given, since the collection began."""
+        if self._last is None or result.T_target_source is None or self.most == 1:
+            return False
+        return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
+
+    def _of_newest_alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
+        """What the newest look alone says of the pose of all: its own is right if that one is, or it has none.
+
+        Others from where it was taken confirm nothing.
+        """
+        if len(asked) < 2:
+            return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
+        if result.T_target_source is None:
+            return Newest.AGREES
+        newest = asked[-1]
+        registrar = self.method.registrar if isinstance(self.method, Tracker) else self.method
+        alone = registrar.register(newest.points, target, result.T_target_source, newest.viewpoint)
+        if alone.T_target_source is None:
+            return Newest.IS_UNCONFIRMED
+        if not se3.pose_error(alone.T_target_source, result.T_target_source, newest.points).is_right:
+            return Newest.DIFFERS
+        own = _direction(newest)
+        is_from_elsewhere = any(_apart_deg(_direction(each), own) >= self.apart_deg for each in asked[:-1])
+        return Newest.AGREES if is_from_elsewhere else Newest.IS_UNCONFIRMED
+
+    def _update_looks(
+        self,
+        said: Newest,
+        result: RegistrationResult,
+        newest: KeptLook,
+        before: list[KeptLook],
+        asked: list[KeptLook],
+    ) -> str:
+        """Decide which looks stay after an answer. Returns how that is said, after the reason.
+
+        Args:
+            said: what the newest look says; a pose that it does not speak against ends what is counted.
+            result: the answer.
+            newest: the look; among those kept so far.
+            before: the looks before it.
+            asked: those with which it has a pose, itself included; after a refusal all others stay, too.
+        """
+        if said in STANDING:
+            if len(asked) < len(self._looks):
+                log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
+            self._looks, self._off_in_a_row, self._another_in_a_row, self._refused_in_a_row = asked, [], [], []
+            self._last = self._last if result.T_target_source is None else result.T_target_source
+            return ""
+        if said in ELSEWHERE:
+            self._off_in_a_row = [*self._off_in_a_row, newest]
+            return self._update_row_elsewhere(self._off_in_a_row, before)
+        if said is Newest.CONTRADICTS:
+            self._another_in_a_row = [*self._another_in_a_row, newest]
+            return self._update_row_elsewhere(self._another_in_a_row, before)
+        if said is not Newest.IS_REFUSED:
+            self._looks = before
+        if self._is_stuck(newest) and self._looks and self._looks != [newest]:
+            self._restart_with([newest])
+            return f"; {STUCK} refusals in a row: the collection restarts with the last look"
+        return "" if said is Newest.IS_REFUSED else "; left out"
+
+    def _update_row_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
+        """As `_update_looks`, for the last of a row of looks with which the bone is elsewhere than before."""
+        if len(row) < self.config.accumulation.most_off:
+            self._looks = before
+            return "; left out"
+        self._restart_with(row)
+        return f"; {len(row)} in a row: the collection restarts with them"
+
+    def _is_stuck(self, newest: KeptLook) -> bool:
+        """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""
+        row = self._refused_in_a_row
+        if row and _apart_deg(_direction(row[0]), _direction(newest)) >= self.apart_deg:
+            row = []
+        self._refused_in_a_row = [*row, newest]
+        return len(self._refused_in_a_row) >= STUCK
+
+    def _restart_with(self, looks: list[KeptLook]) -> None:
+        log.warning("the collection of looks restarts with the last %d", len(looks))
+        self.reset()
+        self._looks = looks[-self.most :]
+
+    def _is_enough(self, look: Look) -> bool:
+        """Whether a look may have a pose at all; fewer points say nothing of it."""
+        return len(look.points) >= self.config.source.fewest_points
+
+    def _add(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
+        """Keep a look. Returns it, and those before it; none where the collection restarts with it."""
+        if self._far_away.restarts_with(look.points, self.collected):
+            self.reset()
+        before = self._looks
+        newest, self._looks = self._with(look)
+        return newest, before
+
+    def _with(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
+        """A look as it is kept, and all that are, itself the last; the nearest gives its place to it, if it is near."""
+        own, others = _direction(look), list(self._looks)
+        apart_deg = [_apart_deg(each.first, own) for each in others]
+        is_near = bool(others) and min(apart_deg) < self.apart_deg
+        first = others.pop(int(np.argmin(apart_deg))).first if is_near else own
+        newest = KeptLook(look.points, look.viewpoint, first)
+        return newest, [*others, newest][-self.most :]
+
+
+def _look(source: ArrayLike, viewpoint: ArrayLike | None) -> Look:
+    if viewpoint is None:
+        raise ConfigError("where the camera was for each look", "none", HOW)
+    return Look(finite_points(source), inputs.numbers(viewpoint, (3,), "viewpoint", HOW))
+
+
+def _added(stage_ms: Mapping[str, float], more_ms: Mapping[str, float]) -> dict[str, float]:
+    """Times of stages, ms, and of those that came after them."""
+    return {stage: stage_ms.get(stage, 0.0) + more_ms.get(stage, 0.0) for stage in [*stage_ms, *more_ms]}
+
+
+def _together(looks: Sequence[Look]) -> Array:
+    return np.concatenate([np.empty((0, 3)), *(look.points for look in looks)])
+
+
+def _direction(look: Look) -> Direction:
+    return Direction(look.viewpoint, look.points.mean(axis=0))
+
+
+def _apart_deg(first: Direction, second: Direction) -> float:
+    """How different two directions are: the larger of two angles.
+
+    That between the cameras, seen from the middle of what both show; and that between what they show, seen from the
+    middle of both cameras.
+    """
+    cameras = np.stack([first.camera, second.camera])
+    shown = np.stack([first.middle, second.middle])
+    return max(_angle_deg(cameras - shown.mean(axis=0)), _angle_deg(shown - cameras.mean(axis=0)))
+
+
+def _angle_deg(pair: Array) -> float:
+    """Between two directions (2, 3) of any length."""
+    a, b = pair / np.maximum(np.linalg.norm(pair, axis=1, keepdims=True), 1e-9)
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))

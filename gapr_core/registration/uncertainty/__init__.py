@@ -1,0 +1,1 @@
+"""The covariance of a pose, and the error to expect at targets."""

@@ -1,0 +1,271 @@
+"""How uncertain a refined pose is: noise, smooth bias, and the stand-off and scale that no residual shows.
+
+A least-squares pose reacts to errors e of the residuals by a gain, G e. With independent noise of variance s^2, a
+smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), a stand-off of variance o^2 that all points share and a
+relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
+Censi 2007 for the noise alone); `sandwich` has all terms. A Hessian alone is over-confident. The size of the bias comes
+from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone
+hardly moves the pose, and one seen from one side does. What varies more slowly than the correlation is constant or
+linear in place: in proportion to the bias, all points share an offset and the source is strained. Of an image, depths
+are wrong: stand-off and scale act along the beam. Slices of a tracked probe share an error each: another K, of short
+reach. An error of the place of the whole cloud, a tracked scanner's, is one of the pose as it is. A weak prior keeps a
+motion of which nothing was observed uncertain, but finite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gapr_core.config import CovarianceConfig, SensorConfig
+from gapr_core.geometry import extent, se3
+from gapr_core.geometry.twists import covariance_about
+from gapr_core.registration.fit import fit_kernels
+from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.problem import sensor as sensors
+from gapr_core.registration.problem.sensor import Errors
+from gapr_core.registration.uncertainty.linear_model import (
+    POSE_PRIOR,
+    UNKNOWNS,
+    NormalEquations,
+    equations_of,
+    fields,
+    root_mean_square,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseUncertainty:
+    """Covariance of a pose, and what follows from it.
+
+    Attributes:
+        covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
+        bias_mm: standard deviation of the smooth bias that the covariance allows for.
+        smooth_mm: the smooth misfit that the residuals show (see `smooth_misfits_mm`).
+        short_mm: the same at a shorter range, which also holds what is rougher: another bone's surface.
+    """
+
+    covariance: Array
+    bias_mm: float
+    smooth_mm: float
+    short_mm: float
+
+    def with_more(self, covariance: Array) -> PoseUncertainty:
+        """The same with a further independent error, (6, 6), of the pose."""
+        return replace(self, covariance=self.covariance + covariance)
+
+    @property
+    def weakest_turn(self) -> Array:
+        """(3,) unit axis, target frame, about which the rotation is least certain."""
+        return _largest_axis(self.covariance[3:, 3:])
+
+    @property
+    def weakest_shift(self) -> Array:
+        """(3,) unit direction, target frame, along which the position is least certain."""
+        return _largest_axis(self.covariance[:3, :3])
+
+    @property
+    def largest_shift_mm(self) -> float:
+        """Standard deviation along the least certain direction, mm."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def largest_turn_deg(self) -> float:
+        """Standard deviation about the least certain axis, deg."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
+
+
+def estimate(
+    fit: Fit,
+    config: CovarianceConfig,
+    sensor: SensorConfig | None = None,
+    around: NDArray[np.int64] | None = None,
+    misfits_mm: tuple[float, ...] | None = None,
+    eye: Array | None = None,
+) -> PoseUncertainty:
+    """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
+
+    Args:
+        fit: the pose and its residuals; all points that it rests on count, the smooth misfits are those of its own.
+        config: of the errors.
+        sensor: what is known of them before.
+        around: (N, k) neighbours of each point, where they are known (see `smooth_misfits_mm`).
+        misfits_mm: the smooth and the short misfit, where they are known; else they are measured.
+        eye: (3,) mm, target frame: where a camera with wrong ranges was (`eye_of`); None for an error of size alone.
+    """
+    rests = fit.rests_on
+    count = int(np.count_nonzero(rests.weights))
+    known = sensors.errors(sensor or SensorConfig(), count)
+    spanned = fields(rests, config.correlation_mm, config.centres)
+    equations = equations_of(rests, config.correlation_mm, config.centres)
+    bias_mm = config.bias_gain * expected_bias_mm(equations, known.bias_mm, config)
+    sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
+    noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, config.noise_points)
+    expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
+    covariance = _about_middle(fit, sandwich(rests, spanned, expected, config, eye))
+    covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
+    counts = config.smooth_neighbours, config.short_neighbours
+    smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)
+    return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm)
+
+
+def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | None:
+    """(3,) mm, target frame: the camera of a source under a pose (4, 4) whose scale was stated, else None.
+
+    What is usual for a kind is an error of the size alone: cameras differ by more in how wrong their distance is.
+    """
+    return None if viewpoint is None or sensor.scale is None else se3.apply(T, viewpoint[None])[0]
+
+
+def covariance_added_by(fit: Fit, errors: Array, config: CovarianceConfig) -> Array:
+    """(6, 6) what independent `errors` (n, k) of the inliers of what the fit rests on add to its covariance, mm."""
+    rests = fit.rests_on
+    spanned = fields(rests, config.correlation_mm, config.centres)
+    moved = gain_of(rests, spanned, rests.sigma_mm)[0] @ errors
+    return _about_middle(fit, moved @ moved.T)
+
+
+def _about_middle(fit: Fit, covariance: Array) -> Array:
+    """The covariance (6, 6) of what a fit rests on, about the middle of its own points."""
+    if fit.rests_on is fit:
+        return covariance
+    return covariance_about(fit.moved.mean(axis=0) - fit.rests_on.moved.mean(axis=0), covariance)
+
+
+def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:
+    """Standard deviation of a point, of `count` points whose residuals spread by `sigma_mm` after a fit of 6 unknowns.
+
+    The sensor's own noise counts as `worth` points: of a dozen points the residuals alone say little.
+    """
+    freedom = max(worth + count - UNKNOWNS, 1.0)
+    return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
+
+
+def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: CovarianceConfig) -> float:
+    """Root mean square of the bias's size under the residuals, log-normal about the sensor's typical one before."""
+    sizes_mm = np.array(config.sizes_mm)
+    log_prior = -0.5 * (np.log(sizes_mm / max(typical_mm, sizes_mm[0])) / config.bias_spread) ** 2
+    log_prior += np.log(np.gradient(np.log(sizes_mm)))  # the sizes are not evenly spaced
+    log_posterior = log_prior + equations.log_likelihood(sizes_mm, config.smallest_share)
+    return float(np.sqrt(max(root_mean_square(sizes_mm, log_posterior) ** 2 - config.no_bias_mm**2, 0.0)))
+
+
+def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig, eye: Array | None = None) -> Array:
+    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P.
+
+    G is the gain of the fit, U = 1 1^T what all points share, s the noise, b the bias with fields F, of which all
+    points share a (`long_share`) and h strains the source (`linear_share`, `strains`), e the local error with fields E,
+    o the stand-off and q the scale (see `directions`), m the error of the bone's model (`model_mm`), T what the place
+    of the whole cloud adds and P the prior.
+    """
+    inlier = fit.weights > 0.0
+    gain, prior = gain_of(fit, bias_fields, errors.noise_mm)
+    shift, growth = directions(fit, errors.along_beam, config.one_sided, eye)
+    moved = np.column_stack(
+        [
+            errors.bias_mm * gain @ bias_fields[inlier],
+            config.long_share * errors.bias_mm * gain.sum(axis=1),
+            config.linear_share * errors.bias_mm * gain @ strains(fit),
+            errors.local_mm * gain @ _local_fields(fit, errors, config)[inlier],
+            errors.standoff_mm * gain @ shift,
+            config.model_mm * gain.sum(axis=1),
+            errors.scale * gain @ growth,
+        ]
+    )
+    return np.asarray(errors.noise_mm**2 * gain @ gain.T + moved @ moved.T + errors.place_covariance + prior)
+
+
+def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None = None) -> tuple[Array, Array]:
+    """How the residuals (n,) of the inliers change by a stand-off of 1 mm, and by an error of the size of 1.
+
+    A stand-off moves every point along its normal, another size by its distance from the centroid; where the ranges of
+    a camera at `eye` (3,), mm, target frame, are wrong, by that from there: the whole cloud is nearer or farther. Where
+    only depths are wrong, both move a point along the beam d: by n . d, and by (n . d) times its depth. The beam is
+    taken for the mean normal; where that is shorter than `one_sided`, the bone was seen from several sides and no beam
+    is common.
+    """
+    inlier = fit.weights > 0.0
+    moved, normals = fit.moved[inlier], fit.gradients[inlier]
+    if not inlier.any():
+        return np.zeros(0), np.zeros(0)
+    away, mean = moved - (moved.mean(axis=0) if eye is None else eye), normals.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if not along_beam or length < one_sided:
+        return np.ones(len(normals)), np.einsum("ni,ni->n", away, normals)
+    beam = mean / length
+    return normals @ beam, (normals @ beam) * (away @ beam)
+
+
+def strains(fit: Fit) -> Array:
+    """(n, 6) how the residuals of the inliers change by independent strains of the source about their centroid.
+
+    A symmetric matrix E moves a point p by E (p - c), and its residual by n . E (p - c). The six are orthogonal, and
+    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. Of p the foot is taken: on
+    a flat piece, what p is off it by would go with the residual, and look like a strain across the piece.
+    """
+    inlier = fit.weights > 0.0
+    if not inlier.any():
+        return np.zeros((0, 6))
+    feet, normals = fit.feet[inlier], fit.gradients[inlier]
+    products = np.einsum("ni,nj->nij", normals, (feet - feet.mean(axis=0)) / extent.radius_mm(feet))
+    i, j = np.triu_indices(3)
+    return np.asarray((products[:, i, j] + products[:, j, i]) / np.where(i == j, 2.0, np.sqrt(2.0)))
+
+
+def _local_fields(fit: Fit, errors: Errors, config: CovarianceConfig) -> Array:
+    if errors.local_mm == 0.0:
+        return np.zeros((len(fit.moved), 1))
+    return fields(fit, config.local_correlation_mm, config.local_centres)
+
+
+def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array]:
+    """How the pose reacts to errors of the inliers: (6, n) twist per mm, and the prior's (6, 6) covariance.
+
+    G = (J^T V^-1 J + P)^-1 J^T V^-1 up to its sign, with V = s^2 W^-1 + c^2 F F^T (Aitken 1935): c is the bias for
+    which the pose is corrected, 0 for plain least squares. V^-1 by Woodbury's identity. P keeps what is not observed
+    finite.
+    """
+    inlier = fit.weights > 0.0
+    J, precision = fit.jacobian[inlier], fit.weights[inlier, None] / noise_mm**2
+    VJ = precision * J
+    if fit.bias_mm > 0.0:
+        F = bias_fields[inlier]
+        R = np.sqrt(precision) * F
+        VJ -= precision * (F @ np.linalg.solve(R.T @ R + np.eye(F.shape[1]) / fit.bias_mm**2, F.T @ VJ))
+    P = POSE_PRIOR / noise_mm**2
+    H_inverse = np.linalg.inv(J.T @ VJ + P)
+    return H_inverse @ VJ.T, H_inverse @ P @ H_inverse
+
+
+def smooth_misfits_mm(
+    fit: Fit, neighbours: tuple[int, ...], around: NDArray[np.int64] | None = None
+) -> tuple[float, ...]:
+    """Root mean square of the inliers' locally averaged residuals, less what noise leaves in an average.
+
+    Args:
+        fit: the residuals.
+        neighbours: of how many points an average is taken, one result for each; with as few inliers, `fit.sigma_mm`.
+        around: (N, k) indices of each point's nearest ones, itself first, inliers or not, where they are known; a point
+            that finds too few inliers among them is looked up.
+    """
+    inlier = fit.weights > 0.0
+    points, signed = fit.moved[inlier], fit.signed_mm[inlier]
+    known = np.empty((len(inlier), 0), dtype=np.int64) if around is None else around
+
+    def misfit_mm(count: int) -> float:
+        averages = fit_kernels.leading_means(fit.signed_mm, inlier, known, count)[inlier]
+        left = np.flatnonzero(np.isnan(averages))
+        if len(left):
+            averages[left] = signed[cKDTree(points).query(points[left], k=count)[1]].mean(axis=1)
+        return float(np.sqrt(max((averages**2).mean() - signed.var() / count, 0.0)))
+
+    return tuple(misfit_mm(count) if len(points) > count else fit.sigma_mm for count in neighbours)
+
+
+def _largest_axis(block: Array) -> Array:
+    return np.asarray(np.linalg.eigh(block)[1][:, -1])

@@ -7,7 +7,6 @@ line: `--set refinement.iterations=5`. A value out of range raises `ConfigError`
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 from gapr_core.errors import ConfigError
 from gapr_core.runtime.settings import Settings, setting
@@ -103,45 +102,12 @@ class RefinementConfig(Settings):
 
 @dataclass(frozen=True)
 class CovarianceConfig(Settings):
-    """The errors of a source that the covariance allows for; `SensorConfig` says what is usual for a sensor."""
+    """Errors of the bone's model that the covariance allows for."""
 
-    correlation_mm: float = setting(
-        20.0, "l of the bias's correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm"
-    )
-    centres: int = setting(60, "points that span the bias", low=1, high=10_000)
-    sizes_mm: tuple[float, ...] = setting(
-        (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0),
-        "standard deviations of the bias to choose from", low=1e-3, high=100, unit="mm",
-    )  # fmt: skip
-    smallest_share: float = setting(0.03, "least information of a usable field, over the largest", low=0, high=1)
-    bias_gain: float = setting(2.1, "bias over what the residuals of a robust fit show of it", low=0, high=100)
-    no_bias_mm: float = setting(0.035, "bias that residuals without any show on average", low=0, high=10, unit="mm")
-    bias_spread: float = setting(1.0, "log standard deviation of the bias before the residuals", low=0.01, high=10)
-    long_share: float = setting(0.5, "of the bias that all points share, over its size", low=0, high=10)
-    linear_share: float = setting(
-        0.6, "relative strain of the source times its root mean square radius, over the bias", low=0, high=10
-    )
-    local_correlation_mm: float = setting(
-        8.0, "the same l of an error that near points share, such as that of a slice", low=0.1, high=1000, unit="mm"
-    )
-    local_centres: int = setting(160, "points that span that error", low=1, high=10_000)
     model_mm: float = setting(
         0.3, "standard deviation of an error by which the bone's model is too thick or too thin; 0: it is exact",
         low=0, high=10, unit="mm",
     )  # fmt: skip
-    one_sided: float = setting(0.3, "length of the mean normal from which on a view has a beam", low=0, high=1)
-    noise_points: float = setting(4.0, "points that the usual noise of the sensor is worth", low=0, high=1000)
-    smooth_neighbours: int = setting(30, "points of an average that shows the smooth misfit", low=2, high=1000)
-    short_neighbours: int = setting(12, "the same at short range, for the confidence alone", low=2, high=1000)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_ascending(self.sizes_mm)
-
-
-def _check_ascending(sizes_mm: tuple[float, ...]) -> None:
-    if len(sizes_mm) < 2 or any(small >= large for small, large in pairwise(sizes_mm)):
-        raise ConfigError("two or more ascending sizes_mm", str(sizes_mm), "name the smallest size first")
 
 
 # Each has an entry in `KINDS` of registration/problem/sensor.py.
@@ -172,104 +138,6 @@ class SensorConfig(Settings):
 
 
 @dataclass(frozen=True)
-class ScaleConfig(Settings):
-    """How far the size of a source may be off, or it is of another bone. The confidence was fitted with these."""
-
-    fewest_points: int = setting(8, "fewer inliers say nothing about the size", low=8, high=1000)
-    widest: float = setting(0.3, "prior standard deviation of the relative size", low=0.01, high=1)
-    standoff_mm: float = setting(0.5, "prior standard deviation of a stand-off", low=1e-3, high=10, unit="mm")
-    sure: float = setting(0.005, "standard deviation of the relative size of the bone's model", low=0, high=0.1)
-    usual: float = setting(0.05, "standard deviation of the relative sizes of other subjects' bones", low=1e-3, high=1)
-
-
-@dataclass(frozen=True)
-class SmoothBiasConfig(Settings):
-    """The smooth bias that an accepted pose is corrected for (`gapr_core.registration.uncertainty.smooth_bias`)."""
-
-    correlation_mm: float = setting(20.0, "l of its correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm")
-    centres: int = setting(60, "points that span it", low=1, high=10_000)
-    sizes_mm: tuple[float, ...] = setting(
-        (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0),
-        "standard deviations to choose from", low=1e-3, high=100, unit="mm",
-    )  # fmt: skip
-    evidence: float = setting(2.0, "log likelihood ratio from which a bias is believed; infinity: never", low=0)
-    smallest_share: float = setting(0.15, "information of a field over the largest, to have a say", low=0, high=1)
-    iterations: int = setting(2, "steps of the pose", low=1, high=100)
-    fewest_points: int = setting(200, "inliers without which no bias is looked for", low=10)
-    largest_move: float = setting(22.5, "largest squared Mahalanobis distance of a move (chi square: 99.9 %)", low=0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_ascending(self.sizes_mm)
-
-
-@dataclass(frozen=True)
-class RulesConfig(Settings):
-    """When a pose may as well be another one, and is refused whatever its probability."""
-
-    largest_turn_deg: float = setting(6.0, "standard deviation of a rotation that is not observed", low=0, unit="deg")
-    largest_shift_mm: float = setting(5.0, "standard deviation of a shift that is not observed", low=0, unit="mm")
-    equal_share: float = setting(0.015, "a rival whose mean square is larger by less is as good", low=0, high=1)
-    equal_mm: float = setting(0.25, "the same as a length, whose square is added", low=0, high=10, unit="mm")
-    largest_scale_z: float = setting(
-        3.0, "standard deviations by which the size of a source may be off; more is another bone", low=0
-    )
-    other_size_better: float = setting(
-        0.5, "log of mean squares by which a source grown or shrunk may fit better; more is another bone", low=0
-    )
-    mirrored_better: float = setting(
-        0.01, "log of mean squares by which the mirrored source may fit better; more is another side", low=0
-    )
-    mirrored_points: int = setting(
-        400, "a source of at most so many points is registered mirrored as well", low=0, high=1_000_000
-    )
-    mirrored_below: float = setting(0.95, "so is one whose answer is less sure than this, a scene too", low=0, high=1)
-    push: float = setting(1.5, "how far a pose is pushed, in units of verification.same_pose_mm", low=1, high=100)
-    pushed_motions: int = setting(
-        3, "motions along which a pose is pushed; on a plane so many are not observed", low=1, high=6
-    )
-    ruled_out: float = setting(0.4, "largest confidence of a pose that a rule refuses", low=0, high=1)
-    independent_points: float = setting(
-        30.0, "independent residuals that a source counts for where hypotheses share the probability", low=0
-    )
-
-
-@dataclass(frozen=True)
-class LimitsConfig(Settings):
-    """What no pose can be sure of (`gapr_core.registration.checks.limits`)."""
-
-    most: float = setting(0.89, "largest confidence where a limit holds; 1: none does", low=0, high=1)
-    few_points: int = setting(250, "fewer near points show neither whose bone nor what size it is", low=0, high=10**6)
-    noise_kept: tuple[float, float] = setting(
-        (0.6, 1.3), "residuals over a stated noise between which they do say it", low=0, high=100
-    )
-    noise_exceeded: float = setting(2.5, "residuals over the known noise from which on they do not", low=0, high=100)
-    model_mm: float = setting(0.3, "error of a bone's model from place to place", low=0, high=10, unit="mm")
-    bias_exceeded: float = setting(1.25, "smooth misfit over what is known from which on they do not", low=0, high=100)
-    shared_noise: float = setting(0.5, "share of a sensor's noise that near points may share", low=0, high=1)
-    model_bias_mm: float = setting(0.1, "smooth error of the model of a bone", low=0, high=10, unit="mm")
-    rough_exceeded: float = setting(
-        0.4, "rough misfit in a scene over the scale of its residuals from which on they do not", low=0, high=100
-    )
-    covered: float = setting(0.9, "least share of the covariance within 4 mm and 5 deg", low=0, high=1)
-    loose_mm: float = setting(5.0, "a larger tre95_mm does not say whose bone it is", low=0, high=1000, unit="mm")
-    standoff_mm: float = setting(3.5, "no residual shows that a larger stated one is right", low=0, high=100, unit="mm")
-
-
-@dataclass(frozen=True)
-class CorticesConfig(Settings):
-    """Sources that follow the inner and the outer cortex of a hollow bone."""
-
-    share: float = setting(
-        0.82, "residual scale to both cortices over that to the outer, below which both are followed", low=0, high=1
-    )
-    noise: float = setting(
-        1.5, "residual scale to both cortices over the noise of the source, below which both are followed", low=0
-    )
-    largest_confidence: float = setting(0.85, "of such a source: the models were not fitted on any", low=0, high=1)
-
-
-@dataclass(frozen=True)
 class AccumulationConfig(Settings):
     """Which sources an `Accumulator` keeps."""
 
@@ -277,72 +145,6 @@ class AccumulationConfig(Settings):
     most_off: int = setting(3, "after so many of them in a row the bone has moved", low=1, high=1000)
     fewest_points: int = setting(20, "points of a source that is checked by itself; of fewer with those before", low=3)
     most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
-
-
-@dataclass(frozen=True)
-class RigidityConfig(Settings):
-    """Whether what was measured is one rigid piece (`gapr_core.registration.checks.rigidity`)."""
-
-    creeps: float = setting(
-        6.0, "log likelihood ratio above which collected sources show that the bone moves; infinity: never", low=0
-    )
-    strained: float = setting(
-        3.0, "log likelihood ratio above which a source shows that it is strained; infinity: never", low=0
-    )
-    apart: float = setting(
-        6.0, "log likelihood ratio above which a source shows two halves in two poses; infinity: never", low=0
-    )
-    layered: float = setting(
-        4.0, "log likelihood ratio above which a layer on the bone grows along a source; infinity: never", low=0
-    )
-    fewest_points: int = setting(200, "inliers without which none of these is looked for", low=12, high=1_000_000)
-    doubled: float = setting(0.5, "as probable a pose makes rejected points a copy of the bone; above 1: never", low=0)
-    doubled_share: float = setting(0.15, "with more points rejected a copy may lie anywhere on the bone", low=0, high=1)
-    rejected_points: int = setting(30, "with fewer rejected points no copy is looked for", low=12, high=1_000_000)
-    cells: int = setting(40, "cells over which residuals are averaged", low=12, high=1000)
-    groups: int = setting(6, "groups of sources in time, whose residuals are averaged apart", low=2, high=100)
-    correlation_mm: float = setting(
-        20.0, "l of a smooth bias's correlation exp(-d^2 / 2 l^2)", low=0.1, high=1000, unit="mm"
-    )
-
-
-@dataclass(frozen=True)
-class EvidenceConfig(Settings):
-    """How the frames of a stream are combined (`gapr_core.registration.streams.evidence`)."""
-
-    correlation: float = setting(0.8, "of two frames: 0 independent, 1 the same again", low=0, high=1)
-    memory: float = setting(10.0, "frames after which a frame's weight has fallen to about 1/e", low=1)
-    agree_mm: float = setting(15.0, "largest motion between frames (rms) that continues a track", low=0, unit="mm")
-    stands: float = setting(
-        0.8, "after a sure source a tracked answer of this confidence needs no search; above 1: it does", low=0, high=2
-    )
-
-
-@dataclass(frozen=True)
-class FollowingConfig(Settings):
-    """How far a pose is followed without an assessment (`gapr_core.registration.streams.following`)."""
-
-    points: int = setting(1000, "points of a source that are refined", low=100, high=1_000_000)
-    most_sources: int = setting(5, "sources in a row that are followed; then one is assessed", low=0, high=1000)
-    largest_tre95_mm: float = setting(
-        4.0, "largest bound of the error; that of a source whose view is weaker is larger", low=0, unit="mm"
-    )
-    largest_turn_deg: float = setting(2.5, "standard deviation of the least certain turn", low=0, unit="deg")
-    largest_residual: float = setting(1.1, "residual over that of the assessed source", low=1, high=100)
-    least_inliers: float = setting(0.95, "inlier ratio over that of the assessed source", low=0, high=1)
-
-
-@dataclass(frozen=True)
-class GuidanceConfig(Settings):
-    """What a further look at the bone is assumed to give."""
-
-    patch_mm: float = setting(30.0, "diameter of what a look shows", low=1, high=1000, unit="mm")
-    patches: int = setting(250, "places that are compared", low=1, high=100_000)
-    points: int = setting(60, "points of a look", low=1, high=100_000)
-    noise_mm: float = setting(0.5, "least white noise of a point", low=1e-3, high=100, unit="mm")
-    bias_mm: float = setting(0.7, "least bias that the points of a look share", low=0, high=100, unit="mm")
-    seen_mm: float = setting(6.0, "a target point with a source point this near counts as seen", low=0, unit="mm")
-    rivals: int = setting(50, "the likeliest other poses that a look is to exclude", low=0, high=100_000)
 
 
 @dataclass(frozen=True)
@@ -412,7 +214,6 @@ class ClutterConfig(Settings):
     infer_viewpoint: bool = setting(True, "a dense cloud without one that is refused as bone may be a camera's")
     inferred_points: int = setting(2000, "points by whose normals the place of its camera is inferred", low=10)
     inferred_rounds: tuple[int, int] = setting((2, 1), "rounds of regions for each place, the likelier first", low=1)
-    inferred_least: float = setting(0.85, "least confidence of a pose that rests on such a place", low=0, high=1)
     least_cos: float = setting(0.3, "cosine of incidence that nearly all points of such a cloud exceed", low=0, high=1)
     origin_deg: float = setting(
         35.0, "a cloud so near to the z axis may be in the frame of its camera; 0: none is", low=0, high=90, unit="deg"
@@ -431,19 +232,6 @@ class ClutterConfig(Settings):
 
 
 @dataclass(frozen=True)
-class PartConfig(Settings):
-    """The part of a scene that a pose explains, and when the rest is the reason of a refusal."""
-
-    agreeing_cos: float = setting(0.7, "cosine of normals up to which a point may lie on the bone", low=0, high=1)
-    crowd: int = setting(12, "neighbours that are asked whether they lie on it, too", low=1, high=200)
-    most_alone: float = setting(0.5, "share of them that must exceed this", low=0, high=1)
-    fewest_points: int = setting(30, "of a part; else the whole cloud is refined on", low=6)
-    rounds: int = setting(2, "of choosing the part and refining on it", low=1, high=100)
-    mostly_clutter: float = setting(0.5, "share that counts for the pose, below which clutter is named", low=0, high=1)
-    mostly_off: float = setting(0.4, "the same without a viewpoint, as the share on the bone", low=0, high=1)
-
-
-@dataclass(frozen=True)
 class RegistrarConfig(Settings):
     """Every setting of a `Registrar`."""
 
@@ -453,25 +241,15 @@ class RegistrarConfig(Settings):
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     clutter: ClutterConfig = field(default_factory=ClutterConfig)
-    part: PartConfig = field(default_factory=PartConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    scale: ScaleConfig = field(default_factory=ScaleConfig)
-    smooth_bias: SmoothBiasConfig = field(default_factory=SmoothBiasConfig)
-    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
-    rules: RulesConfig = field(default_factory=RulesConfig)
-    limits: LimitsConfig = field(default_factory=LimitsConfig)
-    cortices: CorticesConfig = field(default_factory=CorticesConfig)
     accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
-    rigidity: RigidityConfig = field(default_factory=RigidityConfig)
-    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
-    following: FollowingConfig = field(default_factory=FollowingConfig)
     guide: bool = setting(False, "say with every answer where another look would help most")
     min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
-    max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
-    searched_below: float = setting(
-        0.8, "a less confident answer goes to the next proposer; so does one from limits.most to sure", low=0, high=2
+    other_bone_prior: float = setting(
+        0.01, "probability, before the data, that the source is of another subject's bone", low=0, high=1
     )
+    max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
     sure: float = setting(0.95, "nothing more is tried: no proposer, no regions, no search", low=0, high=2)
     num_threads: int = setting(0, "threads of a registration and its target; 0: all cores", low=0, high=1024)
     seed: int = setting(
@@ -482,11 +260,6 @@ class RegistrarConfig(Settings):
     def worth_checking(self) -> float:
         """Probability from which on the costly checks are asked: a stream raises it to its root at most."""
         return self.min_confidence**2
-
-    @property
-    def accepted_if_inferred(self) -> float:
-        """Probability from which on a pose is accepted that rests on an inferred viewpoint; else `min_confidence`."""
-        return max(self.min_confidence, self.clutter.inferred_least)
 
     @property
     def sure_from(self) -> float:

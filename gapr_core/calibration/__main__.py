@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.calibration import conformal, streams
 from gapr_core.calibration.answers import Answers, answers_of, together
@@ -22,24 +23,31 @@ from gapr_core.calibration.card import as_markdown
 from gapr_core.calibration.collect import collect
 from gapr_core.calibration.fit import (
     ACCEPTED,
+    Models,
     by_group,
+    confidences,
     fit,
     known_families,
+    of_own_bone,
     of_unseen_families,
     of_unseen_people,
 )
 from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
 from gapr_core.data.anatomy import SPLITS
 from gapr_core.errors import ConfigError
-from gapr_core.registration.confidence.additive import FORMAT, Additive, as_dict
-from gapr_core.registration.confidence.classifier import CALIBRATIONS
+from gapr_core.registration.confidence import classifier
+from gapr_core.registration.confidence.additive import FORMAT, as_dict
+from gapr_core.registration.confidence.features import FEATURES_OF
+from gapr_core.registration.uncertainty import error_calibration
 from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATURES
 from gapr_core.runtime import cluster, origin
 from gapr_core.runtime.arguments import at_least_one
 from gapr_core.runtime.console import exit_code, say
 from gapr_core.runtime.files import write_json, write_text
 
-SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features that every round has
+Array = NDArray[np.float64]
+
+SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features that every kind has
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,66 +101,57 @@ def _tasks(args: Namespace) -> list[Task]:
 
 
 def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str, Any]) -> dict[str, Any]:
-    """Fit and judge every round's confidence, and the precision; returns their cards by name."""
-    cards, rounds = {}, {}
-    for name, path in CALIBRATIONS.items():
-        answers = answers_of(records, name)
+    """Fit and judge both numbers of each kind, and the precision; returns their cards by name."""
+    models, cards, accepted = {}, {}, []
+    for kind in FEATURES_OF:
+        answers = answers_of(records, kind)
         if not len(answers):
-            continue
-        known = answers.of(known_families(answers))
-        cards[name] = made | confidence_card(answers)
-        if set(SHARED) <= set(answers.feature_names):
-            rounds[name] = answers
-        _write(folder / path.name, "confidence", fit(known), {"proposer": name}, cards[name])
-    model, factor, cards["precision"] = fit_precision(list(rounds.values()))
-    _write(folder / "precision.json", "precision", model, {"factor95": round(factor, 4)}, made | cards["precision"])
+            raise ConfigError(f"answers of the kind {kind!r}", "none", "collect more pairs and scenes")
+        found = {"subjects": of_unseen_people(answers), "families": of_unseen_families(answers)}
+        cards[kind] = {
+            "pairs": len(answers),
+            "right": int(answers.right.sum()),
+            "unseen_subjects": by_group(answers, found["subjects"], answers.family),
+            "unseen_subjects_by_what": by_group(answers, found["subjects"], answers.what),
+            "unseen_families": by_group(answers, found["families"], answers.family),
+        }
+        models[kind] = fit(answers.of(known_families(answers)))
+        confidence = confidences(found["subjects"])
+        chosen = (confidence >= ACCEPTED) & ~answers.refused & of_own_bone(answers) & answers.right
+        accepted.append((answers.of(chosen).with_features(SHARED), confidence[chosen]))
+    rho_pose, rho_bone = streams.correlations(records)
+    pose, bone = ({kind: as_dict(getattr(each, name)) for kind, each in models.items()} for name in Models._fields)
+    data = {"pose": pose, "bone": bone, "rho_pose": rho_pose, "rho_bone": rho_bone}
+    _write(folder / classifier.SHIPPED.name, "confidence", data, made | cards)
+    precision, cards["precision"] = fit_precision(accepted)
+    _write(folder / error_calibration.SHIPPED.name, "precision", precision, made | cards["precision"])
     return cards
 
 
-def confidence_card(answers: Answers) -> dict[str, Any]:
-    """Counts, and AUROC, ECE and wrong poses on unseen subjects, and on unseen subjects seen by unseen sensors."""
-    unseen, unseen_too = of_unseen_people(answers), of_unseen_families(answers)
-    return {
-        "pairs": len(answers),
-        "right": int(answers.right.sum()),
-        "unseen_subjects": by_group(answers, unseen, answers.family),
-        "unseen_subjects_by_what": by_group(answers, unseen, answers.what),
-        "unseen_families": by_group(answers, unseen_too, answers.family),
-    }
-
-
-def accepted(answers: Answers) -> Answers:
-    """Those with a truth that a model of unseen subjects accepts and no rule refuses."""
-    return answers.of((of_unseen_people(answers) >= ACCEPTED) & ~answers.refused & np.isfinite(answers.true_mm))
-
-
-def fit_precision(rounds: Sequence[Answers]) -> tuple[Additive, float, dict[str, Any]]:
-    """Model, factor and card, of what is accepted in any round.
+def fit_precision(kinds: Sequence[tuple[Answers, Array]]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fit the scale and the factors of the bound to the accepted right answers of each kind; returns its card, too.
 
     Raises:
         ConfigError: nothing is accepted.
     """
-    found = [each for each in (accepted(answers).with_features(SHARED) for answers in rounds) if len(each)]
-    if not found:
+    answers, confidence = together([each for each, _ in kinds]), np.concatenate([each for _, each in kinds])
+    if not len(answers):
         raise ConfigError("accepted answers with a truth", "none", "collect more pairs (--count)")
-    answers = together(found)
     known = known_families(answers)
     new_sensor = conformal.scales_of_unseen_families(answers, known)
     new_subject = conformal.scales_of_unseen_people(answers, known)
-    scores = [answers.true_mm / (scale * answers.tre95_mm) for scale in (new_sensor, new_subject)]
-    factor = max(
-        conformal.factor_overall(scores[0][known]),
-        conformal.factor_in_each(scores[1][known], answers.family[known], answers.rounds[known]),
-    )
-    model = conformal.fit_scale(answers.of(known))
+    scores = answers.true_mm / (new_subject * answers.tre95_mm)
+    at, factors = conformal.factors(scores[known], confidence[known], answers.family[known])
+    data = {**as_dict(conformal.fit_scale(answers.of(known))), "confidences": np.round(at, 4).tolist(),
+            "factors": np.round(factors, 4).tolist()}  # fmt: skip
+    factor = np.interp(confidence, at, factors)
     tables = {"coverage": new_subject, "coverage_unseen_families": new_sensor}
     rows = {name: conformal.coverage(answers, scale, factor) for name, scale in tables.items()}
-    return model, factor, {"accepted": len(answers), **rows}
+    return data, {"accepted": len(answers), **rows}
 
 
-def _write(path: Path, kind: str, model: Additive, more: dict[str, Any], card: dict[str, Any]) -> None:
-    data = {"format": FORMAT, "kind": kind, **more, **as_dict(model), "card": card}
-    write_json(path, data)
+def _write(path: Path, kind: str, data: dict[str, Any], card: dict[str, Any]) -> None:
+    write_json(path, {"format": FORMAT, "kind": kind, **data, "card": card})
 
 
 if __name__ == "__main__":

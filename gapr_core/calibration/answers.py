@@ -1,4 +1,4 @@
-"""The records of one round as columns, and who may be judged by whom."""
+"""Records of one kind of answer as columns, and folds by subject and by sensor family."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from gapr_core.calibration.pairs import first_of_twins
 from gapr_core.errors import ConfigError
-from gapr_core.registration.confidence.features import FEATURES_OF
+from gapr_core.registration.confidence.features import BONE, FEATURES_OF, SCENE
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Model = TypeVar("Model")
+STREAM = "stream"
 FOLDS = 6
 NO_TRUTH = {
     "rte_mm": np.nan,
@@ -29,16 +30,16 @@ NO_TRUTH = {
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What one round answered, N pairs.
+    """Answers of one kind, N of them.
 
     Attributes:
         feature_names: F names.
         names: (N,) of the pairs.
-        rounds: (N,) which round answered: keys of `FEATURES_OF`.
+        rounds: (N,) round that answered: network, search, track or scene.
         features: (N, F).
         right: (N,) within 4 mm and 5 deg.
-        refused: (N,) a rule speaks against the pose, whatever the probability.
-        family, seen_as, what, bone: (N,) how and what was seen.
+        refused: (N,) a finding refuses the pose.
+        family, seen_as, what, bone: (N,) sensor family, view, whose bone the source is of, bone.
         people: N tuples, everybody whose bone the points are of, the target's first.
         true_mm, tre_mm, tre95_mm: (N,) true error over the whole bone, the predicted one and its bound; NaN where no
             pose is right.
@@ -65,14 +66,14 @@ class Answers:
         return len(self.names)
 
     def of(self, chosen: Mask) -> Answers:
-        """Only the chosen ones."""
+        """Choose answers by a mask (N,)."""
         columns: dict[str, Any] = {
             name: value[chosen] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
         return replace(self, **columns, people=tuple(p for p, is_in in zip(self.people, chosen, strict=True) if is_in))
 
     def with_features(self, names: tuple[str, ...]) -> Answers:
-        """Only these features."""
+        """Choose features."""
         chosen = [self.feature_names.index(name) for name in names]
         return replace(self, feature_names=names, features=self.features[:, chosen])
 
@@ -88,36 +89,42 @@ class Answers:
             yield ~is_in, own == number
 
 
-def answers_of(records: Sequence[dict[str, Any]], round_name: str) -> Answers:
-    """The answers of one round: a key of `FEATURES_OF`; a record has several of "stream", one for each frame."""
-    found = [(record, NO_TRUTH | answer) for record in records
-             for name, answer in record["answers"].items() if round_of(name) == round_name]  # fmt: skip
+def answers_of(records: Sequence[dict[str, Any]], kind: str) -> Answers:
+    """Collect the answers of one kind: a key of `FEATURES_OF`; a record has several, one for each round."""
+    found = [(record, round_of(name), NO_TRUTH | answer) for record in records
+             for name, answer in record["answers"].items() if kind_of(name) == kind]  # fmt: skip
     columns: dict[str, Any] = {
-        key: np.array([record[key if key != "names" else "name"] for record, _ in found], dtype=str)
+        key: np.array([record[key if key != "names" else "name"] for record, _, _ in found], dtype=str)
         for key in ("names", "family", "seen_as", "what", "bone")
     }
-    columns |= {key: np.array([answer[key] for _, answer in found], dtype=float)
+    columns |= {key: np.array([answer[key] for _, _, answer in found], dtype=float)
                 for key in ("true_mm", "tre_mm", "tre95_mm", "nees")}  # fmt: skip
-    names = FEATURES_OF[round_name]
-    features = [[answer["features"][name] for name in names] for _, answer in found]
+    names = FEATURES_OF[kind]
+    features = [[answer["features"][name] for name in names] for _, _, answer in found]
     return Answers(
         names,
-        rounds=np.full(len(found), round_name),
+        rounds=np.array([name for _, name, _ in found], dtype=str),
         features=np.array(features, dtype=float).reshape(len(found), len(names)),
-        right=np.array([answer["right"] for _, answer in found], dtype=bool),
-        refused=np.array([answer["refusal"] is not None for _, answer in found], dtype=bool),
-        people=tuple(tuple(record["people"]) or (record["name"],) for record, _ in found),
+        right=np.array([answer["right"] for _, _, answer in found], dtype=bool),
+        refused=np.array([answer["refusal"] is not None for _, _, answer in found], dtype=bool),
+        people=tuple(tuple(record["people"]) or (record["name"],) for record, _, _ in found),
         **columns,
     )
 
 
 def round_of(name: str) -> str:
-    """Of "stream 7": which round answered."""
+    """Name the round that answered, such as scene of "scene 1"."""
     return name.split()[0]
 
 
+def kind_of(name: str) -> str:
+    """Name the kind of an answer of this name: a key of `FEATURES_OF`; streams are no kind of their own."""
+    found = round_of(name)
+    return {"scene": SCENE, STREAM: STREAM}.get(found, BONE)
+
+
 def together(groups: Sequence[Answers]) -> Answers:
-    """The answers of several rounds, which have the same features."""
+    """Join answers that have the same features."""
     first = groups[0]
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(group, name) for group in groups])
@@ -130,26 +137,36 @@ def together(groups: Sequence[Answers]) -> Answers:
 def of_models_that_saw_no_subject(
     answers: Answers, known: Mask, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
 ) -> Array:
-    """(N,) predictions, each by a model that was fitted to the known answers (N,) without the pair's subject."""
-    found = np.full(len(answers), np.nan)
-    for fitted, judged in answers.people_folds():
-        if judged.any():
-            found[judged] = predict(fit(_enough(answers.of(fitted & known))), answers.of(judged))
-    return found
+    """(N, ...) predictions, each by a model that was fitted to the known answers (N,) without the pair's subject."""
+    return _predicted(answers, [(judged, fitted & known) for fitted, judged in answers.people_folds()], fit, predict)
 
 
 def of_models_that_saw_neither(
     answers: Answers, known: Mask, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
 ) -> Array:
-    """(N,) predictions, each by a model of the known answers (N,) without the pair's subject and its sensor family."""
-    found = np.full(len(answers), np.nan)
+    """(N, ...) predictions by models of the known answers (N,) without the pair's subject and its sensor family."""
+    folds = []
     for family in np.unique(answers.family):
         of_it: Mask = answers.family == family
-        for fitted, judged in answers.people_folds():
-            if (judged & of_it).any():
-                others = _enough(answers.of(fitted & known & ~of_it))
-                found[judged & of_it] = predict(fit(others), answers.of(judged & of_it))
-    return found
+        folds += [(judged & of_it, fitted & known & ~of_it) for fitted, judged in answers.people_folds()]
+    return _predicted(answers, folds, fit, predict)
+
+
+def _predicted(
+    answers: Answers,
+    folds: Sequence[tuple[Mask, Mask]],
+    fit: Callable[[Answers], Model],
+    predict: Callable[[Model, Answers], Array],
+) -> Array:
+    """(N, ...) predictions of the judged answers of each fold by a model of its fitted ones."""
+    found: list[tuple[Mask, Array]] = []
+    for judged, fitted in folds:
+        if judged.any():
+            found.append((judged, predict(fit(_enough(answers.of(fitted))), answers.of(judged))))
+    result = np.full((len(answers), *found[0][1].shape[1:]), np.nan)
+    for judged, values in found:
+        result[judged] = values
+    return result
 
 
 def _enough(answers: Answers) -> Answers:

@@ -32,9 +32,8 @@ def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
         f"How a bone is seen in the first list (`--count`): {_shares(views)}.",
         f"Whose bone it is there: {_shares(WHAT)}; {100 * SHAPE_SHARE:.0f} % are shapes without a knowable pose. "
         "Scenes, look-alikes and streams come on top; the tables count all.",
-        "AUROC and ECE (10 equal-width bins) are of all pairs; wrong and right count what a confidence of .5 or .9 "
-        "and the safety rules accept. One of these is left out: sources of many points were not registered mirrored "
-        "(`mirrored_below`).",
+        "AUROC and ECE (10 equal-width bins) are of own bones; wrong and right count the answers that a confidence of "
+        ".5 or .9 and the findings accept.",
     ]
     for name, card in cards.items():
         if name == "precision":
@@ -42,10 +41,10 @@ def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
                       "## Precision: neither the subject nor the sensor family was fitted",
                       _table(card["coverage_unseen_families"], PRECISION)]  # fmt: skip
         else:
-            parts += [f"## Confidence, {name}: subjects that were not fitted",
+            parts += [f"## Answers of the kind {name}: subjects that were not fitted",
                       _table(card["unseen_subjects"], CONFIDENCE),
                       "By whose bone the source is of:", _table(card["unseen_subjects_by_what"], CONFIDENCE),
-                      f"## Confidence, {name}: neither the subject nor the sensor family was fitted",
+                      f"## Answers of the kind {name}: neither the subject nor the sensor family was fitted",
                       _table(card["unseen_families"], CONFIDENCE)]  # fmt: skip
     return "\n\n".join(parts) + "\n"
 

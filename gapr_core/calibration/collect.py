@@ -1,7 +1,7 @@
 """Records to learn from: every pair registered in each way that an answer can come about, and judged.
 
-The registrars here accept everything (`ACCEPTING`): what a model of the confidence would say must not decide which
-records it is fitted to. Finished pairs stay in the records file, so that a stopped run goes on where it was.
+The registrars here accept everything (`ACCEPTING`): no model of the confidence may decide which records it is fitted
+to. Finished pairs stay in the records file, so that a stopped run goes on where it was.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from tqdm import tqdm
 
 from gapr_core import metrics
 from gapr_core.calibration import pairs, streams
-from gapr_core.calibration.answers import round_of
+from gapr_core.calibration.answers import STREAM, kind_of
 from gapr_core.calibration.pairs import Drawn, Task
-from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, RulesConfig, SensorConfig
+from gapr_core.config import ClutterConfig, RegistrarConfig, SensorConfig
 from gapr_core.data.pair import Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.geometry.sampling import random_directions
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.confidence.additive import Additive
-from gapr_core.registration.confidence.classifier import Calibration
-from gapr_core.registration.confidence.features import FEATURES_OF, STREAM
+from gapr_core.registration.confidence.classifier import Classifier
+from gapr_core.registration.confidence.features import FEATURES_OF
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
@@ -40,10 +40,11 @@ from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.registrar import Registrar
 from gapr_core.registration.scenes import clutter
-from gapr_core.registration.streams.memory import Memory
+from gapr_core.registration.streams.memory import PreviousPoses
 from gapr_core.registration.uncertainty.error_calibration import Precision
 from gapr_core.results import Hypothesis, Refusal
 from gapr_core.runtime import cluster, origin
+from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.files import write_text
 from gapr_core.runtime.parallel import end_with_parent
 
@@ -55,13 +56,10 @@ FOLLOWED = 0.5  # share of the pairs that become a stream
 LOOKED_AT = 3  # every third cloud of bone alone is registered as a scene as well, where one camera may have seen it
 ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
 FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
-UNCHECKED = RulesConfig(mirrored_below=0.0)  # mirrored sources of many points are not registered: it doubles the time
 AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # what is refused as bone is recorded as that
-EXACT_MODELS = CovarianceConfig(model_mm=0.0)  # a simulated source lies on its model
-SETTINGS = RegistrarConfig(
-    num_threads=1, clutter=AS_IT_IS, rules=UNCHECKED, covariance=EXACT_MODELS, searched_below=2.0
-)
-ACCEPTING = Additive(2.2, ())  # log odds of 0.9: above `min_confidence`, below `sure`: every round of a scene is asked
+SETTINGS = RegistrarConfig(num_threads=1, clutter=AS_IT_IS)
+# log odds of 0.9 and a sure bone: above `min_confidence`, below `sure`, so that every round is asked
+ACCEPTING = Classifier(dict.fromkeys(FEATURES_OF, Additive(2.2, ())), dict.fromkeys(FEATURES_OF, Additive(9.0, ())))
 
 
 def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = None) -> list[Record]:
@@ -172,7 +170,7 @@ def _viewpoints(pair: Pair) -> Array:
 def judged_answer(assessment: Assessment, pair: Pair) -> Record:
     """Features of an answer, what a rule says against it, and its errors where there is a truth."""
     features = {name: round(value, 6) for name, value in assessment.features.items()}
-    refusal = assessment.refusal.status.value if assessment.refusal else None
+    refusal = assessment.refusal.check if assessment.refusal else None
     record: Record = {"features": features, "refusal": refusal, "right": False}
     if not pair.has_truth:
         return record
@@ -190,7 +188,7 @@ def judged_answer(assessment: Assessment, pair: Pair) -> Record:
     }
 
 
-def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Generator) -> tuple[Pair, Memory]:
+def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Generator) -> tuple[Pair, PreviousPoses]:
     """The next source of a stream, and what a `Tracker` remembers of the last one.
 
     A part of the view is lost at one side, and the source has moved by up to 10 mm and 10 deg about its centroid. In
@@ -201,7 +199,7 @@ def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Genera
     source = seen[rng.permutation(len(seen))[: round(rng.uniform(0.7, 1.0) * len(seen))]]
     turn = np.radians(rng.uniform(0.0, STEP_DEG)) * random_directions(1, rng)[0]
     shift = rng.uniform(0.0, STEP_MM) * random_directions(1, rng)[0]
-    memory = Memory()
+    memory = PreviousPoses()
     memory.keep([hypothesis.T_target_source for hypothesis in hypotheses])
     memory.poses = memory.poses @ se3.exp(np.concatenate([shift, turn]), source.mean(axis=0))
     if rng.random() < FORGOTTEN and len(memory.poses) > 2:
@@ -232,11 +230,16 @@ class AskedOnce:
 
 
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig = AS_IT_IS) -> Registrar:
-    """A registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
-    calibrations = [Calibration(proposer.name, ACCEPTING, {}) for proposer in proposers]
+    """Make a registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     config = replace(SETTINGS, sensor=SensorConfig(kind=sensor), clutter=clutter_config)
-    of_scenes = Calibration(clutter.NAME, ACCEPTING, {})
-    return Registrar(config, proposers, calibrations, of_scenes, Precision.unscaled())
+    return Unmirrored(config, proposers, ACCEPTING, Precision.unscaled())
+
+
+class Unmirrored(Registrar):
+    """Registers no mirror images in full: no feature rests on them, and they double the time."""
+
+    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> None:
+        return None
 
 
 @cache
@@ -306,8 +309,9 @@ def _is_stream(record: Record) -> bool:
 
 def _is_current(record: Record, made_of: dict[bool, str]) -> bool:
     answers = record.get("answers", {}).items()
+    of_frames = ("pose", "bone")
     return (
         record.get("settings") == origin.settings(SETTINGS)
         and record.get("made_of") == made_of[_is_stream(record)]
-        and all(set(FEATURES_OF.get(round_of(name), ())) == answer["features"].keys() for name, answer in answers)
+        and all(set(FEATURES_OF.get(kind_of(name), of_frames)) == set(answer["features"]) for name, answer in answers)
     )

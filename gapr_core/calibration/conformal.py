@@ -1,9 +1,8 @@
 """Fit the precision: how predicted errors at the whole bone compare with true ones, and a bound that holds.
 
-The scale of a predicted standard deviation is an additive model of a few features, of the logarithm of what the true
-errors and NEES ask for. The factor of the bound is the conformal quantile of true errors over bounds: large enough for
-all answers together, of models that had seen neither the subject nor the sensor family, and for each family alone, of
-models that had not seen the subject.
+The scale of a predicted standard deviation is an additive model of a few features, of the logarithm of the scale that
+true errors and NEES ask for. The factor of the bound is the conformal quantile of true errors over bounds in bins of
+the confidence (Vovk et al. 2005), of models that had not seen the subject.
 """
 
 from __future__ import annotations
@@ -21,12 +20,14 @@ from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATU
 Array = NDArray[np.float64]
 MEDIAN_NEES = 5.348  # of chi square with six degrees of freedom
 MEDIAN_RATIO = 0.8  # of a true error to its expected root mean square: of two to three directions that matter
-OVERALL, IN_EACH = 0.955, 0.91  # coverage: a little above what is asked for, 95 % over all and 90 % in each
-FEWEST = 30  # accepted answers of a family that has a say of its own
+COVERED = 0.955  # of the errors in a bin: a little above the 95 % that are asked for
+IN_EACH = 0.935  # of the errors of each sensor family in a bin
+BINS = (0.5, 0.8, 0.9, 0.97, 1.0)  # edges of the confidence
+FEWEST = 30  # answers of a bin, or of a family in it, that have a say
 
 
 def fit_scale(answers: Answers) -> Additive:
-    """Of the logarithm of the scale that a predicted standard deviation needs."""
+    """Fit the logarithm of the scale that a predicted standard deviation needs."""
     by_error = np.log(answers.true_mm / (MEDIAN_RATIO * answers.tre_mm))
     by_nees = 0.5 * np.log(answers.nees / MEDIAN_NEES)  # a variance over a variance
     return fit_centre(precision_table(answers), 0.5 * (by_error + by_nees), PRECISION_FEATURES)
@@ -54,47 +55,53 @@ def scales_of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array
     return of_models_that_saw_no_subject(answers, known, fit_scale, scales)
 
 
-def factor_overall(scores: Array) -> float:
-    """The smallest factor with which bounds cover their share of all scores (N,), true errors over bounds."""
-    return conformal_quantile(scores, OVERALL)
-
-
-def factor_in_each(scores: Array, *groupings: NDArray[np.str_]) -> float:
-    """The smallest factor with which bounds cover their share of the scores (N,) of each group.
+def factors(scores: Array, confidence: Array, family: NDArray[np.str_]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Find the factor of the bound in bins of the confidence, never rising with it.
 
     Args:
-        scores: true errors over their bounds.
-        groupings: (N,) each: sensor families, rounds.
+        scores: (N,) true errors over their bounds.
+        confidence: (N,) of the answers.
+        family: (N,) sensor families, each of which is covered in each bin.
+
+    Returns:
+        Middle confidence and factor of each bin that has enough answers.
     """
-    groups = [grouping == name for grouping in groupings for name in np.unique(grouping)]
-    return max((conformal_quantile(scores[of_it], IN_EACH) for of_it in groups if of_it.sum() >= FEWEST), default=0.0)
+    at, found = [], []
+    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+        in_bin = (confidence >= low) & (confidence <= high)
+        if in_bin.sum() < FEWEST:
+            continue
+        families = [in_bin & (family == name) for name in np.unique(family[in_bin])]
+        of_each = [conformal_quantile(scores[of_it], IN_EACH) for of_it in families if of_it.sum() >= FEWEST]
+        at.append(float(np.median(confidence[in_bin])))
+        found.append(max([conformal_quantile(scores[in_bin], COVERED), *of_each]))
+    return tuple(at), tuple(np.maximum.accumulate(found[::-1])[::-1])
 
 
 def conformal_quantile(scores: Array, share: float) -> float:
-    """What the next score of the same kind stays below with at least this probability (Vovk et al. 2005).
+    """Find a number that the next score of the same kind stays below with at least this probability.
 
-    The k-th smallest of n scores, k = ceil((n + 1) share): one more than the plain quantile has. Where k > n, as of 5
-    scores for .95, it is the largest one, which the next score stays below with n / (n + 1) only.
+    The k-th smallest of n scores, k = ceil((n + 1) share): one more than the plain quantile has (Vovk et al. 2005).
+    Where k > n, as of 5 scores for .95, it is the largest one, which the next score stays below with n / (n + 1) only.
     """
     k = int(np.ceil((len(scores) + 1) * share))
     return float(np.sort(scores)[min(k, len(scores)) - 1])
 
 
-def coverage(answers: Answers, scale: Array, factor: float) -> dict[str, dict[str, Any]]:
-    """How often the bound holds, how wide it is, and what the NEES is: all, by family, by round, by size."""
-    rows = {}
-    edges_mm = np.quantile(factor * scale * answers.tre95_mm, [0.0, 0.25, 0.5, 0.75, 1.0])
-    quarter = np.clip(np.searchsorted(edges_mm, factor * scale * answers.tre95_mm, side="right"), 1, 4)
+def coverage(answers: Answers, scale: Array, factor: Array) -> dict[str, dict[str, Any]]:
+    """Measure how often the bound holds, its width, and the NEES: all, by family, by round.
+
+    Args:
+        answers: N accepted ones with a truth.
+        scale: (N,) of the standard deviations.
+        factor: (N,) of the bound.
+    """
     groups = {"all": np.full(len(answers), True)}
     groups |= {str(name): answers.family == name for name in np.unique(answers.family)}
     groups |= {f"round: {name}": answers.rounds == name for name in np.unique(answers.rounds)}
-    for k in range(1, 5):
-        name = f"tre95 {edges_mm[k - 1]:.1f} to {edges_mm[k]:.1f} mm"  # two that read alike are one
-        groups[name] = groups.get(name, False) | (quarter == k)
+    rows = {}
     for name, of_it in groups.items():
-        if not of_it.any():
-            continue
-        true, bound = answers.true_mm[of_it], factor * scale[of_it] * answers.tre95_mm[of_it]
+        true, bound = answers.true_mm[of_it], (factor * scale * answers.tre95_mm)[of_it]
         rows[name] = {
             "accepted": int(of_it.sum()),
             "covered": round(float((true <= bound).mean()), 4),

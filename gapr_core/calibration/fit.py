@@ -1,8 +1,8 @@
-"""Fit the confidence of one round, and judge it on subjects and on sensor families that it has not seen."""
+"""Fit the two numbers of the confidence, and judge them on subjects and sensor families that no fit has seen."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,19 @@ from gapr_core.calibration.pairs import HELD_OUT
 from gapr_core.config import RegistrarConfig
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
 from gapr_core.registration.confidence.additive import Additive
-from gapr_core.registration.confidence.classifier import LARGEST_LOG_ODDS
-from gapr_core.registration.confidence.features import SIGNS
+from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS
+from gapr_core.registration.confidence.features import OF_THE_BONE, SIGNS
 
 Array = NDArray[np.float64]
-ACCEPTED = RegistrarConfig.min_confidence
+ACCEPTED, PRIOR = RegistrarConfig.min_confidence, RegistrarConfig.other_bone_prior
+ANOTHER_BONE = ("person", "scaled")  # of `pairs.WHAT`: another subject's bone, or one of another size
+
+
+class Models(NamedTuple):
+    """The models of both numbers for one kind of answer: log odds of the pose, log likelihood ratio of the bone."""
+
+    pose: Additive
+    bone: Additive
 
 
 def known_families(answers: Answers) -> NDArray[np.bool_]:
@@ -26,51 +34,76 @@ def known_families(answers: Answers) -> NDArray[np.bool_]:
     return ~np.isin(answers.family, HELD_OUT)
 
 
-def fit(answers: Answers) -> Additive:
-    """The log odds that an answer is right; every record counts once."""
-    return fit_log_odds(answers.features, answers.right, answers.feature_names, SIGNS)
+def fit(answers: Answers) -> Models:
+    """Fit both models: the first to own bones, the second to right poses of these and to other subjects' bones."""
+    own = answers.of(of_own_bone(answers))
+    pose = fit_log_odds(own.features, own.right, own.feature_names, SIGNS)
+    told = answers.of(of_own_bone(answers) & answers.right | is_another_bone(answers)).with_features(OF_THE_BONE)
+    is_own = ~is_another_bone(told)
+    bone = fit_log_odds(told.features, is_own, OF_THE_BONE, SIGNS)
+    prior = np.log(max(is_own.sum(), 1) / max((~is_own).sum(), 1))
+    return Models(pose, Additive(bone.constant - float(prior), bone.curves))
 
 
-def probability(model: Additive, answers: Answers) -> Array:
-    """(N,) probabilities as `Calibration.probability` gives them."""
-    return np.asarray(expit(np.clip(model.values(answers.features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
+def of_own_bone(answers: Answers) -> NDArray[np.bool_]:
+    """(N,) mask of the answers to which there is a right pose."""
+    return np.isfinite(answers.true_mm)
+
+
+def is_another_bone(answers: Answers) -> NDArray[np.bool_]:
+    """(N,) mask of the answers to a source of another subject's bone, or of one of another size."""
+    return np.isin(answers.what, ANOTHER_BONE)
+
+
+def numbers(models: Models, answers: Answers) -> Array:
+    """(N, 2) log odds of the pose and log10 likelihood ratio of the bone, as `Classifier.judge` gives them."""
+    pose = np.clip(models.pose.values(answers.features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
+    bone = models.bone.values(answers.with_features(OF_THE_BONE).features) / np.log(10.0)
+    return np.column_stack([pose, np.clip(bone, -LARGEST_EVIDENCE, LARGEST_EVIDENCE)])
+
+
+def confidences(found: Array, prior: float = PRIOR) -> Array:
+    """(N,) P(pose | bone) x P(bone) of numbers (N, 2), as `classifier.joint` gives them."""
+    return np.asarray(expit(found[:, 0]) * expit(np.log(10.0) * found[:, 1] - np.log(prior / (1.0 - prior))))
 
 
 def of_unseen_people(answers: Answers) -> Array:
-    """(N,) probabilities, each by a model fitted without the pair's subject and the held-out families."""
-    return of_models_that_saw_no_subject(answers, known_families(answers), fit, probability)
+    """(N, 2) numbers, each by models fitted without the pair's subject and the held-out families."""
+    return of_models_that_saw_no_subject(answers, known_families(answers), fit, numbers)
 
 
 def of_unseen_families(answers: Answers) -> Array:
-    """(N,) probabilities, each by a model that has seen neither the subject nor the sensor family."""
-    return of_models_that_saw_neither(answers, known_families(answers), fit, probability)
+    """(N, 2) numbers, each by models that have seen neither the subject nor the sensor family."""
+    return of_models_that_saw_neither(answers, known_families(answers), fit, numbers)
 
 
-def quality(answers: Answers, confidence: Array) -> dict[str, Any]:
-    """How well confidences (N,) tell right from wrong, and whether they are probabilities.
+def quality(answers: Answers, found: Array) -> dict[str, Any]:
+    """Measure how well numbers (N, 2) rank right above wrong, and whether confidences are probabilities.
 
-    `wrong` counts wrong poses that would be accepted at 0.5 or more, `wrong_sure` at 0.9 or more: no rule refuses them.
+    AUROC and ECE are of the pose's probability, over own bones. `wrong` counts wrong poses accepted at 0.5 or more,
+    `wrong_sure` at 0.9 or more: no finding refuses them.
     """
+    confidence, own = confidences(found), of_own_bone(answers)
     accepted = (confidence >= ACCEPTED) & ~answers.refused
-    found = [float((accepted & answers.right & (confidence >= least)).sum() / max(answers.right.sum(), 1))
-             for least in (ACCEPTED, SURE)]  # fmt: skip
+    shares = [float((accepted & answers.right & (confidence >= least)).sum() / max(answers.right.sum(), 1))
+              for least in (ACCEPTED, SURE)]  # fmt: skip
     return {
         "pairs": len(answers),
         "right": int(answers.right.sum()),
-        "auroc": _rounded(auroc(confidence, answers.right)),
-        "ece": _rounded(expected_calibration_error(confidence, answers.right)),
+        "auroc": _rounded(auroc(expit(found[own, 0]), answers.right[own]) if own.any() else np.nan),
+        "ece": _rounded(expected_calibration_error(confidence[own], answers.right[own]) if own.any() else np.nan),
         "wrong": false_accepts(accepted, answers.right, confidence),
         "wrong_sure": false_accepts(accepted, answers.right, confidence, SURE),
-        "right_accepted": _rounded(found[0]),
-        "right_sure": _rounded(found[1]),
+        "right_accepted": _rounded(shares[0]),
+        "right_sure": _rounded(shares[1]),
     }
 
 
-def by_group(answers: Answers, confidence: Array, groups: NDArray[np.str_]) -> dict[str, dict[str, Any]]:
-    """`quality` of all, and of each group."""
-    rows = {"all": quality(answers, confidence)}
+def by_group(answers: Answers, found: Array, groups: NDArray[np.str_]) -> dict[str, dict[str, Any]]:
+    """Measure `quality` of all, and of each group."""
+    rows = {"all": quality(answers, found)}
     for group in np.unique(groups):
-        rows[str(group)] = quality(answers.of(groups == group), confidence[groups == group])
+        rows[str(group)] = quality(answers.of(groups == group), found[groups == group])
     return rows
 
 

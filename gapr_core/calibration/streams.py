@@ -1,4 +1,4 @@
-"""Streams that the confidence of a `Tracker` learns from: what the frames say together of own and of other bones.
+"""Streams that the evidence of a `Tracker` learns from: how alike the numbers of their frames are.
 
 The frames are answered by the models that are installed: those of single answers are fitted first. Each stream has its
 own noise, and a smooth bias of one kind, drawn again for each frame or, as that of soft tissue, the same in all.
@@ -6,26 +6,31 @@ own noise, and a smooth bias of one kind, drawn again for each frame or, as that
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core import metrics
 from gapr_core.calibration import pairs
+from gapr_core.calibration.answers import STREAM
 from gapr_core.calibration.pairs import Task
 from gapr_core.config import RegistrarConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.geometry.sampling import log_uniform
-from gapr_core.registration.confidence.additive import Additive, Curve
-from gapr_core.registration.confidence.classifier import LARGEST_LOG_ODDS, Calibration
-from gapr_core.registration.confidence.features import STREAM, STREAM_FEATURES
+from gapr_core.registration.confidence.classifier import Judgement
 from gapr_core.registration.registrar import Registrar
+from gapr_core.registration.streams.evidence import Evidence
 from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.results import RegistrationResult
 
+Array = NDArray[np.float64]
+
 FRAMES = 12
+UNKNOWN_RHO = 0.8
 JUMPS = 0.2  # share of the streams in which the bone is somewhere else halfway
 BIASES = {
     "wave": {"wave": 1.5},
@@ -47,16 +52,32 @@ def tasks(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def record_of_stream(task: Task) -> dict[str, Any]:
-    """The facts of a stream, and an answer "stream K" for each frame of which those before it say something."""
+    """Track a stream whose frames count one by one; an answer "stream K" holds the numbers of each frame alone."""
     family, what, people, frames = draw_stream(task)
-    tracker, target = tracker_of_frames_alone(), _registrar().prepare(frames[0].target)
-    answers = {}
+    tracker = Tracker(_registrar())
+    witness = tracker._evidence = OneByOne(1.0, 1.0)
+    target, answers = tracker.prepare(frames[0].target), {}
     for number, frame in enumerate(frames):
+        seen = len(witness.frames)
         result = tracker.register(frame.source, target)
-        if STREAM_FEATURES[-1] in result.features:
-            answers[f"{STREAM} {number}"] = judged_frame(result, frame)
+        if len(witness.frames) > seen:
+            answers[f"{STREAM} {number}"] = judged_frame(result, witness.frames[-1], frame)
     return {"family": f"stream-{family}", "seen_as": "stream", "what": what, "sensor": "unknown",
             "bone": frames[0].bone, "people": list(people), "answers": answers}  # fmt: skip
+
+
+class OneByOne(Evidence):
+    """Keeps the numbers of each frame, and leaves them as they are."""
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        super().reset()
+        self.frames: list[Judgement] = []
+
+    def observe(self, frame: Judgement, agrees: bool, again: bool = False) -> Judgement:
+        """Keep a frame."""
+        self.frames.append(frame)
+        return frame
 
 
 def draw_stream(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
@@ -84,25 +105,53 @@ def draw_stream(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
     return family, what, people, [pairs.before(setting, source, what, frame) for frame in frames]
 
 
-def judged_frame(result: RegistrationResult, frame: Pair) -> dict[str, Any]:
-    """The features of a frame in its stream, and whether its best pose is right.
+def judged_frame(result: RegistrationResult, numbers: Judgement, frame: Pair) -> dict[str, Any]:
+    """Record the numbers of a frame alone, and whether its best pose is right."""
+    record: dict[str, Any] = {
+        "features": {"pose": round(numbers.pose_log_odds, 5), "bone": round(numbers.bone_evidence, 5)},
+        "refusal": None,
+        "right": False,
+    }
+    if frame.has_truth and result.best is not None:
+        record["right"] = metrics.pose_error(result.best, frame.T_target_source, frame.source).is_right
+    return record
 
-    What a rule refuses has no such features.
+
+def correlations(records: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Fit rho of both numbers: the share of their variance that the frames of a stream have in common.
+
+    One-way analysis of variance within each class (Searle 1971): own bones with right poses for the pose; own bones and
+    other subjects' for the bone. Without streams .8 each.
     """
-    features = {name: round(result.features[name], 6) for name in STREAM_FEATURES}
-    record = {"features": features, "refusal": None, "right": False}
-    if not frame.has_truth:
-        return record
-    error = metrics.pose_error(result.hypotheses[0].T_target_source, frame.T_target_source, frame.source)
-    return record | {"right": error.is_right, "rte_mm": error.rte_mm, "rre_deg": error.rre_deg}
+    own, others = [], []
+    for record in records:
+        if not str(record["name"]).split("-")[1:2] == [STREAM]:
+            continue
+        frames = [answer for answer in record["answers"].values()]
+        right = [answer["features"] for answer in frames if answer["right"]]
+        if record["what"] == "own" and len(right) > 1:
+            own.append(np.array([[f["pose"], f["bone"]] for f in right]))
+        if record["what"] == "person" and len(frames) > 1:
+            others.append(np.array([[a["features"]["pose"], a["features"]["bone"]] for a in frames]))
+    pose = _components([each[:, 0] for each in own])
+    bone = _components([each[:, 1] for each in own]) + _components([each[:, 1] for each in others])
+    return _share(pose), _share(bone)
 
 
-def tracker_of_frames_alone() -> Tracker:
-    """A tracker for one stream that counts its frames one by one, whatever misfit they share."""
-    limits = np.array([-LARGEST_LOG_ODDS, LARGEST_LOG_ODDS])
-    nothing = tuple(Curve(name, np.zeros(1), np.zeros(1)) for name in STREAM_FEATURES[1:])
-    same = Additive(0.0, (Curve(STREAM_FEATURES[0], limits, limits), *nothing))
-    return Tracker(_registrar(), stream=Calibration(STREAM, same, {}))
+def _components(streams: Sequence[Array]) -> Array:
+    """(2,) variance between streams and within them, weighted with the number of streams."""
+    if len(streams) < 2:
+        return np.zeros(2)
+    counts = np.array([len(each) for each in streams], dtype=float)
+    means = np.array([each.mean() for each in streams])
+    within = sum(float(((each - each.mean()) ** 2).sum()) for each in streams) / max(counts.sum() - len(streams), 1.0)
+    between = float(means.var(ddof=1)) - within * float((1.0 / counts).mean())
+    return len(streams) * np.array([max(between, 0.0), within])
+
+
+def _share(components: Array) -> float:
+    total = float(components.sum())
+    return round(float(components[0] / total), 3) if total > 0.0 else UNKNOWN_RHO
 
 
 @cache

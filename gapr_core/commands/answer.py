@@ -22,6 +22,8 @@ def as_json(result: RegistrationResult) -> dict[str, Any]:
     return {
         "transform": None if pose is None else pose.tolist(),
         "confidence": result.confidence,
+        "pose_probability": result.pose_probability,
+        "bone_evidence": result.bone_evidence,
         "status": str(result.status),
         "covariance": None if covariance is None else covariance.tolist(),
         "centre_mm": None if result.centre_mm is None else np.asarray(result.centre_mm).tolist(),

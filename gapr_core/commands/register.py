@@ -95,7 +95,6 @@ def run(args: Namespace) -> int:
     """
     from gapr_core import Registrar, Tracker
     from gapr_core.benchmark import methods
-    from gapr_core.registration.checks.limits import why_no_surer
 
     checks.check_outputs(args)
     checks.check_method(args)
@@ -111,11 +110,9 @@ def run(args: Namespace) -> int:
         hints |= _seen(args, method, source)
         result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     errors = _errors(plan, result)
-    spots = result.guidance.spots(apart_mm=config.guidance.patch_mm) if result.guidance else ()
+    spots = result.guidance.spots() if result.guidance else ()
     code = _show(args, result, errors)
     options.say_uncalibrated(args.method)
-    if result.ok and (why := why_no_surer(result.contributions)):
-        say(f"no surer than that: {why}")
     if result.tre95_mm is not None:
         _say_what_the_bound_leaves_out(config.sensor)
     if config.guide:

@@ -20,7 +20,7 @@ from gapr_core.pages import palette
 from gapr_core.pages.guidance import GuidedStep, guidance_figure
 from gapr_core.pages.registration import Registration
 from gapr_core.pages.report import Report, Step, alignment_figure
-from gapr_core.registration.checks.feature_labels import WORDS
+from gapr_core.registration.confidence.feature_labels import FEATURE_LABELS
 from gapr_core.results import Patch, RegistrationResult, confidence_text
 from gapr_core.runtime import origin
 
@@ -181,7 +181,7 @@ def _add_confidence(report: Report, result: RegistrationResult) -> None:
         return
     ranked = sorted(result.contributions.items(), key=lambda item: -abs(item[1]))
     rows = [
-        (WORDS.get(name, name), name, "for" if adds > 0 else "against" if adds < 0 else NONE, f"{adds:+.2f}",
+        (FEATURE_LABELS.get(name, name), name, "for" if adds > 0 else "against" if adds < 0 else NONE, f"{adds:+.2f}",
          f"{result.features[name]:.3f}" if name in result.features else NONE)
         for name, adds in ranked
     ]  # fmt: skip

@@ -29,6 +29,7 @@ from gapr_core.registration.problem.sensor import Errors, offset_surface
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import as_config, check_call
 from gapr_core.registration.uncertainty import target_error as precision
+from gapr_core.registration.uncertainty.covariance import CORRELATION_MM
 from gapr_core.registration.uncertainty.linear_model import smooth_correlation
 from gapr_core.results import PointCheck, RegistrationResult, Verdict
 
@@ -146,11 +147,10 @@ def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarCo
     Noise, a smooth bias that near points share, a stand-off and an error of the model that all share, another size,
     which moves a point along its normal by its place, and an error of the tracker, which moves all as one body.
     """
-    settings = config.covariance
-    alike = smooth_correlation(moved, moved, settings.correlation_mm)
+    alike = smooth_correlation(moved, moved, CORRELATION_MM)
     grown = np.einsum("ni,ni->n", moved - moved.mean(axis=0), normals) if len(moved) else np.empty(0)
     own_mm2 = errors.noise_mm**2 + errors.local_mm**2
-    shared_mm2 = errors.standoff_mm**2 + settings.model_mm**2
+    shared_mm2 = errors.standoff_mm**2 + config.covariance.model_mm**2
     R = own_mm2 * np.eye(len(moved)) + errors.bias_mm**2 * alike + shared_mm2 + errors.scale**2 * np.outer(grown, grown)
     if len(moved):
         J = distance_jacobian(moved, normals, moved.mean(axis=0))

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gapr_core.config import GuidanceConfig
 from gapr_core.geometry import sampling, se3
 from gapr_core.geometry.twists import distance_jacobian
 from gapr_core.registration.checks.assessment import Assessment
@@ -26,6 +25,10 @@ from gapr_core.results import Guidance, Hypothesis, Patch
 
 Array = NDArray[np.float64]
 
+PATCH_MM, PATCHES = 30.0, 250  # diameter of a look's patch, and places that are compared
+LOOK_POINTS, NOISE_MM, BIAS_MM = 60, 0.5, 0.7  # of a look: points, least white noise, least bias that all share
+SEEN_MM = 6.0  # a target point with a source point this near counts as seen
+MOST_RIVALS = 50  # the likeliest other poses that a look is to exclude
 FACING_COS = 0.3  # least cosine between normals of a patch and that of its centre
 SEEN_SHARE = 0.5  # of a patch, from which there is nothing new to see
 
@@ -43,21 +46,20 @@ class Patches:
     members: list[NDArray[np.int64]]
 
 
-def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
+def guide(assessment: Assessment) -> Guidance | None:
     """Patches of the target ranked by what a look there would gain; None where the whole bone was seen.
 
     Args:
         assessment: the best pose so far, its covariance and its rivals.
-        config: size of a patch, points and bias of a look.
     """
     target = assessment.target
-    rivals = sorted(assessment.hypotheses[1:], key=lambda rival: -rival.probability)[: config.rivals]
-    patches = _unseen(_patches(target, config), assessment, config)
+    rivals = sorted(assessment.hypotheses[1:], key=lambda rival: -rival.probability)[:MOST_RIVALS]
+    patches = _unseen(_patches(target), assessment)
     if not len(patches.centres):
         return None
-    noise_mm = max(assessment.fit.sigma_mm, config.noise_mm)
-    bias_mm = max(assessment.uncertainty.bias_mm, config.bias_mm)
-    bounds = _bounds_mm(assessment, patches, config.points, noise_mm, bias_mm)
+    noise_mm = max(assessment.fit.sigma_mm, NOISE_MM)
+    bias_mm = max(assessment.uncertainty.bias_mm, BIAS_MM)
+    bounds = _bounds_mm(assessment, patches, LOOK_POINTS, noise_mm, bias_mm)
     now_mm2, left_mm2, share = _of_rivals(assessment, rivals, patches, noise_mm, bias_mm)
     now_mm = float(np.sqrt(assessment.tre95_mm**2 + now_mm2))
     after_mm = np.sqrt(bounds**2 + left_mm2)
@@ -84,23 +86,23 @@ def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array
     return np.asarray(inner / noise_mm**2 - common * total[..., :, None] * total[..., None, :])
 
 
-def _patches(target: PreparedTarget, config: GuidanceConfig) -> Patches:
+def _patches(target: PreparedTarget) -> Patches:
     """Balls around evenly spread points, less what faces another way than the centre."""
-    centres = sampling.thin(target.points, config.patches)
-    balls = target.tree.query_ball_point(target.points[centres], config.patch_mm / 2.0)
+    centres = sampling.thin(target.points, PATCHES)
+    balls = target.tree.query_ball_point(target.points[centres], PATCH_MM / 2.0)
     members = [np.array(ball)[target.normals[ball] @ target.normals[i] > FACING_COS]
                for i, ball in zip(centres, balls, strict=True)]  # fmt: skip
     return Patches(centres, members)
 
 
-def _unseen(patches: Patches, assessment: Assessment, config: GuidanceConfig) -> Patches:
+def _unseen(patches: Patches, assessment: Assessment) -> Patches:
     """Those of which the source shows less than half."""
     fit = assessment.fit.rests_on
-    seen = fit.moved[fit.weights > 0.0]
+    seen = fit.moved[fit.counts]
     if not len(seen):
         return patches
     surface = assessment.target.elements[:, :3]  # where a sensor with a stand-off sees the bone
-    near = cKDTree(seen).query(surface)[0] < config.seen_mm
+    near = cKDTree(seen).query(surface)[0] < SEEN_MM
     kept = [k for k, members in enumerate(patches.members) if near[members].mean() < SEEN_SHARE]
     return Patches(patches.centres[kept], [patches.members[k] for k in kept])
 

@@ -10,6 +10,8 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.fit.refinement import evaluate
 
+SHARE, NOISE = 0.82, 1.5  # residual scale to both cortices over that to the outer one, and over the source's noise
+
 
 def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
     """True when the inner cortex explains what the outer one leaves open, down to the noise of the source.
@@ -21,6 +23,6 @@ def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
     if both is None:
         return False
     fit = evaluate(assessment.fit.T, assessment.source.points, both, config.refinement)
-    limits, noise_mm = config.cortices, max(assessment.source.noise_mm, config.refinement.smallest_sigma_mm)
-    explains = fit.sigma_mm < limits.share * assessment.fit.sigma_mm
-    return explains and fit.sigma_mm < limits.noise * noise_mm
+    noise_mm = max(assessment.source.noise_mm, config.refinement.smallest_sigma_mm)
+    explains = fit.sigma_mm < SHARE * assessment.fit.sigma_mm
+    return explains and fit.sigma_mm < NOISE * noise_mm

@@ -1,6 +1,6 @@
-"""Do residuals show further unknowns besides a pose, such as a motion, a strain or a layer?
+"""Test the residuals for further unknowns besides a pose: a motion, a strain, a layer, looks that err.
 
-Each has a few unknowns. Are they there? The restricted likelihood of their best size is compared with that of none, and
+The restricted likelihood of their best size is compared with that of none, and
 the pose is integrated out (Patterson and Thompson 1971). A smooth bias of any size and an error that neighbours share
 are allowed for in both, as they look similar. Averages over blocks of neighbours are compared: a single point's normal
 errs with its residual.
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from gapr_core.config import RigidityConfig
 from gapr_core.geometry import extent, sampling
 from gapr_core.geometry.twists import distance_jacobian
 from gapr_core.registration.fit.refinement import Fit
@@ -24,12 +23,15 @@ from gapr_core.registration.uncertainty.linear_model import smooth_correlation
 
 Array = NDArray[np.float64]
 
+FEWEST_POINTS = 200  # inliers without which nothing is looked for
+CELLS = 40  # over which residuals are averaged
+CORRELATION_MM = 20.0  # l of a smooth bias's correlation exp(-d^2 / 2 l^2)
 BIASES_MM = np.array([0.0, 0.15, 0.3, 0.6, 1.2, 2.4])  # of the smooth bias, to choose from
 SHARED_MM = np.array([0.05, 0.2, 0.5, 1.0])  # of what the points of a block share
 SIZES_MM = np.array([0.0, 0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0, 12.0])  # of the further unknowns
 
 
-class Finding(NamedTuple):
+class Shown(NamedTuple):
     """What the residuals say of further unknowns.
 
     Attributes:
@@ -41,7 +43,7 @@ class Finding(NamedTuple):
     size_mm: float
 
 
-NOTHING = Finding(0.0, 0.0)
+NOTHING = Shown(0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class Blocks:
     feet: Array
 
 
-def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], config: RigidityConfig) -> Blocks:
+def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64]) -> Blocks:
     """Averages of the inliers (n) of a fit, weighted as they count: over cells around points that are spread evenly.
 
     Args:
@@ -71,11 +73,10 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64], c
         free: (n, j) derivatives of the inliers' residuals by what is not in question.
         more: m times (n, k), the same by the further unknowns; k may differ.
         group: (n,) number of a group; a block holds points of one.
-        config: how many cells.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     feet, weights = fit.feet[inlier], fit.weights[inlier]
-    centres = feet[sampling.thin(feet, min(config.cells, len(feet)))]
+    centres = feet[sampling.thin(feet, min(CELLS, len(feet)))]
     cell = cKDTree(centres).query(feet)[1]
     block = np.unique(group * len(centres) + cell, return_inverse=True)[1].reshape(-1)
     most = max(each.shape[1] for each in more)
@@ -93,26 +94,26 @@ def motions(fit: Fit) -> Array:
 
     A turn of 1 mm is one by 1 mm over their root mean square distance from the middle.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
     return distance_jacobian(moved, normals, moved.mean(axis=0)) / np.repeat([1.0, extent.radius_mm(moved)], 3)
 
 
-def findings(found: Blocks, config: RigidityConfig) -> list[Finding]:
+def shown(found: Blocks) -> list[Shown]:
     """What the blocks say of each of the m alternatives, whatever the bias and what the points of a block share."""
-    noise, correlation = np.diag(found.variances), smooth_correlation(found.feet, found.feet, config.correlation_mm)
+    noise, correlation = np.diag(found.variances), smooth_correlation(found.feet, found.feet, CORRELATION_MM)
     shared = SHARED_MM[:, None, None] ** 2 * np.eye(len(noise))
     V = np.concatenate([noise + bias_mm**2 * correlation + shared for bias_mm in BIASES_MM])
     of_all = _log_likelihoods(found, V)
     return [_of_sizes(of_all[:, i]) for i in range(of_all.shape[1])]
 
 
-def _of_sizes(log_likelihood: Array) -> Finding:
+def _of_sizes(log_likelihood: Array) -> Shown:
     """The finding by (errors, K) log likelihoods of each of `SIZES_MM`."""
     best = log_likelihood.max(axis=0)
     posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
     size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
-    return Finding(float(best.max() - best[0]), size_mm)
+    return Shown(float(best.max() - best[0]), size_mm)
 
 
 def _log_likelihoods(found: Blocks, V: Array) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import WeightsError
 
 Array = NDArray[np.float64]
-FORMAT = 2  # 1 were ensembles of networks
+FORMAT = 3
 FIT_AGAIN = "fit it again: python -m gapr_core.calibration --anatomy DIR --out DIR"
 
 

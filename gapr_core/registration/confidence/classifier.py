@@ -1,93 +1,112 @@
-"""How sure an answer is: what the fit and its rivals look like, and an additive model of the odds.
+"""Two questions, two numbers: is this the right pose, and is this the right bone?
 
-The model is fitted on train subjects over all protocols, right and wrong pairs alike, by
-`python -m gapr_core.calibration`; the file names the data and the fit. It can be read: every feature adds its share to
-the log odds, for or against.
+P(right) = P(pose | this bone) x P(this bone). The first factor is the expit of an additive model of the features. The
+second follows from a likelihood ratio of this bone to another subject's, also an additive model, and from a prior that
+the ward knows and the data do not. Both models are fitted by `python -m gapr_core.calibration`; each feature adds its
+share to the log odds, so an answer can be read.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from scipy.special import expit
 
-from gapr_core.errors import ConfigError, MethodUnavailableError, WeightsError
+from gapr_core.errors import WeightsError
 from gapr_core.registration.confidence.additive import FIT_AGAIN, Additive, from_dict, read
-from gapr_core.registration.confidence.features import FEATURES, FEATURES_OF
+from gapr_core.registration.confidence.features import FEATURES_OF
 
-WEIGHTS = Path(__file__).parents[2] / "weights"
-CALIBRATIONS = {name: WEIGHTS / f"confidence_{name}.json" for name in FEATURES_OF}
+SHIPPED = Path(__file__).parents[2] / "weights" / "confidence.json"
 LARGEST_LOG_ODDS = 9.0  # a few thousand records say nothing of rarer errors than one in eight thousand
+LARGEST_EVIDENCE = 3.0  # log10: as few pairs of subjects say nothing of rarer look-alikes than one in a thousand
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The two numbers of an answer.
+
+    Attributes:
+        pose_log_odds: log odds that the pose is within 4 mm and 5 deg, given that this is the right bone.
+        bone_evidence: log10 likelihood ratio of this bone to another subject's.
+        contributions: log odds that each feature adds to those of the pose, compared with the usual answer.
+    """
+
+    pose_log_odds: float
+    bone_evidence: float
+    contributions: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def pose_probability(self) -> float:
+        """Probability, 0 to 1, that the pose is right, given that this is the right bone."""
+        return float(expit(self.pose_log_odds))
+
+
+def joint(judgement: Judgement, other_bone_prior: float) -> float:
+    """P(pose | this bone) x P(this bone).
+
+    Args:
+        judgement: the two numbers.
+        other_bone_prior: probability, before the data, of another subject's bone; 0 to 1.
+    """
+    return judgement.pose_probability * bone_probability(judgement.bone_evidence, other_bone_prior)
+
+
+def bone_probability(evidence: float, other_bone_prior: float) -> float:
+    """Posterior probability of this bone: 1 / (1 + pi / (1 - pi) 10^-evidence)."""
+    if not 0.0 < other_bone_prior < 1.0:
+        return 1.0 - other_bone_prior
+    return float(expit(np.log(10.0) * evidence - np.log(other_bone_prior / (1.0 - other_bone_prior))))
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """The probability of one proposer's answers as an additive model of the log odds.
+class Classifier:
+    """The models of both numbers, for sources that are bone alone and for a camera's clouds.
 
     Attributes:
-        proposer: whose hypotheses came last; a model is good for this one only.
-        model: of the log odds.
-        card: where it comes from.
+        pose: model of the pose's log odds, by kind (`features.FEATURES_OF`).
+        bone: model of the natural log likelihood ratio of this bone, by kind.
+        rho_pose, rho_bone: correlation of two frames of a stream, of each number (`streams.evidence`).
+        card: data and fit.
     """
 
-    proposer: str
-    model: Additive
-    card: dict[str, object]
+    pose: Mapping[str, Additive]
+    bone: Mapping[str, Additive]
+    rho_pose: float = 0.8
+    rho_bone: float = 0.8
+    card: Mapping[str, object] = field(default_factory=dict)
 
     @staticmethod
-    def load(path: str | Path) -> Calibration:
-        """Read the model.
+    def load(path: str | Path = SHIPPED) -> Classifier:
+        """Read the models.
 
         Raises:
-            WeightsError: no such file, one of an older format or of other features, or a damaged one.
+            WeightsError: no such file, another format, other features, or a damaged file.
         """
         path = Path(path)
         data = read(path, "confidence")
         try:
-            model, proposer, card = from_dict(data), str(data["proposer"]), dict(data["card"])
-        except (ValueError, KeyError, TypeError) as error:
+            pose = {kind: from_dict(model) for kind, model in data["pose"].items()}
+            bone = {kind: from_dict(model) for kind, model in data["bone"].items()}
+            found = Classifier(pose, bone, float(data["rho_pose"]), float(data["rho_bone"]), dict(data["card"]))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise WeightsError("a whole confidence model", f"{path}: {error!r}", FIT_AGAIN) from error
-        if model.features != FEATURES_OF.get(proposer):
-            expected = f"a model of {FEATURES_OF.get(proposer)} for {proposer!r}"
-            raise WeightsError(expected, f"{path}: one of {model.features}", FIT_AGAIN)
-        return Calibration(proposer, model, card)
+        for kind, names in FEATURES_OF.items():
+            for models in (pose, bone):
+                if kind not in models or not set(models[kind].features) <= set(names):
+                    expected = f"models of {kind!r} with features among {names}"
+                    raise WeightsError(expected, f"{path}: {models.get(kind)}", FIT_AGAIN)
+        return found
 
-    @staticmethod
-    def shipped(proposer: str) -> Calibration:
-        """The model for an answer whose last hypotheses came from `proposer`.
+    def judge(self, kind: str, features: Mapping[str, float]) -> Judgement:
+        """Compute the two numbers of an answer.
 
-        What a proposer's hypotheses say about rivals is its own: no other one's model stands in.
-
-        Raises:
-            MethodUnavailableError: nobody fitted a confidence for this proposer.
+        Args:
+            kind: a key of `features.FEATURES_OF`.
+            features: measurements of the answer, at least those of the models.
         """
-        if proposer not in CALIBRATIONS:
-            how = "fit one with python -m gapr_core.calibration and pass it as Registrar(..., calibrations=[...])"
-            given = f"proposer {proposer!r}, models exist for {', '.join(CALIBRATIONS)}"
-            raise MethodUnavailableError("a proposer with a fitted confidence model", given, how)
-        return Calibration.load(CALIBRATIONS[proposer])
-
-    def check_is_for(self, proposer: str) -> None:
-        """Refuse a model for another proposer that has one of its own, or for answers that have other features.
-
-        Raises:
-            ConfigError: it is.
-        """
-        of_rounds = FEATURES_OF.get(self.proposer, FEATURES) == FEATURES
-        if self.proposer != proposer and (proposer in CALIBRATIONS or not of_rounds):
-            how = "pass the calibrations in the order of the proposers: a model is good for its own only"
-            raise ConfigError(f"a confidence model of {proposer!r}", f"one of {self.proposer!r}", how)
-
-    def probability(self, features: Mapping[str, float]) -> float:
-        """Probability, 0 to 1, that the pose is within 4 mm and 5 deg; NaN where a feature is no number."""
-        return float(expit(np.clip(self.model.value(features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
-
-    def contributions(self, features: Mapping[str, float]) -> dict[str, float]:
-        """Log odds that each feature adds to those of the usual answer: above 0 it speaks for the pose.
-
-        Their sum and `model.constant` are the log odds of `probability`, which goes no farther than `LARGEST_LOG_ODDS`.
-        """
-        return self.model.contributions(features)
+        log_odds = np.clip(self.pose[kind].value(features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
+        evidence = np.clip(self.bone[kind].value(features) / np.log(10.0), -LARGEST_EVIDENCE, LARGEST_EVIDENCE)
+        return Judgement(float(log_odds), float(evidence), self.pose[kind].contributions(features))

@@ -1,50 +1,57 @@
-"""What speaks for a pose and what against it: the features of the confidence."""
+"""Measurements of a refined pose among its rivals, from which the two numbers are computed."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import CovarianceConfig, RegistrarConfig, ScaleConfig
+from gapr_core.config import RegistrarConfig
 from gapr_core.geometry.extent import half_extent_mm
 from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration.confidence.roughness import SURE_SIGMAS, rough_misfit_mm
-from gapr_core.registration.fit import mirror, other_size
+from gapr_core.registration.fit import alternatives
+from gapr_core.registration.fit.alternatives import Trial
 from gapr_core.registration.fit.refinement import SD_OF_MEDIAN, Fit
 from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem import sensor
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.uncertainty.covariance import PoseUncertainty
+from gapr_core.registration.uncertainty.covariance import (
+    CENTRES,
+    CORRELATION_MM,
+    SIZES_MM,
+    SMALLEST_SHARE,
+    PoseUncertainty,
+)
 from gapr_core.registration.uncertainty.linear_model import equations_of, fields, root_mean_square
 
 Array = NDArray[np.float64]
 
-OTHER_BONE = ("scale_z", "scale_off", "log_scale_sd", "size_margin", "mirror_margin", "rough_misfit")
-FEATURES = (
-    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "residual", "margin", "support",
-    "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
+BONE, SCENE = "bone", "scene"  # kinds of answers: a source that is bone alone, a part of a camera's cloud
+SHARED = (
+    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "rough_misfit", "inlier_ratio", "support",
+    "log_shift_sd", "log_turn_sd", "normal_agreement", "log_points", "extent", "scale_z", "scale_off", "log_scale_sd",
+    "size_margin", "near_size_margin", "mirror_margin",
 )  # fmt: skip
-SCENE_FEATURES = (
-    "free_space_score", "log_explained_mm2", "explained_of_compared", "violating_of_compared", "rival_margin",
-    "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "inlier_ratio", "support", "log_shift_sd",
-    "log_turn_sd", "normal_agreement", "log_points", "extent", *OTHER_BONE,
-)  # fmt: skip  # of `explained.measure`
-STREAM = "stream"
-STREAM_FEATURES = ("frames_log_odds", "shared_misfit", "shared_smooth")  # of `tracking`: one by one, and together
 FEATURES_OF = {
-    "network": FEATURES, "search": FEATURES, "track": FEATURES, "scene": SCENE_FEATURES, STREAM: STREAM_FEATURES,
+    BONE: (*SHARED, "residual", "margin"),
+    SCENE: (*SHARED, "free_space_score", "log_explained_mm2", "explained_of_compared", "violating_of_compared",
+            "rival_margin"),
 }  # fmt: skip
+OF_THE_BONE = tuple(name for name in SHARED if name != "support")  # features of the second number
 SIGNS = {
-    "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "inlier_ratio": 1, "margin": 1, "support": 1,
-    "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1, "mirror_margin": 1,
-    "rough_misfit": -1,
-    "free_space_score": 1, "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
-    "frames_log_odds": 1, "shared_misfit": -1,
+    "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "rough_misfit": -1, "inlier_ratio": 1, "support": 1,
+    "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1,
+    "near_size_margin": 1, "mirror_margin": 1, "margin": 1, "free_space_score": 1, "explained_of_compared": 1,
+    "violating_of_compared": -1, "rival_margin": 1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
+NEAR_SIZES = (0.9725, 1.0275)  # between these and 1: a source of this size fits in 1 as well as in `SIZES`
+FEWEST_FOR_SIZE = 8  # inliers without which nothing is known of the size
+WIDEST, STANDOFF_MM = 0.3, 0.5  # prior standard deviations of the relative size, and of a stand-off
+SURE_SIZE, USUAL_SIZE = 0.005, 0.05  # standard deviations of the model's size, and of other subjects' bones
 ERROR_OF_MEDIAN = float(np.sqrt(np.pi / 2.0))  # standard error of a median over that of a mean
 LEAST_NOISE_MM = 0.1  # a source without noise counts as having so much
-LARGEST_SCALE_Z = 10.0  # what is clearer decides nothing more
+LARGEST_SCALE_Z = 10.0  # clipped: larger values add no information
 RIVAL_IF_ALONE = 2.0  # a pose alone counts as having a rival of so many times its mean square
 LEAST_MARGIN = 1e-3  # added to the share by which the rival is worse, so that its logarithm is finite
 
@@ -57,7 +64,7 @@ def measure(
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """The features of a refined pose among its rivals; every one is finite.
+    """Measure the features of a source that is bone alone; every one is finite.
 
     Args:
         fit: the refined pose and its residuals.
@@ -69,11 +76,11 @@ def measure(
     """
     second = candidates.scores[1] if len(candidates.scores) > 1 else RIVAL_IF_ALONE * candidates.scores[0]
     values = of_the_fit(fit, candidates, uncertainty, source, source.flatness_mm, target, config) | {
-        "inlier_ratio": float((fit.weights > 0.0).mean()),
+        "inlier_ratio": float(fit.counts.mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
         "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + LEAST_MARGIN)),
     }
-    return {name: values[name] for name in FEATURES}
+    return {name: values[name] for name in FEATURES_OF[BONE]}
 
 
 def of_the_fit(
@@ -85,8 +92,8 @@ def of_the_fit(
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """What `FEATURES` and `SCENE_FEATURES` share; `source` is what was fitted, (N,) its flatness in the whole cloud."""
-    inlier = fit.weights > 0.0
+    """Measure the features that both kinds share; `source` was fitted, `flatness_mm` (N,) is of the whole cloud."""
+    inlier = fit.counts
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
     return {
         "log_sigma": float(np.log(fit.sigma_mm)),
@@ -121,38 +128,39 @@ def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
 def of_another_bone(
     fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> dict[str, float]:
-    """What tells a bone of another size, side of the body or subject; `OTHER_BONE` are the names."""
-    (scale, scale_sd), known = scale_of(fit, config.covariance, config.scale), config.scale
-    usual = max(known.sure, sensor.errors(config.sensor, len(source.points)).scale)
+    """Measure whether the bone is of another size, side of the body or subject."""
+    trial = Trial.of(fit.T, source, target, config)
+    scale, scale_sd = scale_of(fit)
+    usual = max(SURE_SIZE, sensor.errors(config.sensor, len(source.points)).scale)
     return {
         "scale_z": min(abs(scale) / float(np.hypot(scale_sd, usual)), LARGEST_SCALE_Z),
-        "scale_off": abs(scale) * known.usual**2 / (known.usual**2 + scale_sd**2),
+        "scale_off": abs(scale) * USUAL_SIZE**2 / (USUAL_SIZE**2 + scale_sd**2),
         "log_scale_sd": float(np.log(scale_sd)),
-        "size_margin": other_size.margin(fit.T, source, target, config.verification, config.num_threads),
-        "mirror_margin": mirror.margin(fit.T, source, target, config.verification, config.num_threads),
+        "size_margin": alternatives.other_size(trial),
+        "near_size_margin": alternatives.other_size(trial, NEAR_SIZES),
+        "mirror_margin": alternatives.mirrored(trial),
         "rough_misfit": rough_misfit_mm(fit),
     }
 
 
-def scale_of(fit: Fit, config: CovarianceConfig, prior: ScaleConfig) -> tuple[float, float]:
-    """How much larger the source would have to be to fit best, and the standard deviation of that.
+def scale_of(fit: Fit) -> tuple[float, float]:
+    """Estimate by how much the source would have to grow to fit best, and the standard deviation of that.
 
-    Generalised least squares of a similarity and a smooth bias (see `bias_field`): the pose's six motions, the size,
+    Generalised least squares of a similarity and a smooth bias (see `linear_model`): the pose's six motions, the size,
     by which a residual grows as n . (q - c) at its foot point q, and a stand-off that all points share, which looks
-    much like another size on a patch seen from one side. How large the bias is follows from what these leave.
+    much like another size on a patch seen from one side. The size of the bias follows from what these leave.
 
     Returns:
         The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
     """
     fit = fit.rests_on
-    if np.count_nonzero(fit.weights) < prior.fewest_points:
+    if np.count_nonzero(fit.counts) < FEWEST_FOR_SIZE:
         return 0.0, 1.0
     growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # the points hold the noise too
     more = np.column_stack([growth, np.ones_like(growth)])
-    bias = config.correlation_mm, config.centres
-    equations = equations_of(fit, *bias).extended(fit, fields(fit, *bias), more, (prior.widest, prior.standoff_mm))
-    sizes_mm = np.array(config.sizes_mm)
-    size_mm = root_mean_square(sizes_mm, equations.log_likelihood(sizes_mm, config.smallest_share))
+    bias = CORRELATION_MM, CENTRES
+    equations = equations_of(fit, *bias).extended(fit, fields(fit, *bias), more, (WIDEST, STANDOFF_MM))
+    size_mm = root_mean_square(SIZES_MM, equations.log_likelihood(SIZES_MM, SMALLEST_SHARE))
     variance = equations.step_covariance(size_mm)[6, 6]
     scale = float(equations.step(size_mm)[6])
     return float(np.clip(scale, -1.0, 1.0)), float(np.clip(np.sqrt(max(variance, 0.0)), 1e-5, 1.0))

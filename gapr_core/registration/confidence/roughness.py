@@ -50,7 +50,7 @@ def on_the_bone(fit: Fit) -> tuple[Array, Array]:
 
     Foot points: noise must not decide which points are near. Rounded: nor must the last bits of a pose.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     signed = fit.signed_mm[inlier]
     damped = signed * np.maximum(1.0 - (signed / (LARGEST_SIGMAS * fit.sigma_mm)) ** 2, 0.0)
     return fit.feet[inlier].round(DIGITS), damped

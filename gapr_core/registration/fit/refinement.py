@@ -62,6 +62,11 @@ class Fit:
         return self.whole or self
 
     @cached_property
+    def counts(self) -> NDArray[np.bool_]:
+        """(N,) mask of the points that count for the pose: all but outliers."""
+        return self.weights > 0.0
+
+    @cached_property
     def jacobian(self) -> Array:
         """(N, 6) derivative of the residuals by x y z rx ry rz about the moved source's centroid."""
         return distance_jacobian(self.moved, self.gradients, self.moved.mean(axis=0))

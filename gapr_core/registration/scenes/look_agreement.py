@@ -23,12 +23,13 @@ from gapr_core.registration.fit import kernels
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.scenes.scene import Scene
-from gapr_core.results import LookAnswer, LookFit, Refusal, RegistrationStatus
+from gapr_core.results import Effect, Finding, LookAnswer, LookFit, RegistrationStatus
 
 Array = NDArray[np.float64]
 Alone = Callable[[Scene], Assessment | None]  # registers one look in full
 
-# All chosen on scenes of train subjects, looks at rest and moved (docs/log.md, "Looks from several places").
+CHECK = "looks apart"
+# All chosen on scenes of train subjects, looks at rest and moved.
 GAINED, AWAY_MM = 0.25, 2.0  # share of what a look could show that lies on it only in its own pose, and how far that is
 SEEN_THROUGH = 0.15  # share in front of what it measured
 LEAST_NEAR, LEAST_ON = 0.5, 0.3  # of the share of the best look: what lies near what a look shows, and on it
@@ -90,15 +91,12 @@ def unless_apart(
         fits[name] = fit
     answers = tuple(map(LookAnswer, scene.given, fits))
     do_not_fit = LookFit.APART in found or 2 * found.count(LookFit.BLIND) >= len(found)
-    refusal = _refusal(answers) if do_not_fit else None
-    return replace(assessment, looks=answers).with_refusal(refusal, config.rules)
+    return replace(assessment, looks=answers).with_finding(_apart(answers) if do_not_fit else None)
 
 
 def is_refused(assessment: Assessment) -> bool:
     """True where a scene was refused for its looks."""
-    refusal = assessment.refusal
-    not_fitting = any(look.fit in (LookFit.APART, LookFit.BLIND) for look in assessment.looks)
-    return not_fitting and refusal is not None and refusal.status is RegistrationStatus.AMBIGUOUS
+    return any(finding.check == CHECK for finding in assessment.findings)
 
 
 def _fits(
@@ -151,12 +149,13 @@ def is_apart(look: LookShares, near: float, on: float) -> bool:
     return look.fits_elsewhere or look.share(look.seen_through) > SEEN_THROUGH or disagrees
 
 
-def _refusal(answers: tuple[LookAnswer, ...]) -> Refusal:
+def _apart(answers: tuple[LookAnswer, ...]) -> Finding:
     places = [look.viewpoint for look in answers if look.fit in (LookFit.APART, LookFit.BLIND)]
-    said = " and ".join(f"({x:.0f}, {y:.0f}, {z:.0f})" for x, y, z in places)
-    why = f"what was seen from {said} mm shows the bone elsewhere than the looks have it in common, or not at all"
-    how = "the bone moved, or its reference, or something was in the way"
-    return Refusal(RegistrationStatus.AMBIGUOUS, f"{why}: {how}")
+    names = " and ".join(f"({x:.0f}, {y:.0f}, {z:.0f})" for x, y, z in places)
+    text = f"the looks from {names} mm show the bone elsewhere than the others, or not at all"
+    advice = "check that neither the bone nor its reference moved, and that nothing was in the way"
+    share = len(places) / len(answers)
+    return Finding(CHECK, Effect.REFUSE, share, 0.5, RegistrationStatus.AMBIGUOUS, text, advice)
 
 
 def _shares_of_look(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.confidence.classifier import Classifier
 from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
@@ -33,7 +33,7 @@ def register(
     seen: Scene,
     target: PreparedTarget,
     poses: Array,
-    calibration: Calibration,
+    classifier: Classifier,
     config: RegistrarConfig,
     clock: Clock,
     rounds: int | None = None,
@@ -44,7 +44,7 @@ def register(
         seen: from one place or several, without regions.
         target: the bone.
         poses: (K, 4, 4) T_target_source, mm, to try as well.
-        calibration: the confidence model of scenes.
+        classifier: of the two numbers.
         config: every setting.
         clock: of the call.
         rounds: of regions at most, of what may be no scene; `ClutterConfig.rounds`, hopeless or not, when not given.
@@ -60,9 +60,9 @@ def register(
         candidates = clutter.verify(pool, scene, target, settings, threads, start)
         poses = candidates.poses
         clock.lap("verify")
-        found = _assessed(candidates, scene, target, calibration, config, clock)
+        found = _assessed(candidates, scene, target, classifier, config, clock)
         assessment = replace(found, proposer=clutter.NAME, rounds=number)
-        hopeless = hopeless + 1 if assessment.probability < settings.hopeless else 0
+        hopeless = hopeless + 1 if assessment.confidence < settings.hopeless else 0
         if assessment.reaches(config.sure_from) or (rounds is not None and hopeless == MOST_HOPELESS):
             break
     return assessment
@@ -73,7 +73,7 @@ def of_remembered(
     target: PreparedTarget,
     poses: Array,
     most_support: float,
-    calibration: Calibration,
+    classifier: Classifier,
     config: RegistrarConfig,
     clock: Clock,
 ) -> Assessment | None:
@@ -85,27 +85,27 @@ def of_remembered(
         poses: (K, 4, 4) T_target_source, mm.
         most_support: share of the hypotheses that came to the pose when regions were asked last. Of a few remembered
             ones, its own is a large share.
-        seen, target, calibration, config, clock: as `register`.
+        seen, target, classifier, config, clock: as `register`.
     """
     pool = clutter.given(poses)
     found = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
     candidates = replace(found, support=np.minimum(found.support, most_support))
     clock.lap("verify")
-    return None if len(candidates.poses) < 2 else _assessed(candidates, seen, target, calibration, config, clock)
+    return None if len(candidates.poses) < 2 else _assessed(candidates, seen, target, classifier, config, clock)
 
 
 def _assessed(
     candidates: Candidates,
     scene: Scene,
     target: PreparedTarget,
-    calibration: Calibration,
+    classifier: Classifier,
     config: RegistrarConfig,
     clock: Clock,
 ) -> Assessment:
     """The first of the candidates, refined on what it explains, and how sure it is."""
     part = explained.refine(candidates.poses[0], scene, target, config)
     clock.lap("refine")
-    assessment = explained.assess_part(part, candidates, scene, target, calibration, config)
+    assessment = explained.assess_part(part, candidates, scene, target, classifier, config)
     clock.lap("assess")
     return assessment
 
@@ -113,9 +113,9 @@ def _assessed(
 def of_unknown(source: ArrayLike, config: RegistrarConfig) -> PreparedSource | None:
     """A source of which nobody said where it was seen from, as what a camera may have seen.
 
-    None where it cannot be that, or where no pose of it would be sure enough.
+    None where it cannot be that.
     """
-    if config.accepted_if_inferred > config.limits.most or not clutter.sees_from_afar(config):
+    if not (config.clutter.infer_viewpoint and clutter.sees_from_afar(config)):
         return None
     try:
         scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)

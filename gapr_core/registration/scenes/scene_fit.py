@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration.checks import rigidity
-from gapr_core.registration.checks import second_copy as doubles
-from gapr_core.registration.checks.assessment import Assessment, judge
-from gapr_core.registration.confidence.classifier import Calibration
-from gapr_core.registration.confidence.features import SCENE_FEATURES, of_the_fit
+from gapr_core.registration.checks.assess import checked_geometry
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.deformation import with_looks
+from gapr_core.registration.confidence.classifier import Classifier
+from gapr_core.registration.confidence.features import FEATURES_OF, SCENE, of_the_fit
 from gapr_core.registration.fit import kernels
 from gapr_core.registration.fit.refinement import Fit, refine_fully
 from gapr_core.registration.fit.verification import Candidates
@@ -23,16 +23,16 @@ from gapr_core.registration.scenes.free_space import Visible
 from gapr_core.registration.scenes.scene import Scene
 from gapr_core.registration.uncertainty import covariance
 from gapr_core.registration.uncertainty.covariance import PoseUncertainty
-from gapr_core.results import Refusal, RegistrationStatus
+from gapr_core.results import Effect, Finding, RegistrationStatus
 
 Array = NDArray[np.float64]
 
+ROUNDS, FEWEST_POINTS = 2, 30  # of choosing the part and refining on it; a smaller part is the whole cloud
+AGREEING_COS = 0.7  # of normals, up to which a point may lie on the bone
+CROWD, MOST_ALONE = 12, 0.5  # neighbours that must lie on it, too, and their share
+MOSTLY_CLUTTER, MOSTLY_OFF = 0.5, 0.4  # least share that counts for the pose; the same without a viewpoint
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
-VIEWPOINT = (
-    ". It also looks so where bone was cut away since the scan, and where the viewpoint, given or read off the pixels, "
-    "is not the camera's place in the frame of the cloud (none: no camera saw it)"
-)
-SAY_WHERE = ", or say where the camera was"
+SAY_WHERE = ", or say where the camera was (viewpoint)"
 RIVAL_IF_ALONE = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
 
 
@@ -53,14 +53,14 @@ class Explained:
     @property
     def share(self) -> float:
         """Share of the scene's points that count for the pose, 0 to 1."""
-        return float((self.fit.weights > 0.0).sum() / len(self.members))
+        return float(self.fit.counts.sum() / len(self.members))
 
 
 def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> Explained:
     """Refine a pose (4, 4) on what it explains; on the whole cloud where that is next to nothing."""
-    for _ in range(config.part.rounds):
+    for _ in range(ROUNDS):
         members = _on_surface(T, scene.source, target, config)
-        if members.sum() < config.part.fewest_points:
+        if members.sum() < FEWEST_POINTS:
             members[:] = True
         part = scene.part(members, config)
         fit = refine_fully(T, part.points, target, config.refinement, part.neighbours)
@@ -73,8 +73,8 @@ def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, config
     signed, gradients, aside, _ = kernels.residuals_at(T, source.points, *target.kernel_view, 0.0)
     near = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < config.clutter.part_mm
     same = np.einsum("ni,ni->n", source.normals @ T[:3, :3].T, gradients)
-    near &= (same if source.oriented else np.abs(same)) > config.part.agreeing_cos
-    return near & (near[source.neighbours[:, : config.part.crowd]].mean(axis=1) > config.part.most_alone)
+    near &= (same if source.oriented else np.abs(same)) > AGREEING_COS
+    return near & (near[source.neighbours[:, :CROWD]].mean(axis=1) > MOST_ALONE)
 
 
 def assess_part(
@@ -82,53 +82,52 @@ def assess_part(
     candidates: Candidates,
     scene: Scene,
     target: PreparedTarget,
-    calibration: Calibration,
+    classifier: Classifier,
     config: RegistrarConfig,
 ) -> Assessment:
-    """As `assess_fit`, for a pose that explains a part of a scene."""
+    """Assess a pose that explains a part of a scene, as `assess_fit` does a source of bone alone."""
     fit, part = explained.fit, explained.source
     eye = covariance.eye_of(fit.T, scene.viewpoint, config.sensor)
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around, eye=eye)
     look = scene.look[explained.members] if len(scene.images) > 1 else None
-    uncertainty = rigidity.allowing_for_looks(uncertainty, fit, look, config)
+    uncertainty = with_looks(uncertainty, fit, look)
     features = measure(explained, candidates, uncertainty, scene, target, config)
-    judged = judge(fit, candidates, uncertainty, features, part, target, calibration, config)
-    return replace(judged, seen=scene.source, members=explained.members, viewpoint=scene.viewpoint, look=look)
+    assessment = Assessment(
+        fit,
+        candidates,
+        uncertainty,
+        features,
+        classifier.judge(SCENE, features),
+        config.other_bone_prior,
+        part,
+        target,
+        seen=scene.source,
+        members=explained.members,
+        viewpoint=scene.viewpoint,
+        look=look,
+    )
+    return checked_geometry(assessment, config)
 
 
-def named_clutter(assessment: Assessment, config: RegistrarConfig) -> Assessment:
-    """The same; a refusal says so where most of the cloud is not this bone.
+def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding | None:
+    """Find that most of a cloud is not this bone: the name of its refusal, should it be refused.
 
-    With a viewpoint, by what the pose explains; of another dense cloud, by what lies on the bone. This is no safety
-    rule: it names why a confidence is low, and so comes after the frames of a stream have been weighed. What lies on
-    the bone in another pose is no clutter; where looks show it in several places, that is said.
+    With a viewpoint, by the share that the pose explains; of another dense cloud, by the share that lies on the bone.
     """
-    source, least, in_scene = assessment.source, config.min_confidence, assessment.seen is not None
-    believed = assessment.probability >= least if in_scene else assessment.reaches(least)
-    if (
-        believed
-        or doubles.is_in_two_poses(assessment)
-        or look_agreement.is_refused(assessment)
-        or not (in_scene or len(source.points) >= config.source.dense_points)
-    ):
-        return assessment
+    source, in_scene = assessment.source, assessment.seen is not None
+    if look_agreement.is_refused(assessment) or not (in_scene or len(source.points) >= config.source.dense_points):
+        return None
     if in_scene:
-        share, limit = assessment.features["inlier_ratio"], config.part.mostly_clutter
-        more = VIEWPOINT if assessment.inferred_viewpoint is None else SAY_WHERE
+        share, limit = assessment.features["inlier_ratio"], MOSTLY_CLUTTER
+        more = "" if assessment.inferred_viewpoint is None else SAY_WHERE
     else:
         share = float(_on_surface(assessment.fit.T, source, assessment.target, config).mean())
-        limit, more = config.part.mostly_off, SAY_WHERE
-    return assessment if share >= limit else replace(assessment, refusal=_clutter(share, assessment.refusal, more))
-
-
-def _clutter(share: float, other: Refusal | None, more: str) -> Refusal:
-    why = "no pose of it is certain" if other is None else other.reason
-    return Refusal(
-        RegistrationStatus.CLUTTER,
-        f"in the best pose {100.0 * share:.0f} % of the cloud is this bone, and {why}: is it the right bone? "
-        f"If so, crop the cloud with a box around the wound or around the last pose (crop_to_track of the node), or "
-        f"expose more of the bone{more}",
-    )
+        limit, more = MOSTLY_OFF, SAY_WHERE
+    if share >= limit:
+        return None
+    text = f"in the best pose only {100.0 * share:.0f} % of the cloud is this bone"
+    advice = f"check that it is the right bone, then crop the cloud with a box, or expose more of the bone{more}"
+    return Finding("clutter", Effect.REFUSE, share, limit, RegistrationStatus.CLUTTER, text, advice)
 
 
 def measure(
@@ -139,13 +138,13 @@ def measure(
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """The features behind the confidence in a scene (`features.SCENE_FEATURES`); every one is finite."""
+    """The features behind the confidence in a scene (`features.FEATURES_OF`); every one is finite."""
     seen = clutter.seen_of(explained.fit.T[None], scene, target, config.clutter)
     visible = _visible_features(seen, candidates, target)
     flatness_mm = scene.source.flatness_mm[explained.members]  # of the part alone it is that of what lies on the bone
     shared = of_the_fit(explained.fit, candidates, uncertainty, explained.source, flatness_mm, target, config)
     values = visible | shared | {"inlier_ratio": explained.share}
-    return {name: values[name] for name in SCENE_FEATURES}
+    return {name: values[name] for name in FEATURES_OF[SCENE]}
 
 
 def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:

@@ -12,17 +12,17 @@ from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
 from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
-from gapr_core.registration.checks import limits, rules
-from gapr_core.registration.checks.rigidity import covariance_of_half
+from gapr_core.registration.checks.conclude import by_threshold
+from gapr_core.registration.checks.deformation import covariance_of_half
 from gapr_core.registration.fit.refinement import distances_mm, refine_fully
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
-from gapr_core.registration.streams import motion_test as creep
+from gapr_core.registration.streams import motion_test
 from gapr_core.registration.streams.duplicate_clouds import fingerprint
 from gapr_core.registration.streams.outlier_clouds import FarInARow
 from gapr_core.registration.streams.tracker import Tracker
-from gapr_core.registration.uncertainty import target_error as precision
+from gapr_core.registration.uncertainty import target_error
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime.parallel import single_threaded_libraries
 from gapr_core.surface import Surface
@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 
 POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
 FEWEST_IN_TIME = 6  # sources that show a motion, as it is refused
-FEWEST_THAT_MAY, MAY_MOVE = 3, 1.0 / 6.0  # sources in which, and share of `rigidity.creeps` from which on it may be one
+FEWEST_THAT_MAY = 3  # sources in which a motion widens the bound
+MAY_MOVE, MOVES = 1.0, 6.0  # log likelihood ratios from which a bone may move, and moves
 
 
 class Accumulator:
@@ -42,7 +43,7 @@ class Accumulator:
     an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
     what lies off the bone, or lay off it under the accepted pose before, is left out, and refused if it is the newest.
     After three of them in a row the bone or its reference has moved, and only these three are kept. Where all show that
-    the bone moves (see `creep`), the answer is refused, and those since a step or the last third are kept.
+    the bone moves (see `motion_test`), the answer is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
@@ -174,27 +175,25 @@ class Accumulator:
         return self._unless_it_moves(result, T, target)
 
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
-        """The answer; a refusal where the sources show that the bone moves, not sure where they hardly exclude it.
+        """The answer; a refusal where the sources show that the bone moves, a wider bound where they hardly exclude it.
 
         What it may have moved by is in the covariance then. Those since a step are left; of a steady motion the last
         third.
         """
-        kept, rigidity = self._kept, self.config.rigidity
+        kept = self._kept
         if len(kept) < FEWEST_THAT_MAY:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
         fit = refine_fully(T, points, seen, self.config.refinement)
-        found = creep.of_motion(fit, order[some], rigidity)
-        ratio = found.finding.log_ratio
-        if ratio <= MAY_MOVE * rigidity.creeps:
+        found = motion_test.of_motion(fit, order[some])
+        ratio = found.shown.log_ratio
+        if ratio <= MAY_MOVE:
             return result
-        if ratio <= rigidity.creeps or len(kept) < FEWEST_IN_TIME:
-            widened = self._widened(
-                result, covariance_of_half(fit, found.finding.size_mm), fit.moved.mean(axis=0), target
-            )
-            return limits.no_surer(widened, limits.MOVING, self.config)
+        if ratio <= MOVES or len(kept) < FEWEST_IN_TIME:
+            added = covariance_of_half(fit, found.shown.size_mm)
+            return self._widened(result, added, fit.moved.mean(axis=0), target)
         self.reset()
         self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
@@ -215,10 +214,10 @@ class Accumulator:
             return result
         covariance = result.covariance + covariance_about(result.centre_mm - about_mm, added)
         tre_mm = predicted_rmse_mm(covariance, target.points, result.centre_mm)
-        tre95_mm = result.factor95 * precision.bound_mm(covariance, target.points, result.centre_mm)
-        refusal = rules.by_threshold(result.confidence, tre95_mm, self.config)
+        tre95_mm = result.factor95 * target_error.bound_mm(covariance, target.points, result.centre_mm)
+        refusal = by_threshold(result.confidence, result.confidence, tre95_mm, self.config)
         if refusal is not None:
-            return result.refused(refusal.status, refusal.reason)
+            return result.refused(refusal.status, refusal.text)
         return replace(result, covariance=covariance, tre_mm=tre_mm, tre95_mm=tre95_mm)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
@@ -281,7 +280,7 @@ class Accumulator:
         T, covariance, centre_mm = last.T_target_source, last.covariance, last.centre_mm
         if T is None or covariance is None or centre_mm is None:  # as of methods that predict no error
             return False
-        least_mm = last.factor95 * precision.bound_mm(covariance, se3.apply(T, source), centre_mm)
+        least_mm = last.factor95 * target_error.bound_mm(covariance, se3.apply(T, source), centre_mm)
         return self._lies_off(source, _together(before), T, target, least_mm)
 
 
@@ -312,5 +311,5 @@ def _was_sent(source: Array, before: list[Array]) -> bool:
 
 
 def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
-    """Of a bone that is no longer where all sources together have it: that their pose is right is not believed."""
-    return replace(result.refused(RegistrationStatus.LOW_CONFIDENCE, reason), confidence=0.0)
+    """Refuse the pose of a bone that is no longer where all sources together have it."""
+    return result.refused(RegistrationStatus.LOW_CONFIDENCE, reason)

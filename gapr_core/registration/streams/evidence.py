@@ -1,64 +1,79 @@
-"""What the frames of a stream say together: is this bone the one of the target?
+"""One evidence of a stream, for both numbers: this pose, and this bone.
 
-A frame's probability p says that the bone is the right one and that the pose is right. Its doubt is split evenly:
-q = r = sqrt(p), q for the bone, r for the pose. The bone is the same in all frames, so their log odds of q add up. But
-frames see the same surface with the same errors: n equally correlated frames count as n / (1 + (n - 1) rho)
-(the variance of a mean of correlated variables). The answer for a frame is the stream's q times its own r. So frames
-that agree raise the confidence, never beyond sqrt(p), and a wrong bone that fits well in one frame only is refused
-there too. After a jump nothing that spoke for the bone counts any more, and what spoke against it still does.
+The log odds of frame k are a + b + e_k: a is true of all frames (right or wrong), b an effect of this pair of bones and
+of how it is measured, e_k an effect of the frame. With variances s_b^2 and s_e^2 alike for right and wrong, n frames of
+mean m have the log odds m / (rho + (1 - rho) / n), where rho = s_b^2 / (s_b^2 + s_e^2). So frames that agree raise the
+evidence, never beyond m / rho: counting makes nothing certain. `gapr_core.calibration` fits both rho on train streams.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
-from scipy.special import expit, logit
 
-from gapr_core.config import EvidenceConfig
+from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS, Judgement
 
-MOST_LOGIT = 8.0  # of one frame: no frame alone is more than certain
+MEMORY = 10.0  # frames after which a frame's weight has fallen to about 1/e
+AGREE_MM = 15.0  # largest motion between frames (rms) that continues a track
+
+
+class State(NamedTuple):
+    """Sums over the frames of a stream, older ones with less weight.
+
+    Attributes:
+        total: (2,) log odds of the pose, and evidence of the bone.
+        weight: sum of the weights.
+        frames: frames that agree, up to the last one.
+    """
+
+    total: np.ndarray
+    weight: float
+    frames: int
+
+
+EMPTY = State(np.zeros(2), 0.0, 0)
 
 
 class Evidence:
-    """Log odds of a stream.
+    """Witness of a stream on one target: observe each frame, reset with another target.
 
     Args:
-        config: correlation of the frames and how long they are remembered.
+        rho_pose, rho_bone: correlation of two frames, 0 independent, 1 the same again.
     """
 
-    def __init__(self, config: EvidenceConfig | None = None) -> None:
-        self.config = config or EvidenceConfig()
+    def __init__(self, rho_pose: float, rho_bone: float) -> None:
+        self._rho = np.array([rho_pose, rho_bone])
         self.reset()
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._sum, self._weight, self._agreeing = 0.0, 0.0, 0
-        self._before = self._sum, self._weight, self._agreeing
+        self._now = self._before = EMPTY
 
-    @property
-    def effective_frames(self) -> float:
-        """How many independent frames those that agree, up to the last one, count for."""
-        n = max(self._agreeing, 1)
-        return n / (1.0 + (n - 1) * self.config.correlation)
-
-    def add(self, probability: float, agrees: bool, again: bool = False) -> float:
-        """The probability of a frame in the light of those before it.
+    def observe(self, frame: Judgement, agrees: bool, again: bool = False) -> Judgement:
+        """Judge a frame in the light of those before it.
 
         Args:
-            probability: 0 to 1, of this frame alone; one that is no number comes back and is not counted.
-            agrees: its pose continues the last one; after a jump the answer is at most `probability`.
-            again: it is the last frame once more, which is counted once: as it is now.
+            frame: the numbers of this frame alone; NaN comes back and is not counted.
+            agrees: its pose continues the last one. After a jump the frames before it say nothing for it: evidence for
+                pose or bone is forgotten, evidence against them is not.
+            again: it is the last frame once more, which is counted once, as it is now.
         """
-        if not np.isfinite(probability):
-            return probability
-        if again:
-            self._sum, self._weight, self._agreeing = self._before
-        self._before = self._sum, self._weight, self._agreeing
-        if not agrees and self._sum > 0.0:
-            self._sum = self._weight = 0.0
-        part = float(np.sqrt(probability))
-        forget = 1.0 - 1.0 / self.config.memory
-        self._sum = forget * self._sum + float(np.clip(logit(part), -MOST_LOGIT, MOST_LOGIT))
-        self._weight = forget * self._weight + 1.0
-        self._agreeing = self._agreeing + 1 if agrees else 1
-        combined = float(expit(self.effective_frames * self._sum / self._weight)) * part
-        return combined if agrees else min(combined, probability)
+        own = np.array([frame.pose_log_odds, frame.bone_evidence])
+        if not np.isfinite(own).all():
+            return frame
+        before = self._before if again else self._now
+        self._before = before
+        if not agrees:
+            before = State(np.minimum(before.total, 0.0), before.weight, 0)
+        kept = 1.0 - 1.0 / MEMORY
+        frames = before.frames + 1
+        self._now = State(kept * before.total + own, kept * before.weight + 1.0, frames)
+        mean = self._now.total / self._now.weight
+        combined = mean / (self._rho + (1.0 - self._rho) / frames)
+        if not agrees:
+            combined = np.minimum(combined, own)
+        limits = np.array([LARGEST_LOG_ODDS, LARGEST_EVIDENCE])
+        pose, bone = np.clip(combined, -limits, limits)
+        return replace(frame, pose_log_odds=float(pose), bone_evidence=float(bone))

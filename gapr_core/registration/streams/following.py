@@ -20,10 +20,15 @@ from gapr_core.geometry import sampling, se3
 from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.fit.refinement import Fit, distances_mm, refine_fully, refine_many, tukey_limit
+from gapr_core.registration.streams.evidence import AGREE_MM
 from gapr_core.registration.uncertainty.linear_model import POSE_PRIOR
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
+
+POINTS, MOST_SOURCES = 1000, 5  # points that are refined; sources in a row that are followed
+LARGEST_TRE95_MM, LARGEST_TURN_DEG = 4.0, 2.5  # of the error's bound, and of the least certain turn
+LARGEST_RESIDUAL, LEAST_INLIERS = 1.1, 0.95  # over those of the assessed source
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,7 @@ class Follower:
             InvalidPointCloudError: wrong shape or type.
         """
         points = finite_points(source)
-        if self._since >= self._config.following.most_sources or len(points) < self._config.source.fewest_points:
+        if self._since >= MOST_SOURCES or len(points) < self._config.source.fewest_points:
             return None
         fit = self._fit_part(points, self._T)
         if why := self.why_not(fit):
@@ -97,17 +102,17 @@ class Follower:
 
     def why_not(self, fit: PartialFit) -> str:
         """Why the source has to be assessed; empty where its pose may be followed."""
-        limits, then, a = self._config.following, self._assessed, self._assessment
+        then, a = self._assessed, self._assessment
         looser = fit.spread_mm / then.spread_mm
-        largest_mm = min(limits.largest_tre95_mm, self._config.max_tre_mm or np.inf)
+        largest_mm = min(LARGEST_TRE95_MM, self._config.max_tre_mm or np.inf)
         then_mm = max(then.residual_mm, self._config.refinement.smallest_sigma_mm)
         rules = {
             "the assessed pose is left": then.inlier_ratio > 0.0 and then.moved_mm <= self._tre95_mm,
-            "the bone moved too far": fit.moved_mm <= self._config.evidence.agree_mm,
-            "less of the source lies on the bone": fit.inlier_ratio >= limits.least_inliers * then.inlier_ratio,
-            "the residuals are larger": fit.residual_mm <= limits.largest_residual * then_mm,
+            "the bone moved too far": fit.moved_mm <= AGREE_MM,
+            "less of the source lies on the bone": fit.inlier_ratio >= LEAST_INLIERS * then.inlier_ratio,
+            "the residuals are larger": fit.residual_mm <= LARGEST_RESIDUAL * then_mm,
             "the error over the bone is not bounded": looser * self._tre95_mm <= largest_mm,
-            "a turn is not observed": looser * a.uncertainty.largest_turn_deg <= limits.largest_turn_deg,
+            "a turn is not observed": looser * a.uncertainty.largest_turn_deg <= LARGEST_TURN_DEG,
         }
         return next((why for why, holds in rules.items() if not holds), "")
 
@@ -131,7 +136,7 @@ class Follower:
 
     def _thinned(self, source: Array) -> Array:
         some = source[:: 1 + len(source) // self._config.source.most_compared]
-        return some[sampling.thin(some, self._config.following.points)]
+        return some[sampling.thin(some, POINTS)]
 
     def _described(self, fit: Fit, moved_mm: float, points: Array) -> PartialFit:
         """What the limits are set for, by the weights that the assessed source had."""

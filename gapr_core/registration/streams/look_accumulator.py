@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.registration.checks import limits
 from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
@@ -89,10 +88,9 @@ class LookAccumulator:
 
     Older looks that show the bone elsewhere than the newest and most others are left out, and the others are asked
     again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
-    pose, and so is a pose that is not sure and another one than the last. Where the newest alone has none, or there is
-    none from elsewhere, the answer is not sure (`limits`). After three in a row that show the bone elsewhere it or its
-    reference has moved, and only these three are kept, whatever their directions; so after three poses in a row that
-    are another. After ten refusals from one direction only the last look is kept.
+    pose, and so is a pose that is not sure and another one than the last. After three in a row that show the bone
+    elsewhere it or its reference has moved, and only these three are kept, whatever their directions; so after three
+    poses in a row that are another. After ten refusals from one direction only the last look is kept.
 
     What all looks share shows in none of them, such as the error of a hand-eye calibration: state it as `tracking_mm`
     of the sensor (`SensorConfig`).
@@ -198,10 +196,7 @@ class LookAccumulator:
         clock.lap("compare")
         found = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
         if said in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
-            ruled_out = min(found.confidence, self.config.rules.ruled_out)
-            found = replace(found.refused(REFUSED_FOR[said], said.value), confidence=ruled_out)
-        if said is Newest.IS_UNCONFIRMED:
-            found = limits.no_surer(found, limits.UNCONFIRMED, self.config)
+            found = found.refused(REFUSED_FOR[said], said.value)
         return replace(found, reason=found.reason + self._update_looks(said, found, newest, before, asked))
 
     def _of_those_that_fit(
@@ -231,7 +226,7 @@ class LookAccumulator:
         if not result.ok:
             return Newest.IS_REFUSED
         said = self._of_newest_alone(asked, result, target)
-        is_sure = said is Newest.AGREES and result.confidence > self.config.limits.most
+        is_sure = said is Newest.AGREES and result.confidence >= self.config.sure_from
         if said in STANDING and not is_sure and self._is_another(result):
             return Newest.CONTRADICTS
         return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said

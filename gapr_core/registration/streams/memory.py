@@ -1,4 +1,4 @@
-"""What a stream remembers: the last pose and its rivals, which are asked for the next source before all else."""
+"""The last pose of a stream and its rivals, asked for the next source before all else."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.geometry import se3
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.confidence.classifier import Calibration
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
@@ -25,8 +24,8 @@ from gapr_core.runtime.clock import Clock
 Array = NDArray[np.float64]
 
 
-class Memory:
-    """A proposer of what is remembered: the last pose, and the rivals that the last full registration gave it.
+class PreviousPoses:
+    """Proposes the last pose, and the rivals that the last full registration gave it.
 
     The rivals matter as much as the pose. Without them nothing would compete with it, and a pose that is merely the
     only one looked at would count as sure.
@@ -73,25 +72,17 @@ class Memory:
         self.keep([moved[nearest], *np.delete(moved, nearest, axis=0)])
 
 
-class MemoryFirst(Registrar):
-    """Asks a memory first, then the proposers of another registrar.
+class TrackingRegistrar(Registrar):
+    """Asks the previous poses first, then the proposers of another registrar.
 
     Args:
         memory: what is remembered of the last source.
-        calibration: the confidence model of its answers.
         full: registers what the memory knows nothing of: the mirror image of a source.
     """
 
-    def __init__(self, memory: Memory, calibration: Calibration, full: Registrar) -> None:
-        proposers, calibrations = (memory, *full.proposers), (calibration, *full.calibrations)
-        super().__init__(full.config, proposers, calibrations, full._scene_calibration, full.precision)
+    def __init__(self, memory: PreviousPoses, full: Registrar) -> None:
+        super().__init__(full.config, (memory, *full.proposers), full.classifier, full.precision)
         self._full, self._memory = full, memory
-
-    def _needs_no_other_proposer(self, assessment: Assessment) -> bool:
-        """A remembered pose has to be sure: what misled the answer before may mislead this one."""
-        if assessment.proposer == Memory.name:
-            return assessment.reaches(self.config.sure_from)
-        return super()._needs_no_other_proposer(assessment)
 
     def assess_from(
         self,
@@ -121,9 +112,9 @@ class MemoryFirst(Registrar):
             return None
         place, _ = places[0]
         found = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
-        if found is None or not found.reaches(self.config.accepted_if_inferred):
+        if found is None or not found.reaches(self.config.min_confidence):
             return None
-        found = self._checked_and_corrected(replace(found, inferred_viewpoint=place), clock, enough)
+        found = self._checked(replace(found, inferred_viewpoint=place), clock, enough)
         return found if found.refusal is None else None
 
     def _places_of(self, source: PreparedSource) -> list[tuple[Array, int]]:
@@ -137,8 +128,8 @@ class MemoryFirst(Registrar):
         """The surest, in a stream of such views: as bone it is nonsense, which would speak against the bone."""
         if self._memory.place is None or not unsure:
             return None
-        surest = max(unsure, key=lambda view: view.probability)
-        return self._checked_and_corrected(surest, clock, never)
+        surest = max(unsure, key=lambda view: view.confidence)
+        return self._checked(surest, clock, never)
 
     def _all_of_scene(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
@@ -154,11 +145,11 @@ class MemoryFirst(Registrar):
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """The best of what is remembered; None where it is not sure, and regions have to be asked."""
-        poses, how = np.concatenate([start, self._memory.now]), (self.scene_calibration, self.config, clock)
+        poses, how = np.concatenate([start, self._memory.now]), (self.classifier, self.config, clock)
         found = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
         if found is None:
             return None
-        found = replace(found, proposer=Memory.name, rounds=1)
+        found = replace(found, proposer=PreviousPoses.name, rounds=1)
         return found if self._needs_no_other_proposer(found) or enough(found) else None
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:

@@ -38,6 +38,20 @@ from gapr_core.registration.uncertainty.linear_model import (
 
 Array = NDArray[np.float64]
 
+CORRELATION_MM, CENTRES = 20.0, 60  # l of the bias's correlation exp(-d^2 / 2 l^2), and points that span the bias
+SIZES_MM = np.array(
+    [0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0]
+)  # standard deviations of the bias to choose from
+SMALLEST_SHARE = 0.03  # least information of a usable field, over the largest
+BIAS_GAIN = 2.1  # bias over the part that the residuals of a robust fit show
+NO_BIAS_MM = 0.035  # bias that residuals without any show on average
+BIAS_SPREAD = 1.0  # log standard deviation of the bias before the residuals
+LONG_SHARE, LINEAR_SHARE = 0.5, 0.6  # of the bias that all points share, and that strains the source, over its size
+LOCAL_CORRELATION_MM, LOCAL_CENTRES = 8.0, 160  # of an error that near points share, such as that of a slice
+ONE_SIDED = 0.3  # length of the mean normal from which on a view has a beam
+NOISE_POINTS = 4.0  # points that the usual noise of the sensor is worth
+NEIGHBOURS = 30, 12  # points of an average that shows the smooth misfit, and at short range
+
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
@@ -101,16 +115,15 @@ def estimate(
     rests = fit.rests_on
     count = int(np.count_nonzero(rests.weights))
     known = sensors.errors(sensor or SensorConfig(), count)
-    spanned = fields(rests, config.correlation_mm, config.centres)
-    equations = equations_of(rests, config.correlation_mm, config.centres)
-    bias_mm = config.bias_gain * expected_bias_mm(equations, known.bias_mm, config)
+    spanned = fields(rests, CORRELATION_MM, CENTRES)
+    equations = equations_of(rests, CORRELATION_MM, CENTRES)
+    bias_mm = BIAS_GAIN * expected_bias_mm(equations, known.bias_mm)
     sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
-    noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, config.noise_points)
+    noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, NOISE_POINTS)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
     covariance = _about_middle(fit, sandwich(rests, spanned, expected, config, eye))
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
-    counts = config.smooth_neighbours, config.short_neighbours
-    smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, counts, around)
+    smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, NEIGHBOURS, around)
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm)
 
 
@@ -122,10 +135,10 @@ def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | N
     return None if viewpoint is None or sensor.scale is None else se3.apply(T, viewpoint[None])[0]
 
 
-def covariance_added_by(fit: Fit, errors: Array, config: CovarianceConfig) -> Array:
+def covariance_added_by(fit: Fit, errors: Array) -> Array:
     """(6, 6) what independent `errors` (n, k) of the inliers of what the fit rests on add to its covariance, mm."""
     rests = fit.rests_on
-    spanned = fields(rests, config.correlation_mm, config.centres)
+    spanned = fields(rests, CORRELATION_MM, CENTRES)
     moved = gain_of(rests, spanned, rests.sigma_mm)[0] @ errors
     return _about_middle(fit, moved @ moved.T)
 
@@ -146,13 +159,12 @@ def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float
     return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
 
 
-def expected_bias_mm(equations: NormalEquations, typical_mm: float, config: CovarianceConfig) -> float:
+def expected_bias_mm(equations: NormalEquations, typical_mm: float) -> float:
     """Root mean square of the bias's size under the residuals, log-normal about the sensor's typical one before."""
-    sizes_mm = np.array(config.sizes_mm)
-    log_prior = -0.5 * (np.log(sizes_mm / max(typical_mm, sizes_mm[0])) / config.bias_spread) ** 2
-    log_prior += np.log(np.gradient(np.log(sizes_mm)))  # the sizes are not evenly spaced
-    log_posterior = log_prior + equations.log_likelihood(sizes_mm, config.smallest_share)
-    return float(np.sqrt(max(root_mean_square(sizes_mm, log_posterior) ** 2 - config.no_bias_mm**2, 0.0)))
+    log_prior = -0.5 * (np.log(SIZES_MM / max(typical_mm, SIZES_MM[0])) / BIAS_SPREAD) ** 2
+    log_prior += np.log(np.gradient(np.log(SIZES_MM)))  # the sizes are not evenly spaced
+    log_posterior = log_prior + equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
+    return float(np.sqrt(max(root_mean_square(SIZES_MM, log_posterior) ** 2 - NO_BIAS_MM**2, 0.0)))
 
 
 def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig, eye: Array | None = None) -> Array:
@@ -163,15 +175,15 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
     o the stand-off and q the scale (see `directions`), m the error of the bone's model (`model_mm`), T what the place
     of the whole cloud adds and P the prior.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     gain, prior = gain_of(fit, bias_fields, errors.noise_mm)
-    shift, growth = directions(fit, errors.along_beam, config.one_sided, eye)
+    shift, growth = directions(fit, errors.along_beam, ONE_SIDED, eye)
     moved = np.column_stack(
         [
             errors.bias_mm * gain @ bias_fields[inlier],
-            config.long_share * errors.bias_mm * gain.sum(axis=1),
-            config.linear_share * errors.bias_mm * gain @ strains(fit),
-            errors.local_mm * gain @ _local_fields(fit, errors, config)[inlier],
+            LONG_SHARE * errors.bias_mm * gain.sum(axis=1),
+            LINEAR_SHARE * errors.bias_mm * gain @ strains(fit),
+            errors.local_mm * gain @ _local_fields(fit, errors)[inlier],
             errors.standoff_mm * gain @ shift,
             config.model_mm * gain.sum(axis=1),
             errors.scale * gain @ growth,
@@ -189,7 +201,7 @@ def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None =
     taken for the mean normal; where that is shorter than `one_sided`, the bone was seen from several sides and no beam
     is common.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
     if not inlier.any():
         return np.zeros(0), np.zeros(0)
@@ -208,7 +220,7 @@ def strains(fit: Fit) -> Array:
     the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. Of p the foot is taken: on
     a flat piece, what p is off it by would go with the residual, and look like a strain across the piece.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     if not inlier.any():
         return np.zeros((0, 6))
     feet, normals = fit.feet[inlier], fit.gradients[inlier]
@@ -217,10 +229,10 @@ def strains(fit: Fit) -> Array:
     return np.asarray((products[:, i, j] + products[:, j, i]) / np.where(i == j, 2.0, np.sqrt(2.0)))
 
 
-def _local_fields(fit: Fit, errors: Errors, config: CovarianceConfig) -> Array:
+def _local_fields(fit: Fit, errors: Errors) -> Array:
     if errors.local_mm == 0.0:
         return np.zeros((len(fit.moved), 1))
-    return fields(fit, config.local_correlation_mm, config.local_centres)
+    return fields(fit, LOCAL_CORRELATION_MM, LOCAL_CENTRES)
 
 
 def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array]:
@@ -230,7 +242,7 @@ def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array
     which the pose is corrected, 0 for plain least squares. V^-1 by Woodbury's identity. P keeps what is not observed
     finite.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     J, precision = fit.jacobian[inlier], fit.weights[inlier, None] / noise_mm**2
     VJ = precision * J
     if fit.bias_mm > 0.0:
@@ -253,7 +265,7 @@ def smooth_misfits_mm(
         around: (N, k) indices of each point's nearest ones, itself first, inliers or not, where they are known; a point
             that finds too few inliers among them is looked up.
     """
-    inlier = fit.weights > 0.0
+    inlier = fit.counts
     points, signed = fit.moved[inlier], fit.signed_mm[inlier]
     known = np.empty((len(inlier), 0), dtype=np.int64) if around is None else around
 

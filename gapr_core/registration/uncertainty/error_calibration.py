@@ -27,16 +27,18 @@ SCALE_LIMITS = (0.9, 6.0)  # of a standard deviation: what was learned may enlar
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """What was learned about true errors.
+    """The correction of predicted errors that was learned from true ones.
 
     Attributes:
         model: of the logarithm of the scale that a predicted standard deviation needs.
-        factor95: a true error stays below so many predicted 95 % quantiles in 95 % of the accepted answers.
-        card: where it comes from.
+        confidences: (K,) ascending confidences at which a factor is known.
+        factors: (K,) there: 95 % of the true errors stay below so many predicted 95 % quantiles.
+        card: data and fit.
     """
 
     model: Additive
-    factor95: float
+    confidences: tuple[float, ...]
+    factors: tuple[float, ...]
     card: dict[str, object]
 
     @staticmethod
@@ -44,31 +46,37 @@ class Precision:
         """Read the model.
 
         Raises:
-            WeightsError: no such file, one of another format or of other features, or a damaged one.
+            WeightsError: no such file, another format, other features, or a damaged file.
         """
         path = Path(path)
         data = read(path, "precision")
         try:
-            precision = Precision(from_dict(data), float(data["factor95"]), dict(data["card"]))
+            at, factors = (tuple(map(float, data[name])) for name in ("confidences", "factors"))
+            precision = Precision(from_dict(data), at, factors, dict(data["card"]))
         except (ValueError, KeyError, TypeError) as error:
             raise WeightsError("a whole precision model", f"{path}: {error!r}", FIT_AGAIN) from error
         if precision.model.features != PRECISION_FEATURES:
             raise WeightsError(f"a model of {PRECISION_FEATURES}", f"{path}: {precision.model.features}", FIT_AGAIN)
-        if not 0.0 < precision.factor95 < np.inf:
-            raise WeightsError("a finite factor95 above 0", f"{path}: {precision.factor95}", FIT_AGAIN)
+        is_usable = len(at) == len(factors) > 0 and list(at) == sorted(at) and all(0.0 < f < np.inf for f in factors)
+        if not is_usable:
+            raise WeightsError("finite factors above 0 at ascending confidences", f"{path}: {at}, {factors}", FIT_AGAIN)
         return precision
 
     @staticmethod
     def unscaled() -> Precision:
-        """Predictions as the covariance gives them: only for the records that a model is fitted to."""
-        return Precision(Additive(0.0, ()), 1.0, {})
+        """Leave predictions as the covariance gives them: only for the records that a model is fitted to."""
+        return Precision(Additive(0.0, ()), (0.5,), (1.0,), {})
 
     def scale(self, features: Mapping[str, float], tre_mm: float) -> float:
-        """What a standard deviation of the covariance is to be multiplied by.
+        """Compute the scale of a standard deviation of the covariance.
 
         Args:
-            features: of the answer (`features.FEATURES` or `features.SCENE_FEATURES`).
+            features: of the answer (`features.FEATURES_OF`).
             tre_mm: the whole-bone error that the covariance predicts, mm.
         """
         log_scale = self.model.value({**features, "log_tre": float(np.log(max(tre_mm, 1e-6)))})
         return float(np.clip(np.exp(log_scale), *SCALE_LIMITS))
+
+    def factor95(self, confidence: float) -> float:
+        """Interpolate the factor of the bound at a confidence: surer answers have a tighter one."""
+        return float(np.interp(confidence, self.confidences, self.factors))

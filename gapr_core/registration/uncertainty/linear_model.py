@@ -37,7 +37,7 @@ def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
 
     Read-only: the same fit gets the same array.
     """
-    spanned = _spanned(fit.feet, fit.weights > 0.0, correlation_mm, centres)
+    spanned = _spanned(fit.feet, fit.counts, correlation_mm, centres)
     spanned.flags.writeable = False
     return spanned
 

@@ -14,33 +14,23 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.config import RegistrarConfig, SmoothBiasConfig
+from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist, nees
-from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.rigidity import allowing_for_looks
 from gapr_core.registration.fit.refinement import Fit, evaluate_trusted, evaluate_with_patches, trust_of_whole
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.uncertainty.covariance import estimate, eye_of
 from gapr_core.registration.uncertainty.linear_model import NormalEquations, equations_of, fields, root_mean_square
 
 Array = NDArray[np.float64]
 
-
-def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessment:
-    """The assessment with its pose, and what follows from it, moved to where a smooth bias does not pull it.
-
-    Without evidence of a bias the same object comes back.
-    """
-    a = assessment
-    fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config)
-    if fit is a.fit:
-        return a
-    misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # those that were assessed
-    eye = eye_of(fit.T, a.viewpoint, config.sensor)
-    uncertainty = estimate(fit, config.covariance, config.sensor, None, misfits_mm, eye)
-    return replace(a, fit=fit, uncertainty=allowing_for_looks(uncertainty, fit, a.look, config))
+CORRELATION_MM, CENTRES = 20.0, 60  # l of the correlation exp(-d^2 / 2 l^2), and points that span the bias
+SIZES_MM = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0])  # standard deviations
+EVIDENCE = 2.0  # log likelihood ratio from which a bias is believed
+SMALLEST_SHARE = 0.15  # information of a field over the largest, to have a say
+STEPS = 2  # of the pose
+FEWEST_POINTS = 200  # inliers without which no bias is looked for
+LARGEST_MOVE = 22.5  # largest squared Mahalanobis distance of a move (chi square: 99.9 %)
 
 
 def corrected_fit(
@@ -55,10 +45,10 @@ def corrected_fit(
         fit: from `refinement.refine_fully`, or from `rest_on_whole` after it.
         covariance: (6, 6) of `fit`, as `gapr_core.registration.uncertainty.covariance.estimate` gives it.
         source, target: what was refined, and on what.
-        config: of the bias, and of the refinement as `fit` was refined.
+        config: of the refinement, as `fit` was refined.
     """
-    bias, refinement, before = config.smooth_bias, config.refinement, fit.rests_on
-    if np.count_nonzero(before.weights) < bias.fewest_points:
+    refinement, before = config.refinement, fit.rests_on
+    if np.count_nonzero(before.counts) < FEWEST_POINTS:
         return fit
     trust = None if fit.whole is None else trust_of_whole(fit, source, refinement)
 
@@ -68,23 +58,22 @@ def corrected_fit(
     def at(T: Array) -> Fit:
         return of_points(T) if trust is None else evaluate_trusted(T, source.whole, target, refinement, trust)
 
-    spanned, corrected = fields(before, bias.correlation_mm, bias.centres), before
-    equations = equations_of(before, bias.correlation_mm, bias.centres)
-    for number in range(bias.iterations):
+    spanned, corrected = fields(before, CORRELATION_MM, CENTRES), before
+    equations = equations_of(before, CORRELATION_MM, CENTRES)
+    for number in range(STEPS):
         if number:
             equations = NormalEquations.of(corrected, spanned).with_design_effect(equations.design_effect)
-        size_mm = believed_size_mm(equations, bias)
+        size_mm = believed_size_mm(equations)
         if size_mm == 0.0:
             break
         T = se3.exp(equations.step(size_mm), corrected.moved.mean(axis=0)) @ corrected.T
         corrected = replace(at(T), bias_mm=size_mm)
-    if corrected is before or not nees(error_twist(corrected.T, fit.T, source.points), covariance) < bias.largest_move:
+    if corrected is before or not nees(error_twist(corrected.T, fit.T, source.points), covariance) < LARGEST_MOVE:
         return fit
     return corrected if trust is None else replace(of_points(corrected.T), bias_mm=corrected.bias_mm, whole=corrected)
 
 
-def believed_size_mm(equations: NormalEquations, config: SmoothBiasConfig) -> float:
-    """Standard deviation of the bias: its posterior root mean square over `config.sizes_mm`; 0 without evidence."""
-    sizes_mm = np.array(config.sizes_mm)
-    log_likelihood = equations.log_likelihood(sizes_mm, config.smallest_share)
-    return 0.0 if log_likelihood.max() < config.evidence else root_mean_square(sizes_mm, log_likelihood)
+def believed_size_mm(equations: NormalEquations) -> float:
+    """Standard deviation of the bias: its posterior root mean square over `SIZES_MM`; 0 without evidence."""
+    log_likelihood = equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
+    return 0.0 if log_likelihood.max() < EVIDENCE else root_mean_square(SIZES_MM, log_likelihood)

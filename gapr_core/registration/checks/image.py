@@ -1,0 +1,90 @@
+"""Does the mirror image of a source fit the bone better: the other side of the body, or a flipped scan?
+
+Near the pose the question is cheap. A nonsensical pose on the bone of the other side has a nonsensical image, so an
+answer that is not sure, or of few points, takes the mirror image registered in full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.table import MIRRORED_BETTER, trial_of
+from gapr_core.registration.fit import alternatives
+from gapr_core.registration.fit.alternatives import flipped
+from gapr_core.registration.fit.verification import mean_square_mm2
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.registration.problem.target import PreparedTarget
+from gapr_core.registration.scenes.scene import Look
+from gapr_core.results import Refusal
+from gapr_core.runtime.clock import Clock
+
+Register = Callable[[PreparedSource, PreparedTarget, Clock], Assessment | None]
+RegisterScene = Callable[[], Assessment | None]
+
+FEW_POINTS = 400  # chance lets the image of so few fit anywhere on the bone
+
+
+def log_ratio(
+    assessment: Assessment,
+    config: RegistrarConfig,
+    believed: bool,
+    register: Register,
+    scene: RegisterScene | None,
+    clock: Clock,
+) -> float:
+    """Measure the log ratio of the misfit of the mirror image over the own one; infinite where nothing compares.
+
+    Args:
+        assessment: the answer.
+        config: every setting.
+        believed: the answer is sure.
+        register: registers the mirror image in full.
+        scene: does so with all that a camera saw; None where no place of a camera was given.
+        clock: of the call.
+    """
+    trial, count = trial_of(assessment, config), len(assessment.source.points)
+    if alternatives.is_symmetric(trial):
+        return np.inf
+    found = alternatives.on_own_image(trial)
+    by_chance = not believed or (scene is None and count <= FEW_POINTS)
+    if not by_chance or found < -MIRRORED_BETTER:
+        return found
+    if scene is not None:
+        return _of_scene(assessment, scene())
+    mirrored = sources.prepare(flipped(assessment.source.whole), config.source, config.num_threads)
+    in_full = None if isinstance(mirrored, Refusal) else register(mirrored, assessment.target, clock)
+    return np.inf if in_full is None else _of_bone(assessment, in_full, config)
+
+
+def flipped_looks(seen: Sequence[Look]) -> list[Look]:
+    """Mirror the looks of a camera."""
+    return [Look(flipped(look.points), flipped(look.viewpoint)) for look in seen]
+
+
+def _of_bone(assessment: Assessment, image: Assessment, config: RegistrarConfig) -> float:
+    """Of mean squares and of robust variances the larger log ratio."""
+
+    def mean_square(a: Assessment) -> float:
+        if a.seen is None:
+            return float(a.candidates.scores[0])
+        return mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)
+
+    return max(
+        alternatives.log_ratio(mean_square(image), mean_square(assessment)),
+        alternatives.log_ratio(image.fit.sigma_mm**2, assessment.fit.sigma_mm**2),
+    )
+
+
+def _of_scene(assessment: Assessment, image: Assessment | None) -> float:
+    """Log ratio of the scores of lines of sight, 1 / score each; infinite where the image is no surer.
+
+    A poor image may give its mirror image a slightly better score. On the bone of the other side that is sure (.999).
+    """
+    if image is None or not image.confidence > assessment.confidence:
+        return np.inf
+    return float(np.log(image.candidates.scores[0] / assessment.candidates.scores[0]))

@@ -1,0 +1,123 @@
+"""Every check of a pose, as one table: each measures, compares with its threshold, and may find.
+
+A check refuses only what no probability can weigh: a motion that is not observed, a rival that is as good, a mirror
+image. What can be learned is a feature of the classifier. `docs/checks.md` has a row for each check, with its gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gapr_core.config import RegistrarConfig
+from gapr_core.geometry import se3
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.checks.deformation import deformation
+from gapr_core.registration.fit import alternatives
+from gapr_core.registration.fit.alternatives import Trial
+from gapr_core.registration.problem.source import PreparedSource
+from gapr_core.results import Effect, Finding, RegistrationStatus
+
+Check = Callable[[Assessment, RegistrarConfig], Assessment]
+Register = Callable[[PreparedSource], Assessment | None]
+
+LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations of a motion that is not observed
+EQUAL_SHARE, EQUAL_MM = 0.015, 0.25  # a rival whose mean square is larger by less is as good; the same as a length
+MIRRORED_BETTER = 0.01  # log of mean squares by which the mirror image may fit better
+MORE_BONE = "measure another side or an end of the bone"
+
+
+def trial_of(assessment: Assessment, config: RegistrarConfig) -> Trial:
+    """Try changes of an assessed pose."""
+    return Trial.of(assessment.fit.T, assessment.source, assessment.target, config)
+
+
+def unobserved_motion(a: Assessment, config: RegistrarConfig) -> Assessment:
+    """Refuse a pose with a motion that the points do not determine: a spin about a shaft, a slide along it."""
+    turn_deg, shift_mm = a.uncertainty.largest_turn_deg, a.uncertainty.largest_shift_mm
+    text = f"{turn_text(a)}; {shift_text(a)}"
+    if turn_deg > LARGEST_TURN_DEG:
+        return a.with_finding(_refuse("unobserved turn", turn_deg, LARGEST_TURN_DEG, DEGENERATE, text))
+    if shift_mm > LARGEST_SHIFT_MM:
+        return a.with_finding(_refuse("unobserved shift", shift_mm, LARGEST_SHIFT_MM, DEGENERATE, text))
+    return a
+
+
+def equal_rival(a: Assessment, config: RegistrarConfig) -> Assessment:
+    """Refuse a pose where a distinct one explains the source as well."""
+    scores = a.candidates.scores
+    if len(scores) < 2 or not scores[1] < as_good_as(scores[0]):
+        return a
+    shift_mm, turn_deg = se3.pose_error(a.candidates.poses[1], a.candidates.poses[0], a.source.points)
+    text = f"another pose, {shift_mm:.0f} mm and {turn_deg:.0f} deg away, explains the source as well"
+    return a.with_finding(_refuse("equal rival", scores[1] / scores[0], 1.0 + EQUAL_SHARE, AMBIGUOUS, text))
+
+
+def flat_valley(a: Assessment, config: RegistrarConfig) -> Assessment:
+    """Refuse a pose that, pushed along its weakest motions, rests elsewhere and explains the source as well."""
+    trial = trial_of(a, config)
+    pushed_mm2, limit_mm2 = alternatives.pushed(trial, a.fit), as_good_as(trial.own_mm2)
+    if not pushed_mm2 < limit_mm2:
+        return a
+    text = "a pose a few mm away fits as well: the observed surface is flat or straight"
+    return a.with_finding(_refuse("flat valley", pushed_mm2, limit_mm2, DEGENERATE, text))
+
+
+def as_good_as(mean_square_mm2: float) -> float:
+    """Mean square, mm^2, below which another pose explains the source as well as one of this mean square.
+
+    Above 2 mm of noise a small share is chance. Below it the target's own roughness decides between such poses:
+    terraces of voxels, or what a smooth element leaves of an edge.
+    """
+    return max((1.0 + EQUAL_SHARE) * mean_square_mm2, mean_square_mm2 + EQUAL_MM**2)
+
+
+def mirror_image(a: Assessment, log_ratio: float) -> Assessment:
+    """Refuse a source whose mirror image fits the bone better, by a log ratio of misfits."""
+    if not log_ratio < -MIRRORED_BETTER:
+        return a
+    text = "the mirror image of the source fits the bone better"
+    advice = "check the side of the body, and whether a scan was flipped from left to right"
+    finding = _refuse("mirror image", log_ratio, -MIRRORED_BETTER, RegistrationStatus.LOW_CONFIDENCE, text, advice)
+    return a.with_finding(finding)
+
+
+def one_rigid_piece(a: Assessment, config: RegistrarConfig) -> Assessment:
+    """Widen the covariance of a source that is strained, in two halves, or under a layer that grows."""
+    found = deformation(a.fit)
+    return a if found is None else a.with_finding(*found)
+
+
+def turn_text(a: Assessment) -> str:
+    """Say how far the bone could still be turned, about an axis of its own."""
+    turn_deg = a.uncertainty.largest_turn_deg
+    axis = axis_name(a.uncertainty.weakest_turn, a)
+    how = f"by {turn_deg:.0f} degrees" if turn_deg <= 180.0 else "freely"
+    return f"the bone could still be turned about {axis} {how}"
+
+
+def shift_text(a: Assessment) -> str:
+    """Say how far the bone could still be shifted, along an axis of its own."""
+    shift_mm = a.uncertainty.largest_shift_mm
+    axis = axis_name(a.uncertainty.weakest_shift, a)
+    how = f"by {shift_mm:.0f} mm" if shift_mm <= 1000.0 else "freely"
+    return f"shifted along {axis} {how}"
+
+
+def axis_name(direction: np.ndarray, a: Assessment) -> str:
+    """Name a direction (3,) of the target frame by the nearest main axis of the bone."""
+    along = np.abs(a.target.main_axes @ direction)
+    return ("its long axis", "its middle axis", "its short axis")[int(np.argmax(along))]
+
+
+DEGENERATE, AMBIGUOUS = RegistrationStatus.DEGENERATE, RegistrationStatus.AMBIGUOUS
+GEOMETRY: tuple[Check, ...] = (unobserved_motion, equal_rival)  # of every pose
+COSTLY: tuple[Check, ...] = (flat_valley,)  # of one that may be accepted
+WIDENING: tuple[Check, ...] = (one_rigid_piece,)  # of one that is accepted
+
+
+def _refuse(
+    check: str, statistic: float, threshold: float, status: RegistrationStatus, text: str, advice: str = MORE_BONE
+) -> Finding:
+    return Finding(check, Effect.REFUSE, float(statistic), float(threshold), status, text, advice)

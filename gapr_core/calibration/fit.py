@@ -15,7 +15,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.metrics.confidence import SURE, auroc, expected_calibration_error, false_accepts
 from gapr_core.registration.confidence.additive import Additive
 from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS
-from gapr_core.registration.confidence.features import OF_THE_BONE, SIGNS
+from gapr_core.registration.confidence.features import SIGNS
 
 Array = NDArray[np.float64]
 ACCEPTED, PRIOR = RegistrarConfig.min_confidence, RegistrarConfig.other_bone_prior
@@ -38,9 +38,9 @@ def fit(answers: Answers) -> Models:
     """Fit both models: the first to own bones, the second to right poses of these and to other subjects' bones."""
     own = answers.of(of_own_bone(answers))
     pose = fit_log_odds(own.features, own.right, own.feature_names, SIGNS)
-    told = answers.of(of_own_bone(answers) & answers.right | is_another_bone(answers)).with_features(OF_THE_BONE)
-    is_own = ~is_another_bone(told)
-    bone = fit_log_odds(told.features, is_own, OF_THE_BONE, SIGNS)
+    either = answers.of(of_own_bone(answers) & answers.right | is_another_bone(answers))
+    is_own = ~is_another_bone(either)
+    bone = fit_log_odds(either.features, is_own, either.feature_names, SIGNS)
     prior = np.log(max(is_own.sum(), 1) / max((~is_own).sum(), 1))
     return Models(pose, Additive(bone.constant - float(prior), bone.curves))
 
@@ -58,7 +58,7 @@ def is_another_bone(answers: Answers) -> NDArray[np.bool_]:
 def numbers(models: Models, answers: Answers) -> Array:
     """(N, 2) log odds of the pose and log10 likelihood ratio of the bone, as `Classifier.judge` gives them."""
     pose = np.clip(models.pose.values(answers.features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
-    bone = models.bone.values(answers.with_features(OF_THE_BONE).features) / np.log(10.0)
+    bone = models.bone.values(answers.features) / np.log(10.0)
     return np.column_stack([pose, np.clip(bone, -LARGEST_EVIDENCE, LARGEST_EVIDENCE)])
 
 

@@ -38,7 +38,6 @@ FEATURES_OF = {
     SCENE: (*SHARED, "free_space_score", "log_explained_mm2", "explained_of_compared", "violating_of_compared",
             "rival_margin"),
 }  # fmt: skip
-OF_THE_BONE = tuple(name for name in SHARED if name != "support")  # features of the second number
 SIGNS = {
     "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "rough_misfit": -1, "inlier_ratio": 1, "support": 1,
     "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1,

@@ -24,16 +24,16 @@ class State(NamedTuple):
 
     Attributes:
         total: (2,) log odds of the pose, and evidence of the bone.
-        weight: sum of the weights.
+        weight: (2,) sum of the weights.
         frames: frames that agree, up to the last one.
     """
 
     total: np.ndarray
-    weight: float
+    weight: np.ndarray
     frames: int
 
 
-EMPTY = State(np.zeros(2), 0.0, 0)
+EMPTY = State(np.zeros(2), np.zeros(2), 0)
 
 
 class Evidence:
@@ -66,7 +66,7 @@ class Evidence:
         before = self._before if again else self._now
         self._before = before
         if not agrees:
-            before = State(np.minimum(before.total, 0.0), before.weight, 0)
+            before = State(np.minimum(before.total, 0.0), before.weight * (before.total <= 0.0), 0)
         kept = 1.0 - 1.0 / MEMORY
         frames = before.frames + 1
         self._now = State(kept * before.total + own, kept * before.weight + 1.0, frames)

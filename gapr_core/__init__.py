@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from gapr_core.registration.problem.target import PreparedTarget
     from gapr_core.registration.registrar import Registrar
     from gapr_core.registration.streams.accumulator import Accumulator
-    from gapr_core.registration.streams.following import FollowedPose
     from gapr_core.registration.streams.look_accumulator import LookAccumulator
     from gapr_core.registration.streams.tracker import Tracker
     from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
@@ -33,7 +32,6 @@ _HOMES = {
     "Tracker": "registration.streams.tracker",
     "Accumulator": "registration.streams.accumulator",
     "LookAccumulator": "registration.streams.look_accumulator",
-    "FollowedPose": "registration.streams.following",
     "RegistrarConfig": "config",
     "PreparedTarget": "registration.problem.target",
     "RegistrationResult": "results",

@@ -138,32 +138,6 @@ class SensorConfig(Settings):
 
 
 @dataclass(frozen=True)
-class AccumulationConfig(Settings):
-    """Which sources an `Accumulator` keeps."""
-
-    off: float = setting(2.5, "a source so many times farther off the bone than all together is discarded", low=1)
-    most_off: int = setting(3, "after so many of them in a row the bone has moved", low=1, high=1000)
-    fewest_points: int = setting(20, "points of a source that is checked by itself; of fewer with those before", low=3)
-    most_points: int = setting(6000, "kept of one source, and compared with", low=100, high=1_000_000)
-
-
-@dataclass(frozen=True)
-class FreeSpaceConfig(Settings):
-    """What a camera would have seen of a pose, point by point on its lines of sight."""
-
-    smallest_pixel: float = setting(0.003, "least width of a pixel, as the tangent of an angle", low=1e-4, high=1)
-    most_pixels: int = setting(160_000, "most pixels of the image; they grow where there would be more", low=100)
-    reach: float = setting(0.006, "tangent up to which a point speaks for a line of sight", low=1e-4, high=1)
-    widest_cos: float = setting(0.25, "cosine to the middle of the view up to which points are seen", low=0.01, high=1)
-    facing_cos: float = setting(0.2, "cosine to the line of sight from which a surface is measured", low=0, high=1)
-    hidden_mm: float = setting(3.0, "bone farther behind the measured point is hidden", low=0, unit="mm")
-    slant_mm: float = setting(9.0, "largest difference in depth to a point in whose plane bone lies", low=0, unit="mm")
-    same_surface_cos: float = setting(0.6, "cosine of normals up to which they are of one surface", low=0, high=1)
-    violation_costs: float = setting(2.0, "cost of a share of the bone that the camera looked through", low=0)
-    misfit_costs: float = setting(0.2, "cost of a share of the bone that lies off the measured surface", low=0)
-
-
-@dataclass(frozen=True)
 class ClutterConfig(Settings):
     """Clouds of a camera that saw more than bone: regions propose, lines of sight decide."""
 
@@ -212,15 +186,6 @@ class ClutterConfig(Settings):
     levelled_by: int = setting(12, "neighbours over which the noise of a measured depth is averaged", low=1, high=200)
     markers: int = setting(16, "points by which two poses are compared", low=3, high=1000)
     infer_viewpoint: bool = setting(True, "a dense cloud without one that is refused as bone may be a camera's")
-    inferred_points: int = setting(2000, "points by whose normals the place of its camera is inferred", low=10)
-    inferred_rounds: tuple[int, int] = setting((2, 1), "rounds of regions for each place, the likelier first", low=1)
-    least_cos: float = setting(0.3, "cosine of incidence that nearly all points of such a cloud exceed", low=0, high=1)
-    origin_deg: float = setting(
-        35.0, "a cloud so near to the z axis may be in the frame of its camera; 0: none is", low=0, high=90, unit="deg"
-    )
-    origin_cos: float = setting(0.15, "cosine of incidence that nearly all points exceed there", low=0, high=1)
-    origin_rounds: int = setting(4, "rounds of regions for that place", low=1, high=100)
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -243,7 +208,6 @@ class RegistrarConfig(Settings):
     clutter: ClutterConfig = field(default_factory=ClutterConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    accumulation: AccumulationConfig = field(default_factory=AccumulationConfig)
     guide: bool = setting(False, "say with every answer where another look would help most")
     min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
     other_bone_prior: float = setting(

@@ -56,7 +56,6 @@ def all_ways() -> Iterator[Callable[[], Any]]:
     yield partial(registrar.register, np.concatenate([near, near + [40.0, 0.0, 0.0]]), target, viewpoint=far)
     for number in range(3):
         yield partial(tracker.register, se3.apply(se3.exp([1.0, 0, 0, 0, 0, 0]), near[number:]), target)
-    yield partial(tracker.follow, near, target)
     together = Accumulator(registrar, 2)
     for number in range(2):
         yield partial(together.register, near[number::2], target)

@@ -24,7 +24,7 @@ from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals import regions
 from gapr_core.registration.proposals.regions import Region
-from gapr_core.registration.scenes.free_space import Visible
+from gapr_core.registration.scenes.free_space import SAME_SURFACE_COS, Visible
 from gapr_core.registration.scenes.kernels import refine_agreeing
 from gapr_core.registration.scenes.scene import Scene
 from gapr_core.runtime.parallel import in_pieces, in_threads
@@ -32,6 +32,10 @@ from gapr_core.runtime.parallel import in_pieces, in_threads
 Array = NDArray[np.float64]
 
 NAME = "scene"
+INFERRED_POINTS, INFERRED_ROUNDS = 2000, (2, 1)  # points that show the camera's place; rounds for each, likelier first
+LEAST_COS = 0.3  # cosine of incidence that nearly all points of a camera's cloud exceed
+ORIGIN_DEG, ORIGIN_COS = 35.0, 0.15  # a cloud so near to the z axis may be in the frame of its camera
+ORIGIN_ROUNDS = 4  # rounds of regions for that place
 AT_THE_BONE = ("pointer", "ultrasound")  # sensors without lines of sight
 GIVEN = -1  # in place of the index of a region
 SMALLEST_SCORE = 1e-4  # a score below, and so one below 0, counts as this
@@ -72,17 +76,16 @@ def inferred_places(source: PreparedSource, config: RegistrarConfig) -> list[tup
     shows. None where it cannot be a camera's: too few points, some that are grazed from wherever the others are seen,
     or a sensor that sees nothing from afar.
     """
-    settings = config.clutter
     if not sees_from_afar(config) or len(source.points) < config.source.dense_points:
         return []
     points, normals = source.points, source.normals
     places = []
-    if one_view.seen_from_origin(points, normals, settings.origin_deg, settings.origin_cos):
-        places.append((np.zeros(3), settings.origin_rounds))
-    some = source.order[: settings.inferred_points]
+    if one_view.seen_from_origin(points, normals, ORIGIN_DEG, ORIGIN_COS):
+        places.append((np.zeros(3), ORIGIN_ROUNDS))
+    some = source.order[:INFERRED_POINTS]
     view = one_view.seen_from_one_place(points, normals, source.neighbours, some, source.spacing_mm)
-    if view.steepest_cos >= settings.least_cos:
-        places += zip(view.viewpoints, settings.inferred_rounds, strict=True)
+    if view.steepest_cos >= LEAST_COS:
+        places += zip(view.viewpoints, INFERRED_ROUNDS, strict=True)
     return places
 
 
@@ -214,7 +217,7 @@ def steps_on(
 ) -> Steps:
     """Of falling limits (first, last, how many), mm, and a share of each for points in front of the bone."""
     both = np.outer(np.linspace(*limits_mm), [1.0, front_share])
-    return Steps(target, both, config.free_space.same_surface_cos)
+    return Steps(target, both, SAME_SURFACE_COS)
 
 
 def _scored(

@@ -15,13 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
-from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidViewpointError
 from gapr_core.geometry import quadrics, se3
 from gapr_core.registration.scenes.kernels import compare_with_image
 from gapr_core.runtime.parallel import in_pieces
 
 Array = NDArray[np.float64]
+
+SMALLEST_PIXEL, MOST_PIXELS = 0.003, 160_000  # least width as the tangent of an angle; pixels grow beyond so many
+REACH = 0.006  # tangent up to which a point speaks for a line of sight
+WIDEST_COS = 0.25  # cosine to the middle of the view up to which points are seen
+FACING_COS = 0.2  # cosine to the line of sight from which a surface is measured
+HIDDEN_MM = 3.0  # bone farther behind the measured point is hidden
+SLANT_MM = 9.0  # largest difference in depth to a point in whose plane bone lies
+SAME_SURFACE_COS = 0.6  # cosine of normals up to which they are of one surface
+VIOLATION_COSTS, MISFIT_COSTS = 2.0, 0.2  # of a share that the camera looked through, and that lies off the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +43,12 @@ class DepthImage:
             is 0 where nothing was measured.
         origin: (2,) x / z and y / z of the middle of pixel (0, 0).
         pixel: edge of a pixel as a difference of x / z.
-        config: how poses are compared with it.
     """
 
     T_camera_source: Array
     pixels: NDArray[np.float32]
     origin: Array
     pixel: float
-    config: FreeSpaceConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +59,11 @@ class Visible:
         explained: (K,) share that faces the camera and lies on what was measured.
         violating: (K,) share that lies clearly in front of what was measured.
         compared: (K,) share that faces the camera and could have been seen: neither outside the image nor hidden.
-        config: what the score takes off for each.
     """
 
     explained: Array
     violating: Array
     compared: Array
-    config: FreeSpaceConfig
 
     @property
     def score(self) -> Array:
@@ -68,56 +72,52 @@ class Visible:
         Large is good: 1 at most, and below 0 where the camera saw more against the pose than for it.
         """
         otherwise = np.maximum(self.compared - self.explained, 0.0)
-        return np.asarray(
-            self.explained - self.config.misfit_costs * otherwise - self.config.violation_costs * self.violating
-        )
+        return np.asarray(self.explained - MISFIT_COSTS * otherwise - VIOLATION_COSTS * self.violating)
 
 
 def average(seen: Sequence[Visible]) -> Visible:
     """The mean of the shares of several images, each of which counts alike."""
     names = ("explained", "violating", "compared")
     explained, violating, compared = (np.mean([getattr(each, name) for each in seen], axis=0) for name in names)
-    return Visible(explained, violating, compared, seen[0].config)
+    return Visible(explained, violating, compared)
 
 
-def see(points: Array, normals: Array, viewpoint: ArrayLike, config: FreeSpaceConfig | None = None) -> DepthImage:
+def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
     """The image of a cloud.
 
     Args:
         points: (N, 3), mm, source frame.
         normals: (N, 3), unit; the sign does not matter.
         viewpoint: (3,), mm, source frame.
-        config: of the image, and of what is compared with it.
 
     Raises:
         InvalidViewpointError: when the viewpoint lies in the middle of the points, so that no camera sees them.
     """
-    config = config or FreeSpaceConfig()
     eye = np.asarray(viewpoint, dtype=np.float64)
     T = _looking_at(eye, points)
     seen = se3.apply(T, points)
-    in_view = seen[:, 2] > config.widest_cos * np.linalg.norm(seen, axis=1)
+    in_view = seen[:, 2] > WIDEST_COS * np.linalg.norm(seen, axis=1)
     if in_view.sum() < min(quadrics.FEWEST_NEIGHBOURS, len(points)):
         raise InvalidViewpointError("a viewpoint outside the cloud", f"{eye}", "pass the camera's place in its frame")
     seen, turned = seen[in_view], normals[in_view] @ T[:3, :3].T
     turned = quadrics.orient(turned, -seen)
     rays = seen[:, :2] / seen[:, 2:]
-    nearest, origin, pixel = _nearest_rays(rays, config)
-    return DepthImage(T, _pixels(nearest, seen, turned), origin, pixel, config)
+    nearest, origin, pixel = _nearest_rays(rays)
+    return DepthImage(T, _pixels(nearest, seen, turned), origin, pixel)
 
 
-def _nearest_rays(rays: Array, config: FreeSpaceConfig) -> tuple[NDArray[np.int64], Array, float]:
+def _nearest_rays(rays: Array) -> tuple[NDArray[np.int64], Array, float]:
     """Of an image of all rays (N, 2), x / z and y / z: (rows, columns) the ray of each pixel, N for none.
 
     And (2,) the middle of its first pixel, and the edge of a pixel: that of the rays' spacing, within the limits set.
     """
     tree, origin, size = cKDTree(rays), rays.min(axis=0), np.ptp(rays, axis=0)
-    pixel = max(config.smallest_pixel, float(np.median(tree.query(rays, k=2)[0][:, 1])))
-    pixel = max(pixel, float(np.sqrt(np.prod(size) / config.most_pixels)))
+    pixel = max(SMALLEST_PIXEL, float(np.median(tree.query(rays, k=2)[0][:, 1])))
+    pixel = max(pixel, float(np.sqrt(np.prod(size) / MOST_PIXELS)))
     columns, rows = (int(n) for n in np.ceil(size / pixel) + 1)
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     centres = origin + pixel * np.stack([x.ravel(), y.ravel()], axis=1)
-    _, nearest = tree.query(centres, distance_upper_bound=max(config.reach, 1.5 * pixel))
+    _, nearest = tree.query(centres, distance_upper_bound=max(REACH, 1.5 * pixel))
     return nearest.reshape(rows, columns), origin, pixel
 
 
@@ -167,12 +167,11 @@ def compare(
     cloud = np.hstack([points, normals]).astype(np.float32)
     view = image.pixels, np.float32(image.origin[0]), np.float32(image.origin[1]), np.float32(1.0 / image.pixel)
 
-    config = image.config
-    limits = on_mm, front_mm, config.facing_cos, config.hidden_mm, config.slant_mm, config.same_surface_cos
+    limits = on_mm, front_mm, FACING_COS, HIDDEN_MM, SLANT_MM, SAME_SURFACE_COS
     limits32 = tuple(map(np.float32, limits))
 
     def work(piece: NDArray[np.float32]) -> NDArray[np.float32]:
         return compare_with_image(piece, cloud, *view, *limits32)  # type: ignore[no-any-return]
 
     explained, violating, compared = np.concatenate(in_pieces(work, T, num_threads)).astype(np.float64).T
-    return Visible(explained, violating, compared, config)
+    return Visible(explained, violating, compared)

@@ -171,7 +171,7 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: RegistrarConfig
         InvalidViewpointError: a viewpoint in the middle of what was seen from it.
     """
     settings, seen = config.clutter, source.facing(viewpoint)
-    image = free_space.see(_levelled(seen, settings.levelled_by), seen.normals, viewpoint, settings.free_space)
+    image = free_space.see(_levelled(seen, settings.levelled_by), seen.normals, viewpoint)
     return Scene(seen, (image,), viewpoint[None], np.zeros(len(seen.points), dtype=np.int64))
 
 

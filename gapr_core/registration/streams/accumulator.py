@@ -20,7 +20,7 @@ from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.streams import motion_test
 from gapr_core.registration.streams.duplicate_clouds import fingerprint
-from gapr_core.registration.streams.outlier_clouds import FarInARow
+from gapr_core.registration.streams.outlier_clouds import MOST_OFF, FarInARow
 from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.registration.uncertainty import target_error
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -29,6 +29,9 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+OFF = 2.5  # a source so many times farther off the bone than all together is discarded
+FEWEST_POINTS = 20  # of a source that is checked by itself; a smaller one with those before it
+MOST_POINTS = 6000  # kept of one source, and compared with
 POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
 FEWEST_IN_TIME = 6  # sources that show a motion, as it is refused
 FEWEST_THAT_MAY = 3  # sources in which a motion widens the bound
@@ -64,7 +67,7 @@ class Accumulator:
         self.method, self.most = _of_many_places(method), most
         self.config = self.method.config
         self._target: PreparedTarget | None = None
-        self._far_away = FarInARow(self.config.accumulation.most_off, "source")
+        self._far_away = FarInARow(MOST_OFF, "source")
         self.reset()
 
     @property
@@ -97,7 +100,7 @@ class Accumulator:
             InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
         """
         points = finite_points(source)
-        points = points[sampling.thin(points, self.config.accumulation.most_points)]
+        points = points[sampling.thin(points, MOST_POINTS)]
         if not len(points):
             return
         if self._far_away.restarts_with(points, self.collected):
@@ -166,7 +169,7 @@ class Accumulator:
         new, off = self._new, self._update_row_off_the_bone(T, target)
         self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
         self._new = []
-        if len(self._off_in_a_row) >= self.config.accumulation.most_off:
+        if len(self._off_in_a_row) >= MOST_OFF:
             return self._restart(result)
         if new and self._off_in_a_row:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
@@ -184,7 +187,7 @@ class Accumulator:
         if len(kept) < FEWEST_THAT_MAY:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
-        some = slice(None, None, 1 + len(order) // self.config.accumulation.most_points)
+        some = slice(None, None, 1 + len(order) // MOST_POINTS)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
         fit = refine_fully(T, points, seen, self.config.refinement)
         found = motion_test.of_motion(fit, order[some])
@@ -242,7 +245,7 @@ class Accumulator:
 
     def _join_small_ones(self, source: Array) -> list[Array]:
         """Take up a source (N, 3). Returns what is judged: it, or of few points those before it too; [] for too few."""
-        fewest = self.config.accumulation.fewest_points
+        fewest = FEWEST_POINTS
         if len(source) >= fewest:
             self._small = []
             return [source]
@@ -264,10 +267,10 @@ class Accumulator:
 
         And farther than `least_mm`.
         """
-        limits, refinement = self.config.accumulation, self.config.refinement
-        some = np.ascontiguousarray(points[:: 1 + len(points) // limits.most_points])
+        refinement = self.config.refinement
+        some = np.ascontiguousarray(points[:: 1 + len(points) // MOST_POINTS])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
-        return own > max(least_mm, limits.off * max(of_all, refinement.smallest_sigma_mm))
+        return own > max(least_mm, OFF * max(of_all, refinement.smallest_sigma_mm))
 
     def _contradicts(self, source: Array, target: PreparedTarget) -> bool:
         """True when a source (N, 3) lies off the bone under the last accepted pose, farther than that may be off there.

@@ -19,7 +19,7 @@ from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.scenes.scene import HOW, MOST_PLACES, Look, Places
-from gapr_core.registration.streams.outlier_clouds import FarInARow
+from gapr_core.registration.streams.outlier_clouds import MOST_OFF, FarInARow
 from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
@@ -118,7 +118,7 @@ class LookAccumulator:
         self.method = method.sharing_points() if isinstance(method, Tracker) else method
         self.most, self.apart_deg, self.config = most, apart_deg, method.config
         self._target: PreparedTarget | None = None
-        self._far_away = FarInARow(self.config.accumulation.most_off, "look")
+        self._far_away = FarInARow(MOST_OFF, "look")
         self.reset()
 
     @property
@@ -295,7 +295,7 @@ class LookAccumulator:
 
     def _update_row_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
         """As `_update_looks`, for the last of a row of looks with which the bone is elsewhere than before."""
-        if len(row) < self.config.accumulation.most_off:
+        if len(row) < MOST_OFF:
             self._looks = before
             return "; left out"
         self._restart_with(row)

@@ -34,7 +34,6 @@ class PreviousPoses:
         poses: (K, 4, 4) T_target_source of the last source that was assessed, mm, best first.
         support: share of the hypotheses that came to the pose in the last full registration.
         place: (3,) mm, frame of the last source: where its camera was inferred to be; None where nobody had to ask.
-        motion: (4, 4) how the source has moved since without an assessment, inv(T_then) T_now.
     """
 
     name = "track"
@@ -43,30 +42,24 @@ class PreviousPoses:
         self.poses: Array = np.empty((0, 4, 4))
         self.support = 0.0
         self.place: Array | None = None
-        self.motion: Array = np.eye(4)
-
-    @property
-    def now(self) -> Array:
-        """(K, 4, 4) where the poses are after the motion."""
-        return self.poses @ self.motion
 
     def prepare(self, target: PreparedTarget) -> None:
         """Nothing of a target is needed."""
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
         """The pose first, then its rivals."""
-        return Proposals(self.now, np.linspace(1.0, 0.0, len(self.poses)))
+        return Proposals(self.poses, np.linspace(1.0, 0.0, len(self.poses)))
 
     def keep(self, poses: Sequence[Array]) -> None:
         """Remember the hypotheses of a full registration, best first: (4, 4) T_target_source, mm, each."""
-        self.poses, self.motion = np.stack(poses), np.eye(4)
+        self.poses = np.stack(poses)
 
     def follow(self, pose: Array, source: Array) -> None:
         """The source (N, 3), mm, has moved from the remembered pose nearest to `pose`, T_before to T_now.
 
         All others move with it, R to R inv(T_before) T_now; the nearest one comes first.
         """
-        before = self.now
+        before = self.poses
         nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in before]))
         moved = before @ (se3.inverse(before[nearest]) @ pose)
         self.keep([moved[nearest], *np.delete(moved, nearest, axis=0)])
@@ -135,7 +128,7 @@ class TrackingRegistrar(Registrar):
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """What is remembered first; of several looks, which may contradict each other, no region is left out."""
-        poses = np.concatenate([start, self._memory.now])
+        poses = np.concatenate([start, self._memory.poses])
         if len(scene.images) > 1:
             return self._in_scene(scene, target, poses, clock)
         found = self._remembered(scene, target, start, clock, enough)
@@ -145,7 +138,7 @@ class TrackingRegistrar(Registrar):
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """The best of what is remembered; None where it is not sure, and regions have to be asked."""
-        poses, how = np.concatenate([start, self._memory.now]), (self.classifier, self.config, clock)
+        poses, how = np.concatenate([start, self._memory.poses]), (self.classifier, self.config, clock)
         found = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
         if found is None:
             return None
@@ -156,4 +149,4 @@ class TrackingRegistrar(Registrar):
         return self._full._of_image(flipped, target, clock)
 
     def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:
-        return super()._of_one_view(source, target, np.concatenate([poses, self._memory.now[:1]]), clock)
+        return super()._of_one_view(source, target, np.concatenate([poses, self._memory.poses[:1]]), clock)

@@ -14,6 +14,8 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+MOST_OFF = 3  # after so many sources in a row that are off the bone it has moved
+
 
 class FarInARow:
     """Counts sources that are metres away from those collected: a few are left out, then the collection restarts.

@@ -19,7 +19,6 @@ from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.scenes.scene import Viewpoint
 from gapr_core.registration.streams.duplicate_clouds import Fingerprint, fingerprint
 from gapr_core.registration.streams.evidence import AGREE_MM, Evidence
-from gapr_core.registration.streams.following import FollowedPose, Follower
 from gapr_core.registration.streams.memory import PreviousPoses, TrackingRegistrar
 from gapr_core.results import Refusal, RegistrationResult
 from gapr_core.runtime.clock import Clock
@@ -112,7 +111,6 @@ class Tracker:
         self._since_full = 0  # sources since the last full registration
         self._is_sure = self._was_sure = False  # this source is, as answered; the one before was
         self._last: Last | None = None
-        self._follower: Follower | None = None  # of the last source, where that was sure
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
         """Compute everything static about a target; see `Registrar.prepare`."""
@@ -137,41 +135,14 @@ class Tracker:
         if initial is not None:
             self._forget_track()
         self._was_sure, self._is_sure = self._is_sure, False  # and stays so where this source is refused
-        self._follower, clock = None, Clock()
+        clock = Clock()
         assessment = self._assess(source, target, initial, viewpoint, clock)
         if isinstance(assessment, Assessment):
             assessment = self._with_evidence(assessment, fingerprint(finite_points(source)))
         result = replace(self.registrar.conclude(assessment, clock), method=self.name)
         if isinstance(assessment, Assessment):
             self._remember(result, assessment.source.points)
-            if self._is_sure and self._has_track and assessment.seen is None:
-                self._follower = Follower(assessment, source, self.config)
         return result
-
-    @single_threaded_libraries
-    def follow(self, source: ArrayLike, target: PreparedTarget) -> FollowedPose | None:
-        """Follow the last pose to where the bone is now, in a fraction of the time of `register`, not assessed.
-
-        None where `register` has to be asked, for this source and all after it: the last answer was refused, not sure
-        or of a cloud with a viewpoint; its error, which counts for more in a weaker view, is not well bounded; the
-        source fits worse, or lies elsewhere; or many were followed in a row (`streams.following`).
-
-        The evidence of the stream does not change, nor when a source is registered in full again. The next registration
-        begins where the bone was followed to.
-
-        Args:
-            source: (N, 3), mm, in the same frame as those before.
-            target: from `prepare`.
-
-        Raises:
-            InvalidPointCloudError: wrong shape or type.
-        """
-        follower, self._follower = self._follower, None
-        found = follower.follow(source) if follower is not None and target is self._bone else None
-        if follower is not None and found is not None:
-            self._follower, self._memory.motion = follower, follower.motion()
-            self._last = self._last and self._last._replace(T_target_source=found.T_target_source.copy())
-        return found
 
     def _assess(
         self,
@@ -186,7 +157,7 @@ class Tracker:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if self._since_full + 1 < self.recheck:
             return self._tracking.assess(source, target, viewpoint=viewpoint, clock=clock, enough=self._stands)
-        return self.registrar.assess_from(source, target, self._memory.now, viewpoint, clock)
+        return self.registrar.assess_from(source, target, self._memory.poses, viewpoint, clock)
 
     def _stands(self, assessment: Assessment) -> bool:
         """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""

@@ -1,4 +1,4 @@
-"""Public real data in the form in which it is published. None of it ships; docs/real_data.md says where it is.
+"""Public real data in the form in which it is published. None of it ships; docs/results/real.md says where it is.
 
 Two forms are known: pairs as NPZ (`source`, `target` and, where it is known, `transform`), such as the RealSense cloud
 of a sawbone femur; and folders of UltraBones100k, `specimenNN/CT_bone_segmentations/BONE.stl` with tracked ultrasound
@@ -61,7 +61,7 @@ def pairs(folder: str | Path) -> Iterator[RealPair]:
     folder = Path(folder)
     found, records = sorted(folder.glob("*.npz")), sorted(_records(folder))
     if not found and not records:
-        raise ConfigError(EXPECTED, str(folder), "docs/real_data.md says what is public and how to lay it out")
+        raise ConfigError(EXPECTED, str(folder), "docs/results/real.md says what is public and how to lay it out")
     yield from map(_of_npz, found)
     for record, bone in records:
         yield _of_record(folder, record, bone)

@@ -1,4 +1,4 @@
-"""The pictures of docs/scenes.md: what the camera sees in a scene of each protocol, and of one wound from four places.
+"""Draw the pictures of docs/concepts/scenes.md: a scene of each protocol, and one wound from four places.
 
 python -m gapr_core.data.scenes.figure docs/figures/scenes.png --looks docs/figures/looks.png
 """

@@ -28,7 +28,7 @@ from gapr_core.results import LookAnswer, LookFit, Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 Alone = Callable[[Scene], Assessment | None]  # registers one look in full
 
-# All chosen on scenes of train subjects, looks at rest and moved (docs/log.md, "Looks from several places").
+# All chosen on scenes of train subjects, looks at rest and moved.
 GAINED, AWAY_MM = 0.25, 2.0  # share of what a look could show that lies on it only in its own pose, and how far that is
 SEEN_THROUGH = 0.15  # share in front of what it measured
 LEAST_NEAR, LEAST_ON = 0.5, 0.3  # of the share of the best look: what lies near what a look shows, and on it

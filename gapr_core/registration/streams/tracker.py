@@ -34,7 +34,7 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 
 # A scene that is hardly believed makes the next ones doubtful: of another subject's bone single scenes may be sure, but
-# seldom all (chosen on scenes of train subjects, docs/log.md, "Streams of scenes")
+# seldom all (chosen on scenes of train subjects)
 DOUBTFUL, DOUBTED_FOR = 0.5, 5  # probability of a scene, alone or in its stream; scenes
 
 

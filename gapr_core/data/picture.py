@@ -43,7 +43,7 @@ def shade(
     scene = o3d.t.geometry.RaycastingScene()
     vertices = surface.points.astype(np.float32)
     scene.add_triangles(vertices, surface.triangles.astype(np.uint32))
-    rays = _rays(vertices, eye, up, right, mm_per_pixel, margin_mm)
+    rays = _rays(surface.points, eye, up, right, mm_per_pixel, margin_mm)
     hit = scene.cast_rays(rays)
     normals = hit["primitive_normals"].numpy()
     normals *= np.sign(np.sum(normals * eye, axis=-1, keepdims=True))

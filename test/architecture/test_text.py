@@ -13,9 +13,23 @@ NO_VERB = re.compile(
     r"(what|where|whether|how|which|who|why|when|that|the|a|an|all|each|every|one|no|of|for|in|if|it)\b"
 )
 TO_DO = (  # packages whose docstrings are still to be shortened: this list only shrinks
-    "gapr_core",
-    "gapr_ros",
-    "msg_adapters",
+    "gapr_core/__init__.py",
+    "gapr_core/calibration",
+    "gapr_core/cli.py",
+    "gapr_core/clouds.py",
+    "gapr_core/commands",
+    "gapr_core/data/picture.py",
+    "gapr_core/formats",
+    "gapr_core/model",
+    "gapr_core/pages",
+    "gapr_core/registration",
+    "gapr_core/results.py",
+    "gapr_core/surface.py",
+    "gapr_core/training",
+    "gapr_ros/bags",
+    "gapr_ros/demo",
+    "gapr_ros/node",
+    "gapr_ros/parameters.py",
 )
 
 
@@ -84,6 +98,8 @@ def test_docstrings_begin_with_a_short_sentence_and_a_verb():
     assert not [fault for path in done for fault in faults(path)]
 
 
-def test_every_package_to_do_exists_and_has_something_to_do():
-    for name in TO_DO:
-        assert any(fault for path in sorted((ROOT / name).rglob("*.py")) for fault in faults(path)), name
+@pytest.mark.parametrize("name", TO_DO)
+def test_a_package_to_do_has_something_to_do(name):
+    assert any(
+        fault for path in [ROOT / name, *(ROOT / name).rglob("*.py")] if path.is_file() for fault in faults(path)
+    )

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import check_extent, check_faces, is_point, load
+from gapr_core.clouds import check_extent, is_point, load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.reading import ending_of
 from gapr_core.runtime import files
-from gapr_core.surface import Surface
+from gapr_core.surface import Surface, check_faces
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")

@@ -183,27 +183,23 @@ def table(measured: Sequence[Growth]) -> str:
 
 
 def draw(measured: Sequence[Growth]) -> Figure:
-    """Time and memory of all of them."""
-    figure = Figure(figsize=(10.0, 2.8 * -(-len(measured) // 2)), layout="constrained")
-    for axes, each in zip(figure.subplots(-(-len(measured) // 2), 2).ravel(), measured, strict=False):
-        axes.plot(each.x, 1e3 * each.wall_s, color=palette.FIRST, marker="o", ms=3)
-        axes.set_title(f"{each.step}: {each.name}", loc="left", fontsize=10)
-        axes.set_ylabel("wall time, ms", color=palette.FIRST)
-        beside = axes.twinx()
-        beside.plot(each.x, each.memory_mb, color=palette.SECOND, marker="s", ms=3, ls="--")
-        beside.set_ylabel("allocated, MB", color=palette.SECOND)
-        for scale, cost in ((axes, 1e3 * each.wall_s), (beside, each.memory_mb)):
-            scale.set_yscale("log")
-            scale.set_ylim(10.0 ** np.floor(np.log10(cost.min())), 10.0 ** np.ceil(np.log10(cost.max())))
-        if not each.is_share:
-            axes.set_xscale("log")
-        for axis in (axes.xaxis, axes.yaxis, beside.yaxis):
-            axis.set_minor_formatter(NullFormatter())
+    """Draw time in the upper row, memory in the lower one, a column for each thing that grows."""
+    figure = Figure(figsize=(2.6 * len(measured), 4.6), layout="constrained")
+    rows = figure.subplots(2, len(measured), sharex="col", sharey="row", squeeze=False)
+    for column, each in zip(rows.T, measured, strict=True):
+        for axes, cost, colour in zip(column, (each.wall_s, each.memory_mb), palette.SERIES[:2], strict=True):
+            axes.plot(each.x, cost, color=colour, marker="o", ms=3)
+            axes.set_yscale("log")
+            axes.set_xscale("linear" if each.is_share else "log")
+            axes.grid(alpha=0.25)
+            axes.spines[["top", "right"]].set_visible(False)
+        column[0].set_title(each.step, loc="left", fontsize=9)
+        column[1].set_xlabel(each.name, fontsize=9)
         if len(each.x) <= len(BONES):
-            axes.set_xticks(each.x, [f"{x:.0f}" for x in each.x])
-        axes.grid(alpha=0.25)
-    for axes in figure.axes:
-        axes.set_visible(axes.has_data())
+            column[1].set_xticks(each.x, [f"{x:.0f}" for x in each.x])
+            column[1].xaxis.set_minor_formatter(NullFormatter())
+    rows[0, 0].set_ylabel("wall time, s")
+    rows[1, 0].set_ylabel("memory, MB")
     return figure
 
 

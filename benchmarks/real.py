@@ -2,7 +2,7 @@
 
     python benchmarks/real.py [--real DIR] [--sensor depth_camera] [--model-mm 0.3]
 
-DIR is as for `gapr demo --real` (docs/real_data.md). Of every cloud with a stated pose: all of it, windows of 40, 75
+DIR is as for `gapr demo --real` (docs/results/real.md). Of every cloud with a stated pose: all of it, windows of 40, 75
 and 120 mm along it where it is longer, and 12 to 200 points drawn from all of it, as a digitiser would take them.
 """
 

@@ -262,7 +262,7 @@ def children(of: psutil.Process) -> list[psutil.Process]:
 
 @contextmanager
 def cluster(count: int, out: Path) -> Iterator[tuple[str, dict[str, psutil.Process]]]:
-    """Scheduler and workers as docs/benchmark.md starts them: the address, and the processes by name."""
+    """Scheduler and workers as docs/tutorials/research.md starts them: the address, and the processes by name."""
     out.mkdir(parents=True, exist_ok=True)
     file = (out / "scheduler.json").resolve()
     file.unlink(missing_ok=True)

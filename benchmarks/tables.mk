@@ -1,9 +1,9 @@
-# The tables of docs/results that rest on the shipped models, each by its own command:
+# The tables that docs/results quotes, of the shipped models, each by its own command:
 #
 #   make -f benchmarks/tables.mk -j 2                    # hours; a stopped run goes on where it was
 #   make -f benchmarks/tables.mk scenes mix              # these; `list` names all
 #   make -f benchmarks/tables.mk real REAL=DIR           # as benchmarks/real.py
-#   make -f benchmarks/tables.mk publish                 # those that are there go into docs
+#   make -f benchmarks/tables.mk publish                 # the figures that are there go into docs
 #
 # Everything is left in $(OUT): tables, figures, records, pairs with their hash. Another commit needs another OUT.
 SHELL   := bash -o pipefail
@@ -102,7 +102,7 @@ done  = $(OUT)/done/$(1)
 .SECONDARY:
 all: $(ALL)
 list: ; @echo $(ALL) real
-publish: ; cp $(OUT)/tables/*.md docs/results/tables/ && cp $(OUT)/figures/*.png docs/figures/
+publish: ; cp $(OUT)/figures/*.png docs/figures/
 real: $(call done,real_pieces) $(call done,real_pieces_described)
 $(ALL): %: $(call done,%)
 

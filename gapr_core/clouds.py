@@ -13,7 +13,7 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import columns, reading
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry.extent import BEYOND
-from gapr_core.surface import Array, Surface, as_array, as_points
+from gapr_core.surface import Array, Surface, as_array, as_points, check_faces
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ def load(
     surface = _drop_non_finite(surface, name)
     if of_bone:
         _check_apart(surface, name)
-    if surface.faces is not None and len(surface.faces):
+    if path is None and surface.faces is not None and len(surface.faces):
         check_faces(surface, name)
     if path is not None and reading.format_of(path).is_in_mm(options or ReadOptions()):
         units, how = "mm", OF_HEADER
@@ -236,21 +236,3 @@ def _warn_of_several_bones(surface: Surface, name: str) -> None:
             "(--label, model_label)",
             name, len(lengths), sizes,
         )  # fmt: skip
-
-
-def check_faces(surface: Surface, name: str) -> None:
-    """Refuse faces that are no triangles, that point beyond the vertices, or that have no area at all.
-
-    Raises:
-        InvalidPointCloudError: they do.
-    """
-    faces, count = np.asarray(surface.faces), len(surface.points)
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-        given = f"faces of shape {faces.shape} and type {faces.dtype} in {name}"
-        raise InvalidPointCloudError("triangles as (F, 3) integers", given, "triangulate the mesh")
-    if faces.min() < 0 or faces.max() >= count:
-        raise InvalidPointCloudError(
-            f"faces of its {count} vertices", f"some that point beyond them in {name}", "export it again"
-        )
-    if not surface.face_areas_mm2.any():
-        raise InvalidPointCloudError("faces with an area", f"none with any in {name}", "export it again")

@@ -109,8 +109,29 @@ class Surface:
         return crosses(self.points, self.triangles)  # type: ignore[no-any-return]
 
 
+def check_faces(surface: Surface, name: str) -> None:
+    """Refuse faces that are no triangles, that point beyond the vertices, or that have no area at all.
+
+    Raises:
+        InvalidPointCloudError: they do.
+    """
+    faces, count = np.asarray(surface.faces), len(surface.points)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        given = f"faces of shape {faces.shape} and type {faces.dtype} in {name}"
+        raise InvalidPointCloudError("triangles as (F, 3) integers", given, "triangulate the mesh")
+    if faces.min() < 0 or faces.max() >= count:
+        raise InvalidPointCloudError(
+            f"faces of its {count} vertices", f"some that point beyond them in {name}", "export it again"
+        )
+    if not surface.face_areas_mm2.any():
+        raise InvalidPointCloudError("faces with an area", f"none with any in {name}", "export it again")
+
+
 def as_points(array: ArrayLike) -> Array:
     """An (N, 3) float64 array from anything of that shape; masked entries become NaN.
+
+    Fields x y z of a structured array, such as `read_points` of ROS gives, are its columns. Of a camera's image
+    (H, W, 3) the rows follow each other, and a pixel of 0 0 0 has no depth: it becomes NaN.
 
     Raises:
         InvalidPointCloudError: for another shape, rows of several lengths, or entries that are not real numbers.
@@ -120,14 +141,22 @@ def as_points(array: ArrayLike) -> Array:
     if isinstance(array, str | PurePath):
         how = "load it first: gapr_core.load(path).points"
         raise InvalidPointCloudError("an array of shape (N, 3)", f"the path {str(array)!r}", how)
+    if hasattr(array, "files"):
+        raise InvalidPointCloudError("an array of shape (N, 3)", "an NPZ archive", "pass its path, or its array points")
     points = as_array(array, "an array of shape (N, 3)", "pass x y z in every row")
+    if points.dtype.names and set("xyz") <= set(points.dtype.names):
+        points = np.stack([np.ravel(points[name]) for name in "xyz"], axis=1)
     if points.ndim == 0 and points.dtype.kind == "O":
         how = next((how for name, how in OF_OBJECTS.items() if hasattr(array, name)), "pass x y z in columns")
         raise InvalidPointCloudError("an array of shape (N, 3)", f"a {type(array).__name__}", how)
     if points.dtype.kind not in "fiu":
         raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")
+    if points.ndim == 3 and points.shape[2] == 3:
+        points = points.reshape(-1, 3).astype(np.float64)
+        points[~points.any(axis=1)] = np.nan
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InvalidPointCloudError("an array of shape (N, 3)", f"shape {points.shape}", "pass x y z in columns")
+        how = "pass its transpose" if points.ndim == 2 and points.shape[0] == 3 else "pass x y z in columns"
+        raise InvalidPointCloudError("an array of shape (N, 3)", f"shape {points.shape}", how)
     return points.astype(np.float64)
 
 

@@ -54,7 +54,7 @@ class NodeParameters(Settings):
 
     model_path: str = setting(
         "",
-        "file of the pre-operative bone: a mesh, a cloud or a label map (docs/formats.md); "
+        "file of the pre-operative bone: a mesh, a cloud or a label map (docs/reference/formats.md); "
         "model_... are read when configuring and by ~/reload_model",
     )
     model_label: str = setting("", "name or number of the bone in a label map; several, with commas, are one bone")

@@ -20,8 +20,8 @@ Registers the partial clouds of a topic to a pre-operative bone, and publishes p
 
   register_node --ros-args -p model_path:=/data/femur_ct.stl -p model_unit:=mm -r points:=/probe/points
 
-`python -m gapr_ros.parameters` prints every parameter with its default, range and meaning; docs/ros.md explains topics,
-services and reasons.
+`python -m gapr_ros.parameters` prints every parameter with its default, range and meaning. Topics, services
+and reasons: docs/reference/ros.md.
 """
 PATIENCE_S = 0.3  # for the registration that is on its way when the program is asked to stop
 

@@ -33,7 +33,7 @@ NAMES = {getattr(PointField, name): name for name in ("INT8", "UINT8", "INT16", 
 def cloud_to_xyz(
     cloud: PointCloud2, *, dtype: DTypeLike = np.float64, keep_nan: bool = False, drop_zeros: bool = False
 ) -> NDArray[Any]:
-    """The x, y, z of every point, row by row, in the unit of the message.
+    """Read x, y, z of every point, row by row, in the unit of the message.
 
     Args:
         cloud: any legal layout: padding, either byte order, float32 or float64 coordinates in any order among other
@@ -63,7 +63,7 @@ def cloud_to_xyz(
 
 
 def cloud_to_grid(cloud: PointCloud2) -> NDArray[np.float64] | None:
-    """The x, y, z of every pixel of an organised cloud, in the unit of the message.
+    """Read x, y, z of every pixel of an organised cloud, in the unit of the message.
 
     Returns:
         (H, W, 3) new array, points that are not finite among them; None for a cloud of one row or one column.
@@ -91,7 +91,7 @@ def cloud_to_field(cloud: PointCloud2, name: str) -> NDArray[Any]:
 def xyz_to_cloud(
     points: ArrayLike, header: Header | None = None, *, fields: Mapping[str, ArrayLike] | None = None
 ) -> PointCloud2:
-    """A little-endian cloud without padding.
+    """Write a little-endian cloud without padding.
 
     Args:
         points: (N, 3), or (H, W, 3) for an organised cloud; float64 stays float64, everything else becomes float32.
@@ -127,7 +127,7 @@ def _coordinate_dtype(cloud: PointCloud2) -> np.dtype[Any]:
 
 
 def _dtype_of(cloud: PointCloud2, fields: Sequence[PointField]) -> np.dtype[Any]:
-    """Of records that hold these fields alone, at their places."""
+    """Describe records that hold these fields alone, at their places."""
     if cloud.point_step > LARGEST_STEP:
         raise InvalidMessageError(f"point_step must be at most {LARGEST_STEP}, got {cloud.point_step}")
     unknown = next((field for field in fields if field.datatype not in DTYPES), None)

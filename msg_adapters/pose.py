@@ -59,7 +59,7 @@ def matrix_to_transform(T: ArrayLike) -> Transform:
 
 
 def covariance_to_list(covariance: ArrayLike) -> list[float]:
-    """The 36 numbers of PoseWithCovariance, row-major x y z rx ry rz, from (6, 6).
+    """Write (6, 6) as the 36 numbers of PoseWithCovariance, row-major x y z rx ry rz.
 
     Raises:
         InvalidMessageError: for another shape or entries that are not finite.

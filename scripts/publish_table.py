@@ -1,9 +1,9 @@
-"""Put a table that a command wrote into docs/results/tables, with its command, commit and machine.
+"""Put a table that a command wrote into a folder, with its command, commit and machine.
 
     python scripts/publish_table.py recall out            # the output folder of `gapr benchmark`
     python scripts/publish_table.py scanners table.md --command "python benchmarks/scanners.py --count 10"
 
-The pages of docs/results show the file as it is. Paths of this machine are shortened to their last part.
+The pages of docs/results quote such tables. Paths of this machine are shortened to their last part.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gapr_core.runtime import origin
 
-TABLES = Path(__file__).resolve().parents[1] / "docs" / "results" / "tables"
+TABLES = Path(__file__).resolve().parents[1] / "build" / "tables"
 ABSOLUTE = re.compile(r"(?<![\w.])/(?:[\w.+-]+/)*([\w.+-]+)/?")
 RULE = re.compile(r"\|(\s*-{3,}\s*\|)+$")  # the line under the head of a table
 
@@ -22,11 +22,11 @@ RULE = re.compile(r"\|(\s*-{3,}\s*\|)+$")  # the line under the head of a table
 def main() -> None:
     """Write one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", help="of the file in docs/results/tables, without .md")
+    parser.add_argument("name", help="of the file, without .md")
     parser.add_argument("made", type=Path, help="folder of gapr benchmark, or a file with what a script printed")
     parser.add_argument("--command", help="that printed it; a folder of gapr benchmark knows its own")
     parser.add_argument("--commit", help="that ran it (this one)")
-    parser.add_argument("--folder", type=Path, default=TABLES, help="where the tables are")
+    parser.add_argument("--folder", type=Path, default=TABLES, help="where the tables are (build/tables)")
     args = parser.parse_args()
     if args.made.is_dir():
         text = (args.made / "table.md").read_text(encoding="utf-8").removeprefix("# Benchmark\n\n")

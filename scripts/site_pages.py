@@ -1,7 +1,6 @@
 """Hook of MkDocs: what the site takes from outside docs/.
 
-Pages that live elsewhere, the help of every command, and tables: a link to results/tables alone on its line is replaced
-by the table, as the command wrote it. So the same Markdown reads well in the repository and on the site.
+Pages that live elsewhere, the help of every command, and the settings of the library.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from gapr_core.pages import markdown
 from gapr_core.runtime.settings import table as table_of
 
 ROOT = Path(__file__).resolve().parents[1]
-SETTINGS = """# Parameters of the library
+SETTINGS = """# Settings
 
 | where | how |
 |---|---|
@@ -34,7 +33,6 @@ SETTINGS = """# Parameters of the library
 A value out of range is an error. `gapr settings` prints these tables as one."""
 ELSEWHERE = {"contributing.md": "CONTRIBUTING.md", "weights.md": "gapr_core/weights/README.md"}  # page: where it lives
 LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
-TABLE = re.compile(r"^\[[^\]]*\]\((\S*tables/\w+\.md)\)$", re.MULTILINE)
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -47,16 +45,10 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Put tables in their places, and lead links to where the site has what they name."""
+    """Lead links to where the site has what they name."""
     name = page.file.src_uri
     here = dirname(ELSEWHERE.get(name, f"docs/{name}"))
-    markdown = TABLE.sub(lambda found: table(ROOT / here / found[1]), markdown)
     return LINK.sub(lambda found: link(found, here, dirname(name), files), markdown)
-
-
-def table(path: Path) -> str:
-    """A table that a command wrote; its headings go below those of the page."""
-    return re.sub(r"^#+ ", lambda found: f"##{found[0]}", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
 
 
 def link(found: re.Match[str], here: str, folder: str, files: Files) -> str:
@@ -91,5 +83,5 @@ def help_of_commands() -> str:
         run = [sys.executable, "-m", "gapr_core.cli", *command.split(), "--help"]
         text = subprocess.run(run, capture_output=True, text=True, check=True, env=env).stdout
         parts.append(f"## {f'gapr {command}'.strip()}\n\n```text\n{text}```")
-    parts.append("The programs of the ROS package, `register_node` and `bag_replay`: [the ROS 2 node](../ros.md).")
+    parts.append("The programs of the ROS package, `register_node` and `bag_replay`: [the ROS 2 node](ros.md).")
     return "\n\n".join(parts)

@@ -29,7 +29,7 @@ REGISTRY: dict[str, Callable[[], RegistrationMethod]] = {
 
 
 def make(name: str) -> RegistrationMethod:
-    """A new instance of a registered method.
+    """Make a new instance of a registered method.
 
     Raises:
         ConfigError: for a name that is not in `REGISTRY`.

@@ -35,7 +35,7 @@ class RegistrationMethod(Protocol):
     name: str
 
     def prepare(self, target: Any, units: str = "mm") -> Any:
-        """Everything about the target that does not depend on the source; done once."""
+        """Make the target ready for `register`."""
         ...
 
     def register(self, source: ArrayLike, target: Any) -> RegistrationResult:
@@ -44,7 +44,7 @@ class RegistrationMethod(Protocol):
 
 
 def takes(method: RegistrationMethod, hint: str) -> bool:
-    """Whether `register` of a method takes this as well: `initial` or `viewpoint`."""
+    """Check whether `register` of a method takes `initial` or `viewpoint`."""
     return hint in signature(method.register).parameters
 
 
@@ -88,7 +88,7 @@ class Baseline(ABC):
     identity_is_failure = False  # libraries that answer failure with the identity
 
     def prepare(self, target: Any, units: str = "mm") -> BaselineTarget:
-        """The target ready for `register`.
+        """Make the target ready for `register`.
 
         Args:
             target: path, (M, 3) array, `Surface`, or anything with `.points` (and `.normals`) in mm, such as a
@@ -128,7 +128,7 @@ class Baseline(ABC):
         return self.answer(T, points, own, {"align": _ms_since(start)})
 
     def answer(self, T: Array, source: Array, target: BaselineTarget, stage_ms: dict[str, float]) -> RegistrationResult:
-        """An accepted pose with its residual and its score."""
+        """Give an accepted pose with its residual and its score."""
         distance, _ = target.tree.query(se3.apply(T, source))
         inliers = float(np.mean(distance < INLIER_MM))
         features = {"residual_mm": truncated_residual(distance)}
@@ -143,7 +143,7 @@ class Baseline(ABC):
         status: RegistrationStatus = RegistrationStatus.LOW_CONFIDENCE,
         stage_ms: dict[str, float] | None = None,
     ) -> RegistrationResult:
-        """No pose, and why."""
+        """Give no pose, and the reason."""
         return RegistrationResult(status, method=self.name, reason=reason, stage_ms=stage_ms or {})
 
     def _own(self, target: Any) -> BaselineTarget:

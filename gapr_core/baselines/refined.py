@@ -30,7 +30,7 @@ class Refined:
         self.name = name or "+".join([*(method.name for method in self.coarse), fine.name])
 
     def prepare(self, target: Any, units: str = "mm") -> tuple[list[Any], Any]:
-        """The target as every coarse method and as the fine one wants it."""
+        """Prepare the target for every coarse method and for the fine one."""
         fine = self.fine.prepare(target, units)
         return [method.prepare(fine) for method in self.coarse], fine
 

@@ -51,7 +51,7 @@ class Origin:
         return self.name.upper()
 
     def find(self, folder: str | Path | None) -> Path:
-        """The absolute path of a checkout; without a folder, that of the environment variable.
+        """Find the absolute path of a checkout; without a folder, that of the environment variable.
 
         Raises:
             MethodUnavailableError: there is none.
@@ -128,7 +128,7 @@ def balls(
     radius: float,
     most: int | None = None,
 ) -> NDArray[np.int64]:
-    """(N, most) rows of points (M, 3) within a radius of each query (N, 3), of its cloud, nearest first; M for none.
+    """Find the points of the same cloud within a radius of each query (N, 3), nearest first; M for none.
 
     Without `most` there are as many columns as the fullest ball has points.
     """

@@ -1,4 +1,4 @@
-"""GeoTransformer (Qin et al., CVPR 2022) by its authors, from a checkout next to the project; no line of it is here.
+"""GeoTransformer (Qin et al., CVPR 2022) by its authors, from a checkout. No line of it is here.
 
 git clone https://github.com/qinzheng93/GeoTransformer && pip install easydict einops ipdb ipython
 python -m gapr_core.training.geotransformer --checkout GeoTransformer --anatomy DIR --pairs 3000 --out runs/peer
@@ -125,6 +125,6 @@ def grid_subsampling(points: Tensor, lengths: Tensor, voxel: float) -> tuple[Ten
 
 
 def radius_neighbors(queries: Tensor, points: Tensor, query_lengths: Tensor, lengths: Tensor, radius: float) -> Tensor:
-    """(N, 64) rows of points (M, 3) within a radius of each query (N, 3), of its cloud, nearest first; M for none."""
+    """Find the points of the same cloud within a radius of each query (N, 3), nearest first; M for none."""
     counts = query_lengths.tolist(), lengths.tolist()
     return torch.from_numpy(checkout.balls(queries.numpy(), points.numpy(), *counts, radius, MOST_NEIGHBORS))

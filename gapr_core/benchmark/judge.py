@@ -23,14 +23,14 @@ FACTS = (*NUMBERS, *TEXTS)  # in the metadata of a pair
 
 
 def record_of(pair: Pair, result: RegistrationResult) -> Record:
-    """A pair that is in no file, and what GAPR answered, judged."""
+    """Judge GAPR's answer to a pair that is in no file."""
     facts = {**vars(pair_facts(pair)), **vars(answer_of(result)), **vars(judge(pair, result))}
     seconds, code = result.seconds, origin.commit() or ""
     return Record(**facts, file="", sha256=pair_hash(pair), method="gapr", seconds=seconds, commit=code)
 
 
 def pair_facts(pair: Pair) -> PairFacts:
-    """What is known about the pair, whatever the method."""
+    """Collect the facts of a pair, whatever the method."""
     return PairFacts(
         pair=pair.name,
         protocol=pair.protocol or "pairs",
@@ -45,7 +45,7 @@ def pair_facts(pair: Pair) -> PairFacts:
 
 
 def answer_of(result: RegistrationResult) -> Answer:
-    """What the method answered."""
+    """Collect the answer of a method."""
     T = result.T_target_source
     return Answer(
         status=str(result.status),
@@ -59,7 +59,7 @@ def answer_of(result: RegistrationResult) -> Answer:
 
 
 def why_unusable(result: Any) -> str:
-    """What of an answer can be neither judged nor written down, in words; empty where all can."""
+    """Say why an answer can be neither judged nor written down; empty if it can."""
     if not isinstance(result, RegistrationResult):
         return f"the method answered {type(result).__name__}, no RegistrationResult"
     if not isinstance(result.confidence, Real) or not np.isfinite(result.confidence):
@@ -81,7 +81,7 @@ def _is_finite(array: Any, shape: tuple[int, ...]) -> bool:
 
 
 def failure(reason: str) -> Answer:
-    """What stands for the answer of a method that raised: a failure, never dropped."""
+    """Make the record of a method that raised: a failure, never dropped."""
     return Answer(status=ERROR, accepted=False, reason=reason)
 
 
@@ -126,7 +126,7 @@ def best_right(pair: Pair, result: RegistrationResult | None) -> bool | None:
 
 
 def uncertainty(pair: Pair, T: Array, result: RegistrationResult) -> dict[str, Any]:
-    """The error as a twist, its NEES, and its ratio to the Cramer-Rao bound, each where it can be had."""
+    """Compute the error as a twist, its NEES, and its ratio to the Cramer-Rao bound, if they exist."""
     turns_about = pair.source if result.centre_mm is None else se3.apply(se3.inverse(T), result.centre_mm[None])
     twist = metrics.error_twist(T, pair.T_target_source, turns_about)
     facts: dict[str, Any] = {"twist": twist.tolist(), "axes": extent.principal(pair.target).axes.tolist()}

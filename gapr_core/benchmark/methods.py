@@ -72,7 +72,7 @@ def _paper_pipeline(weights: str | None) -> RegistrationMethod:
 
 
 def _peer(weights: str | None, name: str, pose: str = "own") -> RegistrationMethod:
-    """A network of others, by its module in `gapr_core.benchmark`."""
+    """Load a network of others by its module in `gapr_core.benchmark`."""
     from gapr_core.benchmark.peer import Peer
 
     if weights is None:
@@ -98,7 +98,7 @@ TRAINED = RAW | {name + REFINED: partial(_refined, maker) for name, maker in RAW
 
 
 def _with_weights(name: str) -> tuple[str, str | None]:
-    """The method and the weights of a name: "gapr_paper@runs/mine/weights.safetensors+point_to_plane" has both.
+    """Split a name such as "gapr_paper@runs/mine/weights.safetensors+point_to_plane" into method and weights.
 
     Raises:
         ConfigError: no weights after the `@` of a method that takes some, as of a variable that is not set.
@@ -112,7 +112,7 @@ def _with_weights(name: str) -> tuple[str, str | None]:
 
 
 def names() -> tuple[str, ...]:
-    """Every method that has a name: ours, then the baselines."""
+    """List every method that has a name: ours, then the baselines."""
     return (*OWN, *TRAINED, *sorted(baselines.REGISTRY))
 
 
@@ -125,7 +125,7 @@ def check(wanted: Sequence[str]) -> None:
 
 
 def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod:
-    """A new instance of a method.
+    """Make a new instance of a method.
 
     Args:
         name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
@@ -155,17 +155,17 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
 
 
 def config_of(name: str, config: RegistrarConfig) -> RegistrarConfig | None:
-    """The settings for a method: those given for our own, none for the others."""
+    """Choose the settings for a method: those given for our own, none for the others."""
     return config if name in OWN else None
 
 
 def settings_of(name: str, config: RegistrarConfig) -> str:
-    """What of them is not the default, as `name=value` with commas."""
+    """List the settings that are not the default, as `name=value` with commas."""
     return ", ".join(settings.changes(config)) if name in OWN else ""
 
 
 def made_of(name: str) -> str:
-    """A short text that changes with the weights or the module behind a name; empty for a baseline.
+    """Hash the weights or the module behind a name; empty for a baseline.
 
     Of a module only its own file counts, not what it imports, nor its folder where it is a package.
     """
@@ -190,7 +190,7 @@ def _digest_or_none(path: Path) -> str:
 def register(
     method: RegistrationMethod, source: ArrayLike, target: Any, viewpoint: ArrayLike | None
 ) -> RegistrationResult:
-    """The method's answer; it is given the camera's place, (3,) mm in the source's frame, if it can make use of it."""
+    """Ask a method; pass the camera's place, (3,) mm in the source's frame, if it takes one."""
     if viewpoint is None or not takes(method, "viewpoint"):
         return method.register(source, target)
     return method.register(source, target, viewpoint=viewpoint)  # type: ignore[call-arg]

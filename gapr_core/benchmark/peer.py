@@ -54,13 +54,13 @@ class Checkout(ABC):
 
     @abstractmethod
     def network(self, sizes: ModelConfig) -> nn.Module:
-        """The network with random weights, at the sizes of one of our networks."""
+        """Make the network with random weights, at the sizes of one of our networks."""
 
     @abstractmethod
     def batch(
         self, source: Cloud, target: Cloud, voxel: float, sizes: ModelConfig, T: Tensor | None = None
     ) -> dict[str, Any]:
-        """The input of the network.
+        """Make the input of the network.
 
         Args:
             source, target: of which the finest points are used.
@@ -74,7 +74,7 @@ class Checkout(ABC):
 
     @abstractmethod
     def matches(self, output: Any, batch: dict[str, Any]) -> Matches:
-        """The correspondences in an output of the network."""
+        """Read the correspondences from an output of the network."""
 
     @abstractmethod
     def own_pose(self, output: Any, batch: dict[str, Any]) -> Array:
@@ -123,7 +123,7 @@ class Peer(Baseline):
 
 
 def thinning(sizes: ModelConfig) -> ModelConfig:
-    """The settings for the first voxels: each stage doubles them, all else is as in our network."""
+    """Give the settings for the first voxels: each stage doubles them, all else is as in our network."""
     return replace(sizes, voxel_growth=2.0)
 
 
@@ -144,7 +144,7 @@ def to_mm(T: Array, source: Cloud, target: Cloud, unit_mm: float) -> Array:
 
 
 def correspondences_mm(found: Matches, source: Cloud, target: Cloud, unit_mm: float) -> Correspondences:
-    """What a network found, in mm; RANSAC does not ask for the patches."""
+    """Give the correspondences of a network in mm; RANSAC does not ask for the patches."""
     p = found.source * unit_mm + source.centre_mm.numpy()[0]
     q = found.target * unit_mm + target.centre_mm.numpy()[0]
     return Correspondences(p, q, found.score, np.zeros(len(p), dtype=np.int64))
@@ -159,7 +159,7 @@ def save(code: Checkout, network: nn.Module, sizes: ModelConfig, path: Path, car
 
 
 def load(code: Checkout, path: str | Path) -> tuple[nn.Module, ModelConfig]:
-    """The network of a file, in evaluation mode, and its sizes.
+    """Load the network of a file, in evaluation mode, and its sizes.
 
     Raises:
         WeightsError: the file is missing, damaged or of another network.

@@ -1,4 +1,4 @@
-"""Predator (Huang et al., CVPR 2021) by its authors, from a checkout next to the project; no line of it is here.
+"""Predator (Huang et al., CVPR 2021) by its authors, from a checkout. No line of it is here.
 
 git clone https://github.com/prs-eth/OverlapPredator && pip install scikit-learn matplotlib open3d
 python -m gapr_core.training.predator --checkout OverlapPredator --anatomy DIR --pairs 3000 --out runs/peer
@@ -183,7 +183,7 @@ def subsample_batch(
 def batch_query(
     queries: Tensor, points: Tensor, query_lengths: Tensor, lengths: Tensor, radius: float = 0.1
 ) -> NDArray[np.int64]:
-    """(N, K) rows of points (M, 3) in the ball of each query (N, 3), of its cloud, nearest first; M for none.
+    """Find the points of the same cloud in the ball of each query (N, 3), nearest first; M for none.
 
     K is what the fullest ball holds.
     """

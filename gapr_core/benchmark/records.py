@@ -72,7 +72,7 @@ def write(path: Path, records: Iterable[Record]) -> None:
 
 
 def read(path: Path) -> list[Record]:
-    """Every whole record; a last line that was cut off when the run was killed does not count.
+    """Read every whole record; ignore a last line that was cut off when the run was killed.
 
     Raises:
         ConfigError: a line in the middle that is no record.
@@ -121,12 +121,12 @@ def _others(expected: str, given: str) -> ConfigError:
 
 
 def conditions(records: Sequence[Record]) -> dict[str, list[str]]:
-    """What ran, and on what: every "commit", number of "threads" and "machine" of the records."""
+    """Collect every commit, number of threads and machine of the records."""
     return {name: sorted({str(getattr(r, name)) for r in records}) for name in ("commit", "threads", "machine")}
 
 
 def sort(records: Iterable[Record], methods: Sequence[str]) -> list[Record]:
-    """One record for each pair and method (the first one written), by pair name, then in the order of `methods`."""
+    """Keep the first record of each pair and method, by pair name, then in the order of `methods`."""
     first: dict[tuple[str, str], Record] = {}
     for record in records:
         first.setdefault((record.pair, record.method), record)
@@ -140,7 +140,7 @@ def write_plan(folder: Path, plan: Plan) -> None:
 
 
 def read_plan(folder: Path) -> Plan:
-    """The plan of a finished or interrupted run.
+    """Read the plan of a finished or interrupted run.
 
     Raises:
         ConfigError: the folder is no output of `gapr benchmark`, or its plan is damaged.
@@ -156,7 +156,7 @@ def read_plan(folder: Path) -> Plan:
 
 
 def _whole_lines(path: Path) -> Iterator[str]:
-    """One line at a time: the text of a long run is as large as its records."""
+    """Read one line at a time: the text of a long run is as large as its records."""
     if path.is_file():
         with path.open(encoding="utf-8", errors="replace") as file:
             yield from (line[:-1] for line in file if line.endswith("\n"))

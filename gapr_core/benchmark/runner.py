@@ -65,7 +65,7 @@ def run(tasks: Sequence[Task], jobs: int = 1, threads: int = 1) -> Iterator[Reco
 
 
 def run_on_cluster(tasks: Sequence[Task], address: str) -> Iterator[Record]:
-    """The same on the workers of a Dask cluster, which read the pairs from the same folder.
+    """Run on the workers of a Dask cluster, which read the pairs from the same folder.
 
     A task whose worker dies goes to another one; one of which several have died is recorded as a failure.
     """
@@ -98,7 +98,7 @@ def _run_pool(waiting: deque[Task], jobs: int, threads: int, lost: list[Task]) -
 
 
 def run_task(task: Task) -> Record:
-    """Prepare, register and judge one pair; the first one of a method in this process is run twice to warm up."""
+    """Prepare, register and judge one pair; run the first one of a method twice to warm up."""
     pair = load_pair(task.path)
     check_truth(pair)
     try:
@@ -148,7 +148,7 @@ def check_truth(pair: Pair) -> None:
 
 
 def doubt_of_truth(pair: Pair) -> str:
-    """Why the truth of a pair seems to be written in another way; empty where nothing speaks for it."""
+    """Say why the truth of a pair seems to be written in another way; empty without a doubt."""
     if not pair.has_truth:
         return ""
     tree, T, some = cKDTree(pair.target), pair.T_target_source, pair.source[:: len(pair.source) // LOOKED_AT + 1]
@@ -163,7 +163,7 @@ def doubt_of_truth(pair: Pair) -> str:
 
 
 def _timed(method: RegistrationMethod, pair: Pair) -> tuple[RegistrationResult, tuple[float, float]]:
-    """The answer, and how long registering and preparing took, s."""
+    """Register, and time registering and preparing, s."""
     start = time.perf_counter()
     target = method.prepare(pair.target, "mm")
     prepared = time.perf_counter()

@@ -19,7 +19,7 @@ RECALLS = {"rr_paper": "within_paper", "rr_1_1": "within_1_1", "rr_2_2": "within
 
 
 def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
-    """The table, grouped by protocol, then bone (`all` last), then the methods in the order given."""
+    """Make the table, grouped by protocol, then bone (`all` last), then the methods in the order given."""
     protocols = sorted({r.protocol for r in records})
     table = []
     for protocol in [*protocols, ALL] if len(protocols) > 1 else protocols:
@@ -34,7 +34,7 @@ def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
 
 
 def differences(records: Sequence[Record], methods: Sequence[str], ours: str) -> list[Row]:
-    """How much more often ours is right than each other method, on the same pairs: one per protocol and method.
+    """Compare ours with each other method on the same pairs: one difference of recalls per protocol and method.
 
     Paired, so that what is hard for both says nothing. A refusal is not right; pairs without a truth are left out.
 
@@ -55,7 +55,7 @@ def differences(records: Sequence[Record], methods: Sequence[str], ours: str) ->
 
 
 def _difference(both: Sequence[tuple[Record, Record]]) -> Row:
-    """Of pairs that ours and another method have judged."""
+    """Compare the pairs that ours and another method have judged."""
     more = [int(own.within_4_5) - int(other.within_4_5) for own, other in both]
     low, high = metrics.interval(more, people([own for own, _ in both]))
     counts = {"pairs": len(more), "ours_alone": more.count(1), "other_alone": more.count(-1)}
@@ -64,7 +64,7 @@ def _difference(both: Sequence[tuple[Record, Record]]) -> Row:
 
 
 def summary(records: Sequence[Record]) -> Row:
-    """Every number of one group; None where there is nothing to say (no truth, no covariance, one kind of answer)."""
+    """Compute every number of one group; None without a truth, a covariance or two kinds of answers."""
     row: Row = {"pairs": len(records), "persons": len({r.person for r in records} - {""})}
     row |= _answers(records) | _accuracy([r for r in records if r.has_truth])
     row |= _calibration(records) | _uncertainty([r for r in records if r.right]) | _times(records)
@@ -73,7 +73,7 @@ def summary(records: Sequence[Record]) -> Row:
 
 
 def people(records: Sequence[Record]) -> list[str] | None:
-    """Who each pair is of, for the bootstrap; None unless that is known of all."""
+    """List the subject of each pair for the bootstrap; None unless it is known of all."""
     named = [r.person for r in records]
     return named if all(named) else None
 
@@ -125,7 +125,7 @@ def _calibration(records: Sequence[Record]) -> Row:
 
 
 def _uncertainty(right: Sequence[Record]) -> Row:
-    """Of the right answers alone: a wrong basin has no meaningful covariance and no distance to the bound."""
+    """Summarise right answers alone: a wrong basin has no meaningful covariance and no distance to the bound."""
     nees, ratio = _values(right, "nees"), _values(right, "bound_ratio")
     return {
         "nees_6": _of(np.mean, nees / 6.0), "nees_6_median": _of(np.median, nees / 6.0),
@@ -135,7 +135,7 @@ def _uncertainty(right: Sequence[Record]) -> Row:
 
 
 def _precision(accepted: Sequence[Record]) -> Row:
-    """Of all accepted answers, right or wrong: whoever uses a pose has its `tre95_mm` and not the truth."""
+    """Summarise all accepted answers, right or wrong: whoever uses a pose has its `tre95_mm` and not the truth."""
     bounded = [r for r in accepted if r.predicted_tre95_mm is not None and r.whole_bone_mm is not None]
     bound, true = _values(bounded, "predicted_tre95_mm"), _values(bounded, "whole_bone_mm")
     return {

@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(prog="python -m gapr_core.calibration", description=__doc__,
                             formatter_class=RawDescriptionHelpFormatter)  # fmt: skip
-    parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (see docs/anatomy.md)")
+    parser.add_argument("--anatomy", required=True, type=Path, help="folder with the bones (docs/develop/anatomy.md)")
     parser.add_argument("--out", required=True, type=Path, help="folder for records, models and their card")
     parser.add_argument("--count", type=int, default=3000, help="pairs (default: %(default)s)")
     parser.add_argument(

@@ -43,7 +43,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("merge", nargs="*", help="`merge DIR...`: join the outputs of several shards into --out")
     parser.add_argument("--pairs", type=a_path, help="folder of NAME.npz, as gapr make-pairs writes it")
     parser.add_argument(
-        "--methods", default=DEFAULT_METHODS, help=f"with commas (default: {DEFAULT_METHODS}); see docs/benchmark.md"
+        "--methods",
+        default=DEFAULT_METHODS,
+        help=f"with commas (default: {DEFAULT_METHODS}); docs/tutorials/research.md",
     )
     parser.add_argument("--out", type=a_path, required=True, help="folder for the table, the plots and the report")
     parser.add_argument("--shard", default="1/1", help="i/n: only every n-th pair, beginning with the i-th")

@@ -185,7 +185,7 @@ def warn_of_tracker(args: Namespace) -> None:
     if _is_tracked(args) and _files_of_itk(args) and args.source_axes == "auto":
         log.warning(
             "%s is taken as LPS. 3D Slicer shows a live tracker (OpenIGTLink, PLUS) as RAS, where this transform would "
-            "be wrong: for such a scene give --source-axes ras, else --source-axes lps (docs/how-to/slicer.md)",
+            "be wrong: for such a scene give --source-axes ras, else --source-axes lps (docs/tutorials/slicer.md)",
             args.source.name,
         )
 
@@ -297,7 +297,7 @@ def warn_of_start(args: Namespace, start: Array | None, source: Array, target: A
     apart_mm, turned_mm = (median_mm(se3.apply(T, source), target) for T in (start, se3.inverse(start)))
     if apart_mm > FAR_LANDMARKS_MM and turned_mm < MUCH_NEARER * apart_mm:
         said = f"lays the source {apart_mm:.0f} mm from the bone, and its inverse {turned_mm:.0f} mm"
-        log.warning("%s %s: is it the other way round? docs/formats.md says which is meant", args.initial.name, said)
+        log.warning("%s %s: is it the other way round? See docs/reference/formats.md", args.initial.name, said)
 
 
 def _is_elsewhere(path: Path, cloud: Array, other: Array) -> bool:

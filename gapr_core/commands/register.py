@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
-NOT_NAMED = "the sensor is not named, and tre95 allows for any (--set sensor.kind=...; docs/sensors.md)"
+NOT_NAMED = "the sensor is not named, and tre95 allows for any (--set sensor.kind=...; docs/how-to/sensors.md)"
 PLACE_IS_EXACT = (
     "an error of the whole cloud's place, such as a tracker's, is not in tre95 "
     "(--set sensor.tracking_mm=... --set sensor.tracking_deg=...)"
@@ -35,7 +35,7 @@ PLACE_IS_EXACT = (
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr register`; docs/formats.md explains formats, axes and units."""
+    """The options of `gapr register`; docs/reference/formats.md explains formats, axes and units."""
     parser.add_argument(
         "--source", required=True, type=a_path, help="partial cloud, markups, recording, folder of slices, bag"
     )
@@ -263,7 +263,7 @@ def _write_pose(args: Namespace, done: Registration) -> None:
         return
     used, given = len(result.residuals.points), len(done.source)
     if used < given and (args.residuals or args.slicer):
-        say(f"distances are of {used} of {given} points, those that were used: docs/formats.md")
+        say(f"distances are of {used} of {given} points, those that were used: docs/reference/formats.md")
     if args.residuals and args.residuals.suffix.lower() == ".json":
         files.write_json(args.residuals, scene.residuals_json(result.residuals))
     elif args.residuals:

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import check_extent, check_faces, is_point, load
+from gapr_core.clouds import check_extent, is_point, load
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats.reading import ending_of
 from gapr_core.runtime import files
-from gapr_core.surface import Surface
+from gapr_core.surface import Surface, check_faces
 
 Array = NDArray[np.float64]
 BONES = ("femur", "tibia", "pelvis", "thoracic")
@@ -41,7 +41,7 @@ class Corresponded:
         return Corresponded(self.points[rows], self.faces, kept, self.bone, self.cohort)
 
     def specimens(self) -> list[Specimen]:
-        """One specimen a subject."""
+        """Make one specimen for each subject."""
         return [
             Specimen(Surface(points, self.faces), self.bone, person, self.cohort)
             for points, person in zip(self.points, self.person, strict=True)
@@ -73,7 +73,7 @@ def splits(folder: str | Path) -> dict[str, list[str]]:
 
 
 def corresponded(folder: str | Path, bone: str) -> list[Corresponded]:
-    """All `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty.
+    """Read all `<bone>_<cohort>.npz` of the folder (points (P, N, 3), faces (F, 3), `person` (P,)); may be empty.
 
     Raises:
         ConfigError: no such folder.
@@ -106,7 +106,7 @@ def _unreadable(path: Path, why: str) -> InvalidPointCloudError:
 
 
 def surfaces(folder: str | Path, bone: str, split: str = "all", cohort: str | None = None) -> list[Specimen]:
-    """The bones of one type of the subjects of one split, ordered by cohort and subject.
+    """List the bones of one type of the subjects of one split, by cohort and subject.
 
     Args:
         folder: layout as in `../shared/anatomy`.
@@ -151,7 +151,7 @@ def _person_of(stem: str) -> str:
 
 
 def meshes(folder: str | Path, bone: str | None = None, split: str = "all", units: str = "mm") -> list[Specimen]:
-    """A user's own meshes, one file per subject, in any format that has faces (`MESHES`); other files are left alone.
+    """Read a user's own meshes, one file per subject, in any format with faces (`MESHES`); ignore other files.
 
     `folder/<person>.stl` are all of one bone, named `bone` or after the folder; `folder/<bone>/<person>.stl` are of
     several. With `splits.json` in the folder subjects are split by it, else 60/20/20 in an order drawn once from a
@@ -194,7 +194,7 @@ def meshes_hash(folder: str | Path, bones: Sequence[str], split: str = "all") ->
 
 
 def is_flat(folder: str | Path) -> bool:
-    """Whether `meshes` takes the files of a folder for one bone."""
+    """Check whether `meshes` takes the files of a folder for one bone."""
     return bool(_mesh_files(Path(folder)))
 
 
@@ -245,5 +245,5 @@ def _of_split(specimens: list[Specimen], split: str, people: dict[str, list[str]
 
 
 def mirrored(specimen: Specimen) -> Specimen:
-    """The bone of the other side of the same subject's body."""
+    """Mirror a bone to the other side of the same subject."""
     return replace(specimen, surface=specimen.surface.mirrored())

@@ -57,7 +57,7 @@ class Site:
 
     @classmethod
     def of(cls, specimen: Specimen, origin_mm: Array, neighbour: Specimen | None = None) -> Site:
-        """A specimen in the frame of a pair that was made of it, and the bone next to it in the same scan."""
+        """Find the specimen of a pair, in its frame, and the next bone of the same scan."""
         rng = np.random.default_rng(0)
         points, normals = specimen.sample(2 * TARGET_POINTS, rng)
         beyond = neighbour.sample(TARGET_POINTS, rng)[0] - origin_mm if neighbour else np.empty((0, 3))
@@ -68,7 +68,7 @@ class Site:
         return np.asarray(self.normals[cKDTree(self.points).query(points)[1]])
 
     def frame_at(self, points: Array, rng: Random) -> tuple[Array, Array]:
-        """One of the points (3,), and (3, 3) rows: two directions along the bone there, and the outward one."""
+        """Choose a point (3,), and (3, 3) rows: two directions along the bone there, and the outward one."""
         place = points[rng.integers(len(points))]
         outward = self.outward(place[None])[0]
         along = np.cross(outward, random_directions(1, rng)[0])
@@ -89,7 +89,7 @@ def cartilage(points: Array, site: Site, rng: Random) -> Array:
 
 
 def plate(points: Array, site: Site, rng: Random) -> Array:
-    """A plate is screwed to the bone, and hides what is under it."""
+    """Screw a plate to the bone, which hides a part of it."""
     place, axes = site.frame_at(points, rng)
     local = (points - place) @ axes.T
     half = np.array(PLATE_MM) / 2.0
@@ -118,7 +118,7 @@ def _sheet(points: Array, site: Site, count: int, rng: Random) -> Array:
 
 
 def joint(points: Array, site: Site, rng: Random) -> Array:
-    """The end of the next bone is in the cloud as well; nothing changes where none is known."""
+    """Add the end of the next bone to the cloud; nothing changes if none is known."""
     if not len(site.neighbour):
         return points
     gaps = cKDTree(site.points).query(site.neighbour)[0]
@@ -129,7 +129,7 @@ def joint(points: Array, site: Site, rng: Random) -> Array:
 
 
 def fracture(points: Array, site: Site, rng: Random) -> Array:
-    """A part of the bone is turned and shifted against the rest; the pose that is asked for is that of the rest."""
+    """Turn and shift a part of the bone against the rest; the true pose is that of the rest."""
     along = points @ random_directions(1, rng)[0]
     fragment = along < np.quantile(along, rng.uniform(*FRAGMENT))
     turn = np.radians(rng.uniform(*FRAGMENT_DEG)) * random_directions(1, rng)[0]
@@ -185,25 +185,25 @@ def stitched(points: Array, site: Site, rng: Random) -> Array:
 
 
 def bent(points: Array, site: Site, rng: Random) -> Array:
-    """The cloud sags by 3 mm towards its ends, as one whose sensor drifts."""
+    """Bend the cloud by 3 mm towards its ends, as a sensor that drifts does."""
     axes, centred = extent.principal(points).axes, points - points.mean(axis=0)
     along = centred @ axes[0]
     return np.asarray(points + SAG_MM * ((along / np.abs(along).max()) ** 2)[:, None] * axes[2])
 
 
 def smoothed(points: Array, site: Site, rng: Random) -> Array:
-    """Every point is the mean of those within 5 mm: what a scanner's software may do."""
+    """Replace every point by the mean of those within 5 mm, as a scanner's software may do."""
     around = cKDTree(points).query_ball_point(points, SMOOTH_MM)
     return np.array([points[rows].mean(axis=0) for rows in around])
 
 
 def even_layer(points: Array, site: Site, rng: Random) -> Array:
-    """An even layer of 4 to 8 mm covers all that is seen: muscle, a drape; or the sensor is off by as much."""
+    """Cover the cloud by an even layer of 4 to 8 mm: muscle, a drape, or an offset of the sensor."""
     return np.asarray(points + rng.uniform(*LAYER_MM) * site.outward(points))
 
 
 def of_source(change: Change, pair: Pair, site: Site, specimen: Specimen, rng: Random) -> Pair:
-    """The pair with its source changed where it lies on the bone."""
+    """Change the source of a pair where it lies on the bone."""
     if not pair.has_truth:
         raise ValueError("a pair with a true pose is damaged; for another subject's bone, its source is taken then")
     on_bone = change(se3.apply(pair.T_target_source, pair.source), site, rng)
@@ -211,7 +211,7 @@ def of_source(change: Change, pair: Pair, site: Site, specimen: Specimen, rng: R
 
 
 def beyond(pair: Pair, site: Site, specimen: Specimen, rng: Random) -> Pair:
-    """The target ends at 60 % of the bone's length, and the source does not."""
+    """End the target at 60 % of the bone's length, but not the source."""
     part = specimen.end(KEPT_LENGTH, bool(rng.integers(2)))
     return replace(pair, target=part.sample(TARGET_POINTS, rng)[0] - pair.metadata["origin_mm"])
 

@@ -25,7 +25,7 @@ def smooth_field(
 
 
 def deform(surface: Surface, rng: np.random.Generator) -> Surface:
-    """The surface moved by waves of 80-250 mm (shape) and 15-50 mm (texture); normals are dropped, faces kept."""
+    """Move the surface by waves of 80-250 mm (shape) and 15-50 mm (texture); drop normals, keep faces."""
     moved = surface.points + smooth_field(surface.points, rng, SHAPE_MM, (80.0, 250.0))
     moved = moved + smooth_field(surface.points, rng, TEXTURE_MM, (15.0, 50.0), waves=24)
     return replace(surface, points=moved, normals=None)

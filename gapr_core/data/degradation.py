@@ -46,7 +46,7 @@ def measured(
     rng: np.random.Generator,
     smooth_bias: str = "waves-peak",
 ) -> Array:
-    """Surface points (N, 3) with white noise and smooth bias; a share of them, the last ones then, is thrown off."""
+    """Add white noise and smooth bias to surface points (N, 3), and throw off a share, the last ones then."""
     outliers = round(outlier_share * len(points))
     dirty = points + rng.normal(0.0, noise_mm, points.shape)
     if bias_mm:

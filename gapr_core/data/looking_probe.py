@@ -50,7 +50,7 @@ class LookingProbe:
         self.anywhere = self._surface[rng.integers(SURFACE_POINTS)]  # (3,) bone frame: a random place to begin
 
     def look(self, centre: Array, number: int) -> Array:
-        """The points of one look.
+        """Measure the points of one look.
 
         Args:
             centre: (3,) in the bone's frame; the middle of the look is the nearest point of the surface.

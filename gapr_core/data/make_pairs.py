@@ -59,7 +59,7 @@ class Recipe:
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr make-pairs`."""
+    """Add the options of `gapr make-pairs`."""
     parser.add_argument("--protocol", required=True, help=f"one or more, with commas: {', '.join(PROTOCOLS)}")
     parser.add_argument("--bones", help="with commas; default: femur,tibia,pelvis,thoracic, or what --meshes holds")
     parser.add_argument("--count", type=at_least_one, default=40, help="pairs for each bone and protocol (40)")
@@ -147,13 +147,13 @@ def begin(recipe: Recipe, out: Path) -> None:
 
 
 def _is_of(listed: dict[str, Any], recipe: Recipe) -> bool:
-    """Whether a manifest lists this recipe; older ones do not say of which anatomy they are."""
+    """Check whether a manifest lists this recipe; older ones do not name their anatomy."""
     unsaid = {"meshes": recipe.meshes, "units": recipe.units} if recipe.origin == "anatomy" and recipe.meshes else {}
     return unsaid | listed == recipe.listed()
 
 
 def read_manifest(folder: str | Path) -> dict[str, Any]:
-    """The manifest of a folder of pairs.
+    """Read the manifest of a folder of pairs.
 
     Raises:
         ConfigError: there is none, or it is damaged.

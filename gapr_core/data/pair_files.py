@@ -40,7 +40,7 @@ def save_pair(path: str | Path, pair: Pair) -> None:
 
 
 def pair_paths(folder: str | Path) -> list[Path]:
-    """The files of a folder of pairs, by name.
+    """List the files of a folder of pairs, by name.
 
     Raises:
         ConfigError: no such folder, or none in it.
@@ -52,8 +52,7 @@ def pair_paths(folder: str | Path) -> list[Path]:
 
 
 def load_clouds(path: str | Path) -> tuple[Array, Array, Array | None]:
-    """Source (N, 3) and target (M, 3), mm, and where the camera was in the source's frame, (3,) or (N, 3); None
-    if not said.
+    """Read source, target, mm, and the camera's place in the source's frame, (3,) or (N, 3); None if not said.
 
     Nothing else of the file is read, so that no truth can be looked at.
 
@@ -82,7 +81,7 @@ def load_pair(path: str | Path) -> Pair:
 
 
 def load_facts(path: str | Path) -> Pair:
-    """What a file says of its pair, checked like a whole one; the clouds are not read, and empty in the answer.
+    """Read and check the facts of a pair like a whole one; its clouds stay empty.
 
     Raises:
         InvalidPointCloudError: as of `load_pair`, as far as it can be known without the coordinates.
@@ -120,7 +119,7 @@ def _head(data: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _pair(clouds: tuple[Array, Array], arrays: Mapping[str, NDArray[Any]], path: str | Path) -> Pair:
-    """The pair with its metadata, whose shapes and types are checked."""
+    """Make the pair with its metadata, and check shapes and types."""
     _check_facts(arrays, path)
     transform = _transform(arrays, path)
     facts = {key: array for key, array in arrays.items() if key not in (*CLOUDS, "transform", "has_truth")}

@@ -12,17 +12,19 @@ SIZE_CORRELATION = 0.7  # how strongly lengths of one subject go together
 
 
 def length(low: float, high: float) -> Any:
-    """A size, mm, that grows with the subject; about 95 % of subjects lie between `low` and `high`."""
+    """Declare a size, mm, that grows with the subject; about 95 % of subjects lie between `low` and `high`."""
     return field(default=(low + high) / 2.0, metadata={"range": (low, high), "grows": True})
 
 
 def trait(low: float, high: float) -> Any:
-    """An angle, a ratio or another trait that does not go with body size."""
+    """Declare an angle, a ratio or another trait that does not go with body size."""
     return field(default=(low + high) / 2.0, metadata={"range": (low, high), "grows": False})
 
 
 def draw(parameters: type[P], rng: np.random.Generator) -> P:
-    """One subject's parameters: normal about the middle of each range, two standard deviations to its ends, clipped."""
+    """Draw one subject's parameters: normal about the middle of each range, two standard deviations to its ends,
+    clipped.
+    """
     body = rng.normal()
     values = {f.name: _draw_one(f.metadata, body, rng) for f in fields(parameters) if f.metadata}  # type: ignore[arg-type]
     return parameters(**values)

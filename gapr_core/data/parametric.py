@@ -22,7 +22,7 @@ from gapr_core.surface import Surface
 
 
 def make_bone(name: str, seed: int) -> Surface:
-    """One bone of subject `seed`: a closed mesh in mm, the same one for the same arguments.
+    """Make one bone of subject `seed`: a closed mesh in mm, the same one for the same arguments.
 
     Args:
         name: a key of `BONES`. Femur and tibia are a left or a right one, as the seed decides.

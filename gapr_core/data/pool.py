@@ -13,7 +13,7 @@ PARAMETRIC_SPLIT = {"train": (0, 1, 2), "val": (3,), "test": (4,)}  # of the sub
 
 
 def parametric_people(split: str, count: int) -> list[int]:
-    """The numbers (seeds of `make_bone`) of the first `count` subjects of a split; no number is in two splits."""
+    """List the numbers (seeds of `make_bone`) of the first `count` subjects of a split; splits share none."""
     if split == "all":
         return list(range(count))
     if split not in PARAMETRIC_SPLIT:
@@ -23,7 +23,7 @@ def parametric_people(split: str, count: int) -> list[int]:
 
 
 def parametric_split(person: str) -> str | None:
-    """The split of a parametric subject by name, "parametric_7"; None for anybody else."""
+    """Find the split of a parametric subject by name, "parametric_7"; None for anybody else."""
     prefix, _, number = person.rpartition("_")
     if prefix != "parametric" or not number.isdecimal():
         return None
@@ -31,7 +31,7 @@ def parametric_split(person: str) -> str | None:
 
 
 def parametric_specimen(bone: str, number: int) -> Specimen:
-    """The bone of parametric subject `number`; all bones of one number are of one subject."""
+    """Make the bone of parametric subject `number`; all bones of one number are of one subject."""
     return Specimen(make_bone(bone, number), bone, f"parametric_{number}", "parametric")
 
 
@@ -43,7 +43,7 @@ def specimens(
     meshes_folder: str | Path | None = None,
     units: str = "mm",
 ) -> list[Specimen]:
-    """The bones of one type to make pairs from.
+    """List the bones of one type to make pairs from.
 
     From `meshes_folder` or `anatomy_folder` everybody of the split; the first `people` parametric ones where neither
     is given, and where the anatomy folder has no mesh of this bone in any split (its cohort then says "parametric").
@@ -56,5 +56,5 @@ def specimens(
 
 
 def bones_in(meshes_folder: str | Path, units: str = "mm") -> list[str]:
-    """The bone names that a folder of meshes in this unit holds."""
+    """List the bone names that a folder of meshes in this unit holds."""
     return sorted({s.bone for s in anatomy.meshes(meshes_folder, units=units)})

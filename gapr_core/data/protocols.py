@@ -74,7 +74,7 @@ for _name, _rms_mm in (("L2", 0.7), ("L3", 1.06)):  # a plane wave of the level'
 def make_pair(
     protocol: str, specimen: Specimen, seed: int, others: Sequence[Specimen] = (), turn: int | None = None
 ) -> Pair:
-    """One pair of `protocol` from one specimen; the same arguments always give the same pair.
+    """Make one pair of `protocol` from one specimen; the same arguments always give the same pair.
 
     Args:
         protocol: a name of `PROTOCOLS`.
@@ -126,7 +126,7 @@ def incomplete(specimen: Specimen, rng: np.random.Generator) -> Pair:
 
 
 def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pair:
-    """What a probe sees of a region: sampled from the surface, with noise, smooth bias and outliers."""
+    """Draw a probe's view of a region: sampled from the surface, with noise, smooth bias and outliers."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     points, normals, metadata = views.best_view(specimen, level.share, level.share_of, rng)
     chosen = rng.permutation(len(points))[: level.max_points]
@@ -141,7 +141,7 @@ def one_sided(specimen: Specimen, rng: np.random.Generator, level: Level) -> Pai
 
 
 def acquired(specimen: Specimen, rng: np.random.Generator, sensor: str) -> Pair:
-    """What a simulated sensor of `data.sensors` measures of the bone; a camera's viewpoint is in the source's frame."""
+    """Measure the bone with a simulated sensor of `data.sensors`; a camera's viewpoint is in the source's frame."""
     target, _ = specimen.sample(TARGET_POINTS, rng)
     found = (SENSORS | SPARSE)[sensor](specimen, rng)
     rotation = se3.random_rotation(rng)
@@ -149,7 +149,7 @@ def acquired(specimen: Specimen, rng: np.random.Generator, sensor: str) -> Pair:
 
 
 def wrong(specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen], turn: int | None = None) -> Pair:
-    """A source that is not of this bone: in turn another bone type, another subject's; each as L1, L2, L3 and paper."""
+    """Draw a source of another bone type or another subject in turn; each as L1, L2, L3 and paper."""
     turn = int(rng.integers(8)) if turn is None else turn
     source_of = _another(specimen, others, turn % 2, rng)
     degraded_as = DEGRADED_AS[turn // 2 % len(DEGRADED_AS)]
@@ -165,7 +165,7 @@ def wrong_scene(
     turn: int | None = None,
     levels: Sequence[str] = ("scene-C1", "scene-C2", "scene-C3"),
 ) -> Pair:
-    """A scene that is not of this bone: in turn of another bone type, of another subject's; each of the levels."""
+    """Draw a scene of another bone type or another subject in turn; each of the levels."""
     turn = int(rng.integers(2 * len(levels))) if turn is None else turn
     source_of = _another(specimen, others, turn % 2, rng)
     level = levels[turn // 2 % len(levels)]
@@ -180,7 +180,7 @@ def wrong_scene(
 def _facts_of_wrong(
     specimen: Specimen, source_of: Specimen, pair: Pair, degraded_as: str, origin_mm: Array
 ) -> dict[str, Any]:
-    """The metadata of a pair with the target of one bone and the source of another, which `pair` is of."""
+    """Collect the metadata of a pair with the target of one bone and the source of another."""
     return {
         **pair.metadata,
         "origin_mm": origin_mm,
@@ -218,7 +218,7 @@ def _finish_like_the_paper(
 
 
 def _crop_centre(cloud: Array, rng: np.random.Generator) -> int:
-    """Index of a random point; of a long bone (twice as long as wide) one from the last 5 % at either end."""
+    """Choose a random point; of a long bone (twice as long as wide) one at either end."""
     centred = cloud - cloud.mean(axis=0)
     axes, variances = extent.principal(cloud)
     if variances[0] < 4.0 * variances[1]:

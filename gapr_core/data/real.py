@@ -1,4 +1,4 @@
-"""Public real data in the form in which it is published. None of it ships; docs/real_data.md says where it is.
+"""Public real data in the form in which it is published. None of it ships; docs/results/real.md says where it is.
 
 Two forms are known: pairs as NPZ (`source`, `target` and, where it is known, `transform`), such as the RealSense cloud
 of a sawbone femur; and folders of UltraBones100k, `specimenNN/CT_bone_segmentations/BONE.stl` with tracked ultrasound
@@ -46,13 +46,13 @@ class RealPair:
 
 
 def default_folder() -> Path:
-    """The folder named by GAPR_REAL, else `../shared/real` next to the repository; it may not exist."""
+    """Find the folder named by GAPR_REAL, else `../shared/real` next to the repository; it may not exist."""
     named = os.environ.get(ENVIRONMENT_VARIABLE)
     return Path(named) if named else Path(__file__).resolve().parents[2].parent / "shared" / "real"
 
 
 def pairs(folder: str | Path) -> Iterator[RealPair]:
-    """Every pair of a folder, one after the other.
+    """Read every pair of a folder, one after the other.
 
     Raises:
         ConfigError: no such folder, or nothing of a known form in it.
@@ -61,7 +61,7 @@ def pairs(folder: str | Path) -> Iterator[RealPair]:
     folder = Path(folder)
     found, records = sorted(folder.glob("*.npz")), sorted(_records(folder))
     if not found and not records:
-        raise ConfigError(EXPECTED, str(folder), "docs/real_data.md says what is public and how to lay it out")
+        raise ConfigError(EXPECTED, str(folder), "docs/results/real.md says what is public and how to lay it out")
     yield from map(_of_npz, found)
     for record, bone in records:
         yield _of_record(folder, record, bone)
@@ -75,7 +75,7 @@ def _of_npz(path: Path) -> RealPair:
 
 
 def _records(folder: Path) -> Iterator[tuple[Path, Path]]:
-    """The reconstructions of a data set, or of one specimen, each with its bone."""
+    """List the reconstructions of a data set, or of one specimen, each with its bone."""
     pattern = "ultrasound_records/*/*/3D_reconstructions/**/*.xyz"
     for record in {*folder.glob(pattern), *folder.glob(f"specimen*/{pattern}")}:
         records = next(parent for parent in record.parents if parent.name == "ultrasound_records")

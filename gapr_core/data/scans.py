@@ -15,12 +15,12 @@ VOXELS_AT_ONCE = 1 << 20
 
 
 def of_size(factor: float) -> Scan:
-    """The surface of a smaller or a larger subject."""
+    """Scale the surface to a smaller or a larger subject."""
     return lambda surface: Surface(surface.points * factor, surface.faces)
 
 
 def of_voxels(*size_mm: float) -> Scan:
-    """The surface of the voxels (x, y, z) whose centres are inside, terraces and all (marching cubes of the mask)."""
+    """Mesh the voxels (x, y, z) whose centres are inside, terraces and all (marching cubes of the mask)."""
     import open3d as o3d
 
     size = np.array(size_mm)
@@ -42,17 +42,17 @@ def of_voxels(*size_mm: float) -> Scan:
 
 
 def of_triangles(count: int) -> Scan:
-    """The surface with so many triangles (quadric decimation)."""
+    """Reduce the surface to so many triangles (quadric decimation)."""
     return _of_mesh(lambda mesh: mesh.simplify_quadric_decimation(count))
 
 
 def smoothed(rounds: int) -> Scan:
-    """The surface after rounds of Laplacian smoothing, which shrinks what is thin."""
+    """Smooth the surface by rounds of Laplace, which shrinks thin parts."""
     return _of_mesh(lambda mesh: mesh.filter_smooth_laplacian(rounds))
 
 
 def drawn(rng: np.random.Generator) -> Scan:
-    """One of the others at random: voxels of 1 to 3 mm within a slice and from slice to slice, or few triangles."""
+    """Draw one of the others at random: voxels of 1 to 3 mm within and between slices, or few triangles."""
     if rng.random() < 0.3:
         return of_triangles(int(rng.integers(800, 4000)))
     within, slices = rng.uniform(1.0, 3.0, 2)
@@ -60,5 +60,5 @@ def drawn(rng: np.random.Generator) -> Scan:
 
 
 def _of_mesh(change: Callable[[Any], Any]) -> Scan:
-    """What changes an `open3d.geometry.TriangleMesh`, for a surface."""
+    """Apply a change of an `open3d.geometry.TriangleMesh` to a surface."""
     return lambda surface: Surface.from_open3d(change(surface.to_open3d()))

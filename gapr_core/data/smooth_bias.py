@@ -19,14 +19,14 @@ FEATURES = 200  # random Fourier features of the process (Rahimi and Recht 2007)
 
 
 def waves(points: Array, rng: np.random.Generator) -> Array:
-    """(N,) sum of plane waves of 60 to 120 mm with normal weights, of variance `WAVES` / 2, at points (N, 3), mm."""
+    """Add plane waves of 60 to 120 mm with normal weights at points (N, 3), variance `WAVES` / 2."""
     wave_vectors = random_directions(WAVES, rng) * (2.0 * np.pi / rng.uniform(*WAVELENGTH_MM, (WAVES, 1)))
     phases, weights = rng.uniform(0.0, 2.0 * np.pi, WAVES), rng.normal(size=WAVES)
     return np.asarray(np.sin(points @ wave_vectors.T + phases) @ weights)
 
 
 def wave(points: Array, rng: np.random.Generator) -> Array:
-    """(N,) one plane wave of 60 to 120 mm and amplitude 1, which is .7 as a root mean square, at points (N, 3), mm."""
+    """Draw one plane wave of 60 to 120 mm and amplitude 1 at points (N, 3), mm."""
     wave_vector = random_directions(1, rng)[0] * (2.0 * np.pi / rng.uniform(*WAVELENGTH_MM))
     return np.asarray(np.sin(points @ wave_vector + rng.uniform(0.0, 2.0 * np.pi)))
 

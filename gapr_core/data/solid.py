@@ -52,7 +52,7 @@ class Solid:
         return self
 
     def surface(self, smoothing_mm: float = 1.5) -> Surface:
-        """The zero level as a closed mesh, outward wound: smoothed, its largest component, at the grid's density."""
+        """Mesh the zero level, outward wound: smoothed, its largest component, at the grid's density."""
         import open3d as o3d
 
         band = np.clip(self._values, -4.0 * self.spacing, 4.0 * self.spacing)
@@ -81,7 +81,7 @@ def simplify(surface: Surface, faces: int) -> Surface:
 
 
 def is_closed(faces: NDArray[np.integer]) -> bool:
-    """Whether every edge of the faces (F, 3) belongs to exactly two of them, once in each direction."""
+    """Check that every edge of the faces (F, 3) belongs to exactly two of them, once in each direction."""
     half_edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     count = int(half_edges.max()) + 1
     forward = np.sort(half_edges[:, 0] * count + half_edges[:, 1])
@@ -96,12 +96,12 @@ def volume_mm3(surface: Surface) -> float:
 
 
 def ball(centre: ArrayLike, radius: float) -> Shape:
-    """A ball of `radius` mm."""
+    """Make a ball of `radius` mm."""
     return tube([centre, centre], [radius, radius])
 
 
 def ellipsoid(centre: ArrayLike, radii: ArrayLike, axes: ArrayLike | None = None) -> Shape:
-    """An ellipsoid with semi-axes `radii` along x, y, z or along the rows of `axes` (3, 3); a first-order distance."""
+    """Make an ellipsoid with semi-axes `radii` along x, y, z or the rows of `axes` (3, 3); first-order distance."""
     c, r = np.asarray(centre, dtype=np.float64), np.asarray(radii, dtype=np.float64)
     frame = np.eye(3) if axes is None else np.asarray(axes, dtype=np.float64)
 
@@ -121,7 +121,7 @@ def tube(
     flat: ArrayLike | None = None,
     flatness: float = 1.0,
 ) -> Shape:
-    """A chain of round cones through `points` (K, 3) with `radii` (K,).
+    """Make a chain of round cones through `points` (K, 3) with `radii` (K,).
 
     With `flat` (a unit vector) the section is an ellipse, `flatness` times the radius along that vector.
     """
@@ -139,7 +139,7 @@ def tube(
 
 
 def wheel(centre: ArrayLike, axis: ArrayLike, radius: float, half_width: float, edge: float) -> Shape:
-    """A cylinder about `axis` (unit vector) with rims rounded by `edge` mm: a condyle, a trochlea."""
+    """Make a cylinder about `axis` (unit vector) with rims rounded by `edge` mm: a condyle, a trochlea."""
     c, a = np.asarray(centre, dtype=np.float64), np.asarray(axis, dtype=np.float64)
 
     def distance(x: Grid, y: Grid, z: Grid) -> Grid:
@@ -155,7 +155,7 @@ def wheel(centre: ArrayLike, axis: ArrayLike, radius: float, half_width: float, 
 
 
 def loft(z_low: float, z_high: float, reach: float, radius: Callable[[Grid, Grid], Grid]) -> Shape:
-    """A shaft along z about the origin: `radius(angle, z)` mm, angle = atan2(y, x); flat ends."""
+    """Make a shaft along z about the origin: `radius(angle, z)` mm, angle = atan2(y, x); flat ends."""
 
     def distance(x: Grid, y: Grid, z: Grid) -> Grid:
         wall = np.sqrt(x**2 + y**2) - radius(np.arctan2(y, x), z)
@@ -165,7 +165,9 @@ def loft(z_low: float, z_high: float, reach: float, radius: Callable[[Grid, Grid
 
 
 def profile(stations: ArrayLike, values: ArrayLike) -> Callable[[Grid], Grid]:
-    """A smooth curve through `values` at increasing `stations`, without overshoot (PCHIP), constant beyond the ends."""
+    """Draw a smooth curve through `values` at increasing `stations`, without overshoot (PCHIP), constant beyond the
+    ends.
+    """
     at = np.asarray(stations, dtype=np.float64)
     curve = PchipInterpolator(at, np.asarray(values, dtype=np.float64))
     return lambda z: np.asarray(curve(np.clip(z, at[0], at[-1])), dtype=np.float32)
@@ -179,7 +181,7 @@ def half_space(point: ArrayLike, outward: ArrayLike, reach: float) -> Shape:
 
 
 def clipped(shape: Shape, point: ArrayLike, outward: ArrayLike) -> Shape:
-    """The shape without what lies beyond the plane through `point`, on the side that `outward` looks to."""
+    """Cut the shape at the plane through `point`, on the side that `outward` looks to."""
     c, n = np.asarray(point, dtype=np.float64), np.asarray(outward, dtype=np.float64)
     n = n / np.linalg.norm(n)
 
@@ -190,7 +192,7 @@ def clipped(shape: Shape, point: ArrayLike, outward: ArrayLike) -> Shape:
 
 
 def sheet(rows: Sequence[tuple[ArrayLike, ArrayLike]], step_mm: float = 2.5) -> Shape:
-    """A bent plate through rows of control points (K, 3), each with radii (K,): smooth along and across the rows."""
+    """Make a bent plate through rows of control points (K, 3), each with radii (K,)."""
     points, radii = (np.stack([np.asarray(row[i], dtype=np.float64) for row in rows]) for i in (0, 1))
     across = int(np.ceil(np.linalg.norm(np.diff(points, axis=0), axis=2).sum(axis=0).max() / step_mm)) + 1
     along = int(np.ceil(np.linalg.norm(np.diff(points, axis=1), axis=2).sum(axis=1).max() / step_mm)) + 1
@@ -202,7 +204,7 @@ def sheet(rows: Sequence[tuple[ArrayLike, ArrayLike]], step_mm: float = 2.5) -> 
 
 
 def skeleton(points: ArrayLike, radii: ArrayLike) -> Shape:
-    """A solid from samples of its medial sheet or line: `points` (K, 3) dense against `radii` (K,).
+    """Make a solid from samples of its medial sheet or line: `points` (K, 3) dense against `radii` (K,).
 
     Every place sees the two samples that are nearest to it, so that the surface is no chain of beads.
     """

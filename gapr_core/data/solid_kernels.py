@@ -11,7 +11,7 @@ FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @numba.njit(**FAST)
 def nearest_samples(x, y, z, centres, radii, limit):
-    """For cells at x, y, z, mm ascending: least distance minus radius of the two nearest samples, (Z, Y, X).
+    """Find the least distance minus radius of the two nearest samples at x, y, z, mm ascending, (Z, Y, X).
 
     Args:
         centres, radii: (K, 3), (K,) mm.

@@ -52,7 +52,7 @@ class Specimen:
         return self.surface.sample(count, rng)
 
     def visible_from(self, points: Array, direction: Array) -> NDArray[np.bool_]:
-        """Which surface points (N, 3) see a far probe in `direction`, (3,) or (N, 3), with nothing in between.
+        """Find the surface points (N, 3) that see a far probe in `direction`, (3,) or (N, 3).
 
         Orientation of the faces does not matter: a ray from the far side runs through the bone and hits it.
         """
@@ -66,7 +66,7 @@ class Specimen:
         return self._scene.compute_distance(queries).numpy().astype(np.float64)
 
     def end(self, share: float, upper: bool) -> Specimen:
-        """What a shorter scan holds of it: a share (0 to 1) of its length at one end, closed where it is cut.
+        """Keep a share of the length at one end, closed where it is cut, as a shorter scan does.
 
         `upper` is the end with the larger coordinate along the axis nearest to the bone's longest direction.
         """
@@ -81,7 +81,7 @@ class Specimen:
         return replace(self, surface=Surface(points, faces))
 
     def cut(self, normal: Array, offset_mm: float) -> Specimen:
-        """What a saw or the border of a scan leaves of it: the side of a plane against its normal, closed by the plane.
+        """Keep the side of a plane against its normal, closed by the plane, as a saw does.
 
         Corners of cut faces that are beyond the plane move onto it.
 
@@ -112,7 +112,7 @@ class Specimen:
 
 
 def _closed(points: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Every hole of a mesh filled with triangles from its rim to the rim's middle."""
+    """Fill every hole of a mesh with triangles from its rim to the rim's middle."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     rim = edges[first[counts == 1]]

@@ -48,7 +48,7 @@ class Motion:
 
 
 def simulate(specimen: Specimen, seed: int, motion: Motion | None = None) -> list[Pair]:
-    """The stream's frames as pairs of one common target, protocol `stream`."""
+    """Simulate the stream's frames as pairs of one common target, protocol `stream`."""
     motion = motion or Motion()
     rng = np.random.default_rng([seed, 23])
     target, _ = specimen.sample(TARGET_POINTS, rng)
@@ -84,7 +84,7 @@ def _measured(specimen: Specimen, points: Array, normals: Array, motion: Motion,
 def _view(
     specimen: Specimen, points: Array, axis: Array, towards: Array, at: float, motion: Motion
 ) -> NDArray[np.intp]:
-    """Indices of the surface points (N, 3) in view at `at` (0 to 1) of the probe's way along the bone and back."""
+    """Find the surface points in view at `at` (0 to 1) of the probe's way along the bone and back."""
     swing = Rotation.from_rotvec(axis * np.radians(motion.swing_deg) * np.sin(4.0 * np.pi * at))
     seen = np.flatnonzero(specimen.visible_from(points, swing.apply(towards)))
     along = points[seen] @ axis

@@ -50,7 +50,7 @@ class Sweep:
 
 
 def simulate(specimen: Specimen, seed: int, how: Acquisition | None = None) -> Sweep:
-    """A probe sweep from one end of the bone to the other, on the side that faces the surgeon."""
+    """Sweep a probe from one end of the bone to the other, on the side that faces the surgeon."""
     how = how or Acquisition()
     rng = np.random.default_rng(seed)
     points, normals = specimen.sample(60_000, rng)
@@ -83,7 +83,7 @@ def _seen_at(
 
 
 def _long_axis(points: Array) -> Array:
-    """The direction (3,) of greatest extent, towards smaller z or x: from the hip down, from the left to the right."""
+    """Find the direction (3,) of greatest extent, towards smaller z or x."""
     axis = extent.principal(points).axes[0]
     return -axis * np.sign(axis[np.argmax(np.abs(axis))])
 

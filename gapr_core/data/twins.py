@@ -46,7 +46,7 @@ def near_duplicates(subjects: Corresponded) -> list[Twins]:
 
 
 def most_similar(specimen: Specimen, others: Sequence[Specimen], count: int) -> list[Specimen]:
-    """Of the same bones of others, those whose shape is most like the specimen's, grown to its size; the nearest first.
+    """Rank the same bones of others by shape, grown to the specimen's size; the nearest first.
 
     Only bones of its cohort whose vertices correspond to its own are compared, so there may be fewer than `count`.
     """
@@ -59,7 +59,7 @@ def most_similar(specimen: Specimen, others: Sequence[Specimen], count: int) -> 
 
 
 def without_size(points: Array, others: Array) -> tuple[float, float]:
-    """How far corresponding points (N, 3) stay apart after the best similarity, and its factor from `points` to others.
+    """Measure how far corresponding points (N, 3) stay apart after the best similarity, and its factor.
 
     The distance is a share of the others' size (Procrustes; Umeyama 1991).
     """

@@ -53,20 +53,20 @@ def best_view(
 
 
 def _seen_of_region(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
-    """What is visible of the `share` of the surface that is nearest to the first point."""
+    """Find the visible points of the `share` of the surface that is nearest to the first point."""
     region = nearest(points, points[0], share)
     return region[specimen.visible_from(points[region], direction)]
 
 
 def _nearest_seen(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
-    """The visible points nearest to the first one, until they are `share` of the surface, or all that is visible."""
+    """Find the visible points nearest to the first one, up to `share` of the surface."""
     seen = np.flatnonzero(specimen.visible_from(points, direction))
     wanted = round(share * len(points))
     return seen if len(seen) <= wanted else seen[nearest(points[seen], points[0], wanted / len(seen))]
 
 
 def _band_seen(specimen: Specimen, points: Array, direction: Array, share: float) -> NDArray[np.intp]:
-    """The visible points nearest to a line through the first one, along what is visible, until they are `share`."""
+    """Find the visible points nearest to a line through the first one, up to `share`."""
     seen = np.flatnonzero(specimen.visible_from(points, direction))
     in_view = points[seen] - points[0]
     in_view -= np.outer(in_view @ direction, direction)
@@ -80,7 +80,7 @@ ENOUGH_SHOWN = {"region": 0.25, "seen": 0.7, "band": 0.7}  # of the share asked 
 
 
 def _probe_direction(specimen: Specimen, point: Array, normal: Array, rng: np.random.Generator) -> Array | None:
-    """A unit direction within 45 degrees of the normal (either sign) from which `point` (1, 3) is seen, if any."""
+    """Draw a direction within 45 degrees of the normal (either sign) from which `point` (1, 3) is seen."""
     for _ in range(8):
         away = sampling.random_directions(1, rng)[0]
         tilt = away - normal * (away @ normal)

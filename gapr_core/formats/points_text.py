@@ -55,9 +55,24 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
         raise tracker.needs_tip(path)
     if (options.tip_mm, options.tool, options.reference) != (None, None, None):
         given = f"{path.name} without columns Q0 or Rz, and Tx"
-        expected = "a recording by NDI Track for --tip, --tool and --reference"
+        expected = f"{tracker.RECORDINGS} for --tip, --tool and --reference"
         raise InvalidPointCloudError(expected, given, "leave them out for points")
     return _surface(data)
+
+
+def read_pts(path: Path, options: ReadOptions) -> Surface:
+    """A count, then so many lines of x y z, often with an intensity and a colour.
+
+    Raises:
+        ValueError: another count, or fewer than three columns.
+    """
+    first, *rows = [line for line in text.lines(options.limits.read(path)) if line.strip()] or [""]
+    values = text.table(rows)
+    if first.strip() != str(len(values)):
+        raise ValueError(f"{len(values)} points where its first line announces {first.strip()[:20]!r}")
+    if len(values) and values.shape[1] < 3:
+        raise ValueError(f"{values.shape[1]} columns, not x y z")
+    return Surface(values[:, :3])
 
 
 def _surface(data: bytes) -> Surface:

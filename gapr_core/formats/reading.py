@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
+
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.formats import axes, plugins, signatures
 from gapr_core.formats.options import ReadOptions
-from gapr_core.surface import Surface
+from gapr_core.surface import Surface, check_faces
 
 Reader = Callable[[Path, ReadOptions], Surface]
 
@@ -78,7 +80,7 @@ FORMATS = {
     ".obj": Format("meshes.obj:read"),
     ".vtk": Format("meshes.vtk:read"),
     ".vtp": Format("meshes.vtp:read"),
-    ".npy": Format("meshes.arrays:read_npy"),
+    ".npy": Format("meshes.arrays:read_npy", uses=("tip_mm",)),
     ".npz": Format("meshes.arrays:read_npz"),
     ".nii": LABEL_MAP,
     ".nii.gz": LABEL_MAP,
@@ -90,6 +92,7 @@ FORMATS = {
     ".csv": Format("points_text:read_csv", uses=TRACKED),
     ".txt": Format("points_text:read"),
     ".xyz": Format("points_text:read"),
+    ".pts": Format("points_text:read_pts"),
     ".igs.mha": Format("sweeps:read_igs", in_mm=True, uses=TRACKED),
 }
 FOLDER = Format("sweeps:read_folder", in_mm=True, uses=TRACKED)
@@ -110,7 +113,8 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
     path = path if path.name else path.resolve()  # a dot has no name
     kind = format_of(path)
     try:
-        surface = kind.read(path, options)
+        with np.errstate(all="ignore"):  # of numbers that are checked afterwards
+            surface = kind.read(path, options)
     except InvalidPointCloudError as error:
         given = error.given if path.is_file() and path.name in error.given else f"{path.name}: {error.given}"
         raise InvalidPointCloudError(error.expected, given, error.how_to_fix) from error
@@ -120,12 +124,14 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
         how = "let this user read it"
         raise InvalidPointCloudError("a file that may be read", f"{path.name} ({error.strerror})", how) from error
     except MemoryError as error:
-        how = "thin it, or use a machine with more memory"
+        how = "thin or crop it, raise the limit (ulimit -v), or use a machine with more memory"
         raise InvalidPointCloudError("a file that fits into memory", path.name, how) from error
     except Exception as error:  # whatever a damaged file leads to: the sentence is the same
         raise unreadable(path, reason_of(error)) from error
     if len(surface.points) == 0:
         raise unreadable(path, "no points in it")
+    if surface.faces is not None and len(surface.faces):
+        check_faces(surface, path.name)
     options.limits.check_counts(len(surface.points), 0 if surface.faces is None else len(surface.faces))
     return surface
 

@@ -195,10 +195,13 @@ def _placed(slices: list[Array], path: Path, options: ReadOptions) -> list[Array
 
 def _check_rigid(T: Array, number: int) -> None:
     """Raise for a matrix that is transposed, scaled or reflected, or has a number that is not finite."""
-    if not np.isfinite(T).all() or se3.why_not_rigid(T):
-        row, R = " ".join(f"{value:.8g}" for value in T[3]), np.nan_to_num(T[:3, :3], posinf=0.0, neginf=0.0)
+    if not np.isfinite(T).all():
+        given, how = f"pose {number} with a number that is not finite", "take it and its slice out"
+        raise InvalidPointCloudError(f"rigid 4x4 matrices in {POSES}", given, how)
+    if se3.why_not_rigid(T):
+        row = " ".join(f"{value:.8g}" for value in T[3])
         with np.errstate(over="ignore"):
-            determinant = np.linalg.det(R)
+            determinant = np.linalg.det(T[:3, :3])
         given = f"pose {number} with last row {row} and determinant {determinant:.3g} of its 3x3 part"
         how = "write it row by row, in mm, with last row 0 0 0 1, without scale or reflection"
         raise InvalidPointCloudError(f"rigid 4x4 matrices in {POSES}", given, how)

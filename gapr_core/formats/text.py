@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import io
+import re
 from collections.abc import Iterable, Iterator
 from itertools import chain
 
@@ -15,6 +16,7 @@ from gapr_core.errors import InvalidPointCloudError
 Array = NDArray[np.float64]
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+NOT_A_NUMBER = re.compile(rb"[-+]?(nan\(\w*\)|1\.#(IND|QNAN|SNAN)\d*)", re.IGNORECASE)
 LOOKED_AT = 64  # bytes at the beginning: enough to see that every other one is zero
 
 
@@ -26,7 +28,12 @@ def lines(data: bytes) -> Iterator[str]:
         ValueError: the last line does not end.
     """
     check_end(data)
-    return iter(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", errors="replace"))
+    return iter(io.TextIOWrapper(io.BytesIO(plain(data)), encoding="utf-8-sig", errors="replace"))
+
+
+def plain(data: bytes) -> bytes:
+    """Text with nan where C libraries of Windows write `-nan(ind)` or `1.#QNAN`."""
+    return NOT_A_NUMBER.sub(b"nan", data) if b"nan(" in data or b"1.#" in data else data
 
 
 def check_end(data: bytes) -> None:

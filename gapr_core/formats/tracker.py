@@ -18,11 +18,13 @@ from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import columns
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.text import check_end
+from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 QUATERNION, ANGLES, PLACE = ("q0", "qx", "qy", "qz"), ("rz", "ry", "rx"), ("tx", "ty", "tz")
+RECORDINGS = "a recording by NDI Track (.csv) or PLUS (.igs.mha), or poses (N, 4, 4) as .npy"
 COLUMNS = "columns Q0 Qx Qy Qz or Rz Ry Rx, then Tx Ty Tz"
 SEEN = ("ok", "enabled", "valid")
 TIP_MM = (1.0, 1000.0)  # from the marker of a pointer, by far; one in m is nearer
@@ -178,6 +180,35 @@ def needs_tip(path: Path) -> InvalidPointCloudError:
     """The error for a recording of poses without the tip of the tool."""
     how = "give it with --tip X,Y,Z; gapr pivot finds it"
     return InvalidPointCloudError("the tip of the tool", f"{path.name}, a recording of its poses", how)
+
+
+def given_tip(tip_mm: tuple[float, float, float] | None, path: Path) -> tuple[float, float, float]:
+    """The tip of the tool that a recording is of.
+
+    Raises:
+        InvalidPointCloudError: none is given.
+    """
+    if tip_mm is None:
+        raise needs_tip(path)
+    return tip_mm
+
+
+def rigid_poses(array: Array, path: Path) -> Array:
+    """(M, 4, 4) of the poses (N, 4, 4), mm, in which the tool was seen: those with a number that is NaN are left out.
+
+    Raises:
+        InvalidPointCloudError: none of them is left, or one is not rigid or far too large.
+    """
+    if array.dtype.kind not in "fiu":
+        raise InvalidPointCloudError("poses of numbers", f"{path.name} of {array.dtype}", "save them as floats")
+    poses = array[~np.isnan(array).any(axis=(1, 2))].astype(np.float64)
+    if not len(poses):
+        raise never_seen([0], ["tool 0"], path)
+    for number, T in enumerate(poses):
+        if not (np.abs(T) <= FARTHEST_MM).all() or (why := se3.why_not_rigid(T)):
+            said = f"pose {number} whose {why}" if (np.abs(T) <= FARTHEST_MM).all() else f"pose {number} far too large"
+            raise InvalidPointCloudError("rigid poses in mm", f"{path.name} with {said}", "leave it out, or set it NaN")
+    return np.stack([se3.nearest_rigid(T) for T in poses])
 
 
 def _is_seen_in(row: Sequence[str], state: int | None) -> bool:

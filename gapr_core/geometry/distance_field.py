@@ -45,7 +45,7 @@ def build(
     reach_mm: float = 12.0,
     num_threads: int = 1,
 ) -> DistanceField:
-    """The field of a target (N, 3), mm, with unit normals (N, 3); cells as fine as the limits allow."""
+    """Build the field of a target (N, 3), mm, with unit normals; cells as fine as the limits allow."""
     low, high = bounds(points)
     low, high = low - reach_mm, high + reach_mm
     cell_mm = max(SMALLEST_CELL_MM, float(np.prod(high - low) / MOST_CELLS) ** (1.0 / 3.0))

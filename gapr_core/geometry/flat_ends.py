@@ -26,7 +26,7 @@ MOST_ENDS = 24  # a table has six
 
 
 def flat_ends(points: Array, normals: Array, spacing_mm: float, least_mm2: float) -> NDArray[np.bool_]:
-    """Which points lie on a flat end, or on its rounded edge.
+    """Find the points that lie on a flat end, or on its rounded edge.
 
     A flat end is a plane that has the whole model on one side (a facet of the convex hull) and points of the model all
     over an area of `least_mm2` or more. What is left is looked at again: behind the outer face of a table is the inner.
@@ -53,7 +53,7 @@ def flat_ends(points: Array, normals: Array, spacing_mm: float, least_mm2: float
 
 
 def _end_of(points: Array, normals: Array, spacing_mm: float, least_mm2: float) -> NDArray[np.bool_] | None:
-    """The points of one flat end; None without one."""
+    """Find the points of one flat end; None without one."""
     fewest = max(FEWEST, least_mm2 / (OF_POINT * spacing_mm**2))
     for outward in _supported(points, spacing_mm, SPLIT * least_mm2):
         height = points @ outward

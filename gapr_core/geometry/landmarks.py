@@ -31,7 +31,7 @@ class LandmarkPose:
 
 
 def paired_pose(source: ArrayLike, target: ArrayLike) -> LandmarkPose:
-    """The rigid motion that lays landmarks on their partners best (Arun 1987; Kabsch 1976).
+    """Find the rigid motion that lays landmarks on their partners best (Arun 1987; Kabsch 1976).
 
     Args:
         source: (K, 3) landmarks in the source's frame, mm, K >= 3, not on one line.

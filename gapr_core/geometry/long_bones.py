@@ -48,7 +48,7 @@ def _slenderness(points: Array) -> float:
 
 
 def _some_nested(bones: list[Array]) -> bool:
-    """Whether the mean of one lies in the box along the axes of another, as that of an inner cortex does."""
+    """Check whether the mean of one lies in the box of another, as that of an inner cortex does."""
     return any(_holds(bone, other.mean(axis=0)) for bone in bones for other in bones if other is not bone)
 
 

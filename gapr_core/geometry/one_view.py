@@ -46,7 +46,7 @@ class OneView:
 def seen_from_one_place(
     points: Array, normals: Array, neighbours: NDArray[np.int64], some: NDArray[np.int64], spacing_mm: float
 ) -> OneView:
-    """The places that a cloud was most likely seen from, if it was one place.
+    """Find the places from which a cloud was most likely seen, if it was one place.
 
     Args:
         points: (N, 3), mm.
@@ -70,7 +70,7 @@ def seen_from_one_place(
 
 
 def seen_from_origin(points: Array, normals: Array, widest_deg: float, least_cos: float) -> bool:
-    """Whether a cloud may be in the optical frame of the camera that saw it: z ahead (REP 103), the origin its place.
+    """Check whether a cloud may be in the optical frame of its camera: z ahead (REP 103), the camera at the origin.
 
     Everything lies ahead, its middle about the z axis, and nearly nothing is grazed from the origin, as little of a
     camera's image is. By chance all of this holds for about one cloud in a hundred whose frame is another one.
@@ -111,7 +111,7 @@ def bulging_share(points: Array, normals: Array, neighbours: NDArray[np.int64], 
 
 
 def with_parallel_sight(points: Array, normals: Array, viewpoint: Array) -> tuple[Array, Array]:
-    """The points and normals under the projective map that takes a camera infinitely far up the z axis.
+    """Map points and normals so that the camera is infinitely far up the z axis.
 
     All lines of sight become parallel to z, and what is nearer to the camera is higher: (x, y, z) goes to
     (d x, d y, d^2) / z, with d the depth of the middle, in a frame of the camera that looks there. Planes stay planes:

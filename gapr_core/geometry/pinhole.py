@@ -26,7 +26,7 @@ LARGEST_DISAGREEMENT = 0.15  # of the distance, between the centres that halves 
 
 
 def camera_of(cloud: ArrayLike) -> Array | None:
-    """Where the camera was: what the pixels of an organised cloud say, or the origin where lines of sight say that.
+    """Find the camera: from the pixels of an organised cloud, or at the origin if the lines of sight meet there.
 
     Args:
         cloud: (N, 3), or (H, W, 3) if it is organised, any unit; points that saw nothing are not finite, or (0, 0, 0).
@@ -40,7 +40,7 @@ def camera_of(cloud: ArrayLike) -> Array | None:
 
 
 def centre_of(grid: ArrayLike) -> Array | None:
-    """The centre of the pinhole camera whose image an organised cloud is.
+    """Find the centre of the pinhole camera whose image an organised cloud is.
 
     The projection matrix is the least-squares solution of the direct linear transform (Hartley and Zisserman 2004,
     section 7.1; PCL's `estimateProjectionMatrix` solves the same). It counts only where both halves of the image, cut
@@ -72,7 +72,7 @@ def centre_of(grid: ArrayLike) -> Array | None:
 
 
 def is_centre_of(points: ArrayLike) -> bool:
-    """Whether the origin is the centre of a pinhole camera that saw a cloud, and the axes are along those of its image.
+    """Check whether a pinhole camera at the origin, with axes along its image, saw a cloud.
 
     The quotients of two coordinates and the third, that along the view, are then few: one for each row and each column,
     while the coordinates themselves are many. A plane across the view could have been seen from anywhere. And they are
@@ -104,7 +104,7 @@ def _is_view_along(axis: int, points: Array) -> bool:
 
 
 def _projection(pixels: Array, points: Array) -> Array | None:
-    """(3, 4) P with (u, v, 1) ~ P (x, y, z, 1) for pixels (N, 2) and points (N, 3); None where it has some behind it.
+    """Solve (u, v, 1) ~ P (x, y, z, 1) for P (3, 4); None if points lie behind the camera.
 
     Both are centred and scaled before, as there (4.4).
     """
@@ -121,7 +121,7 @@ def _projection(pixels: Array, points: Array) -> Array | None:
 
 
 def _normalising(x: Array) -> Array:
-    """The similarity that moves the mean of x (N, D) to the origin and its mean distance from there to 1."""
+    """Find the similarity that moves the mean of x (N, D) to the origin and its mean distance to 1."""
     middle = x.mean(axis=0)
     scale = 1.0 / max(float(np.linalg.norm(x - middle, axis=1).mean()), NOTHING)
     T = np.diag([*[scale] * x.shape[1], 1.0])

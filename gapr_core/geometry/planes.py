@@ -12,7 +12,7 @@ SWEEPS = 12  # most of Jacobi's method, which converges after four or five
 
 
 def fit_planes(points: Array, neighbours: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """A plane through each point's neighbours by least squares.
+    """Fit a plane to each point's neighbours by least squares.
 
     Args:
         points: (N, 3), mm.

@@ -38,7 +38,7 @@ def tangents(nx, ny, nz, lx, ly, lz):
 
 @numba.njit(**EXACT)
 def equations(points, normals, neighbours, rows):
-    """Of some rows: normal equations (R, 6, 6) and (R, 6, 1) of the fit, tangents (R, 2, 3) and reach (R,)."""
+    """Set up the normal equations of some rows, tangents (R, 2, 3) and reach (R,)."""
     gram, right = np.zeros((len(rows), 6, 6)), np.zeros((len(rows), 6, 1))
     basis, reach = np.empty((len(rows), 2, 3)), np.empty(len(rows))
     far, design = np.empty(neighbours.shape[1]), np.ones(6)

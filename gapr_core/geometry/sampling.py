@@ -67,7 +67,7 @@ def thin(points: Array, most: int) -> NDArray[np.int64]:
 
 @numba.njit(cache=True, nogil=True)
 def _occupied(points, low, high, voxel, most):  # type: ignore[no-untyped-def]
-    """How many voxels points are in, counted up to one more than `most`."""
+    """Count the voxels that hold points, up to one more than `most`."""
     table, found = _table(most + 1), 0
     for p in range(len(points)):
         key = _voxel(points, p, low, high, voxel)
@@ -96,7 +96,7 @@ def _voxels(points, low, high, voxel):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _central(points, low, high, voxel):  # type: ignore[no-untyped-def]
-    """Of the points in each voxel, the index of the one nearest to their mean.
+    """Find the point of each voxel that is nearest to the mean.
 
     Of equally near ones, as two in a voxel are but for rounding, the one that comes first by x, y, z.
     """
@@ -134,7 +134,7 @@ def _comes_before(points, p, q):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _voxel(points, p, low, high, voxel):  # type: ignore[no-untyped-def]
-    """The number of the voxel that point p is in."""
+    """Number the voxel of point p."""
     key = np.int64(0)
     for axis in range(3):
         along = np.int64(np.floor((high[axis] - low[axis]) / voxel)) + 1
@@ -144,7 +144,7 @@ def _voxel(points, p, low, high, voxel):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _table(entries):  # type: ignore[no-untyped-def]
-    """An empty hash table with room for so many entries: rows of a key and a value, 0 where there is no entry."""
+    """Make an empty hash table with room for some entries: rows of a key and a value, 0 if empty."""
     slots = 2
     while slots < 2 * entries:
         slots *= 2
@@ -153,7 +153,7 @@ def _table(entries):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _slot(table, key):  # type: ignore[no-untyped-def]
-    """The row of the key, or the one where it belongs."""
+    """Find the row of the key, or the one where it belongs."""
     last = np.uint64(len(table) - 1)
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     slot = (mixed ^ (mixed >> np.uint64(32))) & last
@@ -201,5 +201,5 @@ def random_directions(count: int, rng: np.random.Generator) -> Array:
 
 
 def log_uniform(limits: tuple[float, float], rng: np.random.Generator) -> float:
-    """A number between two limits above 0 whose logarithm is uniform."""
+    """Draw a number between two positive limits, uniform in its logarithm."""
     return float(np.exp(rng.uniform(*np.log(limits))))

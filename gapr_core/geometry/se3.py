@@ -47,7 +47,7 @@ def apply(T: ArrayLike, points: ArrayLike) -> Array:
 
 
 def inverse(T: ArrayLike) -> Array:
-    """The inverse motion; exact for rigid T, cheaper and safer than a matrix inverse."""
+    """Invert a rigid motion exactly; cheaper and safer than a matrix inverse."""
     T = np.asarray(T, dtype=np.float64)
     return from_rotation_translation(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
 
@@ -65,7 +65,7 @@ def nearest_rigid(T: ArrayLike) -> Array:
 
 
 def why_not_rigid(T: Array) -> str:
-    """What keeps a finite T (4, 4) from being rigid, in words; empty where it is."""
+    """Say in words why a finite T (4, 4) is not rigid; empty if it is."""
     R, last = T[:3, :3], T[3]
     if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > LAST_ROW:
         return "last row is {:g} {:g} {:g} {:g}, not 0 0 0 1".format(*last)

@@ -38,7 +38,7 @@ def nees(twist: ArrayLike, covariance: ArrayLike) -> float:
 
 
 def covariance_about(offset: ArrayLike, covariance: ArrayLike) -> Array:
-    """(6, 6) covariance of a pose about a centre that lies `offset` (3,), mm, from the one it is about now.
+    """Move the centre of a (6, 6) covariance of a pose by `offset` (3,), mm.
 
     A turn r about c shifts c + d by r x d: the shift of the new centre is v - d x r.
     """

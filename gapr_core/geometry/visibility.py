@@ -45,7 +45,7 @@ def seen_from(direction: Array, points: Array, normals: Array, pixel_mm: float) 
 
 
 def unobstructed_from(direction: Array, points: Array, normals: Array, pixel_mm: float) -> NDArray[np.bool_]:
-    """Mask of the (N, 3) points over whose tangent plane nothing stands in the 3 x 3 pixels, as `seen_from` takes them.
+    """Mask the (N, 3) points over whose tangent plane no other point of the 3 x 3 pixels stands.
 
     Unlike a difference in height, the distance to the plane is the wall's thickness from wherever a wall is seen.
     """
@@ -54,7 +54,7 @@ def unobstructed_from(direction: Array, points: Array, normals: Array, pixel_mm:
 
 @numba.njit(cache=True, nogil=True)
 def _pixels(direction, points, pixel_mm):  # type: ignore[no-untyped-def]
-    """In a view along `direction`: each point's height and flat pixel index, and how many rows and columns there are.
+    """Give each point's height and pixel in a view along `direction`, and the numbers of rows and columns.
 
     The outermost pixels are empty: every point has eight pixels around its own.
     """
@@ -177,7 +177,7 @@ def _views(
 def outer_layer(
     points: Array, normals: Array, spacing_mm: float, directions: int = 96, num_threads: int = 1
 ) -> tuple[NDArray[np.bool_], Array] | None:
-    """The outer one of the two surfaces of a hollow bone.
+    """Find the outer one of the two surfaces of a hollow bone.
 
     Args:
         points: (N, 3), mm.

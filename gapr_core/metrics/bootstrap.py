@@ -53,6 +53,6 @@ def _mean(values: Array, labels: Array) -> Callable[[Array], Array]:
 
 
 def _each(values: Array, labels: Array, statistic: Callable[[Array], float]) -> Callable[[Array], Array]:
-    """The same of another statistic."""
+    """Apply another statistic in the same way."""
     members = np.split(values[np.argsort(labels, kind="stable")], np.cumsum(np.bincount(labels))[:-1])
     return lambda draws: np.array([statistic(np.concatenate([members[k] for k in draw])) for draw in draws])

@@ -23,7 +23,7 @@ def rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, source: ArrayLike) -> floa
 
 
 def whole_bone_rmse_mm(T_estimate: ArrayLike, T_true: ArrayLike, target: ArrayLike) -> float:
-    """The same over the whole target (M, 3), target frame: what the fit on the observed patch hides."""
+    """Compute the RMSE over the whole target (M, 3), target frame; the fit on the observed patch hides it."""
     return rmse_mm(error_motion(T_estimate, T_true), np.eye(4), target)
 
 
@@ -60,7 +60,7 @@ def recall(successes: ArrayLike) -> float:
 
 
 def r2_rotation(T_estimates: ArrayLike, T_trues: ArrayLike) -> float:
-    """The paper's R2(R): coefficient of determination of Euler angles (zyx, degrees), mean of the three.
+    """Compute the paper's R2(R): coefficient of determination of Euler angles (zyx, degrees), mean of the three.
 
     Angles wrap around at 180 deg, so small errors can cost much: no measure of accuracy (1 deg errors give 0.965).
     """
@@ -68,7 +68,7 @@ def r2_rotation(T_estimates: ArrayLike, T_trues: ArrayLike) -> float:
 
 
 def r2_translation(T_estimates: ArrayLike, T_trues: ArrayLike) -> float:
-    """The paper's R2(t): coefficient of determination of the translation, mean of the three components."""
+    """Compute the paper's R2(t): coefficient of determination of the translation, mean of the three components."""
     return r2(np.asarray(T_estimates)[:, :3, 3], np.asarray(T_trues)[:, :3, 3])
 
 
@@ -85,7 +85,7 @@ def r2(predicted: ArrayLike, true: ArrayLike) -> float:
 
 
 def centroid_alignment(source: ArrayLike, target: ArrayLike) -> Array:
-    """The pose that stands in for a refusal in errors over ALL pairs: no rotation, centroid on centroid."""
+    """Give the pose that stands for a refusal in errors over ALL pairs: no rotation, centroid on centroid."""
     return se3.from_rotation_translation(np.eye(3), np.asarray(target).mean(axis=0) - np.asarray(source).mean(axis=0))
 
 

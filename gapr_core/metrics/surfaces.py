@@ -10,7 +10,7 @@ from gapr_core.geometry import se3
 
 
 def chamfer_mm(first: ArrayLike, second: ArrayLike, cutoff_mm: float = 10.0) -> float:
-    """The paper's CD: mean nearest-neighbour distance, both directions added, pairs beyond the cut-off dropped.
+    """Compute the paper's CD: mean nearest-neighbour distance, both directions added, pairs beyond the cut-off dropped.
 
     Args:
         first: (N, 3) cloud, mm.

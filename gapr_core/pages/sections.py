@@ -105,7 +105,7 @@ LEGEND = (
     "register time without reading files and without preparing the target, which is apart. The confidence of a "
     "baseline is its share of source points within 5 mm, not calibrated. R²(R) is no measure of accuracy: Euler "
     "angles wrap around. Pair by pair: an interval that holds 0 does not show which method is better. Definitions: "
-    "docs/metrics.md."
+    "docs/develop/metrics.md."
 )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def above_zero(text: str) -> float:
-    """A number above 0; it may be infinite."""
+    """Parse a number above 0; it may be infinite."""
     try:
         number = float(text)
     except ValueError:
@@ -18,19 +18,19 @@ def above_zero(text: str) -> float:
 
 
 def at_least_one(text: str) -> int:
-    """A count of 1 or more."""
+    """Parse a count of 1 or more."""
     if not text.strip().isdecimal() or int(text) < 1:
         raise ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
     return int(text)
 
 
 def names(text: str) -> tuple[str, ...]:
-    """The words of a list with commas, each once: pairs of a name that came twice were made twice."""
+    """Split a list with commas, and keep each word once."""
     return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
 def a_path(text: str) -> Path:
-    """A path; an empty one, as of a variable that is not set, would be the folder that one is in."""
+    """Parse a path; refuse an empty one, such as that of a variable that is not set."""
     if not text.strip():
         raise ArgumentTypeError("expected a path, got an empty text: is a variable of the shell not set?")
     return Path(text)

@@ -24,7 +24,7 @@ class WorkersDiedError(RuntimeError):
 
 
 def results(address: str, call: Callable[..., Result], tasks: Iterable[Task], shared: Any = None) -> Iterator[Result]:
-    """What the calls return, as `outcomes`; the first error of a task ends it, and is raised."""
+    """Return the results of the calls, as `outcomes`; raise the first error of a task."""
     for _, outcome in outcomes(address, call, tasks, shared):
         if isinstance(outcome, Exception):
             raise outcome
@@ -34,7 +34,7 @@ def results(address: str, call: Callable[..., Result], tasks: Iterable[Task], sh
 def outcomes(
     address: str, call: Callable[..., Result], tasks: Iterable[Task], shared: Any = None
 ) -> Iterator[tuple[Task, Result | Exception]]:
-    """Every task with what its call returned or raised, in the order in which they finish.
+    """Give every task with the result or the error of its call, in the order in which they finish.
 
     A worker gets several short tasks at a time, and hands back what it does not begin within `TURN_S`. When three
     workers have died of such a turn, each of its tasks is tried alone; when three have died of one task, its outcome
@@ -89,7 +89,7 @@ def outcomes(
 
 
 def _client(distributed: Any, address: str) -> Any:
-    """A connection to the scheduler."""
+    """Connect to the scheduler."""
     try:
         return distributed.Client(address, timeout=PATIENCE_S)
     except (OSError, ValueError) as error:
@@ -98,7 +98,7 @@ def _client(distributed: Any, address: str) -> Any:
 
 
 def _checked_workers(client: Any) -> int:
-    """How many workers there are, each of one thread."""
+    """Count the workers, each of one thread."""
     threads = client.nthreads().values()
     if not threads or max(threads) > 1:
         given = f"{len(threads)} workers, threads {sorted(set(threads))}"

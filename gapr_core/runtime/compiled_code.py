@@ -33,11 +33,11 @@ def find_a_place() -> None:
 
 
 def _of_user() -> Path:
-    """The user's folder of numba (its `appdirs`)."""
+    """Find the user's folder of numba (its `appdirs`)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "numba"
 
 
 def _can_write(folder: Path) -> bool:
-    """Whether a folder can be written to, or made."""
+    """Check whether a folder can be written to, or made."""
     there = next(place for place in (folder, *folder.parents) if place.exists())
     return os.access(there, os.W_OK | os.X_OK)

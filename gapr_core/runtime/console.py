@@ -10,7 +10,7 @@ from gapr_core.errors import GaprError
 
 
 def say(text: str) -> None:
-    """One line on standard output; it goes nowhere, and the program goes on, where nobody reads it any more.
+    """Print one line on standard output; the program goes on if nobody reads it any more.
 
     Letters that the output cannot hold, in names of files and of planned targets, come out as their numbers.
     """
@@ -24,7 +24,7 @@ def say(text: str) -> None:
 
 
 def exit_code(main: Callable[[], int], program: str) -> int:
-    """What a program returns; 1, and one line on standard error, for what its user must fix."""
+    """Return the exit code of a program; 1, and one line on standard error, if its user must fix something."""
     try:
         return main()
     except GaprError as error:

@@ -17,7 +17,7 @@ from gapr_core.errors import ConfigError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A hidden file in the folder of `path`, to be written; it takes the place of `path` when the block ends well.
+    """Give a hidden file next to `path` to write; it replaces `path` if the block ends well.
 
     After an error the old file is as it was. Missing folders are made. A file that is replaced keeps its permissions. A
     link stays, and what it leads to is replaced; a device or a pipe, such as /dev/null, gets the content.
@@ -46,13 +46,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def is_special(path: Path) -> bool:
-    """Whether something is there that no file may replace: a device, a pipe, a socket."""
+    """Check whether a device, a pipe or a socket is there, which no file may replace."""
     return os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
 
 
 @contextmanager
 def one_at_a_time(path: str | Path) -> Iterator[None]:
-    """Wait until no other process is in such a block for a file of the same folder, which is made if it is missing.
+    """Wait until no other process is in such a block for a file of this folder. A missing folder is made.
 
     Where the system has no such lock, as on Windows, nothing is waited for.
 
@@ -74,7 +74,7 @@ def one_at_a_time(path: str | Path) -> Iterator[None]:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """A folder in which no other process is in such a block; it is made if it is missing, and goes again if empty.
+    """Hold a folder for this process alone. A missing folder is made, and removed again if it stays empty.
 
     Raises:
         ConfigError: another process is in such a block, or the folder cannot be made.
@@ -97,7 +97,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def _locked(folder: Path, wait: bool = True) -> int | None:
-    """An open file that holds the lock of a folder until it is closed; None where there is none.
+    """Open a file that holds the lock of a folder until it is closed; None if another process has it.
 
     Raises:
         BlockingIOError: another process has it, where this one does not `wait`.
@@ -149,7 +149,7 @@ def write_json(path: str | Path, content: Any) -> None:
 
 
 def read_json(path: str | Path, what: str, how: str = "check the path, or make the file again") -> Any:
-    """The content of a JSON file.
+    """Read the content of a JSON file.
 
     Args:
         path: where it is.
@@ -172,7 +172,7 @@ def _refuse_folder(path: Path) -> None:
 
 
 def unwritable(path: str | Path, error: OSError) -> ConfigError:
-    """What to say of a path that cannot be written."""
+    """Say why a path cannot be written."""
     why = error.strerror or str(error)
     if isinstance(error, FileExistsError | NotADirectoryError):
         why = "what should be its folder is a file"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 def allocated_mb(call: Callable[[], object]) -> float:
-    """The largest size, MiB, of what Python and NumPy allocate during a call; it is much slower meanwhile."""
+    """Measure the most memory, MiB, that Python and NumPy allocate during a call; the call is much slower."""
     tracemalloc.start()
     try:
         call()

@@ -19,7 +19,7 @@ WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
 
 def commit() -> str | None:
-    """The source tree's commit; None where the package was installed without its repository."""
+    """Find the commit of the source tree; None if the package was installed without its repository."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -33,7 +33,7 @@ def commit() -> str | None:
 
 
 def of_answers(config: Any) -> dict[str, str]:
-    """What an answer depends on but the clouds and the method: code, settings and weights, as short texts.
+    """Give code, settings and weights as short texts: all that an answer depends on but clouds and method.
 
     Args:
         config: a dataclass of settings.
@@ -46,17 +46,17 @@ def of_answers(config: Any) -> dict[str, str]:
 
 
 def shipped_weights() -> str:
-    """A short text that changes with the network or any model that is installed."""
+    """Hash the network and all models that are installed."""
     return digest_of(path for path in sorted(WEIGHTS.iterdir()) if path.suffix != ".md")
 
 
 def digest_of(paths: Iterable[Path]) -> str:
-    """A short text that changes with the content of any of these files, or their order."""
+    """Hash the content of these files in their order."""
     return _digest(path.read_bytes() for path in paths)
 
 
 def settings(config: Any) -> str:
-    """A short text that changes with any setting of a dataclass."""
+    """Hash the settings of a dataclass."""
     return _digest([json.dumps(asdict(config), sort_keys=True).encode()])
 
 
@@ -68,7 +68,7 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def release() -> str | None:
-    """The installed package's version."""
+    """Read the version of the installed package."""
     try:
         return version("gapr_ros")
     except PackageNotFoundError:
@@ -81,7 +81,7 @@ def machine() -> str:
 
 
 def cpu_name() -> str:
-    """The processor as the system calls it."""
+    """Read the name of the processor from the system."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
     named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))

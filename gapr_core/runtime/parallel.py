@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 
 def thread_count(requested: int) -> int:
-    """The number asked for; 0 means every core that this process may use."""
+    """Resolve the number of threads; 0 means every core that this process may use."""
     return requested or len(os.sched_getaffinity(0))
 
 
@@ -58,7 +58,7 @@ def end_with_parent() -> None:
 
 
 def single_threaded_libraries(call: Callable[Given, Result]) -> Callable[Given, Result]:
-    """The same call; while it runs, linear algebra and OpenMP, and with it torch, use one thread.
+    """Run a call while linear algebra, OpenMP and torch use one thread.
 
     The matrices of a registration are small. Several threads gain little with them, and wait for each other busily: as
     soon as something else wants a core, a registration with two of them takes nine times as long. Threads of our own
@@ -76,5 +76,5 @@ def single_threaded_libraries(call: Callable[Given, Result]) -> Callable[Given, 
 
 @cache
 def _controller(with_torch: bool) -> ThreadpoolController:
-    """Of the libraries that are loaded; torch brings its own OpenMP."""
+    """Control the threads of the loaded libraries; torch brings its own OpenMP."""
     return ThreadpoolController()

@@ -26,7 +26,7 @@ def setting(
     default: Any, text: str, *, low: float | None = None, high: float | None = None, unit: str = "",
     choices: Iterable[str] = (), **more: Any,
 ) -> Any:  # fmt: skip
-    """A field of a settings class.
+    """Declare a field of a settings class.
 
     Args:
         default: the value where none is given; the annotation of the field decides the type.
@@ -62,12 +62,12 @@ class Settings:
 
     @classmethod
     def from_dict(cls: type[S], values: Any) -> S:
-        """The defaults with a nested mapping over them; see the function `from_dict`."""
+        """Make a dataclass from nested mappings; an absent key keeps its default."""
         return from_dict(cls, values)
 
     @classmethod
     def from_yaml(cls: type[S], path: str | Path) -> S:
-        """The defaults with a file's entries over them; see `load`."""
+        """Put a file's entries over the defaults; see `load`."""
         return load(cls, path)
 
     def to_dict(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ class Settings:
 
 
 def _of_type(hint: Any, value: Any, name: str) -> Any:
-    """A value that was given in Python, as its annotation wants it; nested settings are made already."""
+    """Convert a value that was given in Python to its annotation; nested settings are made already."""
     if not (isinstance(hint, type) and is_dataclass(hint)):
         return _converted(hint, value, name)
     if not isinstance(value, hint):
@@ -86,7 +86,7 @@ def _of_type(hint: Any, value: Any, name: str) -> Any:
 
 
 def why_not(of: Field, value: Any) -> str:
-    """What a value of a field must be, where it is not; empty where it is."""
+    """Say what a value of a field must be; empty if it is."""
     choices, low, high = (of.metadata.get(key) for key in ("choices", "low", "high"))
     if choices and value not in choices:
         return f"one of {', '.join(choices)}"
@@ -99,7 +99,7 @@ def why_not(of: Field, value: Any) -> str:
 
 
 def range_text(of: Field) -> str:
-    """The range of a field in words, with its unit; empty where it has none."""
+    """Describe the range of a field with its unit; empty without one."""
     low, high, unit = (of.metadata.get(key) for key in ("low", "high", "unit"))
     ends = [f"at least {low:g}" if low is not None else "", f"at most {high:g}" if high is not None else ""]
     text = f"{low:g} to {high:g}" if low is not None and high is not None else "".join(ends)
@@ -107,7 +107,7 @@ def range_text(of: Field) -> str:
 
 
 def from_dict(cls: type[T], values: Any, path: str = "") -> T:
-    """A dataclass from nested mappings; what is absent keeps its default.
+    """Put a nested mapping over the defaults; see the function `from_dict`.
 
     Args:
         cls: the dataclass; its annotations decide what a value may be. Lists become tuples, whole numbers floats.
@@ -147,7 +147,7 @@ def load(cls: type[T], file: str | Path | None = None, assignments: Sequence[str
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """The mapping in a YAML file; an empty file is an empty mapping.
+    """Read the mapping in a YAML file; an empty file is an empty mapping.
 
     Raises:
         ConfigError: it cannot be read, is no YAML, names a key twice, or holds something else than a mapping.
@@ -169,7 +169,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def _key_named_twice(root: Any) -> str:
-    """The first key of a tree of YAML nodes that stands twice in one mapping, with its line; empty without one."""
+    """Find the first key that stands twice in one mapping of a YAML tree, with its line; empty without one."""
     waiting, seen = [root], set[int]()
     while waiting:
         node = waiting.pop()
@@ -198,7 +198,7 @@ class Row(NamedTuple):
 
 
 def table(cls: type, prefix: str = "") -> Iterator[Row]:
-    """Every setting of a class and of those nested in it, with dotted names."""
+    """List every setting of a class and of those nested in it, with dotted names."""
     hints = _hints(cls)
     for f in fields(cls):
         hint = hints[f.name]
@@ -239,7 +239,7 @@ def _is_within(number: Any, low: float | None, high: float | None) -> bool:
 
 
 def _converted(hint: Any, value: Any, path: str) -> Any:
-    """The value as its annotation wants it."""
+    """Convert the value to its annotation."""
     value = value.item() if getattr(value, "shape", None) == () else value  # of NumPy
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):  # only X | None is used
@@ -271,7 +271,7 @@ def _put(values: dict[str, Any], names: list[str], value: Any) -> None:
 
 
 def _parsed(text: str) -> Any:
-    """A value as YAML reads it, 1e-3 included."""
+    """Parse a value as YAML reads it, 1e-3 included."""
     import yaml
 
     try:

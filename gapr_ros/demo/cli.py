@@ -2,7 +2,7 @@
 
 Three acts: a probe that sweeps along the bone; with --scene a camera that circles a wound; with --guided a probe that
 goes where the node says that a look would help most. With --real DIR public real clouds are registered instead, without
-the node; docs/real_data.md says where they are.
+the node; docs/results/real.md says where they are.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def verdict(path):
 
 def in_this_process(path, options, out):
     """What `label_map._in_a_child` gives, or raises; also when the reader raises anything at all."""
-    request = {"path": str(path), "labels": list(options.labels), "limits": vars(options.limits)}
+    request = {"path": str(path), "labels": list(options.labels), "limits": vars(options.limits), "seconds": 0}
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
         code = child.main(json.dumps(request), str(out))
@@ -100,7 +100,7 @@ if __name__ == "__main__":
     import_native_readers()
     if "--isolated" not in sys.argv:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-        child._limit_memory = lambda limits: None
+        child._limit = lambda limits, seconds: None
         label_map._in_a_child = in_this_process
     allowed_kb = peak_kb() + GROWTH_KB
     for line in sys.stdin:

@@ -394,7 +394,8 @@ def test_the_service_and_the_container_start_the_program_and_stop_it_in_time():
 
 def test_topics_services_and_parameters_in_examples_and_deployment_are_those_of_the_node(graph):
     """Whatever they name under the node's own name, or give with -p, exists."""
-    texts = {path: path.read_text() for folder in ("examples/ros", "deploy", "docs", "README.md", "docs/tutorials")
+    folders = ("examples/ros", "deploy", "docs/reference", "docs/how-to", "docs/tutorials", "README.md")
+    texts = {path: path.read_text() for folder in folders
              for path in (sorted((ROOT / folder).glob("*.*")) if (ROOT / folder).is_dir() else [ROOT / folder])
              if path.is_file() and path.suffix != ".png"}  # fmt: skip
     own = {name.split("/")[2] for names in graph.values() for name in names if name.startswith("/register_node/")}

@@ -41,7 +41,7 @@ class FemurParameters:
 
 
 def femur_surface(p: FemurParameters, spacing_mm: float = 2.0) -> Surface:
-    """The closed mesh of one femur; the forward bow is a bend of the straight solid."""
+    """Mesh one femur; the forward bow is a bend of the straight solid."""
     solid = Solid((-75.0, -60.0, -20.0), (65.0, 60.0, p.length_mm + 15.0), spacing_mm)
     _shaft(solid, p)
     _proximal_end(solid, p)
@@ -50,7 +50,7 @@ def femur_surface(p: FemurParameters, spacing_mm: float = 2.0) -> Surface:
 
 
 def _shaft(solid: Solid, p: FemurParameters) -> None:
-    """An oval shaft that flares at both ends, with the linea aspera as a ridge at its back."""
+    """Make an oval shaft that flares at both ends, with the linea aspera as a ridge at its back."""
     width, wide = p.shaft_width_mm / 2.0, p.epicondylar_width_mm / 80.0
     stations = np.array([0.05, 0.09, 0.13, 0.18, 0.25, 0.40, 0.55, 0.70, 0.78, 0.84, 0.88]) * p.length_mm
     half_width = np.array(
@@ -133,7 +133,7 @@ def _distal_end(solid: Solid, p: FemurParameters) -> None:
 
 
 def _groove_and_notch(solid: Solid, p: FemurParameters, deep: float, inner: float, drop: float) -> None:
-    """The groove's tube sinks `groove_depth_mm` into the trochlea; the notch is an arch open to the back and below."""
+    """Make the trochlea's groove, `groove_depth_mm` deep, and the notch, an arch open to the back and below."""
     radius = 13.0
     hub = np.array([0.5, -4.0 * deep, 27.0 * deep - drop])
     reach = 22.5 * deep + radius - p.groove_depth_mm

@@ -89,7 +89,7 @@ class PelvisParameters:
 
 
 def pelvis_surface(p: PelvisParameters, rng: np.random.Generator, spacing_mm: float = 2.3) -> Surface:
-    """The closed mesh of one pelvis; `rng` draws how its two sides differ."""
+    """Mesh one pelvis; `rng` draws how its two sides differ."""
     solid = Solid((-175.0, -115.0, -150.0), (175.0, 105.0, 110.0), spacing_mm)
     for side in (-1.0, 1.0):
         _Hip(p, side, rng).add_to(solid)

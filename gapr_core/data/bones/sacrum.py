@@ -41,7 +41,7 @@ def add_sacrum(
 
 
 def _midline(length_mm: float, curvature: float, tilt_deg: float, depth: float) -> Array:
-    """The side view as (K, 2) y, z: bent, scaled to the length, tilted about S1."""
+    """Draw the side view as (K, 2) y, z: bent, scaled to the length, tilted about S1."""
     chord = MIDLINE[0] + np.linspace(0.0, 1.0, len(MIDLINE))[:, None] * (MIDLINE[-1] - MIDLINE[0])
     bent = chord + curvature * (MIDLINE - chord) - MIDLINE[0]
     c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))

@@ -57,7 +57,7 @@ class ThoracicParameters:
 
 
 def thoracic_surface(p: ThoracicParameters, rng: np.random.Generator, spacing_mm: float = 2.2) -> Surface:
-    """The closed mesh of sternum and cartilages; `rng` draws how the two sides differ."""
+    """Mesh sternum and cartilages; `rng` draws how the two sides differ."""
     chest = _Chest(p)
     reach = 0.5 * p.chest_width_mm + 20.0
     solid = Solid([-reach, -110.0, -350.0 * chest.scale], [reach, 150.0, 25.0], spacing_mm)
@@ -82,7 +82,7 @@ class _Chest:
         self._line = CubicSpline(-z, y, bc_type="natural")
 
     def front(self, z: ArrayLike) -> Array:
-        """The y of the wall amid the chest at height z."""
+        """Give y of the wall amid the chest at height z."""
         return np.asarray(self._line(np.clip(-np.asarray(z), 0.0, 330.0)))
 
     def on_wall(self, x: ArrayLike, z: ArrayLike) -> Array:
@@ -158,7 +158,7 @@ def _outline(chest: _Chest, rib: int, above: Array | None, rng: np.random.Genera
 
 
 def _band(chest: _Chest, middle: Array, rib: int, side: float) -> Shape:
-    """A cartilage: higher than thick, lying on the wall, swelling a little at the bony rib."""
+    """Make a cartilage: higher than thick, lying on the wall, swelling a little at the bony rib."""
     p = chest.p
     normal = chest.normals(middle)
     tangent = np.gradient(middle, axis=0)

@@ -36,7 +36,7 @@ class TibiaParameters:
 
 
 def tibia_surface(p: TibiaParameters, spacing_mm: float = 2.0) -> Surface:
-    """The closed mesh of one tibia; torsion and bow bend the straight solid."""
+    """Mesh one tibia; torsion and bow bend the straight solid."""
     solid = Solid((-55.0, -55.0, -30.0), (55.0, 55.0, p.length_mm + 20.0), spacing_mm)
     _shaft(solid, p)
     _plateau(solid, p)
@@ -88,7 +88,7 @@ def _plateau(solid: Solid, p: TibiaParameters) -> None:
 
 
 def _ankle(solid: Solid, p: TibiaParameters) -> None:
-    """The arched joint surface, the medial malleolus and the notch for the fibula."""
+    """Make the arched joint surface, the medial malleolus and the notch for the fibula."""
     w = p.ankle_width_mm / 46.0
     solid.add(ellipsoid([1.0, 1.0, 8.0], [23.0 * w, 18.5 * w, 15.0]), 8.0)
     solid.cut(half_space([0.0, 0.0, -1.0], [-0.05, -0.1, -1.0], 45.0), 4.0)

@@ -58,7 +58,7 @@ class View:
 
 
 def looking_at(point: Array, position: Array, roll: float) -> Camera:
-    """A camera at `position` whose image's middle is `point`, turned by `roll` radians about its line of sight."""
+    """Place a camera at `position` that looks at `point`, turned by `roll` radians about its line of sight."""
     forward = (point - position) / np.linalg.norm(point - position)
     start = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
     start /= np.linalg.norm(start)
@@ -67,14 +67,14 @@ def looking_at(point: Array, position: Array, roll: float) -> Camera:
 
 
 def upright(point: Array, position: Array, up: Array) -> Camera:
-    """A camera at `position` whose image's middle is `point` and in whose image `up` (3,) points upward."""
+    """Place a camera at `position`, the middle of its image at `point`, with `up` (3,) upward in its image."""
     forward = (point - position) / np.linalg.norm(point - position)
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
     return Camera(position, np.stack([right, np.cross(forward, right), forward]))
 
 
 def see(parts: Sequence[Surface], camera: Camera) -> View:
-    """The first hit of every pixel's ray on the surfaces; no hit and flat hits give no point."""
+    """Find the first hit of every pixel's ray on the surfaces; no hit and flat hits give no point."""
     rays = camera.rays()
     hits = _cast(parts, camera.position, rays)
     steep = np.abs((hits["primitive_normals"].numpy() * rays).sum(axis=1)) > FLATTEST_COSINE
@@ -85,7 +85,7 @@ def see(parts: Sequence[Surface], camera: Camera) -> View:
 
 
 def measured(view: View, rng: np.random.Generator) -> Array:
-    """The points (N, 3) with the depth's errors, each on its own ray.
+    """Add the depth's errors to points (N, 3), each on its own ray.
 
     Random: sigma = 0.4 mm + 1.2e-6 / mm d^2; smooth over the image: up to 0.4 mm, waves of 60-120 mm.
     """
@@ -97,7 +97,7 @@ def measured(view: View, rng: np.random.Generator) -> Array:
 
 
 def seen_in_depth(view: View, rng: np.random.Generator) -> View:
-    """The view with the errors of `measured`."""
+    """Add the errors of `measured` to a view."""
     return replace(view, points=measured(view, rng))
 
 

@@ -22,14 +22,14 @@ IS_BONE_MM = 6.0  # a measured point as near to a target point shows the bone; t
 
 
 def bone_alone(pair: Pair, rng: np.random.Generator) -> Pair:
-    """The points of a scene that are bone, as if somebody had segmented it."""
+    """Keep the points of a scene that are bone, as if somebody had segmented it."""
     is_bone = np.asarray(pair.metadata["is_bone"])
     facts = {"is_bone": is_bone[is_bone], "bone_share": 1.0, "outlier_share": 0.0}
     return replace(pair, source=pair.source[is_bone], metadata={**pair.metadata, **facts})
 
 
 def first_look(pair: Pair, rng: np.random.Generator) -> Pair:
-    """The first of several looks alone."""
+    """Keep the first of several looks alone."""
     first = np.asarray(pair.metadata["look"]) == 0
     is_bone = np.asarray(pair.metadata["is_bone"])[first]
     share = float(is_bone.mean())
@@ -39,7 +39,7 @@ def first_look(pair: Pair, rng: np.random.Generator) -> Pair:
 
 
 def far_clutter(pair: Pair, rng: np.random.Generator, share: float) -> Pair:
-    """The same cloud with points uniform in a box well beyond the bone; `share` of all points then."""
+    """Add points uniform in a box well beyond the bone; they are `share` of all points then."""
     count, found = round(share / (1.0 - share) * len(pair.source)), np.empty((0, 3))
     reach, bone = extent.half_extent_mm(pair.target) + BEYOND_MM, cKDTree(pair.target)
     while len(found) < count:
@@ -50,7 +50,7 @@ def far_clutter(pair: Pair, rng: np.random.Generator, share: float) -> Pair:
 
 
 def echoes(pair: Pair, rng: np.random.Generator) -> Pair:
-    """An ultrasound cloud with what else such an image shows: layers before the bone, echoes behind it.
+    """Add the other interfaces of an ultrasound image: layers before the bone, echoes behind it.
 
     A reverberation lies below the bone's point by the depth of that point under the probe.
     """
@@ -71,7 +71,7 @@ def _some(points: Array, share: float, rng: np.random.Generator) -> NDArray[np.i
 
 
 def _with(pair: Pair, clutter: Array, is_bone: NDArray[np.bool_], rng: np.random.Generator) -> Pair:
-    """The pair with points that are not bone among its own."""
+    """Add points to a pair that are not bone."""
     order = rng.permutation(len(pair.source) + len(clutter))
     flags = np.append(is_bone, np.zeros(len(clutter), dtype=bool))[order]
     share = float(flags.mean())

@@ -30,7 +30,7 @@ WET, WET_MM = (0, 6), (2.0, 8.0)  # spots that give nothing: how many, and their
 
 
 def seen_in_stereo(view: View, rng: np.random.Generator) -> View:
-    """What a stereo camera makes of a view: fewer points, with errors; those that fly are on no surface."""
+    """Turn a view into that of a stereo camera: fewer points, with errors; flying ones are on no surface."""
     return _in_stereo(view, rng, 1.0, WINDOW_MM)
 
 
@@ -59,19 +59,19 @@ def _in_stereo(view: View, rng: np.random.Generator, times: float, windows_mm: t
 
 
 def seen_on_layers(view: View, rng: np.random.Generator) -> View:
-    """The bone under layers, with the errors of `camera.measured`."""
+    """Put the bone under layers, with the errors of `camera.measured`."""
     return seen_in_depth(under_layers([view], rng)[0], rng)
 
 
 def seen_in_theatre(view: View, rng: np.random.Generator) -> View:
-    """The bone under layers as a stereo camera sees it whose range is about 1 % wrong."""
+    """Put the bone under layers before a stereo camera whose range is about 1 % wrong."""
     view = seen_in_stereo(under_layers([view], rng)[0], rng)
     seen = depth_maps.wrong_range(view.points, rng)
     return replace(view, points=seen.of(view.points), camera=seen.of(view.camera))
 
 
 def under_layers(views: Sequence[View], rng: np.random.Generator) -> list[View]:
-    """The same layers on the bone in all views of it: one to three of up to 4 mm, towards the camera."""
+    """Put the same layers on the bone in all views of it: one to three of up to 4 mm, towards the camera."""
     bone = [np.flatnonzero(view.part == 0) for view in views]
     above_mm = layers(np.concatenate([view.points[of] for view, of in zip(views, bone, strict=True)]), rng)
     of_each = np.split(above_mm, np.cumsum([len(of) for of in bone])[:-1])

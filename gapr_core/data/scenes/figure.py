@@ -1,4 +1,4 @@
-"""The pictures of docs/scenes.md: what the camera sees in a scene of each protocol, and of one wound from four places.
+"""Draw the pictures of docs/concepts/scenes.md: a scene of each protocol, and one wound from four places.
 
 python -m gapr_core.data.scenes.figure docs/figures/scenes.png --looks docs/figures/looks.png
 """
@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def draw(out: Path) -> None:
-    """One panel a protocol, as the camera sees it; bone is light, all else is red."""
+    """Draw one panel a protocol, as the camera sees it; bone is light, all else is red."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.6 * COLUMNS, 2.8 * len(PANELS) // COLUMNS), layout="constrained")
@@ -54,7 +54,7 @@ def draw(out: Path) -> None:
 
 
 def draw_looks(out: Path) -> None:
-    """One panel a look of the same wound, each as the camera sees it from there."""
+    """Draw one panel a look of the same wound, each as the camera sees it from there."""
     from matplotlib.figure import Figure
 
     bone, protocol = LOOKED_AT
@@ -86,7 +86,7 @@ def _panel(ax: Any, pair: Pair) -> None:
 
 
 def paint(axes: Any, points: Array, viewpoint: Array | None, colours: Array, up: Array | None = None) -> None:
-    """The image of a cloud, shaded by its normals.
+    """Draw the image of a cloud, shaded by its normals.
 
     Args:
         axes: of matplotlib.

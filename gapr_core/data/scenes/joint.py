@@ -32,7 +32,7 @@ def joint_scene(
     turn: int | None = None,
     level: SceneLevel = AT_A_JOINT,
 ) -> Pair:
-    """A scene of a bone and its neighbour, one of `others`; `is_bone` is of the first.
+    """Make a scene of a bone and its neighbour, one of `others`; `is_bone` is of the first.
 
     Raises:
         ConfigError: no other bone of this subject is near, or no wound shows that share of bone.
@@ -43,7 +43,7 @@ def joint_scene(
 
 
 def next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
-    """The nearest bone of the same scan."""
+    """Find the nearest bone of the same scan."""
     same = () if specimen.cohort in MADE else (specimen.person, specimen.cohort)
     own = [other for other in others if (other.person, other.cohort) == same and other.bone != specimen.bone]
     apart = [float(specimen.distance(other.surface.points).min()) for other in own]
@@ -57,7 +57,7 @@ def next_to(specimen: Specimen, others: Sequence[Specimen]) -> Specimen:
 
 
 def at_joint(specimen: Specimen, neighbour: Specimen, rng: np.random.Generator, level: SceneLevel) -> Setting:
-    """A wound where both bones are near."""
+    """Open a wound where both bones are near."""
     setting = arrange(_together(specimen, neighbour), rng, level, partial(_between, specimen, neighbour))
     return setting._replace(parts=[specimen.surface, *setting.parts[1:], neighbour.surface])
 

@@ -29,12 +29,12 @@ class Nearness(NamedTuple):
 
 @lru_cache(maxsize=64)
 def skin(specimen: Specimen, growth_mm: int) -> Surface:
-    """The skin `growth_mm` off the bone, in the bone's frame; kept for the next scene of this bone."""
+    """Grow the skin `growth_mm` off the bone, in the bone's frame; kept for the next scene of this bone."""
     return _zero_level(_tissue(specimen, growth_mm), _nearness(specimen).low)
 
 
 def carved(specimen: Specimen, growth_mm: int, wound: Wound, floor_mm: float) -> Surface:
-    """The skin with a wound whose walls and floor are tissue; the floor is `floor_mm` below the wound's centre."""
+    """Carve a wound into the skin, with walls and a floor of tissue `floor_mm` below the wound's centre."""
     field, low = _tissue(specimen, growth_mm), _nearness(specimen).low
     z, y, x = np.indices(field.shape)
     local = wound.local(low + VOXEL_MM * np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1))

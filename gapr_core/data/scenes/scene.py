@@ -89,7 +89,7 @@ class Setting(NamedTuple):
 
 
 def scene(specimen: Specimen, rng: np.random.Generator, level: SceneLevel) -> Pair:
-    """One wound of one bone as a camera sees it.
+    """Make one wound of one bone as a camera sees it.
 
     Its metadata hold `viewpoint` (3,) mm in the source's frame, `is_bone` (N,), `bone_share` and how it was made; of a
     whole image also `crop_min` and `crop_max` (3,) mm, a box of interest in the source's frame.
@@ -118,7 +118,7 @@ def first_view(
     level: SceneLevel,
     setting_of: Callable[[np.random.Generator, SceneLevel], Setting],
 ) -> tuple[Setting, View]:
-    """A wound that shows the level's share of bone, and what a camera above it sees, without errors.
+    """Draw a wound with the level's share of bone, and the view of a camera above it, without errors.
 
     Raises:
         ConfigError: none does.
@@ -142,7 +142,7 @@ def arrange(
     level: SceneLevel,
     place_of: Callable[[Specimen, np.random.Generator, Shape], Wound] = wounds.somewhere,
 ) -> Setting:
-    """A wound on the bone, somewhere or where `place_of` says, in a limb of some thickness, with what lies around."""
+    """Open a wound on the bone, at random or at `place_of`, in a limb, with the things around it."""
     growth = int(rng.integers(limb.GROWTH_MM[0], limb.GROWTH_MM[1] + 1))
     wound = place_of(specimen, rng, level.opening)
     retractors = [things.retractor(wound, growth, rng) for _ in range(rng.integers(MOST_RETRACTORS + 1))]
@@ -168,7 +168,7 @@ def camera_above(wound: Wound, rng: np.random.Generator) -> Camera:
 
 
 def camera_off(wound: Wound, off: float, around: float, rng: np.random.Generator) -> Camera:
-    """The same, `off` radians off the wound's axis and `around` radians about it."""
+    """Move the camera `off` radians off the wound's axis and `around` radians about it."""
     direction = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])
     position = wound.at(rng.uniform(*DISTANCE_MM) * direction)
     aim = wound.centre + rng.uniform(0.0, AIM_MM) * random_directions(1, rng)[0]
@@ -176,7 +176,7 @@ def camera_off(wound: Wound, off: float, around: float, rng: np.random.Generator
 
 
 def shown(view: View, centre: Array, level: SceneLevel, rng: np.random.Generator) -> NDArray[np.intp] | None:
-    """Indices of the source's points, at most 8000; None where the bone's share or size is not what it should be."""
+    """Choose at most 8000 points of the source; None if the bone's share or size is out of range."""
     low, high = level.bone_share
     inside = np.arange(len(view.points)) if level.whole_image else _region(view, centre, level.bone_share, rng)
     kept = rng.permutation(inside)[:MOST_POINTS]
@@ -185,7 +185,7 @@ def shown(view: View, centre: Array, level: SceneLevel, rng: np.random.Generator
 
 
 def _region(view: View, centre: Array, share: tuple[float, float], rng: np.random.Generator) -> NDArray[np.intp]:
-    """What lies in a ball about the wound, grown until the bone's share has fallen to one within the level's range.
+    """Grow a ball about the wound until the bone's share falls to one within the level's range.
 
     Empty where the share is never reached or the ball then holds too little of the bone.
     """
@@ -213,7 +213,7 @@ def _as_pair(
 
 
 def _box_of_interest(pair: Pair, rng: np.random.Generator) -> dict[str, Array]:
-    """A box of 200 mm along the source's axes whose middle is within 30 mm of the wound's."""
+    """Draw a box of 200 mm along the source's axes, its middle within 30 mm of the wound's."""
     centre = pair.metadata["wound_centre"] - pair.metadata["origin_mm"]
     off = BOX_OFF_MM * np.cbrt(rng.random()) * random_directions(1, rng)[0]
     middle = se3.apply(se3.inverse(pair.T_target_source), centre[None])[0] + off

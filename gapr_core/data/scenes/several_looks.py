@@ -76,7 +76,7 @@ def several_looks(
     specimen: Specimen, rng: np.random.Generator, others: Sequence[Specimen] = (), turn: int | None = None,
     kind: LookedAt | None = None,
 ) -> Pair:  # fmt: skip
-    """One wound as a camera sees it from `LOOKS` places.
+    """Make one wound as a camera sees it from `LOOKS` places.
 
     Its metadata hold `viewpoint` (N, 3) mm, where the camera was for each point, in the source's frame; `look` (N,);
     `is_bone` (N,), `bone_share` of all looks, the `neighbour` at a joint, and how it was made.
@@ -106,7 +106,7 @@ def _places_around(rng: np.random.Generator) -> Array:
 
 
 def _from(setting: Setting, around: float, radius: float, rng: np.random.Generator) -> View:
-    """The same region from another place, at most `MOST_POINTS` of it; from elsewhere where that shows hardly anything.
+    """View the same region from another place, at most `MOST_POINTS`; try again if hardly anything shows.
 
     Raises:
         ConfigError: no place shows some of it.

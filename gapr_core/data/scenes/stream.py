@@ -52,7 +52,8 @@ class _Stage(NamedTuple):
 
 
 def simulate(specimen: Specimen, seed: int, motion: SceneMotion | None = None) -> Iterator[Pair]:
-    """The stream's frames as pairs of one common target, protocol `scene-stream`, with the metadata of a scene.
+    """Simulate the stream's frames as pairs of one common target, protocol `scene-stream`, with the metadata of a
+    scene.
 
     Raises:
         ConfigError: a bone on which no wound shows the level's share of bone.
@@ -80,7 +81,7 @@ def _prepare(specimen: Specimen, rng: np.random.Generator, motion: SceneMotion) 
 
 
 def _first(specimen: Specimen, rng: np.random.Generator, motion: SceneMotion) -> tuple[Setting, float]:
-    """A wound whose first image shows the level's share of bone, and the radius of the region that does, mm."""
+    """Draw a wound whose first image shows the level's share of bone, and the region's radius, mm."""
     level = SCENE_LEVELS[motion.level]
     for _ in range(TRIES):
         setting = arrange(specimen, rng, level)
@@ -114,7 +115,7 @@ def _to_camera(camera: Camera) -> Array:
 
 
 def _view(stage: _Stage, camera: Camera, T_scene_bone: Array, rng: np.random.Generator) -> View:
-    """What the camera sees in the region of interest, at most 8000 points, in the bone's frame."""
+    """View the region of interest, at most 8000 points, in the bone's frame."""
     T_bone_scene = se3.inverse(T_scene_bone)
     position, middle = se3.apply(T_bone_scene, np.stack([camera.position, stage.setting.wound.centre]))
     view = see(stage.setting.parts, Camera(position, camera.axes @ T_scene_bone[:3, :3]))

@@ -1,4 +1,4 @@
-"""A bone on a table, as a first trial with a camera and a bone of plastic has it; no wound, no tissue."""
+"""A bone on a table, as in a first trial with a camera; no wound, no tissue."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FARTHEST_OFF_DEG = 25.0  # of the cone of cameras from the upright
 
 
 def table_scene(specimen: Specimen, rng: np.random.Generator, level: SceneLevel = ON_A_TABLE) -> Pair:
-    """A bone at rest on a table, seen from up to 50 degrees off the upright, with the table around it.
+    """Lay a bone on a table, seen from up to 50 degrees off the upright.
 
     Metadata as in `scene.scene`.
 

@@ -22,7 +22,7 @@ HAND_MM = 125.0  # from the palm's middle to the finger tips
 
 
 def retractor(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
-    """A flat blade of 8-20 x 60-140 x 3 mm from the wound's edge outward, its near end `height_mm` above the bone."""
+    """Place a blade of 8-20 x 60-140 x 3 mm at the wound's edge, `height_mm` above the bone."""
     size = np.array([rng.uniform(8.0, 20.0), rng.uniform(60.0, 140.0), 3.0])
     turn = Rotation.from_euler("zx", [rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(10.0, 60.0))])
     corners = (np.indices((2, 2, 2)).reshape(3, 8).T - [0.5, 0.0, 0.5]) * size  # its near end at the origin, along y
@@ -31,7 +31,7 @@ def retractor(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surfa
 
 
 def hand(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
-    """A hand that reaches from outside over the wound's edge, 10-30 mm above the skin, the wrist higher."""
+    """Place a hand over the wound's edge, 10-30 mm above the skin, the wrist higher."""
     model = _hand()
     tips = rng.uniform(0.5, 1.0) * wound.radius_mm
     lying = model.points * [rng.choice([-1.0, 1.0]), -1.0, 1.0] + [0.0, HAND_MM, 0.0]  # a left or a right one
@@ -42,7 +42,7 @@ def hand(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
 
 
 def drape(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
-    """A cloth with a round hole over the wound, 5-25 mm above the skin, tilted up to 10 degrees, with soft waves."""
+    """Lay a cloth with a round hole over the wound, 5-25 mm above the skin, tilted and waved."""
     at = np.arange(-CLOTH_MM / 2.0, CLOTH_MM / 2.0 + 1.0, CLOTH_STEP_MM)
     points, faces = sheet(at)
     points[:, 2] = 3.0 * np.sin(points[:, :2] @ rng.normal(0.0, 0.03, 2) + rng.uniform(0.0, 2.0 * np.pi))
@@ -53,7 +53,7 @@ def drape(wound: Wound, height_mm: float, rng: np.random.Generator) -> Surface:
 
 
 def sheet(at: Array) -> tuple[Array, NDArray[np.int64]]:
-    """A flat square of triangles with corners at all pairs of `at` (K,)."""
+    """Make a flat square of triangles with corners at all pairs of `at` (K,)."""
     x, y = np.meshgrid(at, at)
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     corner = (np.arange(len(at) - 1)[:, None] * len(at) + np.arange(len(at) - 1)).ravel()
@@ -63,7 +63,7 @@ def sheet(at: Array) -> tuple[Array, NDArray[np.int64]]:
 
 @lru_cache(maxsize=1)
 def _hand() -> Surface:
-    """A flat hand, mm: palm about the origin, fingers along y, wrist at -y, back of the hand at +z."""
+    """Make a flat hand, mm: palm about the origin, fingers along y, wrist at -y, back of the hand at +z."""
     solid = Solid([-90.0, -140.0, -40.0], [70.0, 140.0, 40.0], spacing_mm=3.0)
     solid.add(ellipsoid([0.0, 0.0, 0.0], [42.0, 52.0, 15.0]))
     for x, length in ((-30.0, 102.0), (-10.0, 117.0), (10.0, 112.0), (30.0, 92.0)):

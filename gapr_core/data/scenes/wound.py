@@ -43,7 +43,7 @@ class Wound:
         return (points - self.centre) @ self.axes.T
 
     def at(self, local: Array) -> Array:
-        """The bone's coordinates of (N, 3) points in the wound's frame."""
+        """Transform (N, 3) points from the wound's frame to the bone's."""
         return self.centre + local @ self.axes
 
 
@@ -53,14 +53,14 @@ def everywhere(points: Array) -> NDArray[np.bool_]:
 
 
 def somewhere(specimen: Specimen, rng: np.random.Generator, shape: Shape, allowed: Allowed = everywhere) -> Wound:
-    """A wound above a random point of the bone that can be seen along its normal, where it is `allowed`."""
+    """Open a wound above a random point of the bone that is seen along its normal, where it is `allowed`."""
     centre, outward = _open_place(specimen, rng, allowed)
     radius = rng.uniform(*RADIUS_MM)
     return Wound(centre, frame(outward, rng), radius, shape(radius, rng))
 
 
 def _open_place(specimen: Specimen, rng: np.random.Generator, allowed: Allowed) -> tuple[Array, Array]:
-    """A surface point (3,) and its outward normal, with nothing of the bone above it.
+    """Choose a surface point (3,) and its outward normal, with nothing of the bone above it.
 
     Raises:
         ConfigError: there is none.
@@ -76,7 +76,7 @@ def _open_place(specimen: Specimen, rng: np.random.Generator, allowed: Allowed) 
 
 
 def _mean_normal(points: Array, normals: Array, row: np.intp) -> Array:
-    """The mean of the normals about a point that look to its own side, as a unit vector (3,)."""
+    """Average the normals about a point that look to its own side, as a unit vector (3,)."""
     close = ((points - points[row]) ** 2).sum(axis=1) < NORMAL_OVER_MM**2
     same_side = normals[close & (normals @ normals[row] > 0.0)]
     return np.asarray(same_side.sum(axis=0) / np.linalg.norm(same_side.sum(axis=0)))
@@ -90,7 +90,7 @@ def frame(outward: Array, rng: np.random.Generator) -> Array:
 
 
 def lobed(radius: float, rng: np.random.Generator) -> Opening:
-    """A round hole whose edge has lobes: r(a) = radius (1 + sum of c_k cos(k a + phase)), k = 2 to 5, c_k to .12."""
+    """Make a round hole with lobes: r(a) = radius (1 + sum of c_k cos(k a + phase)), k = 2 to 5."""
     depth, phase, waves = rng.uniform(0.0, 0.12, 4), rng.uniform(0.0, 2.0 * np.pi, 4), np.arange(2, 6)
 
     def inside(plane: Array) -> NDArray[np.bool_]:
@@ -102,14 +102,14 @@ def lobed(radius: float, rng: np.random.Generator) -> Opening:
 
 
 def slit(radius: float, rng: np.random.Generator) -> Opening:
-    """A cut with round ends, `radius` to either side of its middle and 20-36 mm wide."""
+    """Make a cut with round ends, `radius` to either side of its middle and 20-36 mm wide."""
     half = rng.uniform(10.0, 18.0)
     reach = max(radius - half, 0.0)
     return lambda plane: np.hypot(np.maximum(np.abs(plane[:, 0]) - reach, 0.0), plane[:, 1]) < half
 
 
 def windows(radius: float, rng: np.random.Generator) -> Opening:
-    """Two round holes of .35 to .6 of the radius, one in the middle, with a bridge of 8-16 mm between them."""
+    """Make two round holes of .35 to .6 of the radius, with a bridge of 8-16 mm between them."""
     first, second = radius * rng.uniform(0.35, 0.6, 2)
     apart = first + second + rng.uniform(8.0, 16.0)
 
@@ -121,7 +121,7 @@ def windows(radius: float, rng: np.random.Generator) -> Opening:
 
 
 def opened(skin: Surface, wound: Wound) -> Surface:
-    """The skin without the triangles above the bone that lie in the wound's opening."""
+    """Cut the triangles above the bone that lie in the wound's opening out of the skin."""
     middles = wound.local(skin.points[skin.triangles].mean(axis=1))
     hole = (middles[:, 2] > 0.0) & wound.opening(middles[:, :2])
     return Surface(skin.points, skin.triangles[~hole])

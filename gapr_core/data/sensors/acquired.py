@@ -48,12 +48,12 @@ class View:
     parameters: dict[str, Any]
 
     def only(self, chosen: NDArray[Any]) -> View:
-        """The view of some of its points, by mask or index."""
+        """Keep some points of the view, by mask or index."""
         return View(self.points[chosen], self.outward[chosen], self.towards, self.parameters)
 
 
 def look(specimen: Specimen, share: tuple[float, float], share_of: str, draws: int, rng: np.random.Generator) -> View:
-    """A one-sided view of a `share` of the surface (see `views.best_view`), densely sampled."""
+    """Draw a one-sided view of a `share` of the surface (see `views.best_view`), densely sampled."""
     points, normals, parameters = views.best_view(specimen, share, share_of, rng, draws)
     towards = np.asarray(parameters["view_direction"])
     side = np.where(normals @ towards < 0.0, -1.0, 1.0)
@@ -69,7 +69,7 @@ def tangents(view: View) -> tuple[Array, Array]:
 
 
 def smooth_offsets(points: Array, most_mm: float, rng: np.random.Generator) -> tuple[Array, dict[str, Any]]:
-    """(N,) offsets, mm, of a smooth bias of any shape and of a size up to `most_mm`, and its name and size."""
+    """Draw (N,) offsets, mm, of a smooth bias up to `most_mm`, with its name and size."""
     name, size_mm = str(rng.choice(list(SMOOTH_BIASES))), float(rng.uniform(0.0, most_mm))
     return SMOOTH_BIASES[name](points, size_mm, rng), {"bias": name, "bias_mm": size_mm}
 

@@ -69,5 +69,5 @@ class Range:
 
 
 def wrong_range(points: Array, rng: np.random.Generator) -> Range:
-    """The range of a camera that sees points (N, 3), wrong by about 1 %."""
+    """Scale the range of a camera that sees points (N, 3) by about 1 %."""
     return Range(1.0 + float(rng.normal(0.0, RANGE)), points.mean(axis=0))

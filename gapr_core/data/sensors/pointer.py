@@ -25,7 +25,7 @@ ON_TISSUE, TISSUE_MM = 0.06, (1.0, 4.0)  # largest share of points on soft tissu
 def pointer(
     specimen: Specimen, rng: np.random.Generator, points: tuple[int, int] = POINTS, only_dots: bool = False
 ) -> Acquired:
-    """12 to 200 points in dots and strokes with a constant stand-off, no full contact and a few points on tissue.
+    """Touch 12 to 200 points in dots and strokes, with a stand-off and a few points on tissue.
 
     Real digitisers lie .34 to .62 mm outside of the bone on average.
 
@@ -63,7 +63,7 @@ def _touched(view: View, count: int, in_dots: int, rng: np.random.Generator) -> 
 
 
 def stroke(view: View, length_mm: tuple[float, float], rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of points in a row over the surface, from a random one in a random direction, as long as drawn."""
+    """Choose points in a row over the surface, from a random one in a random direction."""
     start, tilt = int(rng.integers(len(view.points))), rng.normal(size=3)
     ahead = tilt - view.outward[start] * (tilt @ view.outward[start])
     ahead /= np.linalg.norm(ahead)

@@ -32,7 +32,7 @@ RUN = 20  # samples of such a run
 
 
 def tracing(specimen: Specimen, rng: np.random.Generator) -> Acquired:
-    """300 to 4000 samples of strokes over 5 to 35 % of the surface, outside of the bone and shifted with the tip."""
+    """Drag strokes of 300 to 4000 samples over 5 to 35 % of the surface, shifted with the tip."""
     view = look(specimen, SHARE, "seen", 60_000, rng)
     count = round(log_uniform(POINTS, rng))
     chosen, of_stroke = _strokes(view, count, rng.uniform(*SPACING_MM), rng)

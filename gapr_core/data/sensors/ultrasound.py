@@ -29,7 +29,7 @@ OUTLIERS, OUTLIER_MM = 0.08, (2.0, 10.0)  # other interfaces, along the beam
 
 
 def ultrasound(specimen: Specimen, rng: np.random.Generator, count: tuple[int, int] = SLICES) -> Acquired:
-    """4 to 40 slices (`count`) of 20 to 120 points, each with the errors of its own pose, beam and depth."""
+    """Take 4 to 40 slices (`count`), each with the errors of its own pose, beam and depth."""
     view = look(specimen, SHARE, "band" if rng.random() < 0.7 else "seen", 60_000, rng)
     slices = _slices(view, count, rng)
     drawn = {
@@ -84,7 +84,7 @@ def _slice(
 def _image(
     points: Array, bias_mm: Array, view: View, drawn: dict[str, Any], share: float, rng: np.random.Generator
 ) -> Array:
-    """One slice (N, 3) as it is measured: depth scaled, noise by axis, other interfaces, then the tracker's error."""
+    """Measure one slice (N, 3): depth scaled, noise by axis, other interfaces, then the tracker's error."""
     beam = Rotation.from_rotvec(np.radians(rng.normal(0.0, 5.0, 3))).apply(-view.towards)
     depth = points @ beam
     depth_mm = drawn["tissue_mm"] + depth - depth.min()

@@ -11,14 +11,30 @@ import numpy as np
 from numpy.lib import format as npy
 
 from gapr_core.errors import InvalidPointCloudError
+from gapr_core.formats import tracker
 from gapr_core.formats.limits import FileLimits
 from gapr_core.formats.options import ReadOptions
+from gapr_core.geometry import pinhole
 from gapr_core.surface import Surface, as_points
 
 
 def read_npy(path: Path, options: ReadOptions) -> Surface:
-    """An (N, 3) array."""
-    return Surface(as_points(array_of(options.limits.read(path), options.limits)))
+    """An (N, 3) array, a camera's image (H, W, 3), or poses (N, 4, 4) of a tool, mm, NaN where it was not seen.
+
+    Raises:
+        InvalidPointCloudError: poses without the tip, a tip without poses, or poses that are not rigid.
+    """
+    array = array_of(options.limits.read(path), options.limits)
+    if array.shape[1:] == (4, 4):
+        return Surface(
+            tracker.touched(tracker.rigid_poses(array, path), tracker.given_tip(options.tip_mm, path)), joined=True
+        )
+    if options.tip_mm is not None:
+        raise InvalidPointCloudError(
+            f"{tracker.RECORDINGS} for --tip", f"{path.name} of shape {array.shape}", "leave it out for points"
+        )
+    points = as_points(array)
+    return Surface(points, camera=pinhole.centre_of(points.reshape(array.shape)) if array.ndim == 3 else None)
 
 
 def read_npz(path: Path, options: ReadOptions) -> Surface:

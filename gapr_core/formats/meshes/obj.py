@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapr_core.formats import text
 from gapr_core.formats.meshes.polygons import fans
+from gapr_core.formats.meshes.stl import share_vertices
 from gapr_core.formats.options import ReadOptions
-from gapr_core.surface import Surface
+from gapr_core.surface import Surface, check_faces
 
 log = logging.getLogger(__name__)
 
@@ -41,8 +41,11 @@ def read(path: Path, options: ReadOptions) -> Surface:
     triangles = len(corners) - 2 * (len(ends) - 1)  # of a face with n corners n - 2
     options.limits.check_counts(len(vertices) // 3, max(triangles, 0))
     surface = Surface(np.array(vertices).reshape(-1, 3), fans(np.array(ends), np.array(corners)))
+    if len(surface.triangles) == 0:
+        raise ValueError("no faces in it: the file is cut; clouds go into PLY or NPY files")
+    check_faces(surface, path.name)
     _check_whole(surface, len(ends) - 1, announced)
-    if not announced and (open_edges := _open_edges(surface.triangles)):
+    if not announced and (open_edges := _open_edges(surface)):
         log.warning("%s is open at %d edges: compare it with what was exported, it may be cut", path.name, open_edges)
     return surface
 
@@ -78,8 +81,6 @@ def _vertex(corner: str, count: int) -> int:
 
 
 def _check_whole(surface: Surface, polygons: int, announced: dict[str, int]) -> None:
-    if len(surface.triangles) == 0:
-        raise ValueError("no faces in it: the file is cut; clouds go into PLY or NPY files")
     present = {"vertices": len(surface.points), "faces": polygons, "triangles": polygons}
     for name, count in announced.items():
         if present[name] != count:
@@ -89,8 +90,9 @@ def _check_whole(surface: Surface, polygons: int, announced: dict[str, int]) -> 
         raise ValueError(f"{len(surface.points) - used} vertices belong to no face: the file is cut")
 
 
-def _open_edges(faces: NDArray[np.int64]) -> int:
-    """Number of edges that belong to one triangle only."""
+def _open_edges(surface: Surface) -> int:
+    """Number of edges that belong to one triangle only, whether or not triangles share their vertices."""
+    faces = share_vertices(surface.points[surface.triangles].reshape(-1, 3)).triangles
     edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, uses = np.unique(edges[:, 0] * (faces.max() + 1) + edges[:, 1], return_counts=True)
     return int((uses == 1).sum())

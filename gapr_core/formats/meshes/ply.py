@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gapr_core.formats import text
 from gapr_core.formats.limits import FileLimits
-from gapr_core.formats.meshes.polygons import fans
+from gapr_core.formats.meshes.polygons import fans, strips
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
@@ -28,6 +28,8 @@ FEWEST_CORNERS = 3
 CORNERS = ("vertex_indices", "vertex_index")
 END = re.compile(rb"[\r\n]end_header(?=[\r\n])")
 IS_TEXT = re.compile(rb"[\r\n]format[ \t]+ascii\b")
+STRIPS = "tristrips"
+GRID = re.compile(rb"[\r\n]+element[ \t]+range_grid\b(?![\s\S]*[\r\n]element[ \t])[\s\S]*$")
 MOST_LISTS = 3  # of one element: vertices, texture coordinates, and one more
 
 
@@ -35,12 +37,13 @@ def read(path: Path, options: ReadOptions) -> Surface:
     """A mesh, or a cloud with its normals."""
     data = options.limits.read(path)
     _check_header(data, options.limits)
-    ply = _parse(_with_ascii_header(data))
+    ply = _parse(_with_ascii_header(_without_grid(data)))
     columns = ply["vertex"].data
     points = _columns(columns, "xyz")
-    if "face" in ply and ply["face"].count:
-        name = next(n for n in ply["face"].data.dtype.names if n in CORNERS)
-        return Surface(points, _triangles(ply["face"].data[name]))
+    for element, triangles in (("face", _triangles), (STRIPS, _of_strips)):
+        if element in ply and ply[element].count:
+            name = next(n for n in ply[element].data.dtype.names if n in CORNERS)
+            return Surface(points, triangles(ply[element].data[name]))
     normals = ("nx", "ny", "nz")
     return Surface(points, None, _columns(columns, normals) if set(normals) <= set(columns.dtype.names) else None)
 
@@ -55,6 +58,14 @@ def _parse(data: bytes) -> Any:
             return PlyData.read(file, known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
         except (PlyParseError, ValueError):  # other polygons, row by row; old NumPy maps nothing after the last page
             return PlyData.read(io.BytesIO(data))
+
+
+def _without_grid(data: bytes) -> bytes:
+    """Without the last element, if that is which pixel of a scanner each point is (Stanford's range grids)."""
+    header, body = _halves(data)
+    start = GRID.search(header)
+    line_end = b"\r\n" if b"\r\n" in header else b"\n"
+    return data if start is None else header[: start.start()] + line_end + b"end_header" + body
 
 
 def _with_ascii_header(data: bytes) -> bytes:
@@ -85,7 +96,7 @@ def _check_header(data: bytes, limits: FileLimits) -> None:
     Raises:
         ValueError: no header, or a file that is shorter.
     """
-    header, body = _halves(data)
+    header, body = _halves(_without_grid(data))
     is_text = IS_TEXT.search(header) is not None
     if is_text:
         text.lines(data)
@@ -105,9 +116,10 @@ def _check_layout(elements: dict[str, tuple[int, list[list[str]]]]) -> None:
     named = {words[-1] for words in elements["vertex"][1]}
     if missing := [axis for axis in "xyz" if axis not in named]:
         raise ValueError(f"vertices without {' '.join(missing)}")
-    faces, properties = elements.get("face", (0, []))
-    if faces and not any(words[0] == "list" and words[-1] in CORNERS for words in properties):
-        raise ValueError(f"faces without a list {' or '.join(CORNERS)}")
+    for element, called in (("face", "faces"), (STRIPS, STRIPS)):
+        count, properties = elements.get(element, (0, []))
+        if count and not any(words[0] == "list" and words[-1] in CORNERS for words in properties):
+            raise ValueError(f"{called} without a list {' or '.join(CORNERS)}")
 
 
 def _elements(header: str) -> list[tuple[str, int, list[list[str]]]]:
@@ -135,12 +147,22 @@ def _check_property(words: list[str], has_element: bool) -> None:
 def _shortest_row(name: str, properties: list[list[str]], is_text: bool) -> int:
     """Bytes that a row takes at least; a list of corners has three."""
     lists = [words for words in properties if words[0] == "list"]
-    if (lists and name != "face") or len(lists) > MOST_LISTS:
+    if (lists and name not in ("face", STRIPS)) or len(lists) > MOST_LISTS:
         raise ValueError(f"lists in the element {name}, which are not read")
     size = sum(SHORTEST_TEXT if is_text else BYTES[words[1 if words[0] == "list" else 0]] for words in properties)
     corners = [words for words in lists if words[-1] in CORNERS]
     size += sum(FEWEST_CORNERS * (SHORTEST_TEXT if is_text else BYTES[words[2]]) for words in corners)
     return max(size, 1)
+
+
+def _of_strips(lists: Any) -> NDArray[np.int64]:
+    """(F, 3) triangles of strips; a -1 in a list begins another strip."""
+    corners = np.concatenate([[*corners, -1] for corners in lists]).astype(np.int64)
+    breaks = np.flatnonzero(corners == -1)
+    ends = np.concatenate([[0], breaks - np.arange(len(breaks))])
+    triangles = strips(ends, corners[corners != -1])
+    a, b, c = triangles.T
+    return triangles[(a != b) & (b != c) & (c != a)]  # a strip turns a corner by one that has no area
 
 
 def _triangles(polygons: Any) -> NDArray[np.int64]:

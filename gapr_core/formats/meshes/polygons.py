@@ -8,6 +8,18 @@ from numpy.typing import NDArray
 Indices = NDArray[np.int64]
 
 
+def integers(values: NDArray[np.float64]) -> Indices:
+    """The same as integers.
+
+    Raises:
+        ValueError: one of them is none.
+    """
+    indices = values.astype(np.int64)
+    if (indices != values).any():
+        raise ValueError("indices that are no integers")
+    return indices
+
+
 def fans(offsets: Indices, corners: Indices) -> Indices:
     """(F, 3) triangles of polygons, each a fan around its first corner.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
-from gapr_core.formats.meshes.polygons import fans, offsets_of_counted, strips
+from gapr_core.formats.meshes.polygons import fans, integers, offsets_of_counted, strips
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
@@ -119,13 +119,13 @@ class _File:
         words = self.words()
         if words[:1] != ["OFFSETS"]:
             self._at = before
-            return offsets_of_counted(_indices(self.numbers(second, "int")), first)
+            return offsets_of_counted(integers(self.numbers(second, "int")), first)
         _counts(words, 2)
-        offsets = _indices(self.numbers(first, words[1]))
+        offsets = integers(self.numbers(first, words[1]))
         words = self.words()
         if words[:1] != ["CONNECTIVITY"] or len(words) < 2:
             raise ValueError("offsets without corners")
-        return offsets, _indices(self.numbers(second, words[1]))
+        return offsets, integers(self.numbers(second, words[1]))
 
     def skip(self, words: list[str]) -> None:
         """Pass over METADATA (to the next empty line) or FIELD arrays."""
@@ -173,10 +173,3 @@ def _counts(words: list[str], length: int, *places: int) -> list[int]:
     if len(words) < length or not all(words[place].isdecimal() for place in places):
         raise ValueError(f"a line {' '.join(words)[:40]!r} without the counts or the type of its section")
     return [int(words[place]) for place in places]
-
-
-def _indices(values: Array) -> NDArray[np.int64]:
-    indices = values.astype(np.int64)
-    if (indices != values).any():
-        raise ValueError("indices that are no integers")
-    return indices

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.formats.limits import FileLimits
-from gapr_core.formats.meshes.polygons import fans, strips
+from gapr_core.formats.meshes.polygons import fans, integers, strips
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Array, Surface
 
@@ -63,7 +63,7 @@ class _File:
         if self._root.tag != "VTKFile" or self._root.get("type") != "PolyData":
             raise ValueError("no polygonal data in it")
         order = "<" if self._root.get("byte_order") == "LittleEndian" else ">"
-        self._order, self._size = order, np.dtype(order + TYPES[self._root.get("header_type", "UInt32")])
+        self._order, self._size = order, _type(order, self._root.get("header_type", "UInt32"))
         appended = self._root.find("AppendedData")
         self._appended = "" if appended is None else (appended.text or "").strip().removeprefix("_")
 
@@ -76,8 +76,8 @@ class _File:
         if count == 0:
             return np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64)
         arrays = {array.get("Name"): array for array in piece.findall(f"{name}/DataArray")}
-        ends = self.numbers(arrays.get("offsets"), count).astype(np.int64)
-        corners = self.numbers(arrays.get("connectivity"), int(ends[-1])).astype(np.int64)
+        ends = integers(self.numbers(arrays.get("offsets"), count))
+        corners = integers(self.numbers(arrays.get("connectivity"), int(ends[-1])))
         return np.concatenate([[0], ends]), corners
 
     def numbers(self, element: ElementTree.Element | None, count: int) -> Array:
@@ -110,7 +110,7 @@ class _File:
     def _values(self, element: ElementTree.Element, count: int) -> Array:
         if element.get("format") == "ascii":
             return np.array((element.text or "").split(), dtype=np.float64)
-        dtype = np.dtype(self._order + TYPES[element.get("type", "")])
+        dtype = _type(self._order, element.get("type", ""))
         stream = self._stream(element)
         compressor = self._root.get("compressor")
         data = stream.block() if compressor is None else self._blocks(stream, compressor, count * dtype.itemsize)
@@ -135,11 +135,18 @@ class _File:
         return b"".join(_unpacked(part, n, compressor) for part, n in zip(stream.parts(packed), sizes, strict=True))
 
 
+def _type(order: str, name: str) -> np.dtype:
+    if name not in TYPES:
+        raise ValueError(f"numbers of type {name[:20]!r}, which are not read: save them as Float32 or Float64")
+    return np.dtype(order + TYPES[name])
+
+
 def _unpacked(part: bytes, size: int, compressor: str) -> bytes:
-    data = DECOMPRESSORS[compressor]().decompress(part, size)  # type: ignore[operator]
-    if len(data) != size:
-        raise ValueError("packed data that are cut")
-    return data
+    stream = DECOMPRESSORS[compressor]()  # type: ignore[operator]
+    data = stream.decompress(part, size + 1)
+    if len(data) != size or not stream.eof:  # at the end it has compared the checksum
+        raise ValueError("packed data that are cut, or longer than announced")
+    return bytes(data)
 
 
 class _Raw:

@@ -7,6 +7,8 @@ dies of a damaged file, only this process ends.
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,20 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import GaprError, InvalidPointCloudError
-from gapr_core.formats import signatures
+from gapr_core.formats import reading, signatures
 from gapr_core.formats.limits import MB, FileLimits
-from gapr_core.formats.volumes import names, nifti, placement
+from gapr_core.formats.volumes import names, nifti, placement, whole
 from gapr_core.formats.volumes.names import Segment
 
 Array = NDArray[np.float64]
 MARGIN = 6  # voxels around the segments: what smoothing reaches
+LIBRARIES_BYTES = 4 << 30  # address space that they reserve
 
 
 def main(request: str, out: str) -> int:
     """Read what the request names; a refusal goes to stdout as JSON, with exit code 1."""
     asked = json.loads(request)
     limits = FileLimits(**asked["limits"])
-    _limit_memory(limits)
+    _limit(limits, asked["seconds"])
     path = Path(asked["path"])
     try:
         is_dicom = path.suffix.lower() == ".dcm"
@@ -39,17 +42,24 @@ def main(request: str, out: str) -> int:
     except GaprError as error:
         sys.stdout.write(json.dumps([error.expected, error.given, error.how_to_fix]))
         return 1
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever a damaged file leads to
+        sys.stderr.write(reading.reason_of(error))
+        return 1
     np.savez(out, mask=mask, affine=affine, start=start, notes=np.frombuffer(json.dumps(notes).encode(), np.uint8))
     return 0
 
 
-def _limit_memory(limits: FileLimits) -> None:
-    """No more than a load is allowed, so that a damaged size ends this process and takes nothing from others."""
+def _limit(limits: FileLimits, seconds: int) -> None:
+    """End this process, also without its parent, where it takes longer or more memory than a load is allowed."""
     try:
         import resource
     except ImportError:  # not on Windows
         return
-    most = int(20 * limits.unpacked_mb * MB) + (4 << 30)  # address space, of which libraries reserve much
+    signal.alarm(seconds)
+    own = [limit for limit in resource.getrlimit(resource.RLIMIT_AS) if limit != resource.RLIM_INFINITY]
+    most = min([int(20 * limits.unpacked_mb * MB) + LIBRARIES_BYTES, *own])
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
@@ -58,25 +68,25 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[Any]], Array
     import SimpleITK
 
     is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
+    os.environ["ITK_NIFTI_SFORM_PERMISSIVE"] = "1"  # else it refuses an sform that is rounded
     if is_nifti:
         nifti.check_length(path, limits)
+    else:
+        whole.header(path)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
-    try:
-        reader.ReadImageInformation()
-    except RuntimeError as error:
-        if is_nifti and "orthonormal" in str(error):  # ITK reads such a grid from the other kinds of files
-            how = "save it as .nrrd or .mha, or resample it"
-            raise InvalidPointCloudError("voxels at right angles in NIfTI", "a sheared grid", how) from error
-        raise
+    reader.ReadImageInformation()
     one = SimpleITK.Image([1] * reader.GetDimension(), reader.GetPixelID(), reader.GetNumberOfComponents())
-    size = one.GetNumberOfComponentsPerPixel() * one.GetSizeOfPixelComponent()
-    limits.check_unpacked(int(np.prod(reader.GetSize(), dtype=np.float64)) * size)
+    count = int(np.prod(reader.GetSize(), dtype=np.float64)) * one.GetNumberOfComponentsPerPixel()
+    limits.check_unpacked(count * one.GetSizeOfPixelComponent())
+    if not is_nifti:
+        whole.check_voxels(path, count, one.GetSizeOfPixelComponent())
     try:
         image = reader.Execute()
-    except RuntimeError as error:  # ITK says why not, and where in its source, or that a file that is here is not
-        given = "a header without all of them, as of a file that is cut"
-        raise InvalidPointCloudError("the voxels that the header announces", given, "export it again") from error
+    except RuntimeError as error:  # ITK says where in its source, or that a file that is here is not
+        if "allocat" in str(error):
+            raise MemoryError from error
+        raise InvalidPointCloudError("voxels that ITK can read", "others", "save it again with 3D Slicer") from error
     if image.GetDimension() != 3:
         raise InvalidPointCloudError("a volume", f"{image.GetDimension()} dimensions", "export one time step")
     _check_axes(path, {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()})
@@ -89,7 +99,10 @@ def _read_itk(path: Path, limits: FileLimits) -> tuple[list[NDArray[Any]], Array
     if is_nifti:
         named = [Segment(name, value) for value, name in nifti.label_names(path).items()]
     direction = np.reshape(image.GetDirection(), (3, 3))
-    return [_integers(layer) for layer in layers], _affine(direction * image.GetSpacing(), image.GetOrigin()), named
+    affine = _affine(direction * image.GetSpacing(), image.GetOrigin())
+    if is_nifti and (sform := nifti.geometry(path).sform) is not None:
+        affine[:3] = sform * np.array([[-1.0], [-1.0], [1.0]])  # of one that is rounded, ITK 5.4 takes the transpose
+    return [_integers(layer) for layer in layers], affine, named
 
 
 def _check_axes(path: Path, metadata: dict[str, str]) -> None:
@@ -132,6 +145,7 @@ def _read_dicom(
     named = [Segment(word, number, n) for n, (word, number) in enumerate(zip(words, numbers, strict=True))]
     chosen = names.choose(labels, named, {s.layer: {s.value} for s in named})[0] if labels else named
     named = [Segment(s.name, s.value, layer) for layer, s in enumerate(dict.fromkeys(chosen))]
+    _check_pixels(seg)
     geometry = seg.get_volume_geometry()
     if geometry is None:
         raise InvalidPointCloudError("slices of one volume, at one distance", "others", "resample the segmentation")
@@ -145,6 +159,15 @@ def _read_dicom(
     affine[:3, 3] -= MARGIN * affine[:3, 0]
     layers = [np.pad(layer, [(MARGIN, MARGIN), (0, 0), (0, 0)]) for layer in layers]  # empty slices are not written
     return [layer.transpose(2, 1, 0) for layer in layers], affine, named
+
+
+def _check_pixels(seg: Any) -> None:
+    """Raise `ValueError` for another number of frames or bytes than the header announces: DICOM has no checksum."""
+    if (count := len(seg.PerFrameFunctionalGroupsSequence)) != int(seg.NumberOfFrames):
+        raise ValueError(f"places of {count} frames where its header announces {seg.NumberOfFrames}")
+    if not seg.file_meta.TransferSyntaxUID.is_encapsulated:
+        bits = int(seg.NumberOfFrames) * int(seg.Rows) * int(seg.Columns) * int(seg.BitsAllocated)
+        whole.check_length(len(seg.PixelData), -(-bits // 16) * 2)  # an even number
 
 
 def _integers(voxels: NDArray[Any]) -> NDArray[Any]:

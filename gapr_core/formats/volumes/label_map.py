@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import logging
+import re
 import subprocess
 import tempfile
 from dataclasses import asdict
@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 NEEDS = ("SimpleITK", "skimage", "highdicom")
 LONGEST_READ_S = 300
 CHILD = "gapr_core.formats.volumes.child"
+NO_MEMORY = re.compile(r"MemoryError|bad_alloc|annot allocate|failed to map segment")
+COMPLAINT = re.compile(r"error|fail|corrupt|truncated", re.IGNORECASE)  # ITK prints it and returns success
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
@@ -50,30 +52,24 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def _with_small_ending(path: Path, folder: Path) -> Path:
-    """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers.
-
-    Its voxels may be in a file of their own in its folder.
-    """
+    """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers."""
     ending = "".join(path.suffixes[-2:]) if path.suffix.lower() == ".gz" else path.suffix
     if ending == ending.lower():
         return path
-    stem = path.name.removesuffix(ending)
-    for other in path.parent.glob(f"{glob.escape(stem)}.*"):
-        (folder / other.name).symlink_to(other.resolve())
-    link = folder / f"{stem}{ending.lower()}"
-    link.unlink(missing_ok=True)  # another file of that very name
+    link = folder / f"{path.name.removesuffix(ending)}{ending.lower()}"
     link.symlink_to(path.resolve())
     return link
 
 
 def _in_a_child(path: Path, options: ReadOptions, out: Path) -> tuple[Mask, NDArray[np.float64], list[str]]:
     """The cropped mask [k, j, i], the affine of its own indices (i, j, k), and what there is to say."""
-    request = {"path": str(path.absolute()), "labels": list(options.labels), "limits": asdict(options.limits)}
+    request = {"path": str(path.absolute()), "labels": list(options.labels), "limits": asdict(options.limits),
+               "seconds": LONGEST_READ_S}  # fmt: skip
     try:
         done = child.run(CHILD, json.dumps(request), str(out.absolute()), timeout_s=LONGEST_READ_S)
     except subprocess.TimeoutExpired as error:
         raise ValueError(f"not read in {LONGEST_READ_S} s") from error
-    if done.returncode != 0:
+    if done.returncode != 0 or COMPLAINT.search(done.stderr.replace(path.name, "")):
         raise _refusal(done)
     with np.load(out, allow_pickle=False) as data:
         affine, notes = data["affine"].copy(), json.loads(data["notes"].tobytes())
@@ -86,4 +82,4 @@ def _refusal(done: subprocess.CompletedProcess[str]) -> Exception:
     if done.returncode == 1 and done.stdout.startswith("["):
         return InvalidPointCloudError(*json.loads(done.stdout))
     lines = done.stderr.strip().splitlines() or [f"its reader ended with {done.returncode}"]
-    return ValueError(lines[-1])
+    return MemoryError() if NO_MEMORY.search(done.stderr) else ValueError(lines[-1])

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats.limits import FileLimits
+from gapr_core.formats.volumes import whole
 
 EXTENSION_BYTES = 1 << 20
-CHUNK_BYTES = 1 << 24
 HEADER_BYTES = 348
+IN_ONE_FILE = b"n+1\0"  # ends the header; with another end ITK looks for an .img
 MM_PER_UNIT = {1: 1000.0, 2: 1.0, 3: 0.001}  # of xyzt_units: m, mm, um
 
 Array = NDArray[np.float64]
@@ -78,21 +79,20 @@ def geometry(path: Path) -> Geometry:
 
 
 def check_length(path: Path, limits: FileLimits) -> None:
-    """Every voxel that the header announces is in the file; ITK fills up what is missing in silence.
+    """Every voxel that the header announces is in the file, undamaged where it has a checksum, and no other.
 
     Raises:
-        InvalidPointCloudError: more than the limit, or NIfTI-2.
-        ValueError: a file that is cut.
+        InvalidPointCloudError: more than the limit, NIfTI-2, or voxels in another file.
+        ValueError: a file that is damaged, cut or longer.
     """
     with _opened(path) as file:
         head = file.read(HEADER_BYTES)
-        expected = _announced(head)
-        limits.check_unpacked(expected)
-        given = len(head)
-        while given < expected and (chunk := file.read(CHUNK_BYTES)):
-            given += len(chunk)
-    if given < expected:
-        raise ValueError(f"{given} bytes where its header announces {expected}")
+    expected = _announced(head)
+    limits.check_unpacked(expected)
+    is_packed = path.name.lower().endswith(".gz")
+    whole.check_length(whole.gzip_bytes(path) if is_packed else path.stat().st_size, expected)
+    if head[-4:] != IN_ONE_FILE:
+        raise InvalidPointCloudError(whole.ONE_FILE[0], "a header of another file", "save it as one .nii or .nii.gz")
 
 
 def _order(head: bytes) -> str:

@@ -5,7 +5,6 @@ ITK fills in the origin and axes that a header lacks, ignores the unit of NRRD a
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.formats.volumes import nifti
+from gapr_core.formats.volumes import nifti, whole
 
 Array = NDArray[np.float64]
 
@@ -40,9 +39,9 @@ def check(path: Path) -> None:
     if name.endswith((".nii", ".nii.gz")):
         _check_nifti(nifti.geometry(path))
     elif name.endswith(".nrrd"):
-        _check_nrrd(_fields(path, ":"))
+        _check_nrrd(whole.header(path)[0])
     elif name.endswith(".mha"):
-        _check_mha(_fields(path, "="))
+        _check_mha(whole.header(path)[0])
 
 
 def _check_nifti(geometry: nifti.Geometry) -> None:
@@ -54,8 +53,12 @@ def _check_nifti(geometry: nifti.Geometry) -> None:
     if not (np.abs(columns - geometry.pixdim) * np.ptp(corners[:, :3], axis=0) <= STRETCHED_MM).all():
         given = f"{_numbers(columns)} in the sform and {_numbers(geometry.pixdim)} in pixdim"
         raise InvalidPointCloudError("one size of the voxels", given, "write it again with nibabel or 3D Slicer")
-    if geometry.quaternion is None:
-        return
+    if geometry.quaternion is not None:
+        _check_qform(geometry, sform)
+
+
+def _check_qform(geometry: nifti.Geometry, sform: Array) -> None:
+    corners = geometry.corners
     qform, rounding = _qform(geometry)
     apart = np.linalg.norm(corners @ (qform - sform).T, axis=1)
     from_first = np.linalg.norm((corners - corners[0]) @ sform.T, axis=1)
@@ -81,7 +84,6 @@ def _qform(geometry: nifti.Geometry) -> tuple[Array, float]:
 
 
 def _check_nrrd(fields: dict[str, str]) -> None:
-    fields = {name.lower().replace(" ", ""): value for name, value in fields.items()}
     names = ("space directions", "space origin")
     _check_there(names, [name for name in names if VECTOR.search(fields.get(name.replace(" ", ""), ""))])
     units = re.findall(r'"([^"]*)"', fields.get("spaceunits", ""))
@@ -100,18 +102,6 @@ def _check_there(names: Iterable[str], found: list[str]) -> None:
     if missing := [name for name in names if name not in found]:
         expected = f"{', '.join(names)} in the header"
         raise InvalidPointCloudError(expected, f"no {' and no '.join(missing)}", "export it with its affine")
-
-
-def _fields(path: Path, separator: str) -> dict[str, str]:
-    """Names and values of a header in text, which ends with an empty line or with the name of its data."""
-    fields: dict[str, str] = {}
-    with path.open("rb") as file:
-        for line in itertools.takewhile(bytes.strip, file):
-            name, _, value = line.decode("utf-8", "replace").partition(separator)
-            fields.setdefault(name.strip(), value.strip())
-            if name.strip() == "ElementDataFile":
-                break
-    return fields
 
 
 def _numbers(values: Array) -> str:

@@ -19,7 +19,7 @@ from gapr_core.registration.fit.refinement import Fit
 
 Array = NDArray[np.float64]
 
-NEAR_MM, FAR_MM = (0.0, 6.0), (12.0, 16.0)  # between foot points on the bone; how they were chosen: docs/log.md
+NEAR_MM, FAR_MM = (0.0, 6.0), (12.0, 16.0)  # between foot points on the bone; others: docs/tried.md
 LIMITS_MM = np.array([NEAR_MM, FAR_MM])
 CENTRES = 600  # inliers, evenly spread, of which each is compared with all
 LARGEST_SIGMAS = 4.0  # a residual of so many standard deviations counts as none

@@ -275,15 +275,6 @@ def test_endings_may_be_in_capitals(tmp_path, ending):
     np.testing.assert_allclose(surface.points.mean(axis=0), CENTRE, atol=0.5)
 
 
-def test_the_voxels_of_a_file_with_an_ending_in_capitals_may_lie_beside_it(tmp_path):
-    """It is read through a link in another folder, where they were not found."""
-    affine, size = affine_of((3.0, 3.0, 3.0))
-    written = write(tmp_path / "scan.mhd", voxels_of(affine, size), affine)
-    capital = written.rename(tmp_path / "scan.MHA")
-    assert not (tmp_path / "scan.mha").exists() and list(tmp_path.glob("scan.*raw"))
-    np.testing.assert_allclose(clouds.load(capital).points.mean(axis=0), CENTRE, atol=0.5)
-
-
 def test_one_name_twice_is_no_choice():
     with pytest.raises(InvalidPointCloudError, match="2 of the name bone"):
         names.choose(["bone"], [Segment("bone", 1), Segment("Bone", 2)], {0: {1, 2}})
@@ -509,18 +500,33 @@ def test_a_nifti_with_two_sizes_of_a_voxel_is_refused(tmp_path, pixdim_mm):
         clouds.load(wrong)
 
 
-def test_a_sheared_grid_is_read_of_a_nrrd_and_refused_by_its_name_of_a_nifti(tmp_path):
-    """As of a CT with a tilted gantry; exporting such a NIfTI once more would not help."""
+def test_a_sheared_grid_is_read_as_it_is(tmp_path):
+    """As of a CT with a tilted gantry."""
     sheared = {"srow_y": [0.0, 3.0, 0.8, -36.0], "pixdim": [1.0, 3.0, 3.0, np.hypot(3.0, 0.8), 1.0, 1.0, 1.0, 1.0]}
-    with pytest.raises(InvalidPointCloudError, match=r"right angles in NIfTI; got a.nii: a sheared grid; .*\.nrrd"):
-        clouds.load(nifti_with(tmp_path / "a.nii", qform_code=0, **sheared))
+    nifti_with(tmp_path / "a.nii", qform_code=0, **sheared)
     voxels = voxels_of(*affine_of((3.0, 3.0, 3.0))).astype(np.uint8)
     where = "space directions: (3,0,0) (0,3,0) (0,0.8,3)\nspace origin: (0,0,0)\n"
     head = HEADS["nrrd"].format(" ".join(map(str, voxels.shape[::-1])), where)
     (tmp_path / "b.nrrd").write_bytes(head.encode() + voxels.tobytes())
-    points = clouds.load(tmp_path / "b.nrrd").points
-    straight = points - np.outer(points[:, 2], [0.0, 0.8 / 3.0, 0.0])
-    np.testing.assert_allclose(np.ptp(straight, axis=0), 2.0 * RADII, atol=2.0)
+    for name, slope in (("a.nii", -0.8), ("b.nrrd", 0.8)):
+        points = clouds.load(tmp_path / name).points
+        straight = points - np.outer(points[:, 2], [0.0, slope / 3.0, 0.0])
+        np.testing.assert_allclose(np.ptp(straight, axis=0), 2.0 * RADII, atol=2.0)
+
+
+def test_a_sform_rounded_to_three_decimals_is_read_where_it_lies(tmp_path):
+    """As some converters write it (TotalSegmentator, issue 461): ITK calls it not orthonormal."""
+    whole = nifti_with(tmp_path / "a.nii", (0.1, 0.2, 0.3))
+    rows = np.array([nibabel_header(whole)[f"srow_{axis}"] for axis in "xyz"]).round(3)
+    rounded = dict(zip(("srow_x", "srow_y", "srow_z"), rows, strict=True))
+    surface = clouds.load(nifti_with(tmp_path / "b.nii", (0.1, 0.2, 0.3), qform_code=0, **rounded))
+    np.testing.assert_allclose(surface.points, clouds.load(whole).points, atol=0.1)
+
+
+def nibabel_header(path):
+    import nibabel
+
+    return nibabel.load(path).header
 
 
 WHERE = "space directions: (3,0,0) (0,3,0) (0,0,3)\n", "space origin: (-30,-80,-40)\n"

@@ -260,7 +260,7 @@ def test_errors_of_python_are_no_reasons(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("error", "said"), [
     (PermissionError(13, "Permission denied"), r"may be read; got a.xyz \(Permission denied\); let this user read it"),
-    (MemoryError(), "fits into memory; got a.xyz; thin it"),
+    (MemoryError(), "fits into memory; got a.xyz; thin or crop it"),
 ])  # fmt: skip
 def test_what_the_machine_refuses_is_no_damaged_file(tmp_path, monkeypatch, error, said):
     (tmp_path / "a.xyz").write_text("1 2 3\n")

@@ -224,7 +224,7 @@ def test_equations_13_and_14_of_the_fine_loss_up_to_the_number_of_entries():
 
 
 def test_the_documentation_names_the_check_of_every_equation():
-    text = (Path(__file__).parents[3] / "docs" / "network.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "concepts" / "network.md").read_text()
     rows = re.findall(r"^\| \((\d+)\) \|.*\| `(\w+)` \|$", text, re.MULTILINE)
     assert [int(number) for number, _ in rows] == list(range(1, 15))
     assert all(re.search(rf"(?<!\d){number}(?!\d)", test) or "to" in test for number, test in rows)

@@ -44,7 +44,6 @@ from gapr_core.registration.streams.memory import PreviousPoses
 from gapr_core.registration.uncertainty.error_calibration import Precision
 from gapr_core.results import Hypothesis, Refusal
 from gapr_core.runtime import cluster, origin
-from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.files import write_text
 from gapr_core.runtime.parallel import end_with_parent
 
@@ -232,14 +231,7 @@ class AskedOnce:
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig = AS_IT_IS) -> Registrar:
     """Make a registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
     config = replace(SETTINGS, sensor=SensorConfig(kind=sensor), clutter=clutter_config)
-    return Unmirrored(config, proposers, ACCEPTING, Precision.unscaled())
-
-
-class Unmirrored(Registrar):
-    """Registers no mirror images in full: no feature rests on them, and they double the time."""
-
-    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> None:
-        return None
+    return Registrar(config, proposers, ACCEPTING, Precision.unscaled())
 
 
 @cache

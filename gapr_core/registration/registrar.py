@@ -31,7 +31,7 @@ from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.conclude import conclude, unit_question
 from gapr_core.registration.confidence.classifier import Classifier
 from gapr_core.registration.fit.refinement import refine_fully, rest_on_whole
-from gapr_core.registration.fit.verification import support, verify
+from gapr_core.registration.fit.verification import Candidates, support, verify
 from gapr_core.registration.guidance import guide
 from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem import source as sources
@@ -281,9 +281,15 @@ class Registrar:
             clock.lap("assess")
         return assessment
 
-    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
-        """Register the mirror image of a source; `memory.TrackingRegistrar` leaves remembered poses out."""
-        return self._in_rounds(flipped, target, NO_POSES, clock)
+    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Candidates | None:
+        """Find poses of the mirror image of a source with the first proposer."""
+        poses = self.proposers[0].propose(flipped, target, np.random.default_rng(self.config.seed)).poses
+        clock.lap("propose")
+        if not len(poses):
+            return None
+        found = verify(poses, flipped, target, self.config.verification, self.config.num_threads)
+        clock.lap("verify")
+        return found
 
     def _as_scene(
         self, seen: list[Look], target: PreparedTarget, start: Array, clock: Clock, enough: Enough

@@ -1,7 +1,7 @@
 """Does the mirror image of a source fit the bone better: the other side of the body, or a flipped scan?
 
 Near the pose the question is cheap. A nonsensical pose on the bone of the other side has a nonsensical image, so an
-answer that is not sure, or of few points, takes the mirror image registered in full.
+answer that is not sure, or of few points, takes the best pose that the first proposer finds for the mirror image.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.table import MIRRORED_BETTER, trial_of
 from gapr_core.registration.fit import alternatives
 from gapr_core.registration.fit.alternatives import flipped
-from gapr_core.registration.fit.verification import mean_square_mm2
+from gapr_core.registration.fit.refinement import evaluate
+from gapr_core.registration.fit.verification import Candidates, mean_square_mm2
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
@@ -23,7 +24,7 @@ from gapr_core.registration.scenes.scene import Look
 from gapr_core.results import Refusal
 from gapr_core.runtime.clock import Clock
 
-Register = Callable[[PreparedSource, PreparedTarget, Clock], Assessment | None]
+Propose = Callable[[PreparedSource, PreparedTarget, Clock], Candidates | None]
 RegisterScene = Callable[[], Assessment | None]
 
 FEW_POINTS = 400  # chance lets the image of so few fit anywhere on the bone
@@ -33,7 +34,7 @@ def log_ratio(
     assessment: Assessment,
     config: RegistrarConfig,
     believed: bool,
-    register: Register,
+    propose: Propose,
     scene: RegisterScene | None,
     clock: Clock,
 ) -> float:
@@ -43,8 +44,8 @@ def log_ratio(
         assessment: the answer.
         config: every setting.
         believed: the answer is sure.
-        register: registers the mirror image in full.
-        scene: does so with all that a camera saw; None where no place of a camera was given.
+        propose: finds poses of the mirror image.
+        scene: registers the mirror image of all that a camera saw; None where no place of a camera was given.
         clock: of the call.
     """
     trial, count = trial_of(assessment, config), len(assessment.source.points)
@@ -57,8 +58,10 @@ def log_ratio(
     if scene is not None:
         return _of_scene(assessment, scene())
     mirrored = sources.prepare(flipped(assessment.source.whole), config.source, config.num_threads)
-    in_full = None if isinstance(mirrored, Refusal) else register(mirrored, assessment.target, clock)
-    return np.inf if in_full is None else _of_bone(assessment, in_full, config)
+    found_poses = None if isinstance(mirrored, Refusal) else propose(mirrored, assessment.target, clock)
+    if found_poses is None or isinstance(mirrored, Refusal):
+        return np.inf
+    return _of_bone(assessment, mirrored, found_poses, config)
 
 
 def flipped_looks(seen: Sequence[Look]) -> list[Look]:
@@ -66,17 +69,15 @@ def flipped_looks(seen: Sequence[Look]) -> list[Look]:
     return [Look(flipped(look.points), flipped(look.viewpoint)) for look in seen]
 
 
-def _of_bone(assessment: Assessment, image: Assessment, config: RegistrarConfig) -> float:
-    """Of mean squares and of robust variances the larger log ratio."""
-
-    def mean_square(a: Assessment) -> float:
-        if a.seen is None:
-            return float(a.candidates.scores[0])
-        return mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)
-
+def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config: RegistrarConfig) -> float:
+    """Of mean squares and of robust variances the larger log ratio: chance lets a few gross points lie near an image."""
+    own = float(a.candidates.scores[0])
+    if a.seen is not None:  # a scene's own scores are no mean squares
+        own = mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)
+    sigma_mm = evaluate(image.poses[0], mirrored.points, a.target, config.refinement).sigma_mm
     return max(
-        alternatives.log_ratio(mean_square(image), mean_square(assessment)),
-        alternatives.log_ratio(image.fit.sigma_mm**2, assessment.fit.sigma_mm**2),
+        alternatives.log_ratio(float(image.scores[0]), own),
+        alternatives.log_ratio(sigma_mm**2, a.fit.sigma_mm**2),
     )
 
 

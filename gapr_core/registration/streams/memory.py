@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gapr_core.geometry import se3
 from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
@@ -145,7 +146,7 @@ class TrackingRegistrar(Registrar):
         found = replace(found, proposer=PreviousPoses.name, rounds=1)
         return found if self._needs_no_other_proposer(found) or enough(found) else None
 
-    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Assessment | None:
+    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Candidates | None:
         return self._full._of_image(flipped, target, clock)
 
     def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:

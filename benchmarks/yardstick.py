@@ -77,9 +77,10 @@ SINGLE = {
     "bone": List("L2", "bone", 30), "mirrored": List("clean", "mirrored", 40),
     "mirrored-L3": List("L3", "mirrored", 40),
     "scaled": List("L2", "scaled", 40),
+    "drawn-own": List("L3", "own", 200), "drawn-person": List("L3", "person", 400),
 }  # fmt: skip
 STREAMS = {"tracker": (6, 10), "accumulator": (4, 6), "looks": (3, 4)}  # streams of own bones, of another subject's
-OTHERS = ("person", "bone", "mirrored", "scaled", "damage-other")
+ASKING = ("unit", "stand-off", "strained", "apart", "layered")
 HEAD = (
     "list", "sources", "right and accepted", "of these at .9", "wrong accepted", "at .9", "bound holds %",
     "bound, median mm", "ECE", "CPU s",
@@ -95,12 +96,19 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, required=True, help="answers, one JSON object a line (.gz is read, too)")
     parser.add_argument("--against", type=Path, help="frozen answers to compare with")
+    parser.add_argument(
+        "--jitter", type=Path, metavar="DIR", help="move sources by 1e-4 mm instead; folder of the bones"
+    )
     args = parser.parse_args()
+    if args.jitter is not None:
+        say(jitter(str(args.jitter), args.split))
+        return 0
     if args.anatomy is not None:
         names = args.lists.split(",") if args.lists else [*SINGLE, "damage", *STREAMS]
         run(list(cases_of(names, str(args.anatomy), args.split)), args.out, args.jobs)
     now = read(args.out)
     say(table(now) if args.against is None else comparison(read(args.against), now))
+    say("\n" + of_checks(now) + "\n\n" + of_evidence(now))
     return 0
 
 
@@ -234,6 +242,7 @@ def judged(result: RegistrationResult, pair: Pair) -> Row:
         "person": pair.person,
     }  # fmt: skip
     more = {name: getattr(result, name, None) for name in ("pose_probability", "bone_evidence")}
+    row["findings"] = [each.check for each in getattr(result, "findings", ())]
     row |= {name: round(value, 5) for name, value in more.items() if value is not None}
     if best is not None and pair.has_truth:
         error = metrics.pose_error(best, pair.T_target_source, pair.source)
@@ -306,6 +315,54 @@ def comparison(before: Sequence[Row], now: Sequence[Row]) -> str:
     sure = [sure_right(groups["all, own bone"] + groups["all, no pose"], allowed) for groups in (old, new)]
     text = f"at {allowed} wrong ones (as many as .9 let pass before), right ones: {sure[0]} > {sure[1]}"
     return markdown.table(HEAD, lines) + f"\n\n{text}"
+
+
+def of_checks(rows: Sequence[Row]) -> str:
+    """What each refusing check changes: answers that would be accepted without it, right, wrong and of no pose."""
+    counted: dict[str, list[int]] = {}
+    for row in rows:
+        refusing = [name for name in row.get("findings", ()) if name not in ASKING]
+        if row["status"] == "OK" or len(refusing) != 1 or row["confidence"] < 0.5:
+            continue
+        kind = 0 if row["right"] else 1 if row["truth"] else 2
+        counted.setdefault(refusing[0], [0, 0, 0])[kind] += 1
+    head = ("check", "right poses lost", "wrong poses kept out", "other bones kept out")
+    return markdown.table(head, [(name, *values) for name, values in sorted(counted.items())])
+
+
+def of_evidence(rows: Sequence[Row]) -> str:
+    """Of other subjects' bones the share of pairs that evidence doubts where it doubts 1 % and 5 % of own right ones."""
+    own = [row["bone_evidence"] for row in rows if row["truth"] and row["right"] and "bone_evidence" in row]
+    pairs_of: dict[tuple[str, ...], list[float]] = {}
+    for row in rows:
+        if "person" in row["list"] and "bone_evidence" in row:
+            pairs_of.setdefault((row["list"], row["person"], str(row["number"])), []).append(row["bone_evidence"])
+    if not own or not pairs_of:
+        return ""
+    means = np.array([np.mean(each) for each in pairs_of.values()])
+    lines = []
+    for share in (0.01, 0.05):
+        doubted = means < np.quantile(own, share)
+        low, high = metrics.interval(doubted.tolist(), [key[1] for key in pairs_of])
+        lines.append((f"{share:.0%}", f"{doubted.mean():.3f} [{low:.3f}-{high:.3f}]", len(means), len(own)))
+    return markdown.table(("own bones doubted", "pairs of subjects doubted", "pairs", "own"), lines)
+
+
+def jitter(folder: str, split: str, sources: int = 50, draws: int = 8) -> str:
+    """Largest change of the confidence when the points of a source move by 1e-4 mm."""
+    largest = []
+    for number in tqdm(range(sources), unit="source"):
+        pair, sensor = drawn(List("pointer" if number % 2 else "L3", "own", 0), folder, split, number)
+        rng = np.random.default_rng([SEED, number, 6])
+        count = int(np.exp(rng.uniform(np.log(12), np.log(400))))
+        source = pair.source[rng.permutation(len(pair.source))[:count]]
+        registrar = registrar_of(sensor)
+        target = prepared(registrar, pair)
+        moved = [source, *(source + rng.normal(0.0, 1e-4, source.shape) for _ in range(draws))]
+        found = [registrar.register(each, target).confidence for each in moved]
+        largest.append(max(found) - min(found))
+    over = sum(change > 0.02 for change in largest)
+    return f"{sources} sources, {draws} draws: largest change {max(largest):.4f}, above .02 in {over}"
 
 
 def sure_right(rows: Sequence[Row], wrong: int) -> int:

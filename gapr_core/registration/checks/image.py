@@ -70,7 +70,7 @@ def flipped_looks(seen: Sequence[Look]) -> list[Look]:
 
 
 def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config: RegistrarConfig) -> float:
-    """Of mean squares and of robust variances the larger log ratio: chance lets a few gross points lie near an image."""
+    """Take the larger log ratio, of mean squares or robust variances: chance lays a few gross points on an image."""
     own = float(a.candidates.scores[0])
     if a.seen is not None:  # a scene's own scores are no mean squares
         own = mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)

@@ -97,7 +97,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="answers, one JSON object a line (.gz is read, too)")
     parser.add_argument("--against", type=Path, help="frozen answers to compare with")
     parser.add_argument(
-        "--jitter", type=Path, metavar="DIR", help="move sources by 1e-4 mm instead; folder of the bones"
+        "--jitter", type=Path, metavar="DIR", help="folder of the bones: move points by 1e-4 mm"
     )
     args = parser.parse_args()
     if args.jitter is not None:
@@ -331,7 +331,7 @@ def of_checks(rows: Sequence[Row]) -> str:
 
 
 def of_evidence(rows: Sequence[Row]) -> str:
-    """Of other subjects' bones the share of pairs that evidence doubts where it doubts 1 % and 5 % of own right ones."""
+    """Share of other subjects' pairs that the evidence doubts where it doubts 1 % and 5 % of own right answers."""
     own = [row["bone_evidence"] for row in rows if row["truth"] and row["right"] and "bone_evidence" in row]
     pairs_of: dict[tuple[str, ...], list[float]] = {}
     for row in rows:

@@ -6,26 +6,43 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from gapr_core.config import RegistrarConfig, RigidityConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.geometry import se3
-from gapr_core.registration.checks import rigidity
-from gapr_core.registration.checks import unknowns as further_unknowns
-from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.rigidity import of_deformations
-from gapr_core.registration.checks.unknowns import BIASES_MM, SHARED_MM, SIZES_MM, Blocks, blocks, findings
+from gapr_core.registration.checks import deformation as deformations
+from gapr_core.registration.checks.deformation import (
+    APART,
+    LAYERED,
+    STRAINED,
+    TEXTS,
+    deformation,
+    of_deformations,
+    of_looks,
+    with_looks,
+)
+from gapr_core.registration.checks.unknowns import (
+    BIASES_MM,
+    CELLS,
+    CORRELATION_MM,
+    NOTHING,
+    SHARED_MM,
+    SIZES_MM,
+    Blocks,
+    blocks,
+    motions,
+    shown,
+)
 from gapr_core.registration.fit.refinement import Fit
+from gapr_core.registration.streams.accumulator import MOVES
 from gapr_core.registration.streams.motion_test import of_motion, step_times
 from gapr_core.registration.uncertainty.covariance import PoseUncertainty, covariance_added_by
+from gapr_core.results import Effect
 
-CONFIG = RigidityConfig()
-SMALL = RigidityConfig(cells=12, groups=2)
 NOISE_MM = 0.4
 
 
-def of_strain(fit, config):
-    found = of_deformations(fit, config)
-    return found["strained"].finding if found else further_unknowns.NOTHING
+def of_strain(fit):
+    found = of_deformations(fit)
+    return found["strained"].shown if found else NOTHING
 
 
 def fit_of(points, normals, errors, weights=None):
@@ -63,19 +80,18 @@ def some():
                   rng.uniform(0.0, 40.0, (n, 3)))  # fmt: skip
 
 
-def restricted(found, more, bias_mm, shared_mm, size_mm, correlation_mm):
+def restricted(found, more, bias_mm, shared_mm, size_mm):
     """log likelihood of all contrasts that no `free` changes: what restricted likelihood is by definition."""
     apart = np.linalg.norm(found.feet[:, None] - found.feet, axis=2)
     V = np.diag(found.variances) + shared_mm**2 * np.eye(len(apart)) + size_mm**2 * more @ more.T
-    V += bias_mm**2 * np.exp(-0.5 * (apart / correlation_mm) ** 2)
+    V += bias_mm**2 * np.exp(-0.5 * (apart / CORRELATION_MM) ** 2)
     contrasts = np.linalg.svd(found.free)[0][:, found.free.shape[1] :]
     return multivariate_normal(None, contrasts.T @ V @ contrasts).logpdf(contrasts.T @ found.residuals)
 
 
 def test_the_evidence_is_a_ratio_of_restricted_likelihoods_and_the_size_their_mean(some):
-    config = RigidityConfig(correlation_mm=15.0)
-    for i, found in enumerate(findings(some, config)):
-        dense = np.array([[[restricted(some, some.more[:, i], b, c, h, 15.0) for h in SIZES_MM] for c in SHARED_MM]
+    for i, found in enumerate(shown(some)):
+        dense = np.array([[[restricted(some, some.more[:, i], b, c, h) for h in SIZES_MM] for c in SHARED_MM]
                           for b in BIASES_MM])  # fmt: skip
         best = dense.max(axis=(0, 1))
         assert found.log_ratio == pytest.approx(best.max() - best[0], abs=1e-9)
@@ -90,9 +106,9 @@ def test_blocks_are_weighted_means_of_neighbours_of_one_group(seen):
     weights[:40] = 0.0
     fit, inlier = fit_of(points, normals, noise(400), weights), weights > 0.0
     more, group = np.random.default_rng(5).normal(size=(2, 360, 3)), np.arange(360) % 2
-    found = blocks(fit, fit.jacobian[inlier], list(more), group, SMALL)
+    found = blocks(fit, fit.jacobian[inlier], list(more), group)
     count = len(found.residuals)
-    assert SMALL.cells < count <= 2 * SMALL.cells
+    assert CELLS < count <= 2 * CELLS
     total = fit.sigma_mm**2 / found.variances
     assert total.sum() == pytest.approx(weights.sum())
     for of_all, of_blocks in (
@@ -103,7 +119,7 @@ def test_blocks_are_weighted_means_of_neighbours_of_one_group(seen):
         (fit.feet[inlier], found.feet),
     ):
         assert total @ of_blocks == pytest.approx(weights[inlier] @ of_all)
-    alone = blocks(fit, fit.jacobian[inlier], [group[:, None] * np.ones((360, 1))], group, SMALL)
+    alone = blocks(fit, fit.jacobian[inlier], [group[:, None] * np.ones((360, 1))], group)
     assert set(alone.more.ravel()) == {0.0, 1.0}, "no block holds points of two groups"
 
 
@@ -116,8 +132,8 @@ def test_a_bone_that_moves_while_it_is_measured_is_found_and_one_at_rest_is_not(
         [se3.apply(se3.exp(np.array(motion) * t, np.zeros(3)), p[None])[0] for t, p in zip(time, points, strict=True)]
     )
     creeping, resting = (fit_of(points, normals, noise(2400) + off) for off in (moved - points, 0.0))
-    found, nothing = (of_motion(fit, order, CONFIG).finding for fit in (creeping, resting))
-    assert found.log_ratio > CONFIG.creeps > nothing.log_ratio
+    found, nothing = (of_motion(fit, order).shown for fit in (creeping, resting))
+    assert found.log_ratio > MOVES > nothing.log_ratio
     assert found.size_mm > 3.0 * nothing.size_mm and 0.5 < found.size_mm < 5.0
 
 
@@ -126,9 +142,9 @@ def test_what_does_not_go_with_time_is_no_creep(seen):
     points, normals = seen(2400)
     order = np.random.default_rng(6).permutation(np.repeat(np.arange(12), 200))
     off = np.random.default_rng(7).choice([-1.5, 1.5], 2400)[:, None] * [0.0, 0.0, 1.0]
-    assert of_motion(fit_of(points, normals, noise(2400) + off), order, CONFIG).finding.log_ratio < 4.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off), order).shown.log_ratio < 4.0
     off = 3.0 * np.sign(order - 5.5)[:, None] * [0.0, 0.0, 1.0]
-    assert of_motion(fit_of(points, normals, noise(2400) + off), order, CONFIG).finding.log_ratio > 40.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off), order).shown.log_ratio > 40.0
 
 
 @pytest.mark.parametrize("strain", [np.diag([0, 0, 0.03]), np.diag([0.05, 0, 0]),
@@ -136,8 +152,8 @@ def test_what_does_not_go_with_time_is_no_creep(seen):
 def test_a_strained_source_is_found_by_its_size_and_a_rigid_one_is_not(seen, strain):
     points, normals = seen(3000)
     fit, rigid = (fit_of(points, normals, noise(3000) + off) for off in (points @ np.array(strain), 0.0))
-    found, nothing = of_strain(fit, CONFIG), of_strain(rigid, CONFIG)
-    assert found.log_ratio > CONFIG.strained > nothing.log_ratio
+    found, nothing = of_strain(fit), of_strain(rigid)
+    assert found.log_ratio > STRAINED > nothing.log_ratio
     size_mm = np.linalg.norm(strain) * np.sqrt((points**2).sum(axis=1).mean())
     assert found.size_mm == pytest.approx(size_mm / np.sqrt(6.0), rel=0.8)  # one of six components has all of it
     assert nothing.size_mm < 0.5 * found.size_mm
@@ -146,28 +162,28 @@ def test_a_strained_source_is_found_by_its_size_and_a_rigid_one_is_not(seen, str
 def test_smooth_bumps_are_no_strain(seen):
     points, normals = seen(3000)
     bumps = 0.7 * np.sin(points @ [0.13, 0.05, 0.1])[:, None] * normals
-    assert of_strain(fit_of(points, normals, noise(3000) + bumps), CONFIG).log_ratio < CONFIG.strained
+    assert of_strain(fit_of(points, normals, noise(3000) + bumps)).log_ratio < STRAINED
 
 
 def test_a_stand_off_is_no_strain(seen):
     points, normals = seen(3000)
-    assert of_strain(fit_of(points, normals, noise(3000) + 1.5 * normals), CONFIG).log_ratio < 1.0
+    assert of_strain(fit_of(points, normals, noise(3000) + 1.5 * normals)).log_ratio < 1.0
 
 
 def test_another_size_is_a_strain(seen):
     """Of a sensor whose scale is uncertain, too: the scale may be another subject."""
     points, normals = seen(3000)
-    assert of_strain(fit_of(points, normals, noise(3000) + 0.03 * points), CONFIG).log_ratio > CONFIG.strained
+    assert of_strain(fit_of(points, normals, noise(3000) + 0.03 * points)).log_ratio > STRAINED
 
 
 def test_few_points_or_one_source_say_nothing(seen):
     points, normals = seen(199)
     fit = fit_of(points, normals, noise(199) + 0.2 * points)
-    assert of_strain(fit, CONFIG) == further_unknowns.NOTHING == of_motion(fit, np.arange(199), CONFIG).finding
+    assert of_strain(fit) == NOTHING == of_motion(fit, np.arange(199)).shown
     points, normals = seen(200)
     fit = fit_of(points, normals, noise(200) + 0.2 * points * [0, 0, 1])
-    assert of_strain(fit, CONFIG).log_ratio > 3.0
-    assert of_motion(fit, np.zeros(200, dtype=np.int64), CONFIG).finding == further_unknowns.NOTHING
+    assert of_strain(fit).log_ratio > 3.0
+    assert of_motion(fit, np.zeros(200, dtype=np.int64)).shown == NOTHING
 
 
 def test_halves_move_against_each_other_along_each_principal_axis(seen):
@@ -179,7 +195,7 @@ def test_halves_move_against_each_other_along_each_principal_axis(seen):
     away = moved - moved.mean(axis=0)
     radius_mm = np.sqrt((away**2).sum(axis=1).mean())
     axes = np.linalg.svd(feet - feet.mean(axis=0), full_matrices=False)[2]
-    for axis, found in zip(axes, rigidity.halves(fit), strict=True):
+    for axis, found in zip(axes, deformations.halves(fit), strict=True):
         side = np.sign(feet @ axis - np.median(feet @ axis)) / 2.0
         for i, unit in enumerate(np.eye(3)):
             shift, turn = side * normals[100:, i], side * (normals[100:] * np.cross(unit, away)).sum(axis=1) / radius_mm
@@ -195,10 +211,10 @@ def test_two_halves_in_two_poses_are_found_and_one_piece_is_not(seen, motion, ax
     above = along > np.median(along)
     moved = np.where(above[:, None], se3.apply(se3.exp(np.array(motion), points.mean(axis=0)), points), points)
     fit, rigid = (fit_of(points, normals, noise(3000) + off) for off in (moved - points, 0.0))
-    apart, whole = (of_deformations(each, CONFIG)["apart"] for each in (fit, rigid))
-    np.testing.assert_array_equal(apart.changes, rigidity.halves(fit)[axis])
-    assert apart.finding.log_ratio > CONFIG.apart > whole.finding.log_ratio + 3.0
-    assert 0.3 < apart.finding.size_mm < 4.0
+    apart, whole = (of_deformations(each)["apart"] for each in (fit, rigid))
+    np.testing.assert_array_equal(apart.changes, deformations.halves(fit)[axis])
+    assert apart.shown.log_ratio > APART > whole.shown.log_ratio + 3.0
+    assert 0.3 < apart.shown.size_mm < 4.0
 
 
 def deformed(seen, *names, whole=False):
@@ -216,24 +232,25 @@ def deformed(seen, *names, whole=False):
     return Fit(fit.T, fit.sigma_mm, *part, whole=fit) if whole else fit
 
 
-def allowed(fit, **limits):
-    a = Assessment(fit, None, PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), {}, 0.9, None, None, None)
-    never = {"strained": np.inf, "apart": np.inf, "layered": np.inf}
-    found = rigidity.allowing_for_deformation(a, RegistrarConfig(rigidity=RigidityConfig(**never | limits)))
-    return found.deformed, found.uncertainty.covariance - np.eye(6)
-
-
 @pytest.mark.parametrize("whole", [False, True])
-@pytest.mark.parametrize("name", ["apart", "layered", "strained"])
-def test_each_deformation_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, name, whole):
-    fit = deformed(seen, name, whole=whole)
-    assert allowed(fit)[0] == {} and not allowed(fit)[1].any()
-    found, added = allowed(fit, **{name: getattr(CONFIG, name)})
-    expected = of_deformations(fit.rests_on, CONFIG)[name]
-    size_mm = expected.finding.size_mm
-    moved = covariance_added_by(fit, size_mm * expected.changes, RegistrarConfig().covariance)
-    assert found == {name: size_mm}
-    np.testing.assert_allclose(added, moved + (name == "apart") * rigidity.covariance_of_half(fit, size_mm), atol=1e-12)
+@pytest.mark.parametrize("names", [(), ("apart",), ("layered",), ("strained",), ("apart", "strained")])
+def test_what_is_believed_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, names, whole):
+    """Several may be found, and add up; the surest is named. What is below its limit is not believed."""
+    fit = deformed(seen, *names, whole=whole)
+    measured, limits = of_deformations(fit.rests_on), {"strained": STRAINED, "apart": APART, "layered": LAYERED}
+    believed = {name: each for name, each in measured.items() if each.shown.log_ratio > limits[name]}
+    assert set(names) <= set(believed)
+    if not names:
+        assert deformation(fit) is None
+        return
+    finding, added = deformation(fit)
+    expected = sum(covariance_added_by(fit, each.shown.size_mm * each.changes) for each in believed.values())
+    if "apart" in believed:
+        expected = expected + deformations.covariance_of_half(fit, believed["apart"].shown.size_mm)
+    np.testing.assert_allclose(added, expected, atol=1e-12)
+    surest = max(believed, key=lambda name: believed[name].shown.log_ratio)
+    assert (finding.check, finding.text, finding.effect) == (surest, TEXTS[surest], Effect.WIDEN)
+    assert (finding.statistic, finding.threshold) == (believed[surest].shown.log_ratio, limits[surest])
 
 
 def test_either_half_lies_half_of_their_motion_from_the_pose_between_them(seen):
@@ -244,33 +261,23 @@ def test_either_half_lies_half_of_their_motion_from_the_pose_between_them(seen):
     rng = np.random.default_rng(0)
     twists = 0.5 * 1.7 * rng.normal(size=(200_000, 6)) / ([1.0] * 3 + [radius_mm] * 3)
     about = np.hstack([twists[:, :3] + np.cross(twists[:, 3:], middles[0] - middles[1]), twists[:, 3:]])
-    found = rigidity.covariance_of_half(fit, 1.7)
+    found = deformations.covariance_of_half(fit, 1.7)
     scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
     np.testing.assert_allclose(np.cov(about.T) / scale, found / scale, atol=0.015)
-
-
-def test_two_deformations_add_up_and_the_surer_is_named_first(seen):
-    fit = deformed(seen, "apart", "strained")
-    ratios = {name: each.finding.log_ratio for name, each in of_deformations(fit, CONFIG).items()}
-    (both, added), (_, one), (_, other) = (
-        allowed(fit, **each) for each in ({"strained": 0.0, "apart": 0.0}, {"strained": 0.0}, {"apart": 0.0})
-    )
-    assert list(both) == sorted(["strained", "apart"], key=lambda name: -ratios[name])
-    np.testing.assert_allclose(added, one + other, atol=1e-12)
 
 
 def test_what_depends_on_what_is_not_in_question_or_is_scaled_changes_nothing(some):
     more = replace(some, free=np.column_stack([some.free, some.free[:, 0] + some.free[:, 1], np.zeros(16)]))
     scaled = replace(some, free=some.free * [1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
     for found in (more, scaled):
-        np.testing.assert_allclose(findings(found, CONFIG), findings(some, CONFIG))
+        np.testing.assert_allclose(shown(found), shown(some))
 
 
 def test_points_without_weight_say_nothing_of_a_creep(seen):
     points, normals = seen(2400)
     order, weights = np.arange(2400) // 200, np.where(np.arange(2400) % 2, 1.0, 0.0)
     off = np.where(weights[:, None] > 0.0, 0.0, 3.0 * (order / 11.0)[:, None] * [0.0, 0.0, 1.0])
-    assert of_motion(fit_of(points, normals, noise(2400) + off, weights), order, CONFIG).finding.log_ratio < 1.0
+    assert of_motion(fit_of(points, normals, noise(2400) + off, weights), order).shown.log_ratio < 1.0
 
 
 def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(seen):
@@ -279,11 +286,11 @@ def test_a_layer_that_grows_is_found_by_its_size_and_one_that_does_not_is_none(s
     along = points @ axis
     thick = 4.0 * (along - along.min())[:, None] / np.ptp(along) * normals
     growing, even = (
-        of_deformations(fit_of(points, normals, noise(3000) + off), CONFIG)["layered"] for off in (thick, 2.0 * normals)
+        of_deformations(fit_of(points, normals, noise(3000) + off))["layered"] for off in (thick, 2.0 * normals)
     )
-    assert growing.finding.log_ratio > CONFIG.layered > 2.0 > even.finding.log_ratio
+    assert growing.shown.log_ratio > LAYERED > 2.0 > even.shown.log_ratio
     slope = 4.0 / np.ptp(along) * np.sqrt((points**2).sum(axis=1).mean())
-    assert slope / np.sqrt(3.0) < growing.finding.size_mm < 1.5 * slope  # one of three has all of it
+    assert slope / np.sqrt(3.0) < growing.shown.size_mm < 1.5 * slope  # one of three has all of it
 
 
 def test_what_a_layer_has_everywhere_is_in_its_covariance_though_no_residual_shows_it(seen):
@@ -293,7 +300,7 @@ def test_what_a_layer_has_everywhere_is_in_its_covariance_though_no_residual_sho
     fit = fit_of(points, normals, noise(500), weights)
     feet = fit.feet[50:] - fit.feet[50:].mean(axis=0)
     expected = feet / np.sqrt((feet**2).sum(axis=1).mean())
-    np.testing.assert_allclose(rigidity.a_layer(fit), np.column_stack([expected, np.full(450, 3.0**0.5)]))
+    np.testing.assert_allclose(deformations.a_layer(fit), np.column_stack([expected, np.full(450, 3.0**0.5)]))
     thickness = np.linspace(0.0, 1.0, 100_001)
     assert thickness.mean() / thickness.std() == pytest.approx(3.0**0.5, rel=1e-3)
 
@@ -302,8 +309,8 @@ def test_alternatives_may_have_fewer_unknowns_than_others(seen):
     points, normals = seen(400)
     fit = fit_of(points, normals, noise(400))
     more, none = np.random.default_rng(5).normal(size=(400, 5)), np.zeros(400, dtype=np.int64)
-    both = findings(blocks(fit, fit.jacobian, [more, more[:, :2]], none, SMALL), SMALL)
-    alone = findings(blocks(fit, fit.jacobian, [more[:, :2]], none, SMALL), SMALL)
+    both = shown(blocks(fit, fit.jacobian, [more, more[:, :2]], none))
+    alone = shown(blocks(fit, fit.jacobian, [more[:, :2]], none))
     assert both[1] == pytest.approx(alone[0])
 
 
@@ -311,19 +318,12 @@ def test_alternatives_may_have_fewer_unknowns_than_others(seen):
 def test_a_plane_of_which_some_motions_change_nothing_is_judged_by_the_others(lifts):
     points = np.random.default_rng(0).uniform(-20.0, 20.0, (400, 3)) * [1, 1, 0]
     fit = fit_of(points, np.tile([0.0, 0.0, 1.0], (400, 1)), noise(400) + (points @ lifts)[:, None] * [0, 0, 1])
-    found = of_strain(fit, CONFIG)
+    found = of_strain(fit)
     assert found.log_ratio == pytest.approx(0.0, abs=1e-6) and np.isfinite(found.size_mm)
     order = np.arange(400) // 40
     falling = replace(fit, signed_mm=fit.signed_mm + 0.4 * order)
-    moves, rests = (of_motion(each, order, CONFIG).finding for each in (falling, fit))
-    assert moves.log_ratio > CONFIG.creeps > rests.log_ratio
-
-
-def test_infinity_finds_no_strain_and_zero_each_that_is_likelier_than_none(seen):
-    points, normals = seen(3000)
-    rigid = fit_of(points, normals, noise(3000))
-    assert list(allowed(deformed(seen, "strained"), strained=0.0)[0]) == ["strained"]
-    assert allowed(rigid, strained=0.0)[0] == {}
+    moves, rests = (of_motion(each, order).shown for each in (falling, fit))
+    assert moves.log_ratio > MOVES > rests.log_ratio
 
 
 def test_points_without_weight_say_nothing(seen):
@@ -331,8 +331,8 @@ def test_points_without_weight_say_nothing(seen):
     off, weights, strained = noise(3000), np.ones(3000), np.arange(3000) % 2 == 0
     off[strained] += 0.08 * points[strained] * [0, 0, 1]
     weights[strained] = 0.0
-    assert of_strain(fit_of(points, normals, off), CONFIG).log_ratio > 3.0
-    assert of_strain(fit_of(points, normals, off, weights), CONFIG).log_ratio < 1.0
+    assert of_strain(fit_of(points, normals, off)).log_ratio > 3.0
+    assert of_strain(fit_of(points, normals, off, weights)).log_ratio < 1.0
 
 
 def drawn_along(seen):
@@ -351,10 +351,10 @@ def test_of_a_steady_motion_its_rotation_counts_by_the_radius_of_the_points(seen
     fit = fit_of(points, normals, noise(2400) + 4.0 * time * [0.0, 0.0, 1.0])
     changes = time * fit.jacobian / ([1.0] * 3 + [radius_mm] * 3)
     group = np.searchsorted([2 / 12, 4 / 12, 6 / 12, 8 / 12, 10 / 12, 11 / 12], order / 11.0, side="right")
-    (same,) = findings(blocks(fit, fit.jacobian, [changes], group, CONFIG), CONFIG)
-    found = of_motion(fit, order, CONFIG)
-    assert found.rests_from is None and same.log_ratio > CONFIG.creeps
-    assert found.finding == pytest.approx(same, rel=1e-2, abs=1e-3)
+    (same,) = shown(blocks(fit, fit.jacobian, [changes], group))
+    found = of_motion(fit, order)
+    assert found.rests_from is None and same.log_ratio > MOVES
+    assert found.shown == pytest.approx(same, rel=1e-2, abs=1e-3)
 
 
 @pytest.mark.parametrize(("first", "rests_from"), [(2, 3), (4, 5), (6, 7), (8, 9), (10, 10), (11, 11)])
@@ -363,10 +363,10 @@ def test_a_step_is_found_and_what_was_measured_since_is_named(seen, first, rests
     points, normals, order = drawn_along(seen)
     off = np.where(order < first, 0.0, 4.0)[:, None] * [0.0, 0.0, 1.0]
     stepped, at_rest = (fit_of(points, normals, noise(2400) + each) for each in (off, 0.0 * off))
-    found, resting = (of_motion(fit, order, CONFIG) for fit in (stepped, at_rest))
-    assert found.finding.log_ratio > CONFIG.creeps > resting.finding.log_ratio
+    found, resting = (of_motion(fit, order) for fit in (stepped, at_rest))
+    assert found.shown.log_ratio > MOVES > resting.shown.log_ratio
     assert found.rests_from == rests_from
-    later = of_motion(fit_of(points, normals, noise(2400) + off), order + 7, CONFIG)
+    later = of_motion(fit_of(points, normals, noise(2400) + off), order + 7)
     assert later.rests_from == rests_from + 7
 
 
@@ -375,11 +375,9 @@ def test_a_step_is_as_large_as_what_moved_and_may_have_been_between_any_two_grou
     fit = fit_of(points, normals, noise(2400) + np.where(order < 4, 0.0, 4.0)[:, None] * [0.0, 0.0, 1.0])
     steps = step_times(6)
     np.testing.assert_allclose(12.0 * steps, [2.0, 4.0, 6.0, 8.0, 10.0, 11.0])
-    change = (order / 11.0 >= steps[1])[:, None] * further_unknowns.motions(fit)
-    (same,) = findings(
-        blocks(fit, fit.jacobian, [change], np.searchsorted(steps, order / 11.0, "right"), CONFIG), CONFIG
-    )
-    found = of_motion(fit, order, CONFIG).finding
+    change = (order / 11.0 >= steps[1])[:, None] * motions(fit)
+    (same,) = shown(blocks(fit, fit.jacobian, [change], np.searchsorted(steps, order / 11.0, "right")))
+    found = of_motion(fit, order).shown
     assert found.size_mm == pytest.approx(same.size_mm, rel=1e-6)
     assert found.log_ratio == pytest.approx(same.log_ratio - np.log(6.0))
 
@@ -393,7 +391,7 @@ def looks_that_err(seen, size_mm, count=2400):
 
 
 def test_looks_that_err_against_each_other_show_by_how_much(seen):
-    sizes = [rigidity.of_looks(*looks_that_err(seen, size_mm), CONFIG).finding for size_mm in (0.0, 0.5, 1.5)]
+    sizes = [of_looks(*looks_that_err(seen, size_mm)).shown for size_mm in (0.0, 0.5, 1.5)]
     none, some, much = sizes
     assert none.log_ratio < 2.0 < some.log_ratio < much.log_ratio
     assert none.size_mm < 0.2 < 0.25 < some.size_mm < 0.8 < 0.9 < much.size_mm < 2.5
@@ -402,31 +400,24 @@ def test_looks_that_err_against_each_other_show_by_how_much(seen):
 def test_each_look_moves_by_itself(seen):
     fit, look = looks_that_err(seen, 0.5)
     look = np.where(look == 3, 7, look)  # a number that is missing is no look
-    found = rigidity.of_looks(fit, look, CONFIG)
-    moved = further_unknowns.motions(fit)
+    found = of_looks(fit, look)
+    moved = motions(fit)
     assert found.changes.shape == (len(look), 24)
     for k, number in enumerate((0, 1, 2, 7)):
         of_it = found.changes[:, 6 * k : 6 * k + 6]
         assert np.array_equal(of_it, np.where(look == number, 1.0, 0.0)[:, None] * moved)
     group = np.searchsorted([0, 1, 2, 7], look)
-    (same,) = findings(blocks(fit, fit.jacobian, [found.changes], group, CONFIG), CONFIG)
-    assert found.finding == same and found.is_shown
-
-
-def test_of_one_look_and_of_few_points_nothing_is_said(seen):
-    fit, look = looks_that_err(seen, 1.5, 199)
-    assert not rigidity.of_looks(fit, look, CONFIG).is_shown
-    fit, look = looks_that_err(seen, 1.5, 400)
-    assert not rigidity.of_looks(fit, np.zeros_like(look), CONFIG).is_shown
+    (same,) = shown(blocks(fit, fit.jacobian, [found.changes], group))
+    assert found.shown == same and found.limit == 0.0
 
 
 def test_what_looks_err_by_against_each_other_is_added_to_the_covariance_and_nothing_where_none_shows(seen):
     fit, look = looks_that_err(seen, 1.5)
-    uncertainty, config = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), RegistrarConfig()
-    wider = rigidity.allowing_for_looks(uncertainty, fit, look, config)
-    found = rigidity.of_looks(fit, look, config.rigidity)
-    added = covariance_added_by(fit, found.finding.size_mm * found.changes, config.covariance)
-    np.testing.assert_allclose(wider.covariance, np.eye(6) + added)
+    uncertainty, found = PoseUncertainty(np.eye(6), 0.0, 0.0, 0.0), of_looks(fit, look)
+    added = covariance_added_by(fit, found.shown.size_mm * found.changes)
+    np.testing.assert_allclose(with_looks(uncertainty, fit, look).covariance, np.eye(6) + added)
     assert np.trace(added[:3, :3]) > 0.1
-    assert rigidity.allowing_for_looks(uncertainty, fit, None, config) is uncertainty
-    assert rigidity.allowing_for_looks(uncertainty, fit, np.zeros_like(look), config) is uncertainty
+    few = looks_that_err(seen, 1.5, 199)
+    assert of_looks(*few) is None
+    for of_one_or_few in ((fit, None), (fit, np.zeros_like(look)), few):
+        assert with_looks(uncertainty, *of_one_or_few) is uncertainty

@@ -1,117 +1,88 @@
-"""What the frames of a stream say together."""
+"""What the frames of a stream say together: log odds m / (rho + (1 - rho) / n) of n frames of mean m."""
 
 import numpy as np
 import pytest
-from scipy.special import expit, logit
 
-from gapr_core.config import EvidenceConfig
-from gapr_core.registration.streams.evidence import Evidence
+from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS, Judgement
+from gapr_core.registration.streams.evidence import MEMORY, Evidence
 
-
-def test_a_single_frame_keeps_its_probability():
-    for probability in (1e-6, 0.2, 0.7, 0.999):
-        assert Evidence().add(probability, agrees=False) == pytest.approx(probability, rel=1e-6)
+JUMP = {"agrees": False}
+AGAIN = {"agrees": True, "again": True}
 
 
-def test_frames_that_agree_raise_the_confidence_up_to_what_their_correlation_allows():
-    evidence = Evidence(EvidenceConfig(correlation=0.5, memory=1e6))
-    answers = [evidence.add(0.8, agrees=True) for _ in range(200)]
-    assert all(a <= b for a, b in zip(answers, answers[1:], strict=False))
-    part = np.sqrt(0.8)
-    assert answers[1] == pytest.approx(expit(2 / 1.5 * logit(part)) * part)  # n / (1 + (n - 1) rho)
-    assert answers[-1] == pytest.approx(expit(2.0 * logit(part)) * part, rel=1e-2)  # 1 / rho
-    repeated = Evidence(EvidenceConfig(correlation=1.0))
-    assert [repeated.add(0.8, agrees=True) for _ in range(9)] == pytest.approx([0.8] * 9)
+def said(evidence, *frames, bone=0.5, agrees=True, again=False):
+    """The pose's log odds after each of these frames."""
+    return [evidence.observe(Judgement(pose, bone), agrees, again).pose_log_odds for pose in frames]
 
 
-def test_the_frames_that_ship_count_as_little_more_than_one():
-    evidence = Evidence()
-    assert max(evidence.add(0.47, agrees=True) for _ in range(100)) < 0.5
+@pytest.mark.parametrize("rho", [0.2, 0.5, 0.8, 1.0])
+def test_frames_that_agree_count_as_many_as_their_correlation_leaves(rho):
+    found, n = said(Evidence(rho, rho), *[0.7] * 200), np.arange(1, 201)
+    assert found == pytest.approx(0.7 * n / (1.0 + (n - 1) * rho))
+    assert (np.diff(found) >= -1e-12).all() and found[-1] <= 0.7 / rho + 1e-9
+
+
+def test_each_number_has_its_own_correlation_and_its_own_end():
+    evidence = Evidence(rho_pose=0.5, rho_bone=0.25)
+    for _ in range(3):
+        found = evidence.observe(Judgement(1.0, 0.2, {"margin": 1.0}), True)
+    assert (found.pose_log_odds, found.bone_evidence) == pytest.approx((3.0 / 2.0, 0.2 * 3.0 / 1.5))
+    assert found.contributions == {"margin": 1.0}
+    for sign in (1.0, -1.0):
+        free = Evidence(0.0, 0.0)
+        for _ in range(99):
+            found = free.observe(Judgement(sign, sign), True)
+        assert (found.pose_log_odds, found.bone_evidence) == (sign * LARGEST_LOG_ODDS, sign * LARGEST_EVIDENCE)
+
+
+def test_older_frames_weigh_less():
+    kept = 1.0 - 1.0 / MEMORY
+    found = said(Evidence(1.0, 1.0), 3.0, -1.0, 2.0)
+    assert found[1:] == pytest.approx(
+        [(3.0 * kept - 1.0) / (1.0 + kept), (3.0 * kept**2 - kept + 2.0) / (1.0 + kept + kept**2)]
+    )
+    late = said(Evidence(0.8, 0.8), *[-4.0] * 30, *[4.0] * 60)
+    assert late[30] < 0.0 < 4.0 < late[-1]
 
 
 def test_a_frame_that_comes_again_counts_once_and_as_it_is_now():
-    once, again = Evidence(EvidenceConfig(correlation=0.0)), Evidence(EvidenceConfig(correlation=0.0))
-    for evidence in (once, again):
-        evidence.add(0.7, agrees=True)
-    for probability in (0.9, 0.6, 0.8):
-        found = again.add(probability, agrees=True, again=True) if probability != 0.9 else again.add(0.9, agrees=True)
-    assert found == pytest.approx(once.add(0.8, agrees=True))
-    assert again.add(0.8, agrees=True) == pytest.approx(once.add(0.8, agrees=True))
+    once, again = Evidence(0.3, 0.3), Evidence(0.3, 0.3)
+    assert said(once, 1.0, 0.8)[-1] == (said(again, 1.0, 2.0) + said(again, 0.1, 0.8, **AGAIN))[-1]
+    assert said(again, 0.5) == said(once, 0.5)
 
 
-def test_nothing_is_raised_beyond_its_square_root():
-    evidence = Evidence(EvidenceConfig(correlation=0.0))
-    for _ in range(100):
-        evidence.add(0.999, agrees=True)
-    assert evidence.add(0.25, agrees=True) == pytest.approx(0.5, abs=1e-2)
-    assert evidence.add(0.24, agrees=True) < 0.5
+def test_a_jump_forgets_what_spoke_for_the_pose_and_keeps_what_spoke_against_it():
+    good, bad, fresh = Evidence(0.5, 0.5), Evidence(0.5, 0.5), Evidence(0.5, 0.5)
+    said(good, *[4.0] * 20)
+    said(bad, *[-4.0] * 20)
+    assert said(fresh, 2.0, **JUMP) == [2.0]
+    assert said(good, 2.0, **JUMP) == pytest.approx([2.0])
+    assert said(good, 2.0) == pytest.approx(said(fresh, 2.0)), "what follows is a stream of two frames"
+    assert said(bad, 2.0, **JUMP)[0] < 0.0
 
 
-def test_after_a_jump_what_spoke_for_the_bone_is_forgotten_and_what_spoke_against_it_is_not():
-    good, bad = Evidence(), Evidence()
-    for _ in range(20):
-        good.add(0.97, agrees=True)
-        bad.add(0.02, agrees=True)
-    assert good.add(0.28, agrees=False) == pytest.approx(0.28)
-    assert bad.add(0.9, agrees=False) < 0.5
+def test_after_a_jump_a_frame_is_no_surer_than_alone():
+    evidence = Evidence(0.5, 0.5)
+    said(evidence, -1.0)
+    assert said(evidence, -5.0, **JUMP) == [-5.0]
 
 
-def test_after_a_jump_a_frame_is_no_surer_than_alone_although_those_before_spoke_less_against_the_bone():
-    evidence = Evidence()
-    evidence.add(0.2, agrees=True)
-    assert evidence.add(0.01, agrees=False) == 0.01
+def test_a_jump_of_the_pose_forgets_each_number_by_its_own_sign():
+    evidence, kept = Evidence(1.0, 1.0), 1.0 - 1.0 / MEMORY
+    said(evidence, 3.0, bone=-1.0)
+    found = evidence.observe(Judgement(2.0, 0.5), agrees=False)
+    assert found.pose_log_odds == pytest.approx(2.0)
+    assert found.bone_evidence == pytest.approx((0.5 - kept) / (1.0 + kept))
 
 
-def test_after_a_jump_a_frame_that_spoke_for_the_bone_is_as_if_it_had_not_been():
-    seen, fresh = Evidence(), Evidence()
-    seen.add(0.36, agrees=True)  # sqrt(0.36) = 0.6: a little more than even
-    seen.add(0.5, agrees=False)
-    fresh.add(0.5, agrees=False)
-    assert seen.add(0.5, agrees=True) == fresh.add(0.5, agrees=True)
-
-
-@pytest.mark.parametrize("before", [0.16, 0.25])
-def test_after_a_jump_a_frame_that_did_not_speak_for_the_bone_still_weighs(before):
-    """sqrt(0.16) = 0.4 speaks against it, sqrt(0.25) = 0.5 neither for nor against."""
-    evidence = Evidence(EvidenceConfig(memory=4.0))
-    evidence.add(before, agrees=True)
-    part = np.sqrt(0.9)
-    mean = (0.75 * logit(np.sqrt(before)) + logit(part)) / 1.75
-    assert evidence.add(0.9, agrees=False) == pytest.approx(expit(mean) * part)
-
-
-def test_a_stream_without_frames_counts_as_one():
-    assert Evidence().effective_frames == 1.0
-
-
-def test_a_probability_that_is_no_number_is_not_counted():
-    evidence = Evidence()
-    assert np.isnan(evidence.add(np.nan, agrees=True))
-    assert evidence.add(0.7, agrees=False) == pytest.approx(0.7)
+def test_a_frame_that_is_no_number_comes_back_and_is_not_counted():
+    evidence = Evidence(0.5, 0.5)
+    assert np.isnan(said(evidence, np.nan)).all()
+    assert said(evidence, 1.0, 1.0) == said(Evidence(0.5, 0.5), 1.0, 1.0)
+    evidence.reset()
+    assert said(evidence, 1.0) == [1.0]
 
 
 def test_a_wrong_bone_is_detected_by_the_other_frames():
     """One frame in five fits by chance."""
-    evidence = Evidence()
-    answers = [evidence.add(0.7 if i % 5 == 4 else 0.05, agrees=True) for i in range(50)]
-    assert max(answers) < 0.5
-
-
-def test_a_jump_makes_the_frames_count_for_one():
-    evidence = Evidence(EvidenceConfig(correlation=0.5, memory=1e6))
-    for _ in range(20):
-        before = evidence.add(0.8, agrees=True)
-    assert evidence.add(0.8, agrees=False) == pytest.approx(0.8) and before > 0.85
-    assert evidence.effective_frames == 1.0
-    evidence.add(0.8, agrees=True)
-    assert evidence.effective_frames == pytest.approx(2 / 1.5)
-
-
-def test_old_frames_are_forgotten():
-    evidence = Evidence(EvidenceConfig(memory=5.0))
-    for _ in range(30):
-        evidence.add(0.02, agrees=True)
-    answers = [evidence.add(0.95, agrees=True) for _ in range(30)]
-    assert answers[0] < 0.5 < 0.95 < answers[-1]
-    evidence.reset()
-    assert evidence.add(0.7, agrees=True) == pytest.approx(0.7)
+    assert max(said(Evidence(0.8, 0.8), *[2.0 if k % 5 == 4 else -4.0 for k in range(50)])) < 0.0

@@ -3,10 +3,18 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gapr_core.config import RefinementConfig, SourceConfig
+from gapr_core.geometry import se3
 from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.geometry.sampling import fibonacci_directions
+from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.confidence.classifier import Judgement
+from gapr_core.registration.fit import refinement
 from gapr_core.registration.fit.surface_kernels import padded
+from gapr_core.registration.fit.verification import Candidates
+from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.target import PreparedTarget
+from gapr_core.registration.uncertainty.covariance import PoseUncertainty
 from gapr_core.surface import Surface
 
 CELL_MM, REACH_MM = 2.0, 8.0
@@ -68,3 +76,36 @@ def on_ellipsoid(count, seed=0, axes_mm=(30.0, 20.0, 12.0)):
 def rows(points) -> np.ndarray:
     """Room for the rows that the normal equations of points (N, 3) are summed from, full of what must not count."""
     return np.full((7, padded(len(points))), 7.0)
+
+
+def uncertainty(shift_mm=0.1, turn_deg=0.1) -> PoseUncertainty:
+    """Least certain along x and about z."""
+    covariance = np.diag([shift_mm**2, 1e-4, 1e-4, 1e-8, 1e-8, np.radians(turn_deg) ** 2])
+    return PoseUncertainty(covariance, 0.1, 0.2, 0.3)
+
+
+def candidates(*scores, shift_mm=30.0) -> Candidates:
+    """Poses along x."""
+    poses = [se3.exp([shift_mm * k, 0.0, 0.0, 0.0, 0.0, 0.0]) for k in range(len(scores))]
+    return Candidates(np.array(poses), np.array(scores), np.ones(len(scores)))
+
+
+def assessed(
+    points, target, T=None, pose=3.0, bone=3.0, scores=(1.0, 2.0), known=None, prior=0.0, **more
+) -> Assessment:
+    """A source (N, 3) where it lies, with these log odds of the pose and this evidence of the bone."""
+    source = sources.prepare(points, SourceConfig(normal_neighbours=10))
+    fit = refinement.evaluate(np.eye(4) if T is None else T, source.points, target, RefinementConfig())
+    given = {"features": {"inlier_ratio": 0.75}} | more
+    judgement = Judgement(pose, bone, {"margin": -2.0, "extent": 1.0})
+    return Assessment(
+        fit,
+        candidates(*scores),
+        known or uncertainty(),
+        given.pop("features"),
+        judgement,
+        prior,
+        source,
+        target,
+        **given,
+    )

@@ -14,6 +14,7 @@ FEATURE_LABELS = {
     "inlier_ratio": "share of the points that fit",
     "residual": "residual of the best hypothesis before refinement",
     "margin": "lead over the next hypothesis",
+    "log_hypotheses": "number of hypotheses that competed",
     "support": "share of the attempts that ended here",
     "log_shift_sd": "uncertainty of the position",
     "log_turn_sd": "uncertainty of the rotation",

@@ -34,15 +34,15 @@ SHARED = (
     "size_margin", "near_size_margin", "mirror_margin",
 )  # fmt: skip
 FEATURES_OF = {
-    BONE: (*SHARED, "residual", "margin"),
+    BONE: (*SHARED, "residual", "margin", "log_hypotheses"),
     SCENE: (*SHARED, "free_space_score", "log_explained_mm2", "explained_of_compared", "violating_of_compared",
             "rival_margin"),
 }  # fmt: skip
 SIGNS = {
     "log_excess": -1, "smooth_misfit": -1, "short_misfit": -1, "rough_misfit": -1, "inlier_ratio": 1, "support": 1,
     "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1,
-    "near_size_margin": 1, "mirror_margin": 1, "margin": 1, "free_space_score": 1, "explained_of_compared": 1,
-    "violating_of_compared": -1, "rival_margin": 1,
+    "near_size_margin": 1, "mirror_margin": 1, "margin": 1, "log_hypotheses": 1, "free_space_score": 1,
+    "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
 }  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
 NEAR_SIZES = (0.9725, 1.0275)  # between these and 1: a source of this size fits in 1 as well as in `SIZES`
 FEWEST_FOR_SIZE = 8  # inliers without which nothing is known of the size
@@ -78,6 +78,7 @@ def measure(
         "inlier_ratio": float(fit.counts.mean()),
         "residual": float(np.sqrt(candidates.scores[0])),
         "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + LEAST_MARGIN)),
+        "log_hypotheses": float(np.log(candidates.hypotheses)),
     }
     return {name: values[name] for name in FEATURES_OF[BONE]}
 

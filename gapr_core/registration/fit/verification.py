@@ -25,11 +25,13 @@ class Candidates:
         scores: (K,) small is good: mean squared distance of the drawn source points, truncated, mm^2; of a camera's
             cloud 1 / the score of lines of sight (`clutter.small_is_good`).
         support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
+        hypotheses: number of those that competed.
     """
 
     poses: Array
     scores: Array
     support: Array
+    hypotheses: int = 1
 
 
 def verify(
@@ -44,6 +46,7 @@ def verify(
         config: how many survive each stage.
         num_threads: 0 for all cores.
     """
+    count = len(poses)
     few, some = source.subset(config.coarse_points), source.subset(config.middle_points)
     poses, scores = refine_many(poses, few, target, np.linspace(*config.coarse_limits_mm), num_threads)
     poses = _distinct(poses, scores, source, config, config.middle_poses)[0]
@@ -52,7 +55,8 @@ def verify(
     poses = _distinct(poses, scores, source, config, config.final_poses)[0]
     poses, scores = refine_many(poses, source.points, target, np.linspace(*config.final_limits_mm), num_threads)
     poses, scores = _distinct(poses, scores, source, config, config.final_poses)
-    return Candidates(poses, scores, support(poses, crowd, source, config.markers, config.same_pose_mm))
+    shares = support(poses, crowd, source, config.markers, config.same_pose_mm)
+    return Candidates(poses, scores, shares, count)
 
 
 def mean_square_mm2(

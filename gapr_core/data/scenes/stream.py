@@ -52,8 +52,7 @@ class _Stage(NamedTuple):
 
 
 def simulate(specimen: Specimen, seed: int, motion: SceneMotion | None = None) -> Iterator[Pair]:
-    """Simulate the stream's frames as pairs of one common target, protocol `scene-stream`, with the metadata of a
-    scene.
+    """Simulate frames as pairs of one common target, protocol `scene-stream`, with the metadata of a scene.
 
     Raises:
         ConfigError: a bone on which no wound shows the level's share of bone.

@@ -26,7 +26,6 @@ TO_DO = (  # packages whose docstrings are still to be shortened: this list only
     "gapr_core/results.py",
     "gapr_core/surface.py",
     "gapr_core/training",
-    "gapr_ros/bags",
     "gapr_ros/demo",
     "gapr_ros/node",
     "gapr_ros/parameters.py",

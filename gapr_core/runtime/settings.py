@@ -170,7 +170,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def _composed(text: str) -> Any:
-    """The tree of YAML nodes of a text.
+    """Compose the tree of YAML nodes of a text.
 
     Raises:
         YAMLError: it is nested deeper than settings are, or its aliases stand for too many values.
@@ -188,7 +188,7 @@ def _composed(text: str) -> Any:
 
 
 def _values_in(node: Any, known: dict[int, int]) -> int:
-    """How many values a node stands for, those of its aliases included."""
+    """Count the values that a node stands for, those of its aliases included."""
     if node is None or isinstance(node.value, str):
         return 1
     if id(node) not in known:

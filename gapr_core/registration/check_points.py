@@ -135,8 +135,11 @@ def _check_new(points: Array, result: RegistrationResult) -> None:
 def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
     """Signed distances (N,), mm, of points (N, 3) to the surface under a pose, NaN where none is near; its normals.
 
-    Off the edge of a model that was cut off, what a point lies beyond the last surface element counts as well.
+    They are exact where the target is a mesh. Off the edge of a model that was cut off, what a point lies beyond it
+    counts as well.
     """
+    if exact := target.mesh_distances(se3.apply(T, points)):
+        return exact
     signed, normals, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     return np.where(signed < 0.0, -1.0, 1.0) * np.hypot(signed, aside), normals
 

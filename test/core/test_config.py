@@ -217,3 +217,20 @@ def test_a_key_that_stands_twice_in_a_file_is_refused(tmp_path, text, said):
 def test_a_key_may_stand_in_several_mappings_and_an_alias_be_used_again(tmp_path):
     (tmp_path / "my.yaml").write_text("a: &x {one: 1}\nb: *x\nc: {one: 2}\nd: [&y [*x], *y]\n")
     assert settings.read_yaml(tmp_path / "my.yaml")["b"] == {"one": 1}
+
+
+BOMBS = {
+    "aliases": "a: &a [1, 1, 1, 1, 1, 1, 1, 1]\n"
+    + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 8)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
+    "brackets": "a: " + "[" * 20_000,
+    "itself": "a: &a [*a, *a]\n",
+}
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_a_yaml_that_unfolds_without_end_is_refused_at_once(tmp_path, bomb):
+    (tmp_path / "a.yaml").write_text(BOMBS[bomb])
+    with pytest.raises(ConfigError, match="nested too deeply|aliases stand for"):
+        RegistrarConfig.from_yaml(tmp_path / "a.yaml")
+    with pytest.raises(ConfigError, match="value"):
+        settings.load(RegistrarConfig, None, [f"search.spins={BOMBS[bomb].removeprefix('a: ')}"])

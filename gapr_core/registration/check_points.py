@@ -63,7 +63,7 @@ def check_points(
             with the registration bound it to less.
 
     Raises:
-        InvalidPointCloudError: no points, too many, a wrong shape or type, most of them points of the source; a target
+        InvalidPointCloudError: no points, too many, a wrong shape or type, most of them points of the source. A target
             that is not prepared, or a result without a pose or its covariance.
         ConfigError: `within_mm` is not above 0, or something else than a `RegistrarConfig`.
     """

@@ -1,4 +1,4 @@
-"""Is the source one rigid piece of bone? Strains, halves, layers and looks that err widen the covariance.
+"""Deformations of the source: strains, halves, layers and looks that err widen the covariance.
 
 A scan that drifts, or slices that lie too far apart, strain the source. In a scan of two that do not fit, or of a bone
 that is bent or broken, one half lies in another pose. Under tissue that grows thicker the distance from the bone
@@ -21,7 +21,7 @@ from gapr_core.results import Effect, Finding, RegistrationStatus
 
 Array = NDArray[np.float64]
 
-# log likelihood ratios beyond which a deformation is believed, and its text
+# least log likelihood ratios of a detection, and its text
 STRAINED, APART, LAYERED = 3.0, 6.0, 4.0
 TEXTS = {
     "strained": "the source is longer, wider or slanted against the bone",
@@ -36,8 +36,8 @@ class Deformation(NamedTuple):
 
     Attributes:
         shown: evidence of the residuals.
-        changes: (n, k) derivatives of the inliers' residuals by each of its unknowns, of 1 mm.
-        limit: log ratio beyond which it is believed.
+        changes: (n, k) derivatives of the inliers' residuals by its unknowns, of 1 mm each.
+        limit: least log ratio of a detection.
     """
 
     shown: Shown
@@ -46,7 +46,7 @@ class Deformation(NamedTuple):
 
 
 def deformation(fit: Fit) -> tuple[Finding, Array] | None:
-    """Find deformations of a source, and the (6, 6) that they add to the covariance of its pose.
+    """Find deformations of a source, and the covariance (6, 6) that they add to that of its pose.
 
     Several may be found at once: a bent source is strained, too. The finding names the surest.
     """
@@ -68,8 +68,8 @@ def deformation(fit: Fit) -> tuple[Finding, Array] | None:
 def of_deformations(fit: Fit) -> dict[str, Deformation]:
     """Measure each deformation; {} of few points.
 
-    `strained`: see `covariance.strains`. `apart`: the pair of `halves` for which the residuals speak most. `layered`:
-    see `a_layer`. A stand-off is no deformation: it is taken out with the pose.
+    `strained`: see `covariance.strains`. `apart`: the most likely pair of `halves`. `layered`: see `a_layer`. A
+    stand-off is no deformation: it is projected out with the pose.
     """
     count = np.count_nonzero(fit.counts)
     if count < FEWEST_POINTS:
@@ -87,7 +87,7 @@ def of_deformations(fit: Fit) -> dict[str, Deformation]:
 
 
 def halves(fit: Fit) -> list[Array]:
-    """(n, 6) for each principal axis of the inliers: derivatives by a motion of one half against the other."""
+    """Compute derivatives by a motion of one half against the other, (n, 6) for each principal axis of the inliers."""
     feet = fit.feet[fit.counts]
     along = feet @ extent.principal(feet).axes.T
     above, moved = np.where(along > np.median(along, axis=0), 0.5, -0.5), motions(fit)
@@ -95,7 +95,7 @@ def halves(fit: Fit) -> list[Array]:
 
 
 def a_layer(fit: Fit) -> Array:
-    """(n, 4) derivatives of the inliers' residuals by a layer on the bone: its growth along x, y and z, and its mean.
+    """Compute (n, 4) derivatives by a layer on the bone: its growth along x, y and z, and its mean.
 
     No residual shows the mean. A layer that grows evenly from nothing has a mean of root 3 times its standard
     deviation.
@@ -109,9 +109,9 @@ def with_looks(uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64] |
     """Add the errors of looks against each other, each a motion of its own, to an uncertainty.
 
     Args:
-        uncertainty: of the pose that all looks have in common.
-        fit: that pose.
-        look: (N,) number of the look that each point is of; None of a single one.
+        uncertainty: covariance of the common pose of all looks.
+        fit: the common pose.
+        look: (N,) number of each point's look; None of a single one.
     """
     found = None if look is None else of_looks(fit, look)
     if found is None or not found.shown.log_ratio > found.limit:
@@ -135,7 +135,10 @@ def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:
-    """(6, 6) of either half against the pose between both, where they move against each other by `size_mm`."""
+    """Compute the (6, 6) covariance of either half against the pose between both.
+
+    The halves move against each other by `size_mm`.
+    """
     rests = fit.rests_on
     moved = rests.moved[rests.counts]
     deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / extent.radius_mm(moved)] * 3)

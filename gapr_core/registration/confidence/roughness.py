@@ -30,7 +30,7 @@ def rough_misfit_mm(fit: Fit) -> float:
     """Bound the excess of the covariance over less than 6 mm above that over 12 to 16 mm.
 
     Returns its root, mm, with its sign. A product of two independent residuals of variance s^2 has a standard deviation
-    of s^2, a mean of m of them s^2 / sqrt(m); `products_mm2` counts a pair of two centres twice. The bound is at most
+    of s^2, a mean of m of them s^2 / sqrt(m). `products_mm2` counts a pair of two centres twice. The bound is at most
     s^2, and s^2 where no two inliers are so near, or none so far apart.
     """
     feet, damped = on_the_bone(fit)

@@ -35,7 +35,7 @@ class PreparedTarget:
     """The bone as registration sees it: its outer shell as oriented, curved surface elements.
 
     Attributes:
-        points: (M, 3) float64, mm, evenly thinned; only what is visible from outside.
+        points: (M, 3) float64, mm, evenly thinned, visible from outside.
         normals: (M, 3) unit, outward.
         shapes: (M, 3, 3) second fundamental forms, 1/mm (see `quadrics.fit_quadrics`).
         tree: k-d tree of the points.

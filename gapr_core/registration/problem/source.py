@@ -149,7 +149,10 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
 
 
 def _drawn(points: Array, most: int) -> NDArray[np.int64]:
-    """Draw `count` of points (N, 3) at random, always the same; ascending indices."""
+    """Draw at most `most` of the points (N, 3) at random: the same in every frame; ascending indices.
+
+    The draw is among their distances to the centroid, which no frame changes, and not in the order of coordinates.
+    """
     by_distance = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
     chosen = np.random.default_rng(0).choice(len(points), min(most, len(points)), replace=False)
     return np.asarray(np.sort(by_distance[chosen]))

@@ -7,9 +7,8 @@ shown: points on one side of a shaft never show a slide along it. So the answer 
 points alone leave open, by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P. It also has the point that would
 lower this error most (`precision` for errors over the bone).
 
-A pose with a wide covariance allows large distances, which still show its error. Registration and points together
-estimate it as C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. The test takes the size of that error over the
-bone.
+A pose with a wide covariance allows large distances, which still show its error. Registration and points together put
+it at C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. The test takes its size over the bone.
 """
 
 from __future__ import annotations
@@ -136,8 +135,7 @@ def _check_new(points: Array, result: RegistrationResult) -> None:
 def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
     """Measure signed distances (N,), mm, of points (N, 3) to the surface under a pose, and its normals.
 
-    NaN where no surface is near. Off the edge of a model that was cut off, the distance past the last surface element
-    counts as well.
+    NaN where no surface is near. Past the edge of a cut model the distance to the last surface element counts as well.
     """
     signed, normals, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     return np.where(signed < 0.0, -1.0, 1.0) * np.hypot(signed, aside), normals
@@ -163,8 +161,7 @@ def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarCo
 def _probability(distance_mm: Array, S: Array) -> float:
     """Compute the probability that n normal distances with covariance S (n, n) are this large or larger.
 
-    The smaller of two tests', times two: all together (chi-square), and the farthest alone, which many good ones would
-    hide (Bonferroni).
+    The smaller of two tests', times two: of all together (chi-square), and of the farthest alone (Bonferroni).
     """
     together = chdtrc(len(distance_mm), distance_mm @ np.linalg.solve(S, distance_mm))
     farthest = 2.0 * ndtr(-np.abs(distance_mm / np.sqrt(np.diag(S))).max()) * len(distance_mm)

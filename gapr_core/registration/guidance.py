@@ -123,11 +123,7 @@ def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: 
 def _of_rivals(
     assessment: Assessment, rivals: Sequence[Hypothesis], patches: Patches, noise_mm: float, bias_mm: float
 ) -> tuple[float, Array, Array]:
-    """Compute the share of the rivals in the squared bound, mm^2.
-
-    Returns: Their share now, (K,) their share after a look at each patch, and (K,) the share of their probability that
-    it excludes.
-    """
+    """Compute the rivals' part of the squared bound, mm^2, now and (K,) after each look; (K,) excluded shares."""
     if not rivals:
         return 0.0, np.zeros(len(patches.centres)), np.ones(len(patches.centres))
     target, best = assessment.target, assessment.hypotheses[0]
@@ -150,9 +146,8 @@ def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> fl
 def _excluded(patch: Array, rivals: Sequence[Hypothesis], target: PreparedTarget, variance: float) -> Array:
     """Compute the (R,) share of each rival's probability that a look at the patch excludes.
 
-    Under a rival the patch (n, 3), placed by the best pose in the source's frame, lies d off the surface. Its
-    likelihood falls by exp(-d^2 / 2 (s^2 + b^2)); `variance` is s^2 + b^2, mm^2. A rival that slides along the surface
-    is never excluded.
+    Under a rival the patch (n, 3), by the best pose in the source's frame, lies d off the surface. Its likelihood falls
+    by exp(-d^2 / 2 (s^2 + b^2)); `variance` is s^2 + b^2, mm^2. A slide along the surface is never excluded.
     """
     off = [distances_mm(rival.T_target_source, patch, target) for rival in rivals]
     return np.array([1.0 - np.exp(-0.5 * (d**2).mean() / variance) for d in off])

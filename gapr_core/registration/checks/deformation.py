@@ -135,10 +135,7 @@ def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:
-    """Compute the (6, 6) covariance of either half against the pose between both.
-
-    The halves move against each other by `size_mm`.
-    """
+    """Compute the (6, 6) covariance of the pose of either half, where they move apart by `size_mm`."""
     rests = fit.rests_on
     moved = rests.moved[rests.counts]
     deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / extent.radius_mm(moved)] * 3)

@@ -92,10 +92,7 @@ def of_the_fit(
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """Measure the features that both kinds share.
-
-    The fitted points are `source`; `flatness_mm` (N,) is that of the whole cloud.
-    """
+    """Measure the features that both kinds share; `flatness_mm` (N,) is of the whole cloud, `source` was fitted."""
     inlier = fit.counts
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
     return {
@@ -149,10 +146,9 @@ def of_another_bone(
 def scale_of(fit: Fit) -> tuple[float, float]:
     """Estimate the growth with which the source fits best, and its standard deviation.
 
-    Generalised least squares of a similarity and a smooth bias (see `linear_model`), in three parts: the pose's six
-    motions, the size, by which a residual grows as n . (q - c) at its foot point q, and a shared stand-off. A stand-off
-    looks much like another size on a patch seen from one side. The size of the bias follows from the remaining
-    residuals.
+    Generalised least squares with a smooth bias (see `linear_model`), of the pose's six motions, the size, by which a
+    residual grows as n . (q - c) at its foot point q, and a shared stand-off. That looks much like another size on a
+    patch seen from one side. The size of the bias follows from the remaining residuals.
 
     Returns:
         The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.

@@ -104,8 +104,7 @@ def standoff(trial: Trial, standoffs_mm: Sequence[float] = STANDOFFS_MM) -> tupl
 def pushed(trial: Trial, fit: Fit) -> float:
     """Compute the least mean square, mm^2, of the pose pushed along its weakest motions and at rest elsewhere.
 
-    Infinite where every push comes back. A hypothesis in a flat valley stays where it began, so no other one shows the
-    valley.
+    Infinite where every push comes back. No other hypothesis shows a flat valley, since each stays where it began.
     """
     same_mm = trial.config.verification.same_pose_mm
     pushes, centre = _weakest_motions(fit) * PUSH * same_mm, fit.moved.mean(axis=0)
@@ -116,10 +115,7 @@ def pushed(trial: Trial, fit: Fit) -> float:
 
 
 def _weakest_motions(fit: Fit) -> Array:
-    """Compute the motions that the residuals determine least.
-
-    Returns: (K, 6) twists about the moved source's centroid, of 1 mm over it.
-    """
+    """Compute the (K, 6) twists, of 1 mm over the moved source, that the residuals determine least."""
     J, offsets = fit.jacobian, fit.moved - fit.moved.mean(axis=0)
     scale = np.repeat([1.0, 1.0 / extent.radius_mm(fit.moved)], 3)
     motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:PUSHED_MOTIONS] * scale
@@ -148,8 +144,7 @@ def mirrored(trial: Trial) -> float:
 def on_own_image(trial: Trial) -> float:
     """Compute the log ratio of the mirrored source on the bone's own mirror image; 4 without such an image.
 
-    The larger of the ratios of mean squares and of robust variances: by chance a few more gross points may lie near an
-    image.
+    The larger of the ratios of mean squares and of robust variances: a few gross points may fit an image by chance.
     """
     image = _kept_image(trial)
     if image is None:
@@ -192,9 +187,7 @@ def _some_of(target: PreparedTarget) -> Array:
 
 
 def _reflections(trial: Trial) -> list[Array]:
-    """Compute (4, 4) reflections, target frame: at planes through the bone's long axis and at the source's own main
-    planes.
-    """
+    """Compute (4, 4) reflections, target frame, at planes through the bone's long axis and the source's main planes."""
     (_, middle, shortest), centre = trial.target.main_axes, trial.target.centre_mm
     angles = np.arange(PLANES) * np.pi / PLANES
     of_bone = [np.cos(angle) * shortest + np.sin(angle) * middle for angle in angles]

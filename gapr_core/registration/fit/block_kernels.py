@@ -33,10 +33,7 @@ END = ROWS + 7 * B
 
 @numba.njit(**FAST)
 def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
-    """Fill the weighted normal equations H twist = g about the moved middle of the source.
-
-    twist = x y z rx ry rz.
-    """
+    """Fill the normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle."""
     centre = moved(T, middle)
     block, reach = np.empty(END), ELEMENT_RADIUS * spacing
     H[:], g[:] = 0.0, 0.0
@@ -100,8 +97,7 @@ def distance_of(block, c, reach, variance):
 def fill_rows(block, count, centre, reach, limit, variance):
     """Fill the rows: derivatives of the residuals by the twist about `centre` (3), and the residuals.
 
-    Both are times the roots of the weights. A weight is the trust times Tukey's; where the noise's variance is given,
-    times its share in that of the residual.
+    Both are times root w: w is the trust times Tukey's weight, and the noise's share in the variance if that is given.
     """
     noise, known = (variance, 1.0) if variance > 0.0 else (1.0, 0.0)
     cx, cy, cz = centre

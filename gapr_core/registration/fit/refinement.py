@@ -153,10 +153,7 @@ def trust_of_whole(fit: Fit, source: PreparedSource, config: RefinementConfig) -
 
 
 def distances_mm(T: Array, points: Array, target: PreparedTarget) -> Array:
-    """Measure (N,) distances of points (N, 3) to the surface under a pose; infinite where none is near.
-
-    The distance past the edge of the surface counts as well.
-    """
+    """Measure (N,) distances of points (N, 3) to the surface under a pose; infinite without a near one."""
     signed, _, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     return np.hypot(np.nan_to_num(signed, nan=np.inf), aside)
 
@@ -198,10 +195,7 @@ def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfi
 
 
 def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
-    """Compute the scale from the median absolute residual, within the limits set.
-
-    Residuals without a surface near count as large.
-    """
+    """Compute the scale from the median absolute residual, within the limits; NaN residuals count as large."""
     spread = SD_OF_MEDIAN * _median_size(signed)
     return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
 

@@ -68,10 +68,7 @@ def mean_square_mm2(
 
 
 def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same_pose_mm: float) -> Array:
-    """Compute the (K,) share of the crowd (M, 4, 4) near each pose (K, 4, 4).
-
-    Near: within `same_pose_mm`, over `count` markers.
-    """
+    """Compute the (K,) share of the crowd (M, 4, 4) within `same_pose_mm` of each pose, over `count` markers."""
     ends, others = (markers(T, source, count) for T in (poses, crowd))
     gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
     return np.asarray((np.sqrt((gaps**2).mean(axis=2)) < same_pose_mm).mean(axis=1))
@@ -87,8 +84,5 @@ def _distinct(
 
 
 def markers(poses: Array, source: PreparedSource, count: int) -> Array:
-    """Move the same spread points of a source (N, 3) by poses (K, 4, 4).
-
-    Returns: (K, min(count, N), 3), mm, target frame.
-    """
+    """Move the same spread points of a source (N, 3) by poses: (K, min(count, N), 3), mm, target frame."""
     return np.asarray(np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(count)) + poses[:, None, :3, 3])

@@ -41,9 +41,7 @@ class Correspondences:
 
 
 def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -> tuple[Array, Array]:
-    """Fit one pose per patch pair by weighted SVD and refine the best on their inliers (GeoTransformer's LGR).
-
-    All correspondences score each pose.
+    """Fit a pose per patch pair by weighted SVD, score all, and refine on inliers (GeoTransformer's LGR).
 
     Args:
         found: the correspondences.
@@ -107,10 +105,7 @@ def _converge(poses: Array, found: Correspondences, radius_mm: float, count: int
 
 
 def distinct(poses: Array, scores: Array, centroid: Array, count: int) -> NDArray[np.int64]:
-    """Return the rows of up to `count` poses, best first, without near-copies of a better one.
-
-    A near-copy lies within `APART_MM` (at the source's centroid) and `APART_DEG`.
-    """
+    """Select up to `count` rows, best first, none within `APART_MM` (centroid) and `APART_DEG` of a better one."""
     order = np.argsort(-scores, kind="stable")
     rotations = np.ascontiguousarray(poses[order, :3, :3])
     places = rotations @ centroid + poses[order, :3, 3]

@@ -67,10 +67,9 @@ def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Regio
 
 
 def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_array:
-    """Build the (N, N) adjacency of neighbours on one smooth surface.
+    """Build the (N, N) adjacency of neighbours with agreeing normals, each near the other's tangent plane.
 
-    Their normals agree, and each lies near the other's tangent plane. The planes are those of so few neighbours that a
-    fold is one: the normals of the source turn more slowly.
+    The planes are those of so few neighbours that a fold is one: the normals of the source turn more slowly.
     """
     near = np.ascontiguousarray(source.neighbours[:, : config.smooth_neighbours])
     normals, _, _ = fit_planes(source.points, near)

@@ -107,7 +107,7 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
 
 
 def _nearest_rays(rays: Array) -> tuple[NDArray[np.int64], Array, float]:
-    """Assign the nearest of all rays (N, 2), x / z and y / z, to each pixel (rows, columns); N for none.
+    """Assign the nearest of rays (N, 2), x / z and y / z, to each pixel; N for none.
 
     Also returns (2,) the middle of the first pixel, and the edge of a pixel: the rays' spacing, within the limits set.
     """

@@ -16,11 +16,10 @@ OFFSET, DEPTH, FRONT = 3, 4, 5  # columns of a pixel after its normal, as in `fr
 def compare_with_image(
     poses, cloud, pixels, left, top, per_pixel, on_mm, front_mm, facing_cos, hidden_mm, slant_mm, same_surface_cos
 ):
-    """Compute shares of a target explained, violating, compared, under poses (K, 3, 4) T_camera_target.
+    """Compute shares of a target (M, 6) explained, violating, compared, under poses (K, 3, 4) T_camera_target.
 
-    The target is (M, 6): points, normals. All float32. A point is explained when it faces the camera, lies within
-    `on_mm` of the plane measured on its line of sight and has its normal. It violates when it lies `front_mm` in front
-    of every measured point around there.
+    All float32. A point is explained when it faces the camera, lies within `on_mm` of the plane measured on its line of
+    sight and has its normal. It violates when it lies `front_mm` in front of every measurement around there.
     """
     rows, columns = pixels.shape[0], pixels.shape[1]
     out = np.zeros((len(poses), 3), dtype=np.float32)

@@ -161,10 +161,7 @@ def _apart(answers: tuple[LookAnswer, ...]) -> Finding:
 def _shares_of_look(
     T: Array, number: int, is_close: NDArray[np.bool_], scene: Scene, target: PreparedTarget, config: RegistrarConfig
 ) -> LookShares:
-    """Measure look `number` under the common pose (4, 4) and under its own.
-
-    Its points (N,) close to the bone are laid on it for its own pose.
-    """
+    """Measure look `number` under the common pose (4, 4), and refined by its points (N,) close to the bone."""
     source, close = scene.source, np.flatnonzero((scene.look == number) & is_close)
     own, settings, threads = T, config.clutter, config.num_threads
     if len(close) >= FEWEST_POINTS:

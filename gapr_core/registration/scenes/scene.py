@@ -1,8 +1,7 @@
 """A scene: a camera's view from one place or from several.
 
-One image shows one side of a wound, with one set of errors. A camera that moves a little shows more bone, the surface
-that hid it, and other errors. The images are one cloud in one frame in which the bone rests; each keeps its lines of
-sight.
+One image shows one side of a wound, with one set of errors. A camera that moves a little shows more bone, the tissue in
+front of it, and other errors. The images are one cloud in one frame in which the bone rests; each keeps its own lines.
 """
 
 from __future__ import annotations
@@ -132,10 +131,7 @@ def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
 
 
 def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Find the different places of a cloud's finite points.
-
-    Returns: These points (N, 3), the places (K, 3), sorted, and (N,) the place of each point.
-    """
+    """Return the finite points (N, 3) of a cloud, its different places (K, 3), sorted, and (N,) each point's place."""
     points, of_points = as_points(source), as_array(viewpoint, "a viewpoint", HOW)
     usable = is_point(points)
     if of_points.shape == points.shape and of_points.dtype.kind == "f":

@@ -42,13 +42,11 @@ class Accumulator:
     """Registers each source together with those before it.
 
     Images of a probe that determine nothing alone determine the pose together. All sources must be in one frame in
-    which the bone rests, such as that of a reference fixed to it.
-
-    Under an accepted pose each new source is checked by itself, one of few points together with such ones just before
-    it. A source off the bone under this or the last accepted pose is left out; the answer is refused if it is the
-    newest. After three of them in a row the bone or its reference has moved, and only these three are kept. Where all
-    show that the bone moves (see `motion_test`), the answer is refused, and those since a step or the last third are
-    kept.
+    which the bone rests, such as that of a reference fixed to it. Under an accepted pose each new source is checked by
+    itself, one of few points together with such ones just before it. A source off the bone under this or the last
+    accepted pose is left out, and the answer refused if it is the newest. After three of them in a row the bone or its
+    reference has moved, and only these three are kept. Where all show that the bone moves (see `motion_test`), the
+    answer is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers the collected sources; a `Tracker` is not changed but copied to one whose sources count as one
@@ -246,10 +244,7 @@ class Accumulator:
         return off
 
     def _join_small_ones(self, source: Array) -> list[Array]:
-        """Add a source (N, 3), and return the sources to judge it with.
-
-        Itself; of few points those before it too; [] for too few.
-        """
+        """Add a source (N, 3); returns it to judge, a small one with those before it; [] for too few points."""
         fewest = FEWEST_POINTS
         if len(source) >= fewest:
             self._small = []

@@ -127,10 +127,7 @@ class LookAccumulator:
         return _together(self._looks)
 
     def together_with(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> Array:
-        """Join the kept looks and this one as `register` would; (N, 3) mm.
-
-        Args as `collect`.
-        """
+        """Join the kept looks and this one as `register` would; (N, 3) mm. Arguments as `collect`."""
         newest = _look(source, viewpoint)
         return _together(self._with(newest)[1] if self._is_enough(newest) else self._looks)
 
@@ -205,10 +202,7 @@ class LookAccumulator:
     def _of_those_that_fit(
         self, target: PreparedTarget, initial: ArrayLike | None
     ) -> tuple[RegistrationResult, list[KeptLook]]:
-        """Register the looks without older ones that show the bone elsewhere than the newest and most.
-
-        Returns: The answer, and the looks that it is of.
-        """
+        """Register the looks but older ones apart from the newest and most; returns the answer and these looks."""
         stage_ms: dict[str, float] = {}
         asked = self._looks
         while True:
@@ -333,10 +327,7 @@ class LookAccumulator:
         return newest, before
 
     def _with(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
-        """Add a look to those kept, and return it and all, itself the last.
-
-        It replaces the nearest one, if that is near.
-        """
+        """Add a look to those kept, in place of a near one; returns it, and all with itself the last."""
         own, others = _direction(look), list(self._looks)
         apart_deg = [_apart_deg(each.first, own) for each in others]
         is_near = bool(others) and min(apart_deg) < self.apart_deg

@@ -55,10 +55,9 @@ class PreviousPoses:
         self.poses = np.stack(poses)
 
     def follow(self, pose: Array, source: Array) -> None:
-        """Move the poses with the source (N, 3), mm, whose pose is `pose` now.
+        """Move all poses with the source (N, 3), mm: the nearest one to `pose`, T_before, becomes T_now.
 
-        The remembered pose nearest to it went from T_before to T_now; all others go from R to R inv(T_before) T_now.
-        The nearest one comes first.
+        The others go from R to R inv(T_before) T_now; the nearest one comes first.
         """
         before = self.poses
         nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in before]))

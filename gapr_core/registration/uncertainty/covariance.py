@@ -3,14 +3,13 @@
 A least-squares pose reacts to errors e of the residuals by a gain, G e. The noise is independent with variance s^2. A
 smooth bias has variance b^2 and correlation exp(-d^2 / 2 l^2). All points share a stand-off of variance o^2, and a
 relative error of the size of variance q^2. The covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
-Censi 2007 for the noise alone); `sandwich` has all terms. A Hessian alone is over-confident.
-
-The size of the bias comes from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`). An error
-that wraps around the bone hardly moves the pose; one seen from one side does. Errors that vary more slowly than the
-correlation are constant or linear in place: in proportion to the bias, all points share an offset and the source is
-strained. The depths of an image are wrong along the beam, where stand-off and scale then act. Slices of a tracked probe
-share an error each: another K, of short reach. Tracking error adds directly to the pose covariance. A weak prior keeps
-the variance of an unobserved motion finite.
+Censi 2007 for the noise alone); `sandwich` has all terms. A Hessian alone is over-confident. The size of the bias comes
+from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`). An error that wraps around the bone
+hardly moves the pose; one seen from one side does. Errors that vary more slowly than the correlation are constant or
+linear in place: in proportion to the bias, all points share an offset and the source is strained. The depths of an
+image are wrong along the beam, where stand-off and scale then act. Slices of a tracked probe share an error each:
+another K, of short reach. Tracking error adds directly to the pose covariance. A weak prior keeps the variance of an
+unobserved motion finite.
 """
 
 from __future__ import annotations
@@ -154,18 +153,14 @@ def _about_middle(fit: Fit, covariance: Array) -> Array:
 def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:
     """Estimate the standard deviation of a point from the spread `sigma_mm` of residuals after a fit of 6 unknowns.
 
-    The sensor's own noise counts as `worth` points beside the `count` points: a dozen residuals alone carry little
-    information.
+    The sensor's own noise counts as `worth` points on top of `count`: a dozen residuals carry little information.
     """
     freedom = max(worth + count - UNKNOWNS, 1.0)
     return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
 
 
 def expected_bias_mm(equations: NormalEquations, typical_mm: float) -> float:
-    """Estimate the root mean square of the bias's size from the residuals.
-
-    The prior is log-normal about the sensor's typical size.
-    """
+    """Estimate the root mean square of the bias's size, with a log-normal prior about the sensor's typical one."""
     log_prior = -0.5 * (np.log(SIZES_MM / max(typical_mm, SIZES_MM[0])) / BIAS_SPREAD) ** 2
     log_prior += np.log(np.gradient(np.log(SIZES_MM)))  # the sizes are not evenly spaced
     log_posterior = log_prior + equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
@@ -173,13 +168,13 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float) -> float:
 
 
 def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig, eye: Array | None = None) -> Array:
-    """Compute the (6, 6) covariance of the pose from all error terms.
+    """Compute the (6, 6) covariance of the fit by all errors.
 
-    G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P. G is the gain
-    of the fit, U = 1 1^T the covariance of a shared error, s the noise. b is the bias with fields F; all points share a
+    It is G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P. G is the
+    gain of the fit, U = 1 1^T a shared error, s the noise. b is the bias with fields F; all points share a
     (`long_share`) of it, and h strains the source (`linear_share`, `strains`). e is the local error with fields E, o
     the stand-off and q the scale (see `directions`). m is the error of the bone's model (`model_mm`), T that of the
-    whole cloud's place, and P the prior.
+    cloud's place, P the prior.
     """
     inlier = fit.counts
     gain, prior = gain_of(fit, bias_fields, errors.noise_mm)

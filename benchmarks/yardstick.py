@@ -168,7 +168,9 @@ def drawn(how: List, folder: str, split: str, number: int) -> tuple[Pair, str]:
         rng = np.random.default_rng([SEED, number, 5])
         count = min(FEW[number % len(FEW)], len(pair.source))
         pair = replace(pair, source=pair.source[rng.permutation(len(pair.source))[:count]])
-    return (replace(pair, viewpoint=None) if how.unnamed else pair), found.sensor
+    if how.unnamed:
+        pair = replace(pair, metadata={name: fact for name, fact in pair.metadata.items() if name != "viewpoint"})
+    return pair, found.sensor
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What the caller must fix. What the data decided is a `RegistrationStatus` instead."""
+"""Errors that the caller must fix; a `RegistrationStatus` is decided by the data."""
 
 
 class GaprError(ValueError):

@@ -1,4 +1,4 @@
-"""What a message type must offer to bring partial clouds."""
+"""Interface of a message type that brings partial clouds."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Draw pictures of the documentation.
 
 python scripts/figures.py methods docs/figures/methods.png
+python scripts/figures.py wound docs/figures/wound.gif
 """
 
 from __future__ import annotations
@@ -8,14 +9,23 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
+from scipy.spatial import cKDTree
 
+from gapr_core import Registrar, RegistrationResult, Tracker
+from gapr_core.data.pair import Pair
+from gapr_core.data.pool import parametric_specimen
+from gapr_core.data.scenes.figure import BONE, OTHER, paint
+from gapr_core.data.scenes.stream import SceneMotion, simulate
 from gapr_core.pages import palette
 
 METHODS = Path(__file__).resolve().parents[1] / "docs" / "results" / "methods.md"
+FRAMES, DARK, REACH = 18, "#22262c", 0.22  # REACH: tangent of half the image
 
 
 def main() -> None:
@@ -24,10 +34,10 @@ def main() -> None:
     parser.add_argument("name", choices=FIGURES)
     parser.add_argument("out")
     args = parser.parse_args()
-    FIGURES[args.name]().savefig(args.out, dpi=110, facecolor="white")
+    FIGURES[args.name](Path(args.out))
 
 
-def methods() -> Figure:
+def methods(out: Path) -> None:
     """Draw the first table of the page on other methods: right poses by kind of cloud, as bars."""
     rows = re.findall(
         r"^\| (?!\|)(.+?) \| \d+ \| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", METHODS.read_text(), re.MULTILINE
@@ -44,10 +54,32 @@ def methods() -> Figure:
     axes.set(ylabel="right within 4 mm and 5 deg, %", ylim=(0.0, 125.0), yticks=range(0, 101, 25))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(loc="upper right", ncols=3, fontsize=8, frameon=False)
-    return figure
+    figure.savefig(out, dpi=110)
 
 
-FIGURES: dict[str, Callable[[], Figure]] = {"methods": methods}
+def wound(out: Path) -> None:
+    """Draw a camera that circles a wound, as a moving picture: each frame with the points taken for bone."""
+    tracker, motion = Tracker(Registrar.from_pretrained()), SceneMotion(frames=FRAMES)
+    pairs = list(simulate(parametric_specimen("pelvis", 1), 1, motion))
+    target = tracker.prepare(pairs[0].target)
+    images = [_frame(pair, tracker.register(pair.source, target, viewpoint=pair.viewpoint)) for pair in pairs]
+    images[0].save(out, save_all=True, append_images=images[1:], duration=250, loop=0, optimize=True)
+
+
+def _frame(pair: Pair, result: RegistrationResult) -> Image.Image:
+    figure = Figure(figsize=(3.4, 3.2), layout="constrained", facecolor=DARK)
+    axes = figure.subplots()
+    is_taken = result.residuals.inlier[cKDTree(result.residuals.points).query(pair.source)[1]]
+    paint(axes, pair.source, pair.viewpoint, np.where(is_taken[:, None], BONE, OTHER), np.array([0.0, 1.0, 0.0]))
+    axes.collections[0].set_sizes([6.0])
+    axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
+    axes.set_title(str(result).split("  inliers")[0], fontsize=9, color="white")
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    return Image.open(buffer).convert("RGB").quantize(16)
+
+
+FIGURES: dict[str, Callable[[Path], None]] = {"methods": methods, "wound": wound}
 
 
 if __name__ == "__main__":

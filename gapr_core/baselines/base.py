@@ -1,4 +1,4 @@
-"""One interface for every registration method, and what all baselines share: centring, checks, refusals."""
+"""One interface for every registration method, and the common parts of baselines: centring, checks, refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RIGID_TOLERANCE = 1e-3  # on R^T R - I and det R - 1; the libraries work in floa
 
 @runtime_checkable
 class RegistrationMethod(Protocol):
-    """What the benchmark, the node and the compositions take: `Registrar`, `Tracker` and every baseline."""
+    """Interface for the benchmark, the node and compositions: `Registrar`, `Tracker` and every baseline."""
 
     name: str
 
@@ -58,7 +58,7 @@ class BaselineTarget:
         origin: (3,) mean of the points; the libraries see the points relative to it.
         tree: search tree over `points`.
         owner: the method that made `static`.
-        static: what that method's library computes once (features, trees), in coordinates relative to `origin`.
+        static: features or trees that the library computes once, in coordinates relative to `origin`.
     """
 
     points: Array
@@ -96,7 +96,7 @@ class Baseline(ABC):
             units: unit of a path or an array, "mm", "cm" or "m".
 
         Raises:
-            InvalidPointCloudError: for what cannot be a target.
+            InvalidPointCloudError: not a possible target.
             MethodUnavailableError: when the library is missing.
         """
         points, normals = target_points(target, units)
@@ -182,12 +182,12 @@ def target_points(target: Any, units: str = "mm") -> tuple[Array, Array | None]:
 
 
 def truncated_residual(distance: ArrayLike) -> float:
-    """Mean nearest-neighbour distance with every distance cut off at 5 mm: what `Refined` compares poses by, mm."""
+    """Compute the mean nearest-neighbour distance, mm, each cut off at 5 mm; `Refined` compares poses by it."""
     return float(np.minimum(distance, INLIER_MM).mean())
 
 
 def check_rigid(T: Array, identity_is_failure: bool) -> None:
-    """Raise `NoPose` for what a library returns when it fails in silence: NaN, no rotation, or the identity."""
+    """Raise `NoPose` for the answer of a library that fails in silence: NaN, no rotation, or the identity."""
     if not np.isfinite(T).all():
         raise NoPose("the library returned a pose that is not finite")
     R = T[:3, :3]

@@ -36,7 +36,7 @@ class Origin:
         title: as its authors call it.
         repository: its address.
         holds: path inside that every checkout has.
-        libraries: what it needs, for pip.
+        libraries: its requirements, for pip.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Networks of others as methods: what they share of weights, units and poses; `checkout` imports their code.
+"""Networks of others as methods: their weights, units and poses; `checkout` imports their code.
 
 They are made for 3DMatch with a first voxel of 0.025, so their unit is 40 first voxels of a pair's target.
 """
@@ -151,7 +151,7 @@ def correspondences_mm(found: Matches, source: Cloud, target: Cloud, unit_mm: fl
 
 
 def save(code: Checkout, network: nn.Module, sizes: ModelConfig, path: Path, card: dict[str, Any]) -> None:
-    """Write weights with what is needed to build the network again."""
+    """Write weights with all that builds the network again."""
     from safetensors.torch import save_file
 
     header = {"format": _format(code), "sizes": json.dumps(sizes.to_dict()), "card": json.dumps(card)}

@@ -185,7 +185,7 @@ def batch_query(
 ) -> NDArray[np.int64]:
     """Find the points of the same cloud in the ball of each query (N, 3), nearest first; M for none.
 
-    K is what the fullest ball holds.
+    K is the size of the fullest ball.
     """
     counts = np.asarray(query_lengths).tolist(), np.asarray(lengths).tolist()
     return checkout.balls(np.asarray(queries, np.float64), np.asarray(points, np.float64), *counts, radius)

@@ -1,4 +1,4 @@
-"""What a benchmark knows of one method's answer to one pair: typed, and a line of JSON."""
+"""One method's answer to one pair, judged: typed, and a line of JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ERROR = "ERROR"  # status where the method raised or its process died
 
 @dataclass(frozen=True, kw_only=True)
 class PairFacts:
-    """What is known about the pair, whatever the method.
+    """Facts of the pair, whatever the method.
 
     Attributes:
         pair, protocol, bone, person: names; the subject is empty where it is not known.
@@ -46,7 +46,7 @@ class PairFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What the method answered.
+    """Answer of the method.
 
     Attributes:
         status: of the result, or `ERROR`.

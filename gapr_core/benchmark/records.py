@@ -18,7 +18,7 @@ PLAN = "plan.json"
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run was asked the last time; on what it ran, its records say.
+    """Request of the last run; its records name the machine.
 
     Attributes:
         command, started: how and when it was asked, in words.
@@ -38,7 +38,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the records of a run depend on.
+    """Inputs on which the records of a run depend.
 
     Attributes:
         pairs: name to sha256.

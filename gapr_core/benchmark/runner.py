@@ -121,7 +121,7 @@ def run_task(task: Task) -> Record:
 
 
 def check_pairs(paths: Iterable[Path]) -> dict[str, str]:
-    """Check before the first registration what every file says of its pair; the clouds are not read.
+    """Check the facts of every file before the first registration; the clouds are not read.
 
     Returns:
         Name of the file to `facts_hash`.

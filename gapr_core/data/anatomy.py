@@ -185,7 +185,7 @@ def meshes(folder: str | Path, bone: str | None = None, split: str = "all", unit
 
 
 def meshes_hash(folder: str | Path, bones: Sequence[str], split: str = "all") -> str:
-    """sha256 over names and contents of the files that `meshes` reads for these bones, and of what splits them."""
+    """sha256 over names and contents of the files that `meshes` reads for these bones, and of their split."""
     folder = Path(folder)
     found = _mesh_files(folder) or [file for bone in sorted(bones) for file in _mesh_files(folder / bone)]
     if split != "all" and (folder / "splits.json").is_file():

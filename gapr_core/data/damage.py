@@ -1,4 +1,4 @@
-"""What can happen to a source that no protocol, and no pair that anything was fitted to, holds: to judge with only.
+"""Damage of a source that no protocol and no fitted pair holds: to judge with only.
 
 A damage is a function of a `Pair`, of where it was measured, of its bone and of a random generator. It returns the pair
 with another source, or another target. Sizes are those of an operating room: a plate of 80 x 12 mm, 1.5 to 3 mm of

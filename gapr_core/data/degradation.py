@@ -1,4 +1,4 @@
-"""What a real acquisition does to clean surface points: density, noise, smooth bias, outliers. In mm, seeded."""
+"""Errors of a real acquisition: density, noise, smooth bias, outliers. In mm, seeded."""
 
 from __future__ import annotations
 

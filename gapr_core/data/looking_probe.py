@@ -17,7 +17,7 @@ SAME_SIDE = 0.3  # least cosine between a point's normal and that of the middle
 
 @dataclass(frozen=True)
 class LookSize:
-    """What a look shows.
+    """Extent of a look.
 
     Attributes:
         patch_mm: diameter.

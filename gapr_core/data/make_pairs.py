@@ -78,7 +78,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Make the pairs that the arguments name; says what it made, or takes up what an earlier run left."""
+    """Make the pairs that the arguments name, or continue an earlier run, and report."""
     origin = "anatomy" if args.anatomy else "meshes" if args.meshes else "parametric"
     there = pool.bones_in(args.meshes, args.units) if args.meshes and not args.bones else anatomy.BONES
     named = names(args.bones) if args.bones else there

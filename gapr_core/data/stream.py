@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Motion:
-    """What a stream looks like.
+    """Settings of a stream.
 
     Attributes:
         frames: clouds of the stream.

@@ -24,7 +24,7 @@ class Acquisition:
 
     Attributes:
         frames: clouds in the sweep; each holds all points so far.
-        width_mm, slab_mm: what the probe sees at one place, across and along its way.
+        width_mm, slab_mm: extent of the probe's view at one place, across and along its way.
         swing_deg: how far the probe swings around the bone's axis, to either side, on its way.
         points_per_frame: new points of each frame at most.
         noise_mm, bias_mm: white noise per axis, and smooth error along the normals (its peak).
@@ -43,7 +43,7 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What the probe has collected: `clouds[k]` (N_k, 3) mm in the tracker's frame, and the truth."""
+    """Clouds of a probe: `clouds[k]` (N_k, 3) mm in the tracker's frame, and the truth."""
 
     clouds: tuple[Array, ...]
     T_target_source: Array

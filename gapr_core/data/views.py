@@ -1,4 +1,4 @@
-"""What a probe sees of a bone from one side: a region, all that is visible near a point, or a band. Seeded."""
+"""Views of a bone from one side: a region, all that is visible near a point, or a band. Seeded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several long bones in one mesh: what a rigid registration takes for one body."""
+"""Find several long bones in one mesh, which a rigid registration takes for one body."""
 
 from __future__ import annotations
 

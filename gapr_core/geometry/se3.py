@@ -28,7 +28,7 @@ class PoseError(NamedTuple):
 
     @property
     def is_right(self) -> bool:
-        """Within the limits of a right pose: 4 mm and 5 deg, what a confidence is the probability of."""
+        """Check the limits of a right pose: 4 mm and 5 deg. A confidence is the probability of that."""
         return self.within(RIGHT_MM, RIGHT_DEG)
 
 

@@ -1,4 +1,4 @@
-"""Small motions of a pose: error twists, how surprising they are under a covariance, and what they do to points.
+"""Small motions of a pose: error twists, their distance under a covariance, and their effect on points.
 
 A twist is x y z (mm) rx ry rz (rad) in fixed axes of the target frame, rotation about a named centre: the coordinates
 of `RegistrationResult.covariance`.

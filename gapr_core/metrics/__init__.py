@@ -1,4 +1,4 @@
-"""Metrics: pure functions of float64 numpy arrays; what each means is in docs/develop/metrics.md."""
+"""Metrics: pure functions of float64 numpy arrays, explained in docs/develop/metrics.md."""
 
 from gapr_core.geometry.se3 import PoseError, pose_error
 from gapr_core.geometry.twists import error_twist, nees, predicted_rmse_mm

@@ -1,1 +1,1 @@
-"""What every package needs of the machine: console, files, threads, settings, where a result comes from."""
+"""Access to the machine for all packages: console, files, threads, settings, where a result comes from."""

@@ -1,4 +1,4 @@
-"""A process of its own for what native code may die of."""
+"""Run native code that may crash in a process of its own."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def _locked(folder: Path, wait: bool = True) -> int | None:
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise what writing a file would raise, before there is anything to write; nothing stays behind.
+    """Raise the error of writing a file before there is anything to write; leave nothing behind.
 
     Raises:
         ConfigError: a folder, or a place where no file can be written.

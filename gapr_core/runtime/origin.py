@@ -1,4 +1,4 @@
-"""What code runs on what processor: the words that stand with every number."""
+"""Name the code and the processor, which stand with every number."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def from_dict(cls: type[T], values: Any, path: str = "") -> T:
     """Put a nested mapping over the defaults; see the function `from_dict`.
 
     Args:
-        cls: the dataclass; its annotations decide what a value may be. Lists become tuples, whole numbers floats.
+        cls: the dataclass; its annotations decide the types. Lists become tuples, whole numbers floats.
         values: a mapping of names to values.
         path: what stands before the names in an error.
 
@@ -132,7 +132,7 @@ def from_dict(cls: type[T], values: Any, path: str = "") -> T:
 
 
 def load(cls: type[T], file: str | Path | None = None, assignments: Sequence[str] = ()) -> T:
-    """Settings from a YAML file, with `name.name=value` over them; what is named nowhere keeps its default.
+    """Settings from a YAML file, with `name.name=value` over them; others keep their default.
 
     Raises:
         ConfigError: the file cannot be read, or see `from_dict`.

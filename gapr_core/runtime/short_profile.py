@@ -1,4 +1,4 @@
-"""What a Dask worker remembers of its own profile; needs dask.distributed."""
+"""Shorten the profile that a Dask worker keeps of itself; needs dask.distributed."""
 
 from __future__ import annotations
 

@@ -56,14 +56,14 @@ def test_expected_distances_are_those_of_drawn_poses_and_errors():
     target = ellipsoid(count=4000)
     sensor = SensorConfig(noise_mm=0.2, bias_mm=0.4, scale=0.02, standoff_mm=0.0, known_standoff_mm=0.3,
                           tracking_mm=0.3, tracking_deg=0.8)  # fmt: skip
-    config = RegistrarConfig(sensor=sensor, covariance=CovarianceConfig(model_mm=0.25, correlation_mm=15.0))
+    config = RegistrarConfig(sensor=sensor, covariance=CovarianceConfig(model_mm=0.25))
     result = answer(covariance=covariance, factor95=1.5)
     found = check(points, target, result, config)
     _, normals = module._distances(np.eye(4), points, target)
     n, away = 40_000, points - points.mean(axis=0)
     twists = 1.5 * rng.multivariate_normal(np.zeros(6), covariance, n)
     moves = twists[:, None, :3] + np.cross(twists[:, None, 3:], (points - result.centre_mm)[None])
-    alike = np.exp(-0.5 * ((points[:, None] - points) ** 2).sum(axis=2) / 15.0**2)
+    alike = np.exp(-0.5 * ((points[:, None] - points) ** 2).sum(axis=2) / 20.0**2)
     drawn = np.einsum("sni,ni->sn", moves, normals)
     drawn += rng.normal(size=(n, 5)) * 0.2 + rng.normal(size=(n, 1)) * 0.3 + rng.normal(size=(n, 1)) * 0.25
     drawn += rng.normal(size=(n, 1)) * 0.02 * (away * normals).sum(axis=1)

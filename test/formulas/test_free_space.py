@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
+from gapr_core.registration.scenes import free_space
 from gapr_core.registration.scenes.free_space import DepthImage, Visible, _looking_at, _pixels, compare, see
 
 EYE = np.array([0.0, 0.0, 400.0])
@@ -26,9 +26,8 @@ def image():
     return see(points, -normals, EYE)
 
 
-def shares(image, normal=(0.0, 0.0, 1.0), at=(0.0, 0.0, 0.0), config=None, front_mm=FRONT_MM):
+def shares(image, normal=(0.0, 0.0, 1.0), at=(0.0, 0.0, 0.0), front_mm=FRONT_MM):
     """Explained, violating and compared: of one target point with a normal, each 0 or a share of 1."""
-    image = image if config is None else replace(image, config=config)
     unit = np.array(normal) / np.linalg.norm(normal)
     found = compare(np.eye(4)[None], np.array([at]), unit[None], image, ON_MM, front_mm, num_threads=1)
     return float(found.explained[0]), float(found.violating[0]), float(found.compared[0])
@@ -53,15 +52,12 @@ def test_bone_in_front_of_what_was_measured_violates(image, height_mm, violating
 @pytest.mark.parametrize(("height_mm", "compared"), [(3.9, 1.0), (4.1, 0.0), (-2.9, 1.0), (-3.1, 0.0)])
 def test_bone_is_compared_between_too_far_in_front_and_hidden(image, height_mm, compared):
     assert shares(image, at=(0.0, 0.0, height_mm))[2] == compared
-    assert shares(image, at=(0.0, 0.0, -3.1), config=FreeSpaceConfig(hidden_mm=4.0))[2] == 1.0
 
 
 @pytest.mark.parametrize(("cosine", "seen"), [(0.21, 1.0), (0.19, 0.0), (-0.5, 0.0), (1.0, 1.0)])
 def test_a_surface_must_face_the_camera(image, cosine, seen):
     normal = (np.sqrt(1.0 - cosine**2), 0.0, cosine)
     assert shares(image, normal)[2] == seen
-    turned = FreeSpaceConfig(facing_cos=0.1)
-    assert shares(image, (np.sqrt(1.0 - 0.15**2), 0.0, 0.15), config=turned)[2] == 1.0
 
 
 @pytest.mark.parametrize(("cosine", "explained"), [(0.61, 1.0), (0.59, 0.0)])
@@ -153,10 +149,8 @@ def test_all_moves_together():
 
 def test_a_score_takes_off_twice_what_was_seen_through_and_a_fifth_of_what_was_seen_otherwise():
     explained, violating, compared = (np.array(x) for x in ([0.5, 0.5, 0.4], [0.0, 0.1, 0.0], [0.5, 0.8, 0.2]))
-    found = Visible(explained, violating, compared, FreeSpaceConfig())
+    found = Visible(explained, violating, compared)
     assert found.score == pytest.approx([0.5, 0.5 - 0.2 * 0.3 - 2.0 * 0.1, 0.4])
-    dear = Visible(explained, violating, compared, FreeSpaceConfig(violation_costs=3.0, misfit_costs=0.5))
-    assert dear.score == pytest.approx([0.5, 0.5 - 0.5 * 0.3 - 3.0 * 0.1, 0.4])
 
 
 def test_the_image_looks_at_the_middle_and_holds_planes_of_the_camera_frame(image):
@@ -182,18 +176,15 @@ def test_the_smallest_depth_is_that_of_the_pixels_around():
     assert len(set(columns)) <= 2 or len(set(rows)) <= 2  # only along the step
 
 
-@pytest.mark.parametrize(
-    ("config", "pixel"),
-    [
-        (FreeSpaceConfig(), 4.0 / 400.0),  # the spacing of the points
-        (FreeSpaceConfig(smallest_pixel=0.02), 0.02),
-        (FreeSpaceConfig(most_pixels=100), 0.2 / 10.0),  # its 0.2 x 0.2 in a hundred pixels
-    ],
-)
-def test_pixels_are_as_large_as_the_gaps_and_not_too_many(config, pixel):
-    points, normals = wall(half_mm=40.0, step_mm=4.0)
-    image = see(points, normals, EYE, config)
-    assert image.pixel == pytest.approx(pixel, rel=1e-6) and image.config is config
+@pytest.mark.parametrize(("least", "most", "pixel"), [
+    (0.003, 160_000, 4.0 / 400.0),  # the spacing of the points
+    (0.02, 160_000, 0.02), (0.003, 100, 0.2 / 10.0),  # its 0.2 x 0.2 in a hundred pixels
+])  # fmt: skip
+def test_pixels_are_as_large_as_the_gaps_and_not_too_many(monkeypatch, least, most, pixel):
+    monkeypatch.setattr(free_space, "SMALLEST_PIXEL", least)
+    monkeypatch.setattr(free_space, "MOST_PIXELS", most)
+    image = see(*wall(half_mm=40.0, step_mm=4.0), EYE)
+    assert image.pixel == pytest.approx(pixel, rel=1e-6)
     assert image.pixels.shape[:2] == pytest.approx((0.2 / pixel + 1, 0.2 / pixel + 1), abs=1.01)
 
 
@@ -202,21 +193,19 @@ def test_a_measured_point_speaks_for_lines_of_sight_within_its_reach():
     rays = np.vstack([rays, rays + [1e-4, 0.0]])  # in pairs: their gaps ask for the smallest pixel
     points = np.column_stack([rays * 400.0, np.full(len(rays), 400.0)]) * [1.0, 1.0, -1.0] + EYE
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    for reach in (0.006, 0.012):
-        image = see(points, normals, EYE, FreeSpaceConfig(reach=reach))
-        centre = image.origin + image.pixel * np.stack(np.meshgrid(*map(np.arange, image.pixels.shape[1::-1])), -1)
-        seen = se3.apply(image.T_camera_source, points)
-        gap = np.linalg.norm(centre[..., None, :] - seen[:, :2] / seen[:, 2:], axis=-1)
-        assert np.array_equal(image.pixels[..., 4] > 0.0, gap.min(axis=-1) <= reach)
+    image = see(points, normals, EYE)
+    centre = image.origin + image.pixel * np.stack(np.meshgrid(*map(np.arange, image.pixels.shape[1::-1])), -1)
+    seen = se3.apply(image.T_camera_source, points)
+    gap = np.linalg.norm(centre[..., None, :] - seen[:, :2] / seen[:, 2:], axis=-1)
+    assert np.array_equal(image.pixels[..., 4] > 0.0, gap.min(axis=-1) <= free_space.REACH)
 
 
 def test_points_far_aside_of_the_view_are_left_out():
     points, normals = wall(half_mm=40.0, step_mm=4.0)
-    aside = np.array([[3000.0, 0.0, 0.0], [-3000.0, 0.0, 0.0]])
-    image = see(np.vstack([points, aside]), np.vstack([normals, normals[:2]]), EYE)
-    assert np.abs(image.origin).max() < 0.2
-    wide = see(np.vstack([points, aside]), np.vstack([normals, normals[:2]]), EYE, FreeSpaceConfig(widest_cos=0.1))
-    assert np.abs(wide.origin).max() > 5.0
+    for x_mm, least, most in ((3000.0, 0.0, 0.2), (1500.0, 3.5, 4.0)):  # their cosines are .13 and .26
+        aside = np.array([[x_mm, 0.0, 0.0], [-x_mm, 0.0, 0.0]])
+        image = see(np.vstack([points, aside]), np.vstack([normals, normals[:2]]), EYE)
+        assert least < np.abs(image.origin).max() < most
 
 
 def test_a_camera_inside_the_cloud_sees_nothing():

@@ -6,18 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tiny
+from scipy.special import logit
 
-from gapr_core.config import ClutterConfig, FreeSpaceConfig, RegistrarConfig, SourceConfig
+from gapr_core.config import ClutterConfig, RegistrarConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3
 from gapr_core.registration.checks.assessment import Assessment
+from gapr_core.registration.confidence.classifier import Judgement
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.scenes import free_space, look_agreement
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes.free_space import Visible
 from gapr_core.registration.scenes.look_agreement import LookShares
 from gapr_core.registration.scenes.scene import MOST_PLACES, Look, Places, Scene
-from gapr_core.results import LookFit, Refusal, RegistrationStatus
+from gapr_core.results import Effect, Finding, LookFit, Refusal, RegistrationStatus
 
 EYES = np.array([[0.0, 0.0, 300.0], [0.0, 0.0, -300.0]])
 CONFIG = RegistrarConfig(
@@ -114,8 +116,8 @@ def test_a_camera_sees_the_cloud_levelled_over_its_neighbours_along_the_normals(
     seen = []
     monkeypatch.setattr(free_space, "see", lambda *words: seen.append(words))
     scene = scenes.scene_from(source, EYES[0], CONFIG)
-    ((levelled, normals, viewpoint, config),) = seen
-    assert scene.source.oriented and viewpoint.tolist() == EYES[0].tolist() and config is CONFIG.clutter.free_space
+    ((levelled, normals, viewpoint),) = seen
+    assert scene.source.oriented and viewpoint.tolist() == EYES[0].tolist()
     assert scene.regions == () and scene.look.tolist() == [0] * len(source.points)
     for k in (0, 17, 60):
         mean = source.points[source.neighbours[k][:4]].mean(axis=0)
@@ -141,7 +143,7 @@ def test_normals_of_a_scene_and_of_its_parts_point_to_the_place_of_each_point(so
 
 
 def visible(explained, violating, compared):
-    return Visible(np.array([explained]), np.array([violating]), np.array([compared]), FreeSpaceConfig())
+    return Visible(np.array([explained]), np.array([violating]), np.array([compared]))
 
 
 def test_every_place_counts_alike(monkeypatch):
@@ -215,7 +217,7 @@ def test_one_look_has_nothing_to_fit(monkeypatch):
 def agreed(monkeypatch, fits, own=(), probability=0.8, names=None, given=None):
     """What a pose is worth whose looks fit so, where looks by themselves have the poses `own`, by number."""
     fit = SimpleNamespace(T=np.eye(4))
-    common = Assessment(fit, None, None, {}, probability, None, None, None)
+    common = Assessment(fit, None, None, {}, Judgement(float(logit(probability)), 3.0), 0.0, None, None)
     given = 100.0 * np.arange(3.0 * len(fits)).reshape(-1, 3) if given is None else given
     names = np.arange(len(fits)) if names is None else np.array(names)
     scene = SimpleNamespace(images=fits, each=range(len(fits)), names=names, given=given)
@@ -223,12 +225,12 @@ def agreed(monkeypatch, fits, own=(), probability=0.8, names=None, given=None):
     return look_agreement.unless_apart(common, scene, None, dict(own).get, CONFIG)
 
 
-def alone(x_mm, deg=0.0, probability=0.8, refusal=None):
+def alone(x_mm, deg=0.0, probability=0.8, findings=()):
     """A look by itself has a pose so far away, turned so much about the middle of what it shows."""
     points = np.array([[50.0, 0.0, 0.0], [70.0, 0.0, 0.0]])
     turn = se3.exp([x_mm, 0.0, 0.0, 0.0, 0.0, np.radians(deg)], points.mean(axis=0))
     fit, source = SimpleNamespace(T=turn), SimpleNamespace(points=points)
-    return Assessment(fit, None, None, {}, probability, refusal, source, None)
+    return Assessment(fit, None, None, {}, Judgement(float(logit(probability)), 3.0), 0.0, source, None, findings)
 
 
 @pytest.mark.parametrize(("fits", "is_refused"), [
@@ -238,19 +240,19 @@ def alone(x_mm, deg=0.0, probability=0.8, refusal=None):
 def test_a_pose_stands_where_no_look_is_apart_and_less_than_half_of_them_are_blind(monkeypatch, fits, is_refused):
     found = agreed(monkeypatch, fits)
     assert [look.fit for look in found.looks] == fits and (found.refusal is not None) is is_refused
-    assert found.probability == (CONFIG.rules.ruled_out if is_refused else 0.8)
     assert look_agreement.is_refused(found) is is_refused
 
 
 def test_the_refusal_names_the_places(monkeypatch):
     refusal = agreed(monkeypatch, [APART, FIT, BLIND]).refusal
-    assert refusal.status.value == "AMBIGUOUS" and "from (0, 100, 200) and (600, 700, 800) mm" in refusal.reason
+    assert refusal.status.value == "AMBIGUOUS" and "from (0, 100, 200) and (600, 700, 800) mm" in refusal.text
 
 
 @pytest.mark.parametrize(("own", "fits"), [
     (alone(2.9), True), (alone(3.1), False), (alone(0.0, 2.9), True), (alone(0.0, 3.1), False),
     (alone(0.0, probability=0.49), False),
-    (alone(0.0, refusal=Refusal(RegistrationStatus.DEGENERATE, "")), False), (None, False),
+    (alone(0.0, findings=(Finding("x", Effect.REFUSE, 1.0, 0.5, RegistrationStatus.DEGENERATE, ""),)), False),
+    (None, False),
 ])  # fmt: skip
 def test_a_look_that_seems_apart_fits_where_it_alone_has_the_same_pose(monkeypatch, own, fits):
     found = agreed(monkeypatch, [FIT, APART, FIT], {1: own})

@@ -1,164 +1,122 @@
-"""The steps of the bias correction, with the linear algebra replaced: `test_bias_field` holds that."""
+"""The steps of the bias correction: its linear algebra is held by `test_bias_field`."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tiny
 
-from gapr_core.config import RegistrarConfig, SensorConfig, SmoothBiasConfig
+from gapr_core.config import RegistrarConfig, SensorConfig, SourceConfig
 from gapr_core.geometry import se3
-from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.fit.refinement import Fit
-from gapr_core.registration.uncertainty import smooth_bias
+from gapr_core.geometry.twists import error_twist, nees
+from gapr_core.registration.checks.assess import bias_corrected
+from gapr_core.registration.checks.deformation import with_looks
+from gapr_core.registration.fit import refinement
+from gapr_core.registration.problem import source as sources
+from gapr_core.registration.uncertainty import covariance
+from gapr_core.registration.uncertainty.linear_model import NormalEquations, equations_of, fields, root_mean_square
+from gapr_core.registration.uncertainty.smooth_bias import (
+    CENTRES,
+    CORRELATION_MM,
+    EVIDENCE,
+    FEWEST_POINTS,
+    LARGEST_MOVE,
+    SIZES_MM,
+    SMALLEST_SHARE,
+    STEPS,
+    believed_size_mm,
+    corrected_fit,
+)
 
-COUNT = 12
-CONFIG = SmoothBiasConfig(fewest_points=10, iterations=3, sizes_mm=(0.5, 1.0), largest_move=22.5)
-STEP = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.015])
-POINTS = np.random.default_rng(0).uniform(-20.0, 20.0, (COUNT, 3)) + [30.0, 0.0, 10.0]
-SOURCE = SimpleNamespace(points=POINTS, neighbours=np.arange(COUNT)[:, None])
-EXACT = np.diag([1.0] * 3 + [1e-2] * 3)
-
-
-def fit_of(T, weights=None):
-    moved = se3.apply(T, POINTS)
-    weights = np.ones(COUNT) if weights is None else weights
-    nothing = np.zeros(COUNT)
-    return Fit(T, 0.5, nothing, weights, np.ones((COUNT, 3)), nothing.astype(int), moved)
-
-
-class Equations:
-    """Evidence for a bias in the first rounds, the same step in each."""
-
-    def __init__(self, believed):
-        self.believed, self.seen, self.effects, self.design_effect = list(believed), [], [], 3.0
-
-    def of(self, fit, spanned):
-        self.seen.append(fit.T)
-        return self
-
-    def with_design_effect(self, effect):
-        self.effects.append(effect)
-        return self
-
-    def log_likelihood(self, sizes_mm, share):
-        assert share == CONFIG.smallest_share and tuple(sizes_mm) == CONFIG.sizes_mm
-        return np.array([self.believed.pop(0), -50.0])  # all on the first size
-
-    def step(self, size_mm):
-        assert size_mm == pytest.approx(0.5)
-        return STEP
+CONFIG = RegistrarConfig(num_threads=1)
+LOOSE = np.diag([1e3] * 3 + [10.0] * 3)
 
 
-@pytest.fixture
-def steps(monkeypatch):
-    """Replaces fields, equations and refinement; says what evidence each round has."""
+@pytest.fixture(scope="module")
+def biased():
+    """600 points of one half of an egg, off it by waves of 1 mm."""
+    egg = tiny.ellipsoid((60.0, 40.0, 30.0), count=4000)
+    rng = np.random.default_rng(0)
+    some = rng.permutation(np.flatnonzero(egg.points[:, 2] > -5.0))[:600]
+    points, normals = egg.points[some], egg.normals[some]
+    wave = np.sin(points @ [0.10, 0.04, 0.02] + 0.5)[:, None]
 
-    def use(*believed):
-        equations = Equations(believed)
-        monkeypatch.setattr(smooth_bias, "fields", lambda fit, length_mm, centres: (length_mm, centres))
-        monkeypatch.setattr(smooth_bias, "equations_of", lambda fit, *of_bias: equations.of(fit, of_bias))
-        monkeypatch.setattr(smooth_bias, "NormalEquations", equations)
-        monkeypatch.setattr(smooth_bias, "evaluate_with_patches", lambda T, points, *_: fit_of(T))
-        return equations
+    def of(fitted=1500, size_mm=1.0):
+        moved = points + size_mm * wave * normals + rng.normal(0.0, 0.1, points.shape)
+        source = sources.prepare(moved, SourceConfig(fitted_points=fitted))
+        fit = refinement.refine_fully(np.eye(4), source.points, egg, CONFIG.refinement, source.neighbours)
+        return refinement.rest_on_whole(fit, source, egg, CONFIG.refinement), source, egg
 
-    return use
-
-
-def corrected(fit, config=CONFIG, covariance=EXACT):
-    return smooth_bias.corrected_fit(fit, covariance, SOURCE, None, RegistrarConfig(smooth_bias=config))
-
-
-def moved_by(count, T):
-    for _ in range(count):
-        T = se3.exp(STEP, se3.apply(T, POINTS).mean(axis=0)) @ T
-    return T
+    return of
 
 
-@pytest.mark.parametrize("rounds", [1, 2, 3])
-def test_each_round_steps_about_the_centroid_of_where_the_source_lies(steps, rounds):
-    equations = steps(9.0, 9.0, 9.0)
-    found = corrected(fit_of(np.eye(4)), replace(CONFIG, iterations=rounds))
-    assert found.T == pytest.approx(moved_by(rounds, np.eye(4)), abs=1e-12) and len(equations.seen) == rounds
-    assert found.bias_mm == pytest.approx(0.5)
-    assert equations.effects == [3.0] * (rounds - 1)  # that of the first round stays
+@pytest.mark.parametrize("fitted", [1500, 200])
+def test_each_step_is_that_of_generalised_least_squares_about_the_centroid_of_all_points(biased, fitted):
+    fit, source, target = biased(fitted)
+    found, before = corrected_fit(fit, LOOSE, source, target, CONFIG), fit.rests_on
+    assert (fit.whole is not None) is (fitted < 600)
+    trust = None if fit.whole is None else refinement.trust_of_whole(fit, source, CONFIG.refinement)
+    spanned, now = fields(before, CORRELATION_MM, CENTRES), before
+    equations = first = equations_of(before, CORRELATION_MM, CENTRES)
+    for _ in range(STEPS):
+        size_mm = believed_size_mm(equations)
+        assert size_mm > 0.0
+        T = se3.exp(equations.step(size_mm), now.moved.mean(axis=0)) @ now.T
+        if trust is None:
+            now = refinement.evaluate_with_patches(T, source.points, target, CONFIG.refinement, source.neighbours)
+        else:
+            now = refinement.evaluate_trusted(T, source.whole, target, CONFIG.refinement, trust)
+        equations = NormalEquations.of(now, spanned).with_design_effect(first.design_effect)  # that of the first stays
+    np.testing.assert_allclose(found.T, T, atol=1e-12)
+    assert found.bias_mm == found.rests_on.bias_mm == pytest.approx(size_mm)
+    assert len(found.moved) == len(source.points) and len(found.rests_on.moved) == 600
+    assert np.array_equal(found.rests_on.weights, now.weights)
 
 
-def test_a_round_without_evidence_is_the_last(steps):
-    steps(9.0, 1.99, 9.0)
-    assert corrected(fit_of(np.eye(4))).T == pytest.approx(moved_by(1, np.eye(4)), abs=1e-12)
+def test_a_bias_is_believed_from_its_evidence_on(biased):
+    sizes = []
+    for size_mm in np.linspace(0.0, 0.4, 9):
+        equations = equations_of(biased(size_mm=size_mm)[0], CORRELATION_MM, CENTRES)
+        log_likelihood = equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
+        expected = root_mean_square(SIZES_MM, log_likelihood) if log_likelihood.max() >= EVIDENCE else 0.0
+        sizes.append(believed_size_mm(equations))
+        assert sizes[-1] == expected
+    assert sizes[0] == 0.0 < sizes[-1]
+    fit, source, target = biased(size_mm=0.0)
+    assert corrected_fit(fit, LOOSE, source, target, CONFIG) is fit
 
 
-def test_without_evidence_the_same_fit_comes_back(steps):
-    steps(1.99)
-    fit = fit_of(np.eye(4))
-    assert corrected(fit) is fit
-
-
-def test_evidence_of_exactly_the_limit_is_believed(steps):
-    steps(2.0, 0.0)
-    assert corrected(fit_of(np.eye(4))).bias_mm > 0.0
-
-
-@pytest.mark.parametrize(("inliers", "is_moved"), [(9, False), (10, True)])
-def test_too_few_inliers_show_no_bias(steps, inliers, is_moved):
-    steps(9.0, 0.0)
-    fit = fit_of(np.eye(4), np.arange(COUNT) < inliers)
-    assert (corrected(fit) is not fit) is is_moved
+@pytest.mark.parametrize(("inliers", "is_moved"), [(FEWEST_POINTS - 1, False), (FEWEST_POINTS, True)])
+def test_too_few_inliers_show_no_bias(biased, inliers, is_moved):
+    fit, source, target = biased()
+    few = replace(fit, weights=np.where(np.cumsum(fit.counts) <= inliers, fit.weights, 0.0))
+    assert (corrected_fit(few, LOOSE, source, target, CONFIG) is not few) is is_moved
 
 
 @pytest.mark.parametrize(("factor", "is_moved"), [(1.01, True), (0.99, False)])
-def test_a_move_beyond_the_limit_in_its_covariance_is_not_made(steps, factor, is_moved):
+def test_a_move_beyond_the_limit_in_its_covariance_is_not_made(biased, factor, is_moved):
     """The limit is a squared Mahalanobis distance of the move; the covariance is scaled to lie on either side."""
-    steps(9.0, 0.0)
-    fit = fit_of(np.eye(4))
-    move = np.array([*(se3.apply(moved_by(1, np.eye(4)), POINTS) - POINTS).mean(axis=0), *STEP[3:]])
-    distance = move @ np.linalg.solve(EXACT, move)
-    found = corrected(fit, covariance=EXACT * distance / CONFIG.largest_move * factor)
+    fit, source, target = biased()
+    moved = corrected_fit(fit, LOOSE, source, target, CONFIG)
+    distance = nees(error_twist(moved.T, fit.T, source.points), LOOSE)
+    found = corrected_fit(fit, LOOSE * distance / LARGEST_MOVE * factor, source, target, CONFIG)
     assert (found is not fit) is is_moved
 
 
-def test_all_points_of_the_source_decide_where_only_some_are_fitted(steps, monkeypatch):
-    """Six of the twelve are fitted: the steps are about the centroid of all, whose trust is in the weights."""
-    equations, some, trusts = steps(9.0, 9.0, 9.0), np.arange(6), []
-    source = SimpleNamespace(points=POINTS[some], neighbours=some[:, None], whole=POINTS)
-    monkeypatch.setattr(smooth_bias, "trust_of_whole", lambda *_: np.linspace(0.0, 1.0, COUNT))
-    monkeypatch.setattr(smooth_bias, "evaluate_trusted", lambda T, *of: trusts.append(of[-1]) or fit_of(T, of[-1]))
-    monkeypatch.setattr(smooth_bias, "evaluate_with_patches", lambda T, points, *_: replace(fit_of(T), moved=points))
-    fit = replace(fit_of(np.eye(4)), moved=POINTS[some], whole=fit_of(np.eye(4)))
-    found = smooth_bias.corrected_fit(fit, EXACT, source, None, RegistrarConfig(smooth_bias=CONFIG))
-    assert found.T == pytest.approx(moved_by(3, np.eye(4)), abs=1e-12) and found.bias_mm == pytest.approx(0.5)
-    assert len(found.moved) == 6 and len(found.whole.moved) == COUNT and found.whole.bias_mm == found.bias_mm
-    assert np.array_equal(found.whole.weights, trusts[-1]) and len(equations.seen) == 3
-
-
-def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(steps, monkeypatch):
-    monkeypatch.setattr(smooth_bias, "estimate", lambda fit, *given: ("estimated", fit.bias_mm, *given[-2:]))
-    config = RegistrarConfig(smooth_bias=CONFIG)
-    known = SimpleNamespace(covariance=EXACT, smooth_mm=0.3, short_mm=0.4)
-    assessment = Assessment(fit_of(np.eye(4)), None, known, {}, 0.9, None, SOURCE, None)
-    steps(0.0)
-    assert smooth_bias.bias_corrected(assessment, config) is assessment
-    steps(9.0, 0.0)
-    found = smooth_bias.bias_corrected(assessment, config)
-    assert found.fit.T == pytest.approx(moved_by(1, np.eye(4)), abs=1e-12)
-    assert found.uncertainty == ("estimated", pytest.approx(0.5), (0.3, 0.4), None) and found.probability == 0.9
-    steps(9.0, 0.0)
-    stated, eye = replace(config, sensor=SensorConfig(scale=0.01)), np.array([0.0, 0.0, -400.0])
-    seen = smooth_bias.bias_corrected(replace(assessment, viewpoint=eye), stated)
-    np.testing.assert_allclose(seen.uncertainty[-1], se3.apply(seen.fit.T, eye[None])[0])
-
-
-def test_a_corrected_pose_keeps_what_its_looks_err_by(steps, monkeypatch):
-    look, asked = np.arange(COUNT) % 2, []
-    monkeypatch.setattr(smooth_bias, "estimate", lambda *_: "estimated")
-    monkeypatch.setattr(smooth_bias, "allowing_for_looks", lambda *given: asked.append(given) or "wider")
-    config = RegistrarConfig(smooth_bias=CONFIG)
-    known = SimpleNamespace(covariance=EXACT, smooth_mm=0.3, short_mm=0.4)
-    steps(9.0, 0.0)
-    found = smooth_bias.bias_corrected(
-        Assessment(fit_of(np.eye(4)), None, known, {}, 0.9, None, SOURCE, None, look=look), config
-    )
-    ((estimated, fit, of_points, settings),) = asked
-    assert found.uncertainty == "wider" and estimated == "estimated" and settings is config
-    assert fit is found.fit and of_points is look
+@pytest.mark.parametrize("sensor", [SensorConfig(), SensorConfig("depth_camera", scale=0.01)])
+@pytest.mark.parametrize("looks", [1, 2])
+def test_an_assessment_gets_the_pose_and_its_covariance_or_stays_the_same(biased, sensor, looks):
+    fit, source, target = biased()
+    config = replace(CONFIG, sensor=sensor)
+    a = tiny.assessed(source.points, target, known=replace(tiny.uncertainty(), covariance=LOOSE))
+    a = replace(a, fit=fit, source=source, viewpoint=np.array([0.0, 0.0, 400.0]), look=np.arange(600) % looks)
+    found = bias_corrected(a, config)
+    expected = corrected_fit(fit, LOOSE, source, target, config)
+    assert np.array_equal(found.fit.T, expected.T) and found.judgement is a.judgement
+    eye = covariance.eye_of(expected.T, a.viewpoint, sensor)
+    misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm
+    known = covariance.estimate(expected, config.covariance, sensor, None, misfits_mm, eye)
+    np.testing.assert_allclose(found.uncertainty.covariance, with_looks(known, expected, a.look).covariance)
+    assert (found.uncertainty.smooth_mm, found.uncertainty.short_mm) == misfits_mm
+    few = replace(a, fit=replace(fit, weights=np.zeros(600)))
+    assert bias_corrected(few, config) is few

@@ -20,20 +20,23 @@ from gapr_core.surface import Surface
 CELL_MM, REACH_MM = 2.0, 8.0
 
 
-def ellipsoid(axes_mm=(30.0, 20.0, 12.0), count=400, variance=0.0) -> PreparedTarget:
+def ellipsoid(axes_mm=(30.0, 20.0, 12.0), count=400, variance=0.0, symmetric=False) -> PreparedTarget:
     """x^T A x = 1 with A = diag(1 / axes^2): normals and second fundamental forms from the implicit function.
 
     The Hessian of (x^T A x - 1) / |2 A x| restricted to the tangent plane, with its sign turned, is the form of the
-    height over the outward normal.
+    height over the outward normal. `symmetric`: its points, too, are their own mirror images.
     """
     A = np.diag(1.0 / np.square(axes_mm))
     points = fibonacci_directions(count) * axes_mm
+    if symmetric:
+        flips = 1.0 - 2.0 * np.indices((2, 2, 2)).reshape(3, -1).T
+        points = np.concatenate([points[(points > 0.5).all(axis=1)] * flip for flip in flips])
     gradient = points @ A
     length = np.linalg.norm(gradient, axis=1)
     normals = gradient / length[:, None]
     tangent = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     shapes = -tangent @ (A / length[:, None, None]) @ tangent
-    return described(points, normals, shapes, np.full(count, variance))
+    return described(points, normals, shapes, np.full(len(points), variance))
 
 
 def plane(size_mm=40.0, step_mm=2.0, variance=0.0) -> PreparedTarget:

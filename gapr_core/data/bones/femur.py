@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FemurParameters:
-    """What a surgeon would measure; ranges hold about 95 % of adults."""
+    """Measures of a surgeon; ranges hold about 95 % of adults."""
 
     length_mm: float = length(395.0, 495.0)
     head_diameter_mm: float = length(41.0, 53.0)

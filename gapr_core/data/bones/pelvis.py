@@ -67,7 +67,7 @@ TUBERCLE = [[22, -84, -65]]
 
 @dataclass(frozen=True)
 class PelvisParameters:
-    """What a surgeon would measure; ranges hold about 95 % of adults."""
+    """Measures of a surgeon; ranges hold about 95 % of adults."""
 
     intercristal_mm: float = length(248.0, 300.0)
     hip_distance_mm: float = length(154.0, 184.0)  # between the centres of the acetabula

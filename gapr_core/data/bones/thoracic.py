@@ -37,7 +37,7 @@ HEIGHT = {1: 8.0, 2: 7.0, 3: 6.5, 4: 6.5, 5: 7.0, 6: 7.5, 7: 8.0, 8: 7.0, 9: 6.0
 
 @dataclass(frozen=True)
 class ThoracicParameters:
-    """What one would measure on a CT; ranges hold about 95 % of adults."""
+    """Measures on a CT; ranges hold about 95 % of adults."""
 
     manubrium_length_mm: float = length(42.0, 56.0)
     body_length_mm: float = length(84.0, 118.0)

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TibiaParameters:
-    """What a surgeon would measure; ranges hold about 95 % of adults."""
+    """Measures of a surgeon; ranges hold about 95 % of adults."""
 
     length_mm: float = length(320.0, 410.0)
     plateau_width_mm: float = length(66.0, 84.0)

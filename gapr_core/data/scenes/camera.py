@@ -40,7 +40,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """What a camera sees.
+    """View of a camera.
 
     Attributes:
         points: (N, 3) mm, without error where `see` made it.

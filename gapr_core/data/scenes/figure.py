@@ -93,7 +93,7 @@ def paint(axes: Any, points: Array, viewpoint: Array | None, colours: Array, up:
         points: (N, 3) mm.
         viewpoint: (3,) mm, where the camera is; None: the cloud is looked at from far away, across its flattest side.
         colours: (N, 3) red, green, blue, 0 to 1, of the lit points.
-        up: (3,) what points upward in the image; the cloud's longest side where it is not given.
+        up: (3,) direction that is up in the image; the cloud's longest side where it is not given.
     """
     image, sight = _image(points, viewpoint, up)
     light = np.abs((_normals(points) * sight).sum(axis=1))[:, None] ** 0.7

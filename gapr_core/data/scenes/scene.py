@@ -1,4 +1,4 @@
-"""The protocols `scene-C1`, `scene-C2`, `scene-C3` and their variants: what a depth camera sees of a bone in a wound.
+"""The protocols `scene-C1`, `scene-C2`, `scene-C3` and their variants: a depth camera's view of a bone in a wound.
 
 The limb is the bone grown by 12-35 mm, the wound a hole in it with a lobed edge above a point of the bone, with up to
 two retractors. The camera is 350-550 mm away and up to 25 degrees off the wound's axis. The source is what it sees in
@@ -45,13 +45,13 @@ TRIES = 60
 
 @dataclass(frozen=True)
 class SceneLevel:
-    """What is in the picture and how much of it is bone.
+    """Things in the picture, and the share of bone.
 
     Attributes:
         bone_share: of the points of the source.
         opening: shape of the wound.
         packed: the wound has walls and a floor of tissue; else the limb is a thin skin.
-        things: what else lies there.
+        things: other things that lie there.
         whole_image: the source is all that the camera sees; else a region about the wound.
         errors: of the camera, and of what lies on the bone.
     """
@@ -81,7 +81,7 @@ SCENE_LEVELS = {
 
 
 class Setting(NamedTuple):
-    """A wound of a bone with what is around it: `parts` are the surfaces, the bone first."""
+    """A wound of a bone with its surroundings: `parts` are the surfaces, the bone first."""
 
     wound: Wound
     parts: list[Surface]

@@ -44,7 +44,7 @@ RANGE = 0.003  # standard deviation of the relative error of a calibrated camera
 
 @dataclass(frozen=True)
 class LookedAt:
-    """What the looks show.
+    """Content of the looks.
 
     Attributes:
         bone_share: of the points of the first look.

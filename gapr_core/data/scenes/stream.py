@@ -1,4 +1,4 @@
-"""A camera that circles a wound while the bone moves: frame by frame what it sees, with the true pose. Seeded."""
+"""Frames of a camera that circles a wound while the bone moves, with the true pose. Seeded."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SceneMotion:
-    """What a stream of scenes looks like.
+    """Settings of a stream of scenes.
 
     Attributes:
         frames: clouds of the stream.
@@ -42,7 +42,7 @@ class SceneMotion:
 
 
 class _Stage(NamedTuple):
-    """What stays the same over a stream; the scene is arranged in the bone's frame of the first image."""
+    """Parts that stay the same over a stream; the scene is arranged in the bone's frame of the first image."""
 
     setting: Setting
     region_mm: float  # radius
@@ -52,8 +52,7 @@ class _Stage(NamedTuple):
 
 
 def simulate(specimen: Specimen, seed: int, motion: SceneMotion | None = None) -> Iterator[Pair]:
-    """Simulate the stream's frames as pairs of one common target, protocol `scene-stream`, with the metadata of a
-    scene.
+    """Simulate frames as pairs of one common target, protocol `scene-stream`, with the metadata of a scene.
 
     Raises:
         ConfigError: a bone on which no wound shows the level's share of bone.

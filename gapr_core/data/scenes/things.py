@@ -1,4 +1,4 @@
-"""What lies around a wound and is no bone: retractors, a hand, a drape."""
+"""Things around a wound that are no bone: retractors, a hand, a drape."""
 
 from __future__ import annotations
 

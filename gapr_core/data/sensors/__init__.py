@@ -1,4 +1,4 @@
-"""Simulators of what measures a bone in surgery: a seeded function from a `Specimen` to an `Acquired` cloud each."""
+"""Simulators of the sensors of surgery: a seeded function from a `Specimen` to an `Acquired` cloud each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every simulator gives, and the view of the bone that it begins with."""
+"""The cloud of every simulator, and the view of the bone from which it starts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Acquired:
         points: (N, 3) mm, in the frame of the bone.
         parameters: what was drawn: `family`, `noise_mm`, `bias_mm`, `outlier_share`, `standoff_mm` (mean offset out of
             the bone), `scale` (1 is true to size), and what the family has of its own.
-        viewpoint: (3,) mm, in the frame of the bone: where a camera stands; None for what has no viewpoint.
+        viewpoint: (3,) mm, in the frame of the bone: where a camera stands; None without a viewpoint.
     """
 
     points: Array

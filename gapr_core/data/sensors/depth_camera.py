@@ -22,7 +22,7 @@ FLYING, FLYING_MM, RIM = 0.06, (1.0, 20.0), 0.45  # largest share, distance behi
 
 
 def depth_camera(specimen: Specimen, rng: np.random.Generator) -> Acquired:
-    """500 to 6000 points of what one camera sees, as dense as its pixels fall."""
+    """Draw 500 to 6000 points of one camera's view, as dense as its pixels fall."""
     view = look(specimen, SHARE, "seen", 30_000, rng)
     viewpoint = view.points.mean(axis=0) + rng.uniform(*DISTANCE_MM) * view.towards
     view = view.only(_pixels(specimen, view, viewpoint, rng))

@@ -51,7 +51,7 @@ def windows(view: View, size_mm: float) -> Windows:
 
 @dataclass(frozen=True, eq=False)
 class Range:
-    """What a camera makes of its cloud whose range is wrong by a factor: rays keep their directions, the size changes.
+    """A range that is wrong by a factor: rays keep their directions, the size changes.
 
     The shift along the look that comes with it is left out: it is part of the pose, which registration looks for.
 

@@ -115,7 +115,9 @@ def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding |
     With a viewpoint, by the share that the pose explains; of another dense cloud, by the share that lies on the bone.
     """
     source, in_scene = assessment.source, assessment.seen is not None
-    if look_agreement.is_refused(assessment) or not (in_scene or len(source.points) >= config.source.dense_points):
+    is_believed = in_scene and assessment.confidence >= config.min_confidence  # and refused for another reason
+    is_cloud = in_scene or len(source.points) >= config.source.dense_points
+    if is_believed or not is_cloud or look_agreement.is_refused(assessment):
         return None
     if in_scene:
         share, limit = assessment.features["inlier_ratio"], MOSTLY_CLUTTER

@@ -15,6 +15,19 @@ from gapr_core.registration.uncertainty import covariance
 from gapr_core.registration.uncertainty import linear_model as bias_field
 
 CONFIG = CovarianceConfig(model_mm=0.0)
+
+
+@pytest.fixture
+def known(monkeypatch):
+    """Changes constants of the covariance."""
+
+    def change(**values):
+        for name, value in values.items():
+            monkeypatch.setattr(covariance, name.upper(), value)
+
+    return change
+
+
 NO_COMMON_BIAS = replace(CONFIG, long_share=0.0, linear_share=0.0)
 NOTHING = Errors(offset_mm=0.0, standoff_mm=0.0, noise_mm=1e-6, bias_mm=0.0, scale=0.0)
 
@@ -242,7 +255,7 @@ def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by():
     """As strains in proportion to the bias do, about the middle of the points that were compared."""
     fit = curved_fit()
     errors = replace(NOTHING, bias_mm=0.8)
-    fields = covariance.fields(fit, CONFIG.correlation_mm, CONFIG.centres)
+    fields = covariance.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
     strained, rigid = (
         covariance.sandwich(fit, fields, errors, replace(CONFIG, long_share=0.0, linear_share=share))
         for share in (0.7, 0.0)
@@ -267,57 +280,58 @@ def test_the_noise_of_few_points_is_larger_than_their_residuals_say():
 
 @pytest.mark.parametrize("size_mm", [0.0, 0.3, 0.9])
 def test_the_bias_is_as_large_as_the_residuals_say(size_mm):
-    """`bias_gain` is for what robust weights hide; without it the size is that which was drawn."""
-    config, sizes = replace(CONFIG, bias_gain=1.0), []
+    """`BIAS_GAIN` is for what robust weights hide; without it the size is that which was drawn."""
+    sizes = []
     for seed in range(6):
         fit = curved_fit(2500, sigma_mm=0.4, seed=seed)
         rng = np.random.default_rng(100 + seed)
-        fields = bias_field.fields(fit, config.correlation_mm, config.centres)
+        fields = bias_field.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
         signed = size_mm * fields @ rng.normal(size=fields.shape[1]) + rng.normal(size=2500) * 0.4
         fit = replace(fit, signed_mm=signed)
         equations = bias_field.NormalEquations.of(fit, fields)
-        sizes.append(covariance.expected_bias_mm(equations, 0.1, config))
+        sizes.append(covariance.expected_bias_mm(equations, 0.1))
     assert np.mean(sizes) == pytest.approx(size_mm, rel=0.25, abs=0.04)
 
 
-def test_without_points_the_bias_is_what_the_sensor_is_known_for():
+def test_without_points_the_bias_is_what_the_sensor_is_known_for(known):
     fit = replace(curved_fit(), weights=np.zeros(300))
     equations = bias_field.NormalEquations.of(fit, bias_field.fields(fit, 20.0, 80))
-    config = replace(CONFIG, bias_spread=0.05, no_bias_mm=0.0)
-    assert covariance.expected_bias_mm(equations, 0.2, config) == pytest.approx(0.2, rel=0.1)
-    assert covariance.expected_bias_mm(equations, 1.0, config) == pytest.approx(1.0, rel=0.1)
+    known(bias_spread=0.05, no_bias_mm=0.0)
+    assert covariance.expected_bias_mm(equations, 0.2) == pytest.approx(0.2, rel=0.1)
+    assert covariance.expected_bias_mm(equations, 1.0) == pytest.approx(1.0, rel=0.1)
 
 
 @pytest.mark.parametrize("typical_mm", [0.3, 0.0])
-def test_without_points_the_bias_is_the_mean_square_of_a_log_normal_size(typical_mm):
+def test_without_points_the_bias_is_the_mean_square_of_a_log_normal_size(known, typical_mm):
     """sqrt(E[s^2]) is m exp(v^2) for a median m and a standard deviation v of the logarithm."""
     steps = np.random.default_rng(4).uniform(0.002, 0.03, 500)  # the sizes are not evenly spaced
-    sizes_mm = tuple(0.01 * np.exp(np.cumsum(steps)))
+    sizes_mm = 0.01 * np.exp(np.cumsum(steps))
     fit = replace(curved_fit(20), weights=np.zeros(20))
     equations = bias_field.NormalEquations.of(fit, bias_field.fields(fit, 20.0, 80))
-    config = replace(CONFIG, bias_spread=0.4, no_bias_mm=0.0, sizes_mm=sizes_mm)
-    found = covariance.expected_bias_mm(equations, typical_mm, config)
+    known(bias_spread=0.4, no_bias_mm=0.0, sizes_mm=sizes_mm)
+    found = covariance.expected_bias_mm(equations, typical_mm)
     if typical_mm:
         assert found == pytest.approx(0.3 * np.exp(0.4**2), rel=2e-3)
     else:  # the smallest size is the median
-        assert found == covariance.expected_bias_mm(equations, sizes_mm[0], config)
-        assert found < covariance.expected_bias_mm(equations, sizes_mm[1], config)
+        assert found == covariance.expected_bias_mm(equations, sizes_mm[0])
+        assert found < covariance.expected_bias_mm(equations, sizes_mm[1])
 
 
-def test_what_residuals_without_a_bias_show_is_taken_off():
+def test_what_residuals_without_a_bias_show_is_taken_off(known):
     fit = replace(curved_fit(20), weights=np.zeros(20))
     equations = bias_field.NormalEquations.of(fit, bias_field.fields(fit, 20.0, 80))
-    whole, less, none = (
-        covariance.expected_bias_mm(equations, 1.0, replace(CONFIG, bias_spread=0.1, no_bias_mm=size))
-        for size in (0.0, 0.6, 3.0)
-    )
+    found = []
+    for size_mm in (0.0, 0.6, 3.0):
+        known(bias_spread=0.1, no_bias_mm=size_mm)
+        found.append(covariance.expected_bias_mm(equations, 1.0))
+    whole, less, none = found
     assert less**2 == pytest.approx(whole**2 - 0.36) and none == 0.0
 
 
-def test_a_pose_is_never_surer_than_a_micrometre():
+def test_a_pose_is_never_surer_than_a_micrometre(known):
     sensor = SensorConfig("laser", 0.0, noise_mm=1e-3, scale=0.0, known_standoff_mm=1e-3)
-    config = replace(CONFIG, bias_gain=0.0, noise_points=0.0)
-    C = covariance.estimate(curved_fit(300, sigma_mm=1e-5), config, sensor).covariance
+    known(bias_gain=0.0, noise_points=0.0)
+    C = covariance.estimate(curved_fit(300, sigma_mm=1e-5), CONFIG, sensor).covariance
     assert (np.diag(C)[:3] >= 1e-6).all() and (np.diag(C)[3:] >= 1e-10).all()
     assert (np.diag(C)[:3] < 1e-5).all() and (np.diag(C)[3:] < 1e-8).all()
     assert np.linalg.eigvalsh(C).min() > 0.0
@@ -374,10 +388,9 @@ def test_fewer_points_than_an_average_needs_show_their_own_spread():
 def test_what_is_known_of_the_sensor_reaches_the_covariance():
     fit = curved_fit(100)
     fit = replace(fit, signed_mm=np.random.default_rng(0).normal(0.0, 0.5, 100))
-    config = replace(CONFIG, centres=80)
 
     def spread(**sensor):
-        return np.trace(covariance.estimate(fit, config, SensorConfig(**sensor)).covariance[:3, :3])
+        return np.trace(covariance.estimate(fit, CONFIG, SensorConfig(**sensor)).covariance[:3, :3])
 
     unknown, known = spread(kind="pointer"), spread(kind="pointer", standoff_mm=0.5)
     assert known < 0.7 * unknown
@@ -391,8 +404,9 @@ def test_what_is_known_of_the_sensor_reaches_the_covariance():
 @pytest.mark.skipif(
     "NUMBA_DISABLE_JIT" in os.environ, reason="24 fits of 1000 points take minutes without the compiler"
 )
-def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target):
+def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target, known):
     """Over draws of noise without bias, refined from the truth: the mean of NEES / 6 is about 1."""
+    known(bias_gain=0.0)
     ratios = []
     for seed in range(24):
         rng = np.random.default_rng(seed)
@@ -400,7 +414,7 @@ def test_noise_alone_gives_the_spread_that_the_covariance_says(femur, target):
         source = points[normals @ [0.0, 1.0, 0.0] > 0.2][:1000]
         source = source + rng.normal(0.0, 0.8, source.shape)
         fit = refinement.refine_fully(np.eye(4), source, target, refinement.RefinementConfig())
-        C = covariance.estimate(fit, replace(CONFIG, bias_gain=0.0), SensorConfig("laser", 0.0, scale=0.0)).covariance
+        C = covariance.estimate(fit, CONFIG, SensorConfig("laser", 0.0, scale=0.0)).covariance
         ratios.append(nees(error_twist(fit.T, np.eye(4), source), C) / 6.0)
     assert 0.4 < np.mean(ratios) < 1.6
 
@@ -411,23 +425,27 @@ def test_the_bias_in_two_points_is_alike_by_a_normal_curve_of_their_distance():
     np.testing.assert_allclose(bias_field.smooth_correlation(points[:1], points, 20.0)[0], expected)
 
 
-def test_a_share_of_the_bias_moves_all_points_together():
+def test_a_share_of_the_bias_moves_all_points_together(known):
     fit = curved_fit(400)
-    fields = bias_field.fields(fit, CONFIG.correlation_mm, CONFIG.centres)
+    fields = bias_field.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
     noise = np.random.default_rng(0).normal(0.0, 0.5, 400)
     fit = replace(fit, signed_mm=0.6 * fields @ np.random.default_rng(1).normal(size=fields.shape[1]) + noise)
-    without, with_it = (covariance.estimate(fit, replace(CONFIG, long_share=share)) for share in (0.0, 2.0))
-    effect = bias_field.equations_of(fit, CONFIG.correlation_mm, CONFIG.centres).design_effect
+    found = []
+    for share in (0.0, 2.0):
+        known(long_share=share)
+        found.append(covariance.estimate(fit, CONFIG))
+    without, with_it = found
+    effect = bias_field.equations_of(fit, covariance.CORRELATION_MM, covariance.CENTRES).design_effect
     sigma_mm = np.sqrt(effect) * 0.5
-    noise_mm = covariance.expected_noise_mm(sigma_mm, np.count_nonzero(fit.weights), 0.5, CONFIG.noise_points)
+    noise_mm = covariance.expected_noise_mm(sigma_mm, np.count_nonzero(fit.weights), 0.5, covariance.NOISE_POINTS)
     together = covariance.gain_of(fit, fields, noise_mm)[0].sum(axis=1)
     expected = (2.0 * without.bias_mm) ** 2 * np.outer(together, together)
     np.testing.assert_allclose(with_it.covariance - without.covariance, expected, rtol=1e-4, atol=1e-9)
 
 
-def test_points_that_err_alike_make_the_noise_of_the_pose_larger():
+def test_points_that_err_alike_make_the_noise_of_the_pose_larger(known):
     """The variance of a pose under the noise alone grows by the design effect."""
-    config = replace(CONFIG, bias_gain=0.0, noise_points=0.0)
+    known(bias_gain=0.0, noise_points=0.0)
     sensor = SensorConfig(standoff_mm=0.0, known_standoff_mm=1e-3, scale=0.0)
     fit = curved_fit(2000, sigma_mm=0.5)
     rng = np.random.default_rng(3)
@@ -437,7 +455,19 @@ def test_points_that_err_alike_make_the_noise_of_the_pose_larger():
         signed = np.empty(2000)
         signed[near] = np.repeat(rng.normal(0.0, 0.5, 2000 // clump), clump)
         alike = replace(fit, signed_mm=signed, moved=fit.moved + signed[:, None] * fit.gradients)
-        effects.append(bias_field.equations_of(alike, CONFIG.correlation_mm, CONFIG.centres).design_effect)
-        sizes.append(np.trace(covariance.estimate(alike, config, sensor).covariance[:3, :3]))
+        effects.append(bias_field.equations_of(alike, covariance.CORRELATION_MM, covariance.CENTRES).design_effect)
+        sizes.append(np.trace(covariance.estimate(alike, CONFIG, sensor).covariance[:3, :3]))
     assert effects[1] > 2.0 * effects[0]
     assert sizes[1] / sizes[0] == pytest.approx(effects[1] / effects[0], rel=0.05)
+
+
+def test_what_was_not_observed_is_uncertain_and_not_exact():
+    """Of a plane: the slides and the spin are not known at all, and across it only its stand-off is not."""
+    points = np.column_stack([np.random.default_rng(1).uniform(-30.0, 30.0, (500, 2)), np.zeros(500)])
+    up, signed = np.tile([0.0, 0.0, 1.0], (500, 1)), np.random.default_rng(2).normal(0.0, 0.2, 500)
+    fit = refinement.Fit(np.eye(4), 0.2, signed, np.ones(500), up, np.zeros(500, dtype=np.int64), points)
+    for weights in (np.ones(500), np.zeros(500)):
+        found = covariance.estimate(replace(fit, weights=weights), CovarianceConfig())
+        assert found.largest_shift_mm > 100.0 and found.largest_turn_deg > 100.0
+        np.linalg.cholesky(found.covariance)
+        assert (np.sqrt(found.covariance[2, 2]) < 0.6) is bool(weights.any())

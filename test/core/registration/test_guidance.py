@@ -6,16 +6,24 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, RegistrarConfig
-from gapr_core.config import GuidanceConfig, SensorConfig
+from gapr_core.config import SensorConfig
 from gapr_core.geometry import se3
 from gapr_core.registration import guidance
+from gapr_core.registration.confidence.classifier import Judgement
 from gapr_core.registration.guidance import guide, information
 from gapr_core.registration.problem import target as targets
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Hypothesis
 
-CONFIG = GuidanceConfig(patches=120)
+DOUBTFUL = Judgement(float(np.log(0.4 / 0.6)), 3.0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_patches():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(guidance, "PATCHES", 120)
+        yield
 
 
 def test_the_information_of_a_look_is_that_of_its_noise_and_of_the_bias_that_its_points_share():
@@ -44,7 +52,7 @@ def distal(femur, registrar, target):
 
 
 def test_the_far_end_of_the_bone_is_where_a_look_helps_most(distal):
-    found = guide(distal, CONFIG)
+    found = guide(distal)
     best, seen = found.patches[0], distal.fit.moved
     assert best.centre[2] > seen[:, 2].max() + 30.0
     assert best.tre95_mm < 0.8 * distal.tre95_mm
@@ -55,7 +63,7 @@ def test_the_far_end_of_the_bone_is_where_a_look_helps_most(distal):
 
 
 def test_what_was_seen_is_not_looked_at_again(distal):
-    found = guide(distal, CONFIG)
+    found = guide(distal)
     tree = guidance.cKDTree(distal.fit.moved)
     for patch in found.patches:
         members = distal.target.tree.query_ball_point(patch.centre, 5.0)
@@ -63,20 +71,20 @@ def test_what_was_seen_is_not_looked_at_again(distal):
     everything = replace(
         distal, fit=replace(distal.fit, moved=distal.target.points, weights=np.ones(len(distal.target.points)))
     )
-    assert guide(everything, CONFIG) is None
+    assert guide(everything) is None
 
 
 def test_the_expected_bound_is_that_of_the_updated_covariance(distal):
-    found = guide(distal, CONFIG)
+    found = guide(distal)
     target, centre = distal.target, distal.centre_mm
     patch = found.patches[0]
-    members = np.array(target.tree.query_ball_point(patch.centre, CONFIG.patch_mm / 2.0))
+    members = np.array(target.tree.query_ball_point(patch.centre, guidance.PATCH_MM / 2.0))
     members = members[target.normals[members] @ patch.normal > 0.3]
     normals = target.normals[members]
     J = np.hstack([normals, np.cross(target.points[members] - centre, normals)])
-    noise_mm, bias_mm = max(distal.fit.sigma_mm, CONFIG.noise_mm), max(distal.uncertainty.bias_mm, CONFIG.bias_mm)
+    noise_mm, bias_mm = max(distal.fit.sigma_mm, guidance.NOISE_MM), max(distal.uncertainty.bias_mm, guidance.BIAS_MM)
     after = np.linalg.inv(distal.uncertainty.covariance)
-    after = np.linalg.inv(after + information(J, CONFIG.points, noise_mm, bias_mm))
+    after = np.linalg.inv(after + information(J, guidance.LOOK_POINTS, noise_mm, bias_mm))
     bound_mm = precision.bound_mm(after, target.points[target.anchors], centre)
     over_all = distal.tre95_mm / distal.bound_mm(target.points[target.anchors])
     assert patch.tre95_mm == pytest.approx(over_all * distal.factor95 * bound_mm)
@@ -87,8 +95,13 @@ def test_a_rival_sends_the_probe_to_where_it_differs(distal):
     turn = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 1.5], distal.fit.moved.mean(axis=0))
     poses = np.stack([distal.candidates.poses[0], turn @ distal.fit.T])
     scores = np.repeat(distal.candidates.scores[0], 2)
-    rival = replace(distal, candidates=replace(distal.candidates, poses=poses, scores=scores), probability=0.4)
-    found = guide(rival, CONFIG)
+    rival = replace(
+        distal,
+        candidates=replace(distal.candidates, poses=poses, scores=scores),
+        judgement=DOUBTFUL,
+        other_bone_prior=0.0,
+    )
+    found = guide(rival)
     assert found.now_mm > 2.0 * distal.tre95_mm
     assert found.patches[0].rivals_excluded > 0.95
     assert min(patch.rivals_excluded for patch in found.patches) < 0.7
@@ -120,46 +133,53 @@ def test_a_stand_off_excludes_no_rival_that_fits_as_well(distal):
         assert excluded.max() < 0.02
 
 
-def test_a_look_that_says_nothing_gains_nothing(distal):
+def test_a_look_that_says_nothing_gains_nothing(distal, monkeypatch):
     """What is known now is the bound over the same points as what would be known then."""
-    found = guide(distal, replace(CONFIG, noise_mm=100.0, points=1))
+    monkeypatch.setattr(guidance, "NOISE_MM", 100.0)
+    monkeypatch.setattr(guidance, "LOOK_POINTS", 1)
+    found = guide(distal)
     gains = np.array([patch.gain_mm for patch in found.patches])
     assert np.all(gains >= 0.0) and gains.max() < 1e-3 * found.now_mm
 
 
 def test_what_is_handed_out_is_nobody_else_s(distal):
     points = distal.target.points.copy()
-    found = guide(distal, CONFIG)
+    found = guide(distal)
     found.points[:] /= 1000.0
     found.patches[0].centre[:] = found.patches[0].normal[:] = 0.0
     np.testing.assert_array_equal(distal.target.points, points)
 
 
-def rivalled(distal, turn_rad, probability=0.4):
+def rivalled(distal, turn_rad):
     turn = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, turn_rad], distal.fit.moved.mean(axis=0))
     poses = np.stack([distal.candidates.poses[0], turn @ distal.fit.T])
     scores = np.repeat(distal.candidates.scores[0], 2)
-    return replace(distal, candidates=replace(distal.candidates, poses=poses, scores=scores), probability=probability)
+    return replace(
+        distal,
+        candidates=replace(distal.candidates, poses=poses, scores=scores),
+        judgement=DOUBTFUL,
+        other_bone_prior=0.0,
+    )
 
 
 def test_the_bias_that_was_found_makes_a_look_exclude_less(distal):
     """1 - exp(-d^2 / 2 (s^2 + b^2)), b the larger one of what was found and what is assumed."""
     rival, shares = rivalled(distal, 0.1), {}
-    for bias_mm in (0.1, CONFIG.bias_mm, 3.0):
+    for bias_mm in (0.1, guidance.BIAS_MM, 3.0):
         uncertain = replace(rival, uncertainty=replace(rival.uncertainty, bias_mm=bias_mm))
-        found = guide(uncertain, CONFIG)
+        found = guide(uncertain)
         shares[bias_mm] = {tuple(patch.centre): patch.rivals_excluded for patch in found.patches}
-    assert shares[0.1] == shares[CONFIG.bias_mm]
-    variances = (max(distal.fit.sigma_mm, CONFIG.noise_mm) ** 2 + bias_mm**2 for bias_mm in (CONFIG.bias_mm, 3.0))
+    assert shares[0.1] == shares[guidance.BIAS_MM]
+    variances = (max(distal.fit.sigma_mm, guidance.NOISE_MM) ** 2 + bias_mm**2 for bias_mm in (guidance.BIAS_MM, 3.0))
     ratio = next(variances) / next(variances)
     for centre, share in shares[3.0].items():
-        assert share == pytest.approx(1.0 - (1.0 - shares[CONFIG.bias_mm][centre]) ** ratio, abs=1e-9)
+        assert share == pytest.approx(1.0 - (1.0 - shares[guidance.BIAS_MM][centre]) ** ratio, abs=1e-9)
 
 
 def test_what_the_rivals_leave_open_counts_by_their_probability(distal):
     """now^2 = bound^2 + sum of p d^2; after a look the same with what it leaves of each."""
     rival = rivalled(distal, 1.5)
-    found, target = guide(rival, CONFIG), distal.target
+    found, target = guide(rival), distal.target
     best, other = rival.hypotheses
     motion = best.T_target_source @ se3.inverse(other.T_target_source)
     apart_mm2 = se3.rms_apart_mm(np.eye(4), motion, target.points[target.anchors]) ** 2
@@ -172,37 +192,46 @@ def test_what_the_rivals_leave_open_counts_by_their_probability(distal):
 
 def test_what_points_that_are_not_fitted_show_is_seen_too(distal):
     everywhere = replace(distal.fit, moved=distal.target.points, weights=np.ones(len(distal.target.points)))
-    assert guide(distal, CONFIG) is not None
-    assert guide(replace(distal, fit=replace(distal.fit, whole=everywhere)), CONFIG) is None
+    assert guide(distal) is not None
+    assert guide(replace(distal, fit=replace(distal.fit, whole=everywhere))) is None
 
 
 def test_a_sensor_that_stands_off_has_seen_the_bone_under_it(distal):
     """Everything was seen, 8 mm outside: with the stand-off there is nothing left to look at."""
     target, far_mm = distal.target, 8.0
-    assert far_mm > CONFIG.seen_mm
+    assert far_mm > guidance.SEEN_MM
     outside = target.points + far_mm * target.normals
     lifted = replace(distal, fit=replace(distal.fit, moved=outside, weights=np.ones(len(outside))))
-    assert guide(lifted, CONFIG) is not None
+    assert guide(lifted) is not None
     sensor = SensorConfig(standoff_mm=far_mm)
-    assert guide(replace(lifted, target=offset_surface(target, sensor)), CONFIG) is None
+    assert guide(replace(lifted, target=offset_surface(target, sensor))) is None
 
 
-def test_only_the_likeliest_rivals_count(distal):
+def test_only_the_likeliest_rivals_count(distal, monkeypatch):
     """A ball has thousands of rivals; the second one here is the likelier, so that alone it decides."""
     turns = [se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, angle], distal.fit.moved.mean(axis=0)) for angle in (0.2, 1.5)]
     poses = np.stack([distal.fit.T, *(turn @ distal.fit.T for turn in turns)])
     scores = distal.candidates.scores[0] * np.array([1.0, 1.3, 1.01])
-    many = replace(distal, candidates=replace(distal.candidates, poses=poses, scores=scores), probability=0.4)
+    many = replace(
+        distal,
+        candidates=replace(distal.candidates, poses=poses, scores=scores),
+        judgement=DOUBTFUL,
+        other_bone_prior=0.0,
+    )
     first, second = (rival.probability for rival in many.hypotheses[1:])
     assert 0.0 < first < second
     alone = replace(many, candidates=replace(many.candidates, poses=poses[[0, 2]], scores=scores[[0, 2]]))
-    found, one, none = (guide(case, replace(CONFIG, rivals=count)) for case, count in ((many, 2), (many, 1), (many, 0)))
-    assert one.patches[0].rivals_excluded == guide(alone, CONFIG).patches[0].rivals_excluded
+    of_one, guided = guide(alone).patches[0].rivals_excluded, []
+    for count in (2, 1, 0):
+        monkeypatch.setattr(guidance, "MOST_RIVALS", count)
+        guided.append(guide(many))
+    found, one, none = guided
+    assert one.patches[0].rivals_excluded == of_one
     assert found.now_mm > one.now_mm > none.now_mm == pytest.approx(many.tre95_mm)
 
 
 def test_the_registrar_says_where_to_look_only_when_asked(target, distal):
     for asked in (False, True):
-        registrar = Registrar(RegistrarConfig(num_threads=1, guide=asked, guidance=CONFIG))
+        registrar = Registrar(RegistrarConfig(num_threads=1, guide=asked))
         result = registrar.register(distal.source.points, target)
         assert (result.guidance is not None) is asked

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gapr_core.config import CovarianceConfig, RefinementConfig, RegistrarConfig, SmoothBiasConfig, SourceConfig
+from gapr_core.config import CovarianceConfig, RefinementConfig, RegistrarConfig, SourceConfig
 from gapr_core.data.degradation import bias_along_normals
 from gapr_core.geometry import se3
 from gapr_core.registration.fit.refinement import refine_fully, rest_on_whole
@@ -10,7 +10,7 @@ from gapr_core.registration.uncertainty.covariance import estimate
 from gapr_core.registration.uncertainty.linear_model import NormalEquations
 from gapr_core.registration.uncertainty.smooth_bias import believed_size_mm, corrected_fit
 
-REFINEMENT, CONFIG = RefinementConfig(), SmoothBiasConfig()
+REFINEMENT = RefinementConfig()
 
 
 def view(femur, target, seed, bias_mm, noise_mm=0.4, fitted=1500, at_rest=rest_on_whole):
@@ -26,9 +26,9 @@ def view(femur, target, seed, bias_mm, noise_mm=0.4, fitted=1500, at_rest=rest_o
     return prepared, at_rest(fit, prepared, target, REFINEMENT)
 
 
-def without_bias(fit, source, target, config=CONFIG):
+def without_bias(fit, source, target):
     known = estimate(fit, CovarianceConfig()).covariance
-    return corrected_fit(fit, known, source, target, RegistrarConfig(smooth_bias=config))
+    return corrected_fit(fit, known, source, target, RegistrarConfig())
 
 
 def error_mm(T, source):
@@ -63,18 +63,6 @@ def test_without_a_bias_the_pose_stays_bit_by_bit(femur, target):
         assert without_bias(fit, source, target) is fit
 
 
-def test_too_few_points_and_infinite_evidence_leave_the_pose(femur, target):
-    source, fit = view(femur, target, 0, bias_mm=1.5)
-    for config in (SmoothBiasConfig(evidence=np.inf), SmoothBiasConfig(fewest_points=10_000)):
-        assert without_bias(fit, source, target, config) is fit
-
-
-def test_a_move_that_the_covariance_rules_out_is_not_made(femur, target):
-    source, fit = view(femur, target, 0, bias_mm=1.5)
-    assert without_bias(fit, source, target) is not fit
-    assert corrected_fit(fit, np.eye(6) * 1e-8, source, target, RegistrarConfig()) is fit
-
-
 @pytest.mark.parametrize("size_mm", [0.0, 0.2, 0.8])
 def test_the_size_of_a_bias_is_found_and_a_motion_with_it(size_mm):
     """Linear problem with fields and motions drawn at random: the estimate is right on average."""
@@ -85,7 +73,7 @@ def test_the_size_of_a_bias_is_found_and_a_motion_with_it(size_mm):
         y = -J @ expected + fields @ rng.normal(0.0, size_mm or 1e-9, 20) + rng.normal(0.0, 0.5, count)
         WJ, WF = J / 0.25, fields / 0.25
         equations = NormalEquations(J.T @ WJ, J.T @ WF, fields.T @ WF, WJ.T @ y, WF.T @ y)
-        sizes.append(believed_size_mm(equations, CONFIG))
+        sizes.append(believed_size_mm(equations))
         motions.append(equations.step(max(sizes[-1], 0.05)))
     assert np.mean(sizes) == pytest.approx(size_mm, rel=0.25, abs=0.02)
     assert np.mean(motions, axis=0) == pytest.approx(expected, abs=0.02)

@@ -97,7 +97,7 @@ def _patches(target: PreparedTarget) -> Patches:
 
 def _unseen(patches: Patches, assessment: Assessment) -> Patches:
     """Select the patches of which the source shows less than half."""
-    fit = assessment.fit.rests_on
+    fit = assessment.fit.full_fit
     seen = fit.moved[fit.counts]
     if not len(seen):
         return patches

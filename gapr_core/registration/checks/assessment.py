@@ -111,7 +111,7 @@ class Assessment:
     def residuals(self) -> Residuals:
         """Residuals of every source point under the best pose."""
         if self.seen is None or self.members is None:
-            fit = self.fit.rests_on
+            fit = self.fit.full_fit
             points = self.source.points if fit is self.fit else self.source.whole
             return Residuals(points, fit.signed_mm, fit.counts)
         distance_mm = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]

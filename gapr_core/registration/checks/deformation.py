@@ -50,7 +50,7 @@ def deformation(fit: Fit) -> tuple[Finding, Array] | None:
 
     Several may be found at once: a bent source is strained, too. The finding names the surest.
     """
-    found = {name: each for name, each in of_deformations(fit.rests_on).items() if each.shown.log_ratio > each.limit}
+    found = {name: each for name, each in of_deformations(fit.full_fit).items() if each.shown.log_ratio > each.limit}
     if not found:
         return None
     added = np.zeros((6, 6))
@@ -136,7 +136,7 @@ def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:
     """Compute the (6, 6) covariance of the pose of either half, where they move apart by `size_mm`."""
-    rests = fit.rests_on
-    moved = rests.moved[rests.counts]
+    full = fit.full_fit
+    moved = full.moved[full.counts]
     deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / extent.radius_mm(moved)] * 3)
     return covariance_about(fit.moved.mean(axis=0) - moved.mean(axis=0), np.diag(deviations**2))

@@ -116,11 +116,11 @@ def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
     Noise and the curvature of the bone take neighbours off their plane. Their foot points show the curvature alone, and
     variances add up. The median of the remainder has the standard error of one of as many independent patches.
     """
-    curved_mm = fit_planes(fit.rests_on.feet, source.patches)[1]
+    curved_mm = fit_planes(fit.full_fit.feet, source.patches)[1]
     left_mm2 = flatness_mm**2 - curved_mm**2
     middle_mm2 = float(np.median(left_mm2))
     spread_mm2 = SD_OF_MEDIAN * float(np.median(np.abs(left_mm2 - middle_mm2)))
-    patches = max(len(fit.rests_on.feet) / source.patches.shape[1], 1.0)
+    patches = max(len(fit.full_fit.feet) / source.patches.shape[1], 1.0)
     most_mm2 = middle_mm2 + SURE_SIGMAS * ERROR_OF_MEDIAN * spread_mm2 / np.sqrt(patches)
     return float(np.sqrt(max(most_mm2, 0.0)))
 
@@ -153,7 +153,7 @@ def scale_of(fit: Fit) -> tuple[float, float]:
     Returns:
         The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
     """
-    fit = fit.rests_on
+    fit = fit.full_fit
     if np.count_nonzero(fit.counts) < FEWEST_FOR_SIZE:
         return 0.0, 1.0
     growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # feet: points carry noise

@@ -57,7 +57,7 @@ class Fit:
     whole: Fit | None = None
 
     @property
-    def rests_on(self) -> Fit:
+    def full_fit(self) -> Fit:
         """Fit of the same pose with all points of the source."""
         return self.whole or self
 

@@ -112,16 +112,16 @@ def estimate(
         misfits_mm: the smooth and the short misfit, if known; else they are measured.
         eye: (3,) mm, target frame: place of a camera with wrong ranges (`eye_of`); None for an error of size alone.
     """
-    rests = fit.rests_on
-    count = int(np.count_nonzero(rests.weights))
+    full = fit.full_fit
+    count = int(np.count_nonzero(full.weights))
     known = sensors.errors(sensor or SensorConfig(), count)
-    spanned = fields(rests, CORRELATION_MM, CENTRES)
-    equations = equations_of(rests, CORRELATION_MM, CENTRES)
+    spanned = fields(full, CORRELATION_MM, CENTRES)
+    equations = equations_of(full, CORRELATION_MM, CENTRES)
     bias_mm = BIAS_GAIN * expected_bias_mm(equations, known.bias_mm)
-    sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
+    sigma_mm = float(np.sqrt(equations.design_effect)) * full.sigma_mm
     noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, NOISE_POINTS)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
-    covariance = _about_middle(fit, sandwich(rests, spanned, expected, config, eye))
+    covariance = _about_middle(fit, sandwich(full, spanned, expected, config, eye))
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, NEIGHBOURS, around)
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm)
@@ -137,17 +137,17 @@ def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | N
 
 def covariance_added_by(fit: Fit, errors: Array) -> Array:
     """Compute the (6, 6) covariance that independent `errors` (n, k), mm, of the full fit's inliers add."""
-    rests = fit.rests_on
-    spanned = fields(rests, CORRELATION_MM, CENTRES)
-    moved = gain_of(rests, spanned, rests.sigma_mm)[0] @ errors
+    full = fit.full_fit
+    spanned = fields(full, CORRELATION_MM, CENTRES)
+    moved = gain_of(full, spanned, full.sigma_mm)[0] @ errors
     return _about_middle(fit, moved @ moved.T)
 
 
 def _about_middle(fit: Fit, covariance: Array) -> Array:
     """Shift the covariance (6, 6) of a full fit to the middle of the fit's own points."""
-    if fit.rests_on is fit:
+    if fit.full_fit is fit:
         return covariance
-    return covariance_about(fit.moved.mean(axis=0) - fit.rests_on.moved.mean(axis=0), covariance)
+    return covariance_about(fit.moved.mean(axis=0) - fit.full_fit.moved.mean(axis=0), covariance)
 
 
 def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:

@@ -47,7 +47,7 @@ def corrected_fit(
         source, target: the refined source and its target.
         config: settings with which `fit` was refined.
     """
-    refinement, before = config.refinement, fit.rests_on
+    refinement, before = config.refinement, fit.full_fit
     if np.count_nonzero(before.counts) < FEWEST_POINTS:
         return fit
     trust = None if fit.whole is None else trust_of_whole(fit, source, refinement)

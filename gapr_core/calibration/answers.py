@@ -159,12 +159,12 @@ def _predicted(
     predict: Callable[[Model, Answers], Array],
 ) -> Array:
     """Predict (N, ...) the judged answers of each fold by a model of its fitted ones."""
-    found: list[tuple[Mask, Array]] = []
+    predictions: list[tuple[Mask, Array]] = []
     for judged, fitted in folds:
         if judged.any():
-            found.append((judged, predict(fit(_enough(answers.of(fitted))), answers.of(judged))))
-    result = np.full((len(answers), *found[0][1].shape[1:]), np.nan)
-    for judged, values in found:
+            predictions.append((judged, predict(fit(_enough(answers.of(fitted))), answers.of(judged))))
+    result = np.full((len(answers), *predictions[0][1].shape[1:]), np.nan)
+    for judged, values in predictions:
         result[judged] = values
     return result
 

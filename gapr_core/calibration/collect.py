@@ -81,9 +81,9 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = Non
     left = [task for task in tasks if _name(task) not in done]
     where = (tasks[0].folder, tasks[0].split)
     shared = *where, pairs.bones_of(*where) if left else {}
-    found = _on_cluster(left, dask, shared) if dask else _in_processes(left, jobs, shared)
+    records = _on_cluster(left, dask, shared) if dask else _in_processes(left, jobs, shared)
     with path.open("a") as file:
-        for made in tqdm(found, total=len(left), unit="pair"):
+        for made in tqdm(records, total=len(left), unit="pair"):
             record = made | {"made_of": made_of[_is_stream(made)]}
             file.write(json.dumps(record) + "\n")
             file.flush()

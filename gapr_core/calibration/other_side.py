@@ -21,8 +21,8 @@ def on_own_side(mirrored: Specimen, specimen: Specimen) -> Array:
     rng = np.random.default_rng(0)
     moving, fixed = mirrored.sample(POINTS, rng)[0], specimen.sample(MODEL_POINTS, rng)[0]
     tree = cKDTree(fixed)
-    found = [_icp(start, moving, fixed, tree) for start in _turns(moving, fixed)]
-    return min(found, key=lambda each: each[1])[0]
+    fits = [_icp(start, moving, fixed, tree) for start in _turns(moving, fixed)]
+    return min(fits, key=lambda each: each[1])[0]
 
 
 def _turns(moving: Array, fixed: Array) -> list[Array]:

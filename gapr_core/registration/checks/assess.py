@@ -56,11 +56,10 @@ def checked_geometry(assessment: Assessment, config: RegistrarConfig) -> Assessm
 
 def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """Move the pose to where a smooth bias does not pull it; the same object without evidence of a bias."""
-    a = assessment
-    fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config)
-    if fit is a.fit:
-        return a
-    misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # of the assessed fit
-    eye = covariance.eye_of(fit.T, a.viewpoint, config.sensor)
+    fit = corrected_fit(assessment.fit, assessment.uncertainty.covariance, assessment.source, assessment.target, config)
+    if fit is assessment.fit:
+        return assessment
+    misfits_mm = assessment.uncertainty.smooth_mm, assessment.uncertainty.short_mm  # of the assessed fit
+    eye = covariance.eye_of(fit.T, assessment.viewpoint, config.sensor)
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, None, misfits_mm, eye)
-    return replace(a, fit=fit, uncertainty=with_looks(uncertainty, fit, a.look))
+    return replace(assessment, fit=fit, uncertainty=with_looks(uncertainty, fit, assessment.look))

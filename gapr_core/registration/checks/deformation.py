@@ -50,15 +50,15 @@ def deformation(fit: Fit) -> tuple[Finding, Array] | None:
 
     Several may be found at once: a bent source is strained, too. The finding names the surest.
     """
-    found = {name: each for name, each in of_deformations(fit.full_fit).items() if each.shown.log_ratio > each.limit}
-    if not found:
+    detected = {name: each for name, each in of_deformations(fit.full_fit).items() if each.shown.log_ratio > each.limit}
+    if not detected:
         return None
     added = np.zeros((6, 6))
-    for name, each in found.items():
+    for name, each in detected.items():
         added += covariance_added_by(fit, each.shown.size_mm * each.changes)
         if name == "apart":
             added += covariance_of_half(fit, each.shown.size_mm)
-    name, surest = max(found.items(), key=lambda item: item[1].shown.log_ratio)
+    name, surest = max(detected.items(), key=lambda item: item[1].shown.log_ratio)
     finding = Finding(
         name, Effect.WIDEN, surest.shown.log_ratio, surest.limit, RegistrationStatus.OK, TEXTS[name], ADVICE
     )
@@ -113,10 +113,10 @@ def with_looks(uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64] |
         fit: the common pose.
         look: (N,) number of each point's look; None of a single one.
     """
-    found = None if look is None else of_looks(fit, look)
-    if found is None or not found.shown.log_ratio > found.limit:
+    looks = None if look is None else of_looks(fit, look)
+    if looks is None or not looks.shown.log_ratio > looks.limit:
         return uncertainty
-    return uncertainty.with_more(covariance_added_by(fit, found.shown.size_mm * found.changes))
+    return uncertainty.with_more(covariance_added_by(fit, looks.shown.size_mm * looks.changes))
 
 
 def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
@@ -130,8 +130,8 @@ def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
     numbers, group = np.unique(of_inliers, return_inverse=True)
     moved, group = motions(fit), group.reshape(-1)
     changes = np.column_stack([np.where(group == k, 1.0, 0.0)[:, None] * moved for k in range(len(numbers))])
-    (found,) = shown(blocks(fit, fit.jacobian[fit.counts], [changes], group))
-    return Deformation(found, changes, 0.0)
+    (evidence,) = shown(blocks(fit, fit.jacobian[fit.counts], [changes], group))
+    return Deformation(evidence, changes, 0.0)
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:

@@ -217,9 +217,9 @@ def _outer_cortex(
     points: Array, normals: Array, spacing_mm: float, config: TargetConfig, num_threads: int
 ) -> tuple[Array, Array] | None:
     """Select points and outward normals of a hollow bone's outer cortex; None for a bone of one surface."""
-    found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions, num_threads)
-    if found is None:
+    layer = visibility.outer_layer(points, normals, spacing_mm, config.view_directions, num_threads)
+    if layer is None:
         return None
-    points, outward = points[found[0]], found[1][found[0]]
+    points, outward = points[layer[0]], layer[1][layer[0]]
     _, neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
     return points, quadrics.orient(quadrics.local_frames(points, neighbours, num_threads).normals, outward)

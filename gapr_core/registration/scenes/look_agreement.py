@@ -86,11 +86,11 @@ def unless_apart(
     if len(scene.given) < 2:
         return assessment
     fits = [LookFit.TOO_SMALL] * len(scene.given)
-    found = _fits(assessment, scene, target, alone, config)
-    for name, fit in zip(scene.names, found, strict=True):
+    own_fits = _fits(assessment, scene, target, alone, config)
+    for name, fit in zip(scene.names, own_fits, strict=True):
         fits[name] = fit
     answers = tuple(map(LookAnswer, scene.given, fits))
-    do_not_fit = LookFit.APART in found or 2 * found.count(LookFit.BLIND) >= len(found)
+    do_not_fit = LookFit.APART in own_fits or 2 * own_fits.count(LookFit.BLIND) >= len(own_fits)
     return replace(assessment, looks=answers).with_finding(_apart(answers) if do_not_fit else None)
 
 
@@ -105,11 +105,11 @@ def _fits(
     """Judge the fit of each of the K looks; not asked where the pose is refused anyway."""
     if not assessment.reaches(config.worth_checking):
         return [LookFit.NOT_ASKED] * len(scene.images)
-    found = look_fits(assessment.fit.T, scene, target, config)
-    for number, fit in enumerate(found):
+    fits = look_fits(assessment.fit.T, scene, target, config)
+    for number, fit in enumerate(fits):
         if fit is LookFit.APART and _has_same_pose(alone(scene.each[number]), assessment, config):
-            found[number] = LookFit.FITS
-    return found
+            fits[number] = LookFit.FITS
+    return fits
 
 
 def _has_same_pose(own: Assessment | None, common: Assessment, config: RegistrarConfig) -> bool:
@@ -126,15 +126,15 @@ def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarC
         return [LookFit.FITS]
     signed, _, aside, _ = kernels.residuals_at(T, scene.source.points, *target.kernel_view, 0.0)
     close = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < REACH_MM
-    found = [_shares_of_look(T, number, close, scene, target, config) for number in range(len(scene.images))]
-    widest = max(each.compared for each in found)
-    blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in found])
-    seeing = [each for each, is_blind in zip(found, blind, strict=True) if not is_blind]
+    shares = [_shares_of_look(T, number, close, scene, target, config) for number in range(len(scene.images))]
+    widest = max(each.compared for each in shares)
+    blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in shares])
+    seeing = [each for each, is_blind in zip(shares, blind, strict=True) if not is_blind]
     near = max(each.share(each.near) for each in seeing)
     on = max(each.share(each.on) for each in seeing)
     return [
         LookFit.BLIND if is_blind else LookFit.APART if is_apart(each, near, on) else LookFit.FITS
-        for each, is_blind in zip(found, blind, strict=True)
+        for each, is_blind in zip(shares, blind, strict=True)
     ]
 
 

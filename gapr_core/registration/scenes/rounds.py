@@ -88,8 +88,8 @@ def of_remembered(
         seen, target, classifier, config, clock: as `register`.
     """
     pool = clutter.given(poses)
-    found = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
-    candidates = replace(found, support=np.minimum(found.support, most_support))
+    verified = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
+    candidates = replace(verified, support=np.minimum(verified.support, most_support))
     clock.lap("verify")
     return None if len(candidates.poses) < 2 else _assessed(candidates, seen, target, classifier, config, clock)
 

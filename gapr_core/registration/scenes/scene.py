@@ -126,8 +126,8 @@ def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
     if len(places) > MOST_PLACES:
         how = "pass the last images, or those from places that differ most"
         raise InvalidPointCloudError(f"at most {MOST_PLACES} places of a camera", f"{len(places)}", how)
-    found = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
-    return found or [Look(points, np.zeros(3))]  # of no point at all
+    looks = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
+    return looks or [Look(points, np.zeros(3))]  # of no point at all
 
 
 def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -151,10 +151,10 @@ def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
     Raises:
         InvalidViewpointError: a viewpoint in the middle of what was seen from it.
     """
-    found = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
-    seen = {name: source for name, source in enumerate(found) if isinstance(source, PreparedSource)}
+    clouds = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
+    seen = {name: source for name, source in enumerate(clouds) if isinstance(source, PreparedSource)}
     if not seen:
-        return next(source for source in found if isinstance(source, Refusal))
+        return next(source for source in clouds if isinstance(source, Refusal))
     fewest = config.clutter.region_fewest_points
     seen = {name: source for name, source in seen.items() if len(source.points) >= fewest} or seen
     each = [scene_from(source, looks[name].viewpoint, config) for name, source in seen.items()]

@@ -147,9 +147,9 @@ class Accumulator:
         except Exception:
             self._new = before if self._kept is kept else []  # or the collection restarted with this source
             raise
-        found = self._decide_on_new(replace(result, method=self.name), target)
-        self._accepted = found if found.ok else self._accepted
-        return found
+        answer = self._decide_on_new(replace(result, method=self.name), target)
+        self._accepted = answer if answer.ok else self._accepted
+        return answer
 
     def _registered_together(self) -> list[Array]:
         """Return the sources that are registered as one, the newest last."""
@@ -190,15 +190,15 @@ class Accumulator:
         some = slice(None, None, 1 + len(order) // MOST_POINTS)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
         fit = refine_fully(T, points, seen, self.config.refinement)
-        found = motion_test.of_motion(fit, order[some])
-        ratio = found.shown.log_ratio
+        motion = motion_test.of_motion(fit, order[some])
+        ratio = motion.shown.log_ratio
         if ratio <= MAY_MOVE:
             return result
         if ratio <= MOVES or len(kept) < FEWEST_IN_TIME:
-            added = covariance_of_half(fit, found.shown.size_mm)
+            added = covariance_of_half(fit, motion.shown.size_mm)
             return self._widened(result, added, fit.moved.mean(axis=0), target)
         self.reset()
-        self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
+        self._kept = kept[-(len(kept) // 3) :] if motion.rests_from is None else kept[motion.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
 

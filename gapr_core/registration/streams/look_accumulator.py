@@ -192,12 +192,12 @@ class LookAccumulator:
             self._looks = before
             raise
         clock = Clock()
-        said = self._of_newest(result, asked, target)
+        verdict = self._of_newest(result, asked, target)
         clock.lap("compare")
-        found = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
-        if said in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
-            found = found.refused(REFUSED_FOR[said], said.value)
-        return replace(found, reason=found.reason + self._update_looks(said, found, newest, before, asked))
+        answer = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
+        if verdict in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
+            answer = answer.refused(REFUSED_FOR[verdict], verdict.value)
+        return replace(answer, reason=answer.reason + self._update_looks(verdict, answer, newest, before, asked))
 
     def _of_those_that_fit(
         self, target: PreparedTarget, initial: ArrayLike | None
@@ -225,11 +225,11 @@ class LookAccumulator:
             return Newest.SHOWS_NOTHING
         if not result.ok:
             return Newest.IS_REFUSED
-        said = self._of_newest_alone(asked, result, target)
-        is_sure = said is Newest.AGREES and result.confidence >= self.config.sure_from
-        if said in STANDING and not is_sure and self._is_another(result):
+        verdict = self._of_newest_alone(asked, result, target)
+        is_sure = verdict is Newest.AGREES and result.confidence >= self.config.sure_from
+        if verdict in STANDING and not is_sure and self._is_another(result):
             return Newest.CONTRADICTS
-        return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said
+        return Newest.IS_DOUBTFUL if verdict is Newest.IS_UNCONFIRMED and self._off_in_a_row else verdict
 
     def _is_another(self, result: RegistrationResult) -> bool:
         """Return True where the pose differs from the last one given since the collection began."""
@@ -259,7 +259,7 @@ class LookAccumulator:
 
     def _update_looks(
         self,
-        said: Newest,
+        verdict: Newest,
         result: RegistrationResult,
         newest: KeptLook,
         before: list[KeptLook],
@@ -268,30 +268,30 @@ class LookAccumulator:
         """Decide which looks stay after an answer. Returns a text to add to the reason.
 
         Args:
-            said: verdict of the newest look; a pose that stands ends all counts.
+            verdict: verdict of the newest look; a pose that stands ends all counts.
             result: the answer.
             newest: the look, already kept.
             before: the looks before it.
             asked: looks of the common pose, itself included; after a refusal all others stay, too.
         """
-        if said in STANDING:
+        if verdict in STANDING:
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
             self._looks, self._off_in_a_row, self._another_in_a_row, self._refused_in_a_row = asked, [], [], []
             self._last = self._last if result.T_target_source is None else result.T_target_source
             return ""
-        if said in ELSEWHERE:
+        if verdict in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
             return self._update_row_elsewhere(self._off_in_a_row, before)
-        if said is Newest.CONTRADICTS:
+        if verdict is Newest.CONTRADICTS:
             self._another_in_a_row = [*self._another_in_a_row, newest]
             return self._update_row_elsewhere(self._another_in_a_row, before)
-        if said is not Newest.IS_REFUSED:
+        if verdict is not Newest.IS_REFUSED:
             self._looks = before
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
             self._restart_with([newest])
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
-        return "" if said is Newest.IS_REFUSED else "; left out"
+        return "" if verdict is Newest.IS_REFUSED else "; left out"
 
     def _update_row_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
         """Update the looks, as `_update_looks`, after the last of a row that show the bone elsewhere."""

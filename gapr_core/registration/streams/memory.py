@@ -89,9 +89,9 @@ class TrackingRegistrar(Registrar):
         """Assess a source; after a source with an inferred camera, as the next view of that camera first."""
         if viewpoint is None and self._memory.place is not None:
             surface = offset_surface(target, self.config.sensor)
-            found = self._of_next_view(source, surface, start, clock, enough)
-            if found is not None:
-                return found
+            assessment = self._of_next_view(source, surface, start, clock, enough)
+            if assessment is not None:
+                return assessment
         return super().assess_from(source, target, start, viewpoint, clock, enough)
 
     def _of_next_view(
@@ -104,11 +104,11 @@ class TrackingRegistrar(Registrar):
         if scene is None or not places:
             return None
         place, _ = places[0]
-        found = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
-        if found is None or not found.reaches(self.config.min_confidence):
+        assessment = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
+        if assessment is None or not assessment.reaches(self.config.min_confidence):
             return None
-        found = self._checked(replace(found, inferred_viewpoint=place), clock, enough)
-        return found if found.refusal is None else None
+        assessment = self._checked(replace(assessment, inferred_viewpoint=place), clock, enough)
+        return assessment if assessment.refusal is None else None
 
     def _places_of(self, source: PreparedSource) -> list[tuple[Array, int]]:
         """Infer places as the full registrar; the one nearest to the last inferred place comes first."""
@@ -131,19 +131,19 @@ class TrackingRegistrar(Registrar):
         poses = np.concatenate([start, self._memory.poses])
         if len(scene.images) > 1:
             return self._in_scene(scene, target, poses, clock)
-        found = self._remembered(scene, target, start, clock, enough)
-        return self._in_scene(scene, target, poses, clock) if found is None else found
+        assessment = self._remembered(scene, target, start, clock, enough)
+        return self._in_scene(scene, target, poses, clock) if assessment is None else assessment
 
     def _remembered(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """Assess the best of the previous poses; None where it is not sure and regions must propose."""
         poses, how = np.concatenate([start, self._memory.poses]), (self.classifier, self.config, clock)
-        found = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
-        if found is None:
+        assessment = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
+        if assessment is None:
             return None
-        found = replace(found, proposer=PreviousPoses.name, rounds=1)
-        return found if self._needs_no_other_proposer(found) or enough(found) else None
+        assessment = replace(assessment, proposer=PreviousPoses.name, rounds=1)
+        return assessment if self._needs_no_other_proposer(assessment) or enough(assessment) else None
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Candidates | None:
         return self._full._of_image(flipped, target, clock)

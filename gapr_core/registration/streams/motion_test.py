@@ -47,16 +47,16 @@ def of_motion(fit: Fit, order: NDArray[np.int64]) -> Motion:
     group = np.searchsorted(steps, time, side="right")
     moved = motions(fit)
     changes = [when[:, None] * moved for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in steps)]]
-    found = shown(blocks(fit, fit.jacobian[inlier], changes, group))
+    evidence = shown(blocks(fit, fit.jacobian[inlier], changes, group))
     any_of_steps = np.log(len(steps))  # all are equally likely before the residuals
-    ratios = [found[0].log_ratio, *(each.log_ratio - any_of_steps for each in found[1:])]
+    ratios = [evidence[0].log_ratio, *(each.log_ratio - any_of_steps for each in evidence[1:])]
     best = int(np.argmax(ratios))
     if best == 0:
-        return Motion(found[0])
+        return Motion(evidence[0])
     # a step in the first half of a group is found at the edge before it
     at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()
     rests_from = int(np.ceil(order.min() + at * (order.max() - order.min())))
-    return Motion(Shown(ratios[best], found[best].size_mm), rests_from)
+    return Motion(Shown(ratios[best], evidence[best].size_mm), rests_from)
 
 
 def step_times(groups: int) -> Array:

@@ -184,11 +184,11 @@ class Tracker:
         """
         if assessment.refusal is not None or self._is_no_view(assessment):
             return assessment
-        a, last = assessment, self._last
+        last = self._last
         again = last is not None and cloud.is_of_same(last.cloud)
-        agrees = self._agrees(a) and (last is None or last.agreed or not again)
-        self._last = Last(a.fit.T, cloud, agrees)
-        return replace(a, judgement=self._evidence.observe(a.judgement, agrees, again))
+        agrees = self._agrees(assessment) and (last is None or last.agreed or not again)
+        self._last = Last(assessment.fit.T, cloud, agrees)
+        return replace(assessment, judgement=self._evidence.observe(assessment.judgement, agrees, again))
 
     def _remember(self, result: RegistrationResult, source: Array) -> None:
         """Follow an accepted pose; a refusal changes nothing, since the bone may not have moved.

@@ -23,7 +23,7 @@ from gapr_core.registration.proposals.consensus import Correspondences, local_to
 
 Array = NDArray[np.float64]
 METHODS = ("local_to_global", "ransac")
-RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # a correspondence agrees with a pose within so many first voxels
+RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # radius of agreement of a correspondence, over the first voxel
 SHIPPED = Path(__file__).parents[2] / "weights" / "gapr_net.safetensors"
 
 
@@ -32,7 +32,7 @@ class NetworkProposer:
 
     Args:
         network: in evaluation mode, on any device.
-        method: `local_to_global`, or `ransac` as the paper says.
+        method: `local_to_global`, or `ransac` as in the paper.
         count: most poses for one pair.
         weights_name: key of the target's cached features, with the device, so that networks of the
             same weights share them; without a name they are the network's alone.

@@ -149,7 +149,7 @@ def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
     holes.
 
     Raises:
-        InvalidViewpointError: a viewpoint in the middle of what was seen from it.
+        InvalidViewpointError: a viewpoint in the middle of its own points.
     """
     clouds = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
     seen = {name: source for name, source in enumerate(clouds) if isinstance(source, PreparedSource)}
@@ -168,7 +168,7 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: RegistrarConfig
     """Build the scene seen from one viewpoint (3,), mm, source frame; no regions yet.
 
     Raises:
-        InvalidViewpointError: a viewpoint in the middle of what was seen from it.
+        InvalidViewpointError: a viewpoint in the middle of its own points.
     """
     settings, seen = config.clutter, source.facing(viewpoint)
     image = free_space.see(_levelled(seen, settings.levelled_by), seen.normals, viewpoint)

@@ -161,7 +161,7 @@ class Accumulator:
         The answer is refused where the newest source lies off the bone, or so many in a row that the bone has moved.
         """
         T = result.best if result.status in POSED else None
-        if T is None:  # it says nothing of any source, nor of a row of those off the bone
+        if T is None:  # no evidence on any source, nor on a row of those off the bone
             for source in self._new:
                 self._join_small_ones(source)
             self._kept, self._new = self._registered_together(), []

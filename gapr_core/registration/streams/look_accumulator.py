@@ -82,7 +82,7 @@ class LookAccumulator:
     """Registers each look of a camera together with those before it.
 
     A single image of a wound shows little of the bone, with one set of errors. A few from places some ten degrees apart
-    show more of it and of what hid it. All must be in one frame in which the bone rests, such as that of a reference
+    show more of it and its cover. All must be in one frame in which the bone rests, such as that of a reference
     fixed to it, and the camera's place must be known for each. A look replaces one from nearly the same direction. So
     those of a video do not push out all others, and some of a moving camera stay.
 

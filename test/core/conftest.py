@@ -7,11 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import logit
 
 from gapr_core import Registrar, RegistrarConfig
 from gapr_core.config import ClutterConfig, SearchConfig, VerificationConfig
 from gapr_core.data.parametric import make_bone
 from gapr_core.data.specimen import Specimen
+from gapr_core.registration.confidence.additive import Additive
+from gapr_core.registration.confidence.classifier import Classifier
+from gapr_core.registration.confidence.features import FEATURES_OF
 from gapr_core.results import RegistrationResult, RegistrationStatus
 
 
@@ -42,6 +46,17 @@ def on_own_clock(monkeypatch):
         clock = SimpleNamespace(perf_counter=lambda: method.now, monotonic=time.monotonic)
         monkeypatch.setattr(module, "time", clock)
         return method
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def believing():
+    """Makes a classifier by which every pose has one probability, and is surely of this bone."""
+
+    def made(probability):
+        of_all = dict.fromkeys(FEATURES_OF, Additive(float(logit(probability)), ()))
+        return Classifier(of_all, dict.fromkeys(FEATURES_OF, Additive(99.0, ())))
 
     return made
 

@@ -13,14 +13,13 @@ from gapr_core.calibration import collect, pairs
 from gapr_core.calibration import shapes as odd_shapes
 from gapr_core.calibration.answers import answers_of
 from gapr_core.calibration.pairs import Drawn, Task
-from gapr_core.config import RegistrarConfig
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
-from gapr_core.registration.confidence.features import FEATURES, FEATURES_OF
+from gapr_core.registration.confidence.features import BONE, FEATURES_OF, SCENE
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.scenes import clutter
-from gapr_core.registration.streams.memory import Memory
+from gapr_core.registration.streams.memory import PreviousPoses
 from gapr_core.results import Hypothesis, Refusal, RegistrationStatus
 from gapr_core.runtime import origin
 
@@ -71,10 +70,10 @@ def test_a_record_holds_every_round_with_its_features_and_its_true_error(truth, 
         ["p0"],
     )
     answer = record["answers"]["search"]
-    assert answer["right"] and tuple(answer["features"]) == FEATURES
+    assert answer["right"] and tuple(answer["features"]) == FEATURES_OF[BONE]
     assert 0.0 < answer["true_mm"] < 2.0 and answer["rte_mm"] < 2.0 and 0.0 < answer["nees"] < 1000.0
     assert 0.0 < answer["tre_mm"] < answer["tre95_mm"]
-    assert answers_of([record], "search").right.tolist() == [True]
+    assert answers_of([record], BONE).right.all()
 
 
 def test_a_pose_without_a_truth_is_wrong_and_has_no_error(truth, monkeypatch):
@@ -123,15 +122,9 @@ def test_the_search_answers_though_the_first_round_would_be_accepted(truth, pair
     assert found.reaches(0.85) and (found.proposer, found.rounds) == ("search", 2)
 
 
-def test_simulated_models_are_exact_in_the_fit_and_others_are_not(truth):
-    registrars = collect._registrars("pointer").values()
-    assert {registrar.config.covariance.model_mm for registrar in registrars} == {0.0}
-    assert RegistrarConfig().covariance.model_mm == 0.3
-
-
 def test_records_know_nothing_of_the_models_that_ship(truth, monkeypatch):
     for model in (
-        "gapr_core.registration.confidence.classifier.Calibration.shipped",
+        "gapr_core.registration.registrar.Classifier.load",
         "gapr_core.registration.registrar.Precision.load",
     ):
         monkeypatch.setattr(model, lambda *_: pytest.fail("a model that ships was asked for"))
@@ -162,10 +155,10 @@ def test_a_scene_is_registered_from_its_camera_or_from_both_ends_of_its_line_of_
 
 
 def test_both_places_of_a_record_are_answers_of_the_round_of_scenes():
-    answer = {"features": dict.fromkeys(FEATURES_OF[clutter.NAME], 0.5), "refusal": None}
+    answer = {"features": dict.fromkeys(FEATURES_OF[SCENE], 0.5), "refusal": None}
     answers = {"scene 0": answer | {"right": True}, "scene 1": answer | {"right": False}}
     facts = dict.fromkeys(("name", "family", "seen_as", "what", "bone"), "a") | {"people": ["p0"], "answers": answers}
-    found = answers_of([facts], clutter.NAME)
+    found = answers_of([facts], SCENE)
     assert found.right.tolist() == [True, False] and found.people == (("p0",), ("p0",))
 
 
@@ -177,7 +170,7 @@ def test_the_next_source_of_a_stream_is_a_part_of_the_view_and_the_memory_is_off
     forgotten = 0
     for seed in range(40):
         moved, memory = collect.moved_on(pair, hypotheses, np.random.default_rng(seed))
-        assert isinstance(memory, Memory) and 0.45 * len(pair.source) < len(moved.source) <= len(pair.source)
+        assert isinstance(memory, PreviousPoses) and 0.45 * len(pair.source) < len(moved.source) <= len(pair.source)
         kept = {tuple(point) for point in pair.source}
         assert all(tuple(point) in kept for point in moved.source)
         forgotten += len(memory.poses) == 2
@@ -207,7 +200,7 @@ def test_the_memory_of_a_stream_is_off_by_motions_of_all_sizes_and_its_rivals_by
 
 
 def test_finished_records_are_kept_and_those_of_other_features_are_made_again(tmp_path, monkeypatch):
-    features = dict.fromkeys(FEATURES, 0.5)
+    features = dict.fromkeys(FEATURES_OF[BONE], 0.5)
     old = {name: value for name, value in features.items() if name != "mirror_margin"}
     answer = {"refusal": None, "right": True}
     path = tmp_path / "records.jsonl"

@@ -6,7 +6,7 @@ from answer_cases import made_answers
 from scipy.stats import chi2
 
 from gapr_core.calibration import conformal
-from gapr_core.registration.confidence.features import FEATURES
+from gapr_core.registration.confidence.features import BONE, FEATURES_OF
 from gapr_core.registration.uncertainty.error_calibration import SCALE_LIMITS
 
 
@@ -38,11 +38,11 @@ def test_the_scale_makes_an_error_hardly_smaller():
 
 def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_families():
     def doubled_where_smooth(features, family):
-        return np.exp(0.7 * np.abs(features[:, FEATURES.index("smooth_misfit")]))
+        return np.exp(0.7 * np.abs(features[:, FEATURES_OF[BONE].index("smooth_misfit")]))
 
     answers = made_answers(3000, error_scale=doubled_where_smooth)
     scale = conformal.scales_of_unseen_families(answers, np.full(len(answers), True))
-    factor = conformal.factor_overall(answers.true_mm / (scale * answers.tre95_mm))
+    factor = conformal.conformal_quantile(answers.true_mm / (scale * answers.tre95_mm), conformal.COVERED)
     rows = conformal.coverage(answers, scale, factor)
     assert 0.945 < rows["all"]["covered"] < 0.975
     assert 0.8 < rows["all"]["nees_over_median"] < 1.2
@@ -50,15 +50,6 @@ def test_the_scale_follows_a_feature_and_the_bound_covers_new_subjects_and_famil
     new = made_answers(2000, seed=5, error_scale=doubled_where_smooth)
     rows = conformal.coverage(new, conformal.scales(conformal.fit_scale(answers), new), factor)
     assert all(row["covered"] > 0.93 for row in rows.values())
-
-
-def test_no_quarter_of_the_bounds_is_lost_where_two_read_alike():
-    answers = made_answers(400)
-    alike = 2.0 + 0.001 * np.arange(400) / 400 + 30.0 * (np.arange(400) >= 300)
-    scale = alike / answers.tre95_mm
-    rows = conformal.coverage(answers, scale, 1.0)
-    counts = {name: row["accepted"] for name, row in rows.items() if name.startswith("tre95")}
-    assert sum(counts.values()) == 400 and counts["tre95 2.0 to 2.0 mm"] == 200
 
 
 def test_the_table_holds_medians_of_true_errors_over_scaled_ones_for_each_family():
@@ -79,24 +70,47 @@ def test_the_table_holds_medians_of_true_errors_over_scaled_ones_for_each_family
         }, abs=1e-3)  # fmt: skip
 
 
-def test_a_family_with_larger_errors_has_a_say_of_its_own():
-    def tripled_for_pointers(features, family):
-        return np.where(family == "pointer", 3.0, 1.0)
-
-    answers = made_answers(3000, error_scale=tripled_for_pointers)
-    scores = answers.true_mm / answers.tre95_mm
-    factor = conformal.factor_in_each(scores, np.full(3000, "one"), answers.family)
-    assert factor > conformal.factor_overall(scores) > conformal.factor_in_each(scores, np.full(3000, "one"))
-    rows = conformal.coverage(answers, np.ones(3000), factor)
-    assert rows["pointer"]["covered"] == pytest.approx(conformal.IN_EACH, abs=0.01)
+def drawn(count, seed, of_pointers=1.0):
+    """Scores that are smaller for surer answers, of three families, of which one may err by more."""
+    rng = np.random.default_rng(seed)
+    confidence, family = rng.uniform(0.5, 1.0, count), rng.choice(["pointer", "laser", "ultrasound"], count)
+    scale = (2.0 - confidence) * np.where(family == "pointer", of_pointers, 1.0)
+    return scale * np.abs(rng.normal(size=count)), confidence, family
 
 
-def test_a_family_of_a_few_answers_does_not_decide_for_all():
-    family = np.array(["many"] * 500 + ["few"] * 10)
-    scores = np.r_[np.linspace(0.0, 1.0, 500), np.full(10, 9.0)]
-    assert 0.0 < conformal.factor_in_each(scores, family) < 1.0
-    assert conformal.factor_in_each(scores[:9], family[500:509]) == 0.0
-    assert conformal.factor_in_each(np.full(conformal.FEWEST, 9.0), np.full(conformal.FEWEST, "few")) == 9.0
+@pytest.mark.parametrize("of_pointers", [1.0, 2.0])
+def test_the_factors_cover_every_bin_and_every_family_and_never_rise_with_the_confidence(of_pointers):
+    at, factors = conformal.factors(*drawn(8000, 0, of_pointers))
+    assert len(at) == len(conformal.BINS) - 1 and list(at) == sorted(at)
+    assert (np.diff(factors) <= 0.0).all() and factors[0] > 1.2 * factors[-1]
+    scores, confidence, family = drawn(40_000, 1, of_pointers)
+    covered = scores <= np.interp(confidence, at, factors)
+    for low, high in zip(conformal.BINS[:-1], conformal.BINS[1:], strict=True):
+        in_bin = (confidence >= low) & (confidence < high)
+        assert covered[in_bin].mean() > 0.945
+        assert all(covered[in_bin & (family == name)].mean() > 0.92 for name in np.unique(family))
+
+
+def test_a_bin_whose_errors_are_larger_widens_the_bound_of_all_less_sure_ones():
+    scores, confidence, family = drawn(8000, 0)
+    plain, worse = (
+        conformal.factors(np.where(confidence > 0.97, times * scores, scores), confidence, family)[1]
+        for times in (1.0, 5.0)
+    )
+    assert worse[-1] == pytest.approx(5.0 * plain[-1]) and set(worse) == {worse[-1]}
+
+
+def test_a_bin_or_a_family_of_a_few_answers_decides_nothing():
+    scores, confidence, family = drawn(8000, 0)
+    few = slice(0, conformal.FEWEST - 1)
+    plain = conformal.factors(scores, confidence, family)
+    rare = np.r_[np.full(conformal.FEWEST - 1, "camera"), family[conformal.FEWEST - 1 :]]
+    gross = scores.copy()
+    gross[few] = 99.0
+    found = conformal.factors(gross, confidence, rare)[1]
+    assert max(found) < 1.3 * max(plain[1])
+    sparse = (confidence < 0.9) | (np.cumsum(confidence >= 0.9) < conformal.FEWEST)
+    assert len(conformal.factors(scores[sparse], confidence[sparse], family[sparse])[0]) == 2
 
 
 def test_no_scale_is_from_a_model_that_has_seen_the_family(monkeypatch):

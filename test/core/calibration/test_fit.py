@@ -4,28 +4,57 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from answer_cases import made_answers
+from answer_cases import OTHERS_MISFIT, made_answers
 
 from gapr_core.calibration import __main__ as calibration
 from gapr_core.calibration import fit as fits
 from gapr_core.calibration.answers import answers_of, together
+from gapr_core.calibration.fit import Models
 from gapr_core.calibration.pairs import HELD_OUT, TWINS
 from gapr_core.errors import ConfigError
-from gapr_core.registration.confidence.additive import Additive, Curve
-from gapr_core.registration.confidence.features import FEATURES
+from gapr_core.registration.confidence.additive import Additive
+from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS, Judgement, joint
+from gapr_core.registration.confidence.features import BONE, FEATURES_OF, SCENE
 
 
 @pytest.fixture(scope="module")
 def answers():
-    return made_answers()
+    return made_answers(others=0.2)
 
 
 def test_the_fit_learns_what_separates_right_from_wrong(answers):
-    confidence = fits.of_unseen_people(answers)
-    rows = fits.by_group(answers, confidence, answers.family)
+    rows = fits.by_group(answers, fits.of_unseen_people(answers), answers.family)
     assert rows["all"]["auroc"] > 0.96 and rows["all"]["ece"] < 0.03
     assert set(rows) == {"all", "laser", "pointer", "ultrasound"}
     assert sum(rows[name]["pairs"] for name in rows if name != "all") == len(answers)
+
+
+@pytest.mark.parametrize("others", [0.1, 0.5])
+def test_the_evidence_of_the_bone_is_a_likelihood_ratio_whatever_the_mix(others):
+    """Of normal misfits of means 0 and d: d^2 / 2 - d x, to the base 10."""
+    answers = made_answers(6000, others=others)
+    evidence = fits.numbers(fits.fit(answers), answers)[:, 1]
+    misfit = answers.features[:, FEATURES_OF[BONE].index("smooth_misfit")]
+    usual = (misfit > -0.5) & (misfit < 2.5)
+    expected = (OTHERS_MISFIT**2 / 2.0 - OTHERS_MISFIT * misfit) / np.log(10.0)
+    assert evidence[usual].mean() == pytest.approx(expected[usual].mean(), abs=0.12)
+    assert np.polyfit(misfit[usual], evidence[usual], 1)[0] == pytest.approx(-OTHERS_MISFIT / np.log(10.0), rel=0.2)
+
+
+def test_a_wrong_pose_on_the_own_bone_says_nothing_of_the_bone():
+    answers = made_answers(3000, others=0.3)
+    wrong = ~answers.right & (answers.what == "own")
+    features = answers.features.copy()
+    features[wrong, FEATURES_OF[BONE].index("smooth_misfit")] = 9.0
+    found, expected = (fits.fit(each).bone for each in (replace(answers, features=features), answers))
+    value = dict.fromkeys(FEATURES_OF[BONE], 0.5)
+    assert found.value(value) == pytest.approx(expected.value(value))
+
+
+def test_confidences_are_those_of_the_classifier(answers):
+    found = fits.of_unseen_people(answers)
+    expected = [joint(Judgement(pose, bone), 0.07) for pose, bone in found]
+    np.testing.assert_allclose(fits.confidences(found, 0.07), expected)
 
 
 def test_no_model_judges_a_subject_whose_bone_is_in_any_pair_that_it_was_fitted_on(answers):
@@ -51,8 +80,8 @@ def test_nobody_is_judged_by_a_model_that_learned_from_a_twin(answers):
 def test_the_families_that_are_held_out_are_in_no_fit(answers, monkeypatch, judged_by):
     seen, every_fifth = set(), np.arange(len(answers)) % 5 == 0
     answers = replace(answers, family=np.where(every_fifth, "structured-light", answers.family))
-    monkeypatch.setattr(fits, "fit", lambda known: seen.update(known.family) or Additive(0.0, ()))
-    monkeypatch.setattr(fits, "probability", lambda model, judged: np.zeros(len(judged)))
+    monkeypatch.setattr(fits, "fit", lambda known: seen.update(known.family))
+    monkeypatch.setattr(fits, "numbers", lambda model, judged: np.zeros((len(judged), 2)))
     judged_by(answers)
     assert set(HELD_OUT) <= set(answers.family) and seen == set(answers.family) - set(HELD_OUT)
 
@@ -62,7 +91,7 @@ def test_the_rounds_together_keep_what_each_record_is(answers):
     other = replace(some, rounds=np.full(5, "track"), true_mm=some.true_mm + 1.0)
     both = together([some.with_features(names), other.with_features(names)])
     assert both.rounds.tolist() == ["search"] * 5 + ["track"] * 5 and both.people == some.people * 2
-    assert both.features[:5, 0] == pytest.approx(some.features[:, FEATURES.index("extent")])
+    assert both.features[:5, 0] == pytest.approx(some.features[:, FEATURES_OF[BONE].index("extent")])
     assert both.true_mm[5:] == pytest.approx(some.true_mm + 1.0)
 
 
@@ -71,39 +100,43 @@ def test_no_model_judges_a_family_that_it_was_fitted_on(answers, monkeypatch):
 
     def fit_nothing(known):
         seen.append(set(known.family))
-        return Additive(float(len(seen)), ())
+        return len(seen)
 
     monkeypatch.setattr(fits, "fit", fit_nothing)
-    monkeypatch.setattr(fits, "probability", lambda model, judged: np.full(len(judged), model.constant))
-    for family, model in zip(answers.family, fits.of_unseen_families(answers).astype(int), strict=True):
+    monkeypatch.setattr(fits, "numbers", lambda model, judged: np.full((len(judged), 2), float(model)))
+    for family, model in zip(answers.family, fits.of_unseen_families(answers)[:, 0].astype(int), strict=True):
         assert family not in seen[model - 1]
 
 
-def test_a_wrong_pose_counts_where_it_is_accepted_and_no_rule_refuses_it(answers):
-    four = answers.of(np.arange(len(answers)) < 4)
+def test_a_wrong_pose_counts_where_it_is_accepted_and_no_finding_refuses_it(answers):
+    four = answers.of(np.arange(len(answers)) >= len(answers) - 4)
     four = replace(four, right=np.array([True, False, False, False]), refused=np.array([False, False, True, False]))
-    row = fits.quality(four, np.array([0.95, 0.92, 0.99, 0.6]))
+    row = fits.quality(four, np.array([[3.0, 3.0], [2.5, 3.0], [4.0, 3.0], [0.5, 3.0]]))
     assert (row["wrong"], row["wrong_sure"], row["right_accepted"], row["right_sure"]) == (2, 1, 1.0, 1.0)
     assert row["auroc"] == pytest.approx(2 / 3, abs=1e-4)
 
 
-def test_the_probability_ends_where_so_few_records_say_nothing(answers):
-    certain = Additive(50.0, tuple(Curve(name, np.zeros(1), np.zeros(1)) for name in FEATURES))
-    assert 0.999 < fits.probability(certain, answers)[0] < 0.9999
+def test_numbers_end_where_so_few_records_say_nothing(answers):
+    certain = Models(Additive(50.0, ()), Additive(-50.0, ()))
+    none = replace(answers, feature_names=(), features=answers.features[:, :0])
+    assert fits.numbers(certain, none)[0].tolist() == [LARGEST_LOG_ODDS, -LARGEST_EVIDENCE]
 
 
-def test_records_become_the_answers_of_a_round():
-    features = {name: float(number) for number, name in enumerate(FEATURES)}
+def test_records_become_the_answers_of_a_kind():
+    features = {name: float(number) for number, name in enumerate(FEATURES_OF[BONE])}
     record = {"name": "0-1", "family": "L2", "seen_as": "L2", "what": "person", "bone": "tibia", "people": ["a", "b"]}
-    wrong = {"features": features, "refusal": "DEGENERATE", "right": False}
+    wrong = {"features": features, "refusal": "equal rival", "right": False}
     right = wrong | {"refusal": None, "right": True, "nees": 5.0, "true_mm": 1.0, "tre_mm": 2.0, "tre95_mm": 3.0}
-    shape = record | {"name": "0-2", "people": [], "answers": {"search": right}}
-    answers = answers_of([record | {"answers": {"search": wrong, "track": right}}, shape], "search")
-    assert answers.right.tolist() == [False, True] and answers.refused.tolist() == [True, False]
-    assert answers.people == (("a", "b"), ("0-2",))
+    scene = right | {"features": dict.fromkeys(FEATURES_OF[SCENE], 0.5)}
+    shape = record | {"name": "0-2", "people": [], "answers": {"search": right, "scene 0": scene, "scene 1": scene}}
+    records = [record | {"answers": {"network": wrong, "track": right}}, shape]
+    answers = answers_of(records, BONE)
+    assert answers.rounds.tolist() == ["network", "track", "search"]
+    assert answers.right.tolist() == [False, True, True] and answers.refused.tolist() == [True, False, False]
+    assert answers.people == (("a", "b"), ("a", "b"), ("0-2",))
     assert np.isnan(answers.true_mm[0]) and answers.tre95_mm[1] == 3.0
-    assert answers.features[0].tolist() == list(range(len(FEATURES)))
-    assert len(answers_of([shape], "track")) == 0
+    assert answers.features[0].tolist() == list(range(len(FEATURES_OF[BONE])))
+    assert len(answers_of(records, SCENE)) == 2 and len(answers_of(records[:1], SCENE)) == 0
 
 
 @pytest.mark.parametrize("judged_by", [fits.of_unseen_people, fits.of_unseen_families])

@@ -1,21 +1,17 @@
 """Streams to learn from: drawn by their number, judged frame by frame."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from gapr_core import RegistrationStatus
 from gapr_core.calibration import collect, pairs, streams
-from gapr_core.calibration.answers import answers_of
+from gapr_core.calibration.answers import STREAM
 from gapr_core.calibration.pairs import Task
-from gapr_core.data.pair import Pair
 from gapr_core.data.smooth_bias import SMOOTH_BIASES
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.geometry import se3
-from gapr_core.registration.confidence.features import STREAM, STREAM_FEATURES
-from gapr_core.results import Hypothesis, RegistrationResult
+from gapr_core.registration.confidence.classifier import Judgement, joint
 
 TASK = Task("folder", "train", 0, 5, STREAM)
 
@@ -94,44 +90,59 @@ def test_a_bias_is_that_of_the_bone_or_of_the_frame(people, monkeypatch, stays):
         assert np.median(people["femur"][0].distance(placed)) == pytest.approx(0.7, abs=0.05)
 
 
-class Said:
-    """A tracker that says the same of every frame but the first, of which nothing is known."""
-
-    def __init__(self, status, pose):
-        accepted = pose if status is RegistrationStatus.OK else None
-        self.result = RegistrationResult(status, accepted, hypotheses=(Hypothesis(pose, 0.5),))
-        self.asked = 0
-
-    def register(self, source, target):
-        self.asked += 1
-        features = dict.fromkeys(STREAM_FEATURES, 0.25) if self.asked > 1 else {}
-        return replace(self.result, features=features | {"margin": 1.0})
-
-
-@pytest.mark.parametrize(
-    ("status", "off_mm", "right"), [(RegistrationStatus.OK, 0.0, True), (RegistrationStatus.LOW_CONFIDENCE, 9.0, False)]
-)
-def test_every_frame_of_which_others_say_something_is_an_answer(monkeypatch, status, off_mm, right):
-    pose = se3.exp([off_mm, 0.0, 0.0, 0.0, 0.0, 0.0])
-    points = np.random.default_rng(0).normal(0.0, 20.0, (50, 3))
-    frame = Pair(points, points, np.eye(4), "", "femur", "p0", "stream", {})
-    said = Said(status, pose)
-    monkeypatch.setattr(streams, "draw_stream", lambda task: ("waves", "own", ("p0",), [frame] * 4))
-    monkeypatch.setattr(streams, "tracker_of_frames_alone", lambda: said)
-    monkeypatch.setattr(streams, "_registrar", lambda: SimpleNamespace(prepare=lambda target: None))
+def test_every_frame_is_an_answer_with_its_numbers_alone(specimen, quick, monkeypatch):
+    frames = simulate(specimen, 1, Motion(frames=3, share=0.35, points=1000))
+    monkeypatch.setattr(streams, "draw_stream", lambda task: ("waves", "own", ("p0",), frames))
+    monkeypatch.setattr(streams, "_registrar", lambda: quick)
     record = collect.record_of(TASK)
-    assert record["family"] == "stream-waves" and list(record["answers"]) == [f"{STREAM} {k}" for k in (1, 2, 3)]
+    assert record["family"] == "stream-waves" and list(record["answers"]) == [f"{STREAM} {k}" for k in range(3)]
+    target = quick.prepare(frames[0].target)
+    for number, frame in enumerate(frames[:1]):
+        alone, answer = quick.register(frame.source, target), record["answers"][f"{STREAM} {number}"]
+        numbers = Judgement(answer["features"]["pose"], answer["features"]["bone"])
+        assert joint(numbers, quick.config.other_bone_prior) == pytest.approx(alone.confidence, abs=1e-4)
+        assert answer["right"] and answer["refusal"] is None
     made_of = {False: "of single answers", True: "of streams"}
     assert collect._is_current(record | {"made_of": "of streams"}, made_of)
     assert not collect._is_current(record | {"made_of": "of single answers"}, made_of)
-    answers = answers_of([record], STREAM)
-    assert len(answers) == 3 and answers.right.tolist() == [right] * 3
-    assert not answers.refused.any()
-    assert answers.features.tolist() == [[0.25] * 3] * 3 and answers.people == (("p0",),) * 3
 
 
-def test_the_frames_count_one_by_one_whatever_they_share():
-    tracker = streams.tracker_of_frames_alone()
-    for shared in (-1.0, 0.0, 2.0):
-        features = dict(zip(STREAM_FEATURES, (1.5, shared, -shared), strict=True))
-        assert tracker._stream.model.value(features) == pytest.approx(1.5)
+def records_of(frames, what="own", right=True):
+    """Streams (S, N, 2) of numbers of the pose and of the bone."""
+    return [
+        {"name": f"0-{STREAM}-{number}", "what": what, "answers": {
+            f"{STREAM} {k}": {"features": {"pose": pose, "bone": bone}, "right": right, "refusal": None}
+            for k, (pose, bone) in enumerate(stream)}}
+        for number, stream in enumerate(frames)
+    ]  # fmt: skip
+
+
+def simulated(rng, count, between, within, mean=0.0):
+    """Streams of 2 to 12 frames with effects of the stream and of the frame of these deviations, each (2,)."""
+    return [
+        mean + rng.normal(0.0, between, 2) + rng.normal(0.0, within, (rng.integers(2, 13), 2)) for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("between", "within"), [((1.5, 0.5), (0.8, 1.0)), ((0.3, 2.0), (1.0, 0.4))])
+def test_the_correlations_are_the_shares_of_variance_that_frames_have_in_common(between, within):
+    rng = np.random.default_rng(0)
+    own, others = (simulated(rng, 600, between, within, mean) for mean in ((4.0, 2.0), (-3.0, -1.0)))
+    expected = [b**2 / (b**2 + w**2) for b, w in zip(between, within, strict=True)]
+    found = streams.correlations(records_of(own) + records_of(others, "person", False))
+    assert found == pytest.approx(expected, abs=0.04), "the classes' own means are no common effect"
+    assert streams.correlations(records_of(own)) == pytest.approx(expected, abs=0.05)
+
+
+def test_what_is_no_right_pose_of_the_own_bone_says_nothing_of_the_correlation_of_poses():
+    rng = np.random.default_rng(1)
+    own = records_of(simulated(rng, 300, (1.0, 1.0), (1.0, 1.0)))
+    wrong = records_of(simulated(rng, 300, (9.0, 9.0), (1.0, 1.0)), right=False)
+    others = records_of(simulated(rng, 300, (9.0, 1.0), (1.0, 1.0)), "person", False)
+    single = [{"name": "0-5", "what": "own", "answers": {}}]
+    assert streams.correlations(own + wrong + others + single) == pytest.approx((0.5, 0.5), abs=0.06)
+
+
+def test_without_streams_or_of_numbers_that_are_all_alike_a_usual_correlation_is_taken():
+    assert streams.correlations([]) == (streams.UNKNOWN_RHO,) * 2
+    assert streams.correlations(records_of(np.ones((5, 4, 2)))) == (streams.UNKNOWN_RHO,) * 2

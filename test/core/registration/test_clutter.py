@@ -5,29 +5,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import logit
 
 from gapr_core import Registrar, RegistrarConfig, RegistrationStatus, Tracker
-from gapr_core.config import ClutterConfig, RulesConfig, SensorConfig, SourceConfig
+from gapr_core.config import ClutterConfig, SensorConfig, SourceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import se3, visibility
-from gapr_core.registration.checks import costly as checks
-from gapr_core.registration.checks import limits
+from gapr_core.registration.checks import image, table
 from gapr_core.registration.confidence.additive import Additive, Curve
-from gapr_core.registration.confidence.classifier import Calibration
-from gapr_core.registration.confidence.features import SCENE_FEATURES
+from gapr_core.registration.confidence.classifier import Classifier, Judgement
+from gapr_core.registration.confidence.features import BONE, FEATURES_OF, SCENE
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import prepare
 from gapr_core.registration.scenes import clutter
 from gapr_core.registration.scenes import rounds as scene_rounds
 from gapr_core.registration.scenes import scene as scenes
-from gapr_core.registration.streams.duplicate_clouds import fingerprint
-from gapr_core.registration.streams.memory import Memory, MemoryFirst
-from gapr_core.results import Refusal
+from gapr_core.registration.streams.memory import PreviousPoses, TrackingRegistrar
 from gapr_core.runtime.clock import Clock
 from gapr_core.surface import Surface
 
+ONE_THREAD = RegistrarConfig(num_threads=1)
 T_SOURCE_TARGET = se3.exp(np.array([80.0, -40.0, 25.0, 0.4, -1.1, 0.7]), np.zeros(3))
+
+
+def judging(scene, bone=0.01):
+    """A classifier of which the pose of a scene has this probability, and that of a source of bone alone another."""
+    pose = {kind: Additive(float(logit(each)), ()) for kind, each in ((SCENE, scene), (BONE, bone))}
+    return Classifier(pose, dict.fromkeys(FEATURES_OF, Additive(99.0, ())))
+
+
+def seeing(scene, bone=0.01):
+    return Registrar(ONE_THREAD, classifier=judging(scene, bone))
 
 
 @pytest.fixture(scope="module")
@@ -80,51 +89,40 @@ def test_residuals_say_which_points_were_taken_for_bone(result, scene):
 
 
 def test_every_feature_of_the_confidence_model_is_measured_and_finite(result):
-    assert set(result.features) == set(SCENE_FEATURES) and np.isfinite(list(result.features.values())).all()
+    assert set(result.features) == set(FEATURES_OF[SCENE]) and np.isfinite(list(result.features.values())).all()
 
 
 def test_without_the_bone_what_is_mostly_clutter_is_refused_as_such(target, scene):
-    undecided = Calibration("scene", Additive(0.0, ()), {})
-    limited = Registrar(RegistrarConfig(num_threads=1, min_confidence=0.6), scene_calibration=undecided)
-    result = limited.register(scene[0][scene[2] :], target, viewpoint=scene[1])
+    result = seeing(0.49).register(scene[0][scene[2] :], target, viewpoint=scene[1])
     assert result.status is RegistrationStatus.CLUTTER and result.T_target_source is None
     assert "crop" in result.reason and result.hypotheses
 
 
 def test_without_a_viewpoint_a_refusal_of_clutter_asks_for_one(target, scene):
-    result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0][scene[2] :], target)
+    result = Registrar(ONE_THREAD).register(scene[0][scene[2] :], target)
     assert result.status is RegistrationStatus.CLUTTER and "where the camera was" in result.reason
 
 
 def test_nobody_has_to_say_where_the_camera_was(target, scene):
     points, viewpoint, count = scene
-    result = Registrar(RegistrarConfig(num_threads=1)).register(points, target)
+    result = Registrar(ONE_THREAD).register(points, target)
     assert result.ok and result.proposer == clutter.NAME
     shift_mm, turn_deg = se3.pose_error(result.T_target_source, se3.inverse(T_SOURCE_TARGET), points[:count])
     assert shift_mm < 2.0 and turn_deg < 2.0
     ways = [place - points.mean(axis=0) for place in (result.inferred_viewpoint, viewpoint)]
     assert np.dot(*[way / np.linalg.norm(way) for way in ways]) > np.cos(np.radians(30.0))
-    assert "inferred" in result.contributions or result.confidence < RegistrarConfig().limits.most
-    assert result.confidence <= RegistrarConfig().limits.most
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"clutter": ClutterConfig(infer_viewpoint=False)},
-        {"clutter": ClutterConfig(least_cos=1.0)},  # no cloud is seen so squarely
-        {"source": SourceConfig(dense_points=100_000)},
-    ],
-)
+@pytest.mark.parametrize("settings", [{"clutter": ClutterConfig(infer_viewpoint=False)},
+                                      {"source": SourceConfig(dense_points=100_000)}])  # fmt: skip
 def test_a_cloud_that_cannot_be_a_camera_s_is_taken_for_bone_alone(target, scene, settings):
     result = Registrar(RegistrarConfig(num_threads=1, **settings)).register(scene[0], target)
     assert not result.ok and result.inferred_viewpoint is None and result.proposer != clutter.NAME
 
 
-@pytest.mark.parametrize(("odds", "is_taken"), [(1.7, False), (1.8, True)])  # .846 and .858
-def test_a_pose_that_rests_on_an_inferred_place_needs_more_than_half(target, scene, odds, is_taken):
-    model = Calibration("scene", Additive(odds, ()), {})
-    result = Registrar(RegistrarConfig(num_threads=1), scene_calibration=model).register(scene[0], target)
+@pytest.mark.parametrize(("probability", "is_taken"), [(0.49, False), (0.51, True)])
+def test_a_pose_that_rests_on_an_inferred_place_is_taken_where_it_is_accepted(target, scene, probability, is_taken):
+    result = seeing(probability).register(scene[0], target)
     assert result.ok is is_taken and (result.inferred_viewpoint is not None) is is_taken
 
 
@@ -135,22 +133,10 @@ def test_sensors_that_touch_the_bone_or_skin_have_no_lines_of_sight(scene, kind,
     assert (scene_rounds.of_unknown(scene[0], config) is not None) is bool(asked), "nothing is prepared in vain"
 
 
-@pytest.mark.parametrize(("least", "is_asked"), [(0.5, True), (0.89, True), (0.9, False)])
-def test_no_camera_is_looked_for_where_none_would_be_sure_enough(target, scene, monkeypatch, least, is_asked):
-    asked = []
-    monkeypatch.setattr(clutter, "inferred_places", lambda *_: asked.append(1) or [])
-    Registrar(RegistrarConfig(num_threads=1, min_confidence=least)).register(scene[0], target)
-    assert bool(asked) is is_asked
-
-
 def test_a_pose_that_a_later_check_refuses_is_none_and_the_first_refusal_stands(target, scene, monkeypatch):
-    def refuse(assessment, config):
-        why = Refusal(RegistrationStatus.LOW_CONFIDENCE, "grown")
-        return assessment.with_refusal(why, config.rules) if assessment.inferred_viewpoint is not None else assessment
-
-    monkeypatch.setattr(checks, "unless_grown", refuse)
-    result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0], target)
-    assert not result.ok and result.inferred_viewpoint is None and "grown" not in result.reason
+    monkeypatch.setattr(image, "log_ratio", lambda a, *_: np.inf if a.inferred_viewpoint is None else -1.0)
+    result = seeing(0.9).register(scene[0], target)
+    assert not result.ok and result.inferred_viewpoint is None and "mirror image" not in result.reason
 
 
 def test_a_few_points_metres_away_do_not_turn_a_refusal_into_an_error(target, scene, monkeypatch):
@@ -159,34 +145,24 @@ def test_a_few_points_metres_away_do_not_turn_a_refusal_into_an_error(target, sc
     rng = np.random.default_rng(7)
     many = np.vstack([scene[0]] * 4) + rng.normal(0.0, 0.3, (4 * len(scene[0]), 3))
     far = scene[0].mean(axis=0) + [3000.0, 0.0, 0.0] + rng.normal(0.0, 1.0, (8, 3))
-    result = Registrar(RegistrarConfig(num_threads=1)).register(np.vstack([many, far]), target)
+    result = Registrar(ONE_THREAD).register(np.vstack([many, far]), target)
     assert isinstance(result.status, RegistrationStatus)
-
-
-def test_a_stream_takes_the_wound_for_one_and_never_more_than_that(target, scene):
-    """Five frames agree: without the limit they would raise each other. The last pose helps to find the next."""
-    rng = np.random.default_rng(3)
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
-    results = [tracker.register(scene[0] + rng.normal(0.0, 0.1, scene[0].shape), target) for _ in range(5)]
-    assert all(result.ok and result.inferred_viewpoint is not None for result in results)
-    assert max(result.confidence for result in results) <= RegistrarConfig().limits.most
-    assert tracker._evidence is not None and not tracker._is_sure
 
 
 def test_a_stream_with_a_viewpoint_is_seen_from_there_to_the_last_cloud(target, scene):
     """A tracker that left it out would infer one of its own, and find the bone as well."""
     rng = np.random.default_rng(3)
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
-    for proposer in (clutter.NAME, Memory.name, Memory.name):
+    tracker = Tracker(seeing(0.97))
+    for proposer in (clutter.NAME, PreviousPoses.name, PreviousPoses.name):
         points = scene[0] + rng.normal(0.0, 0.1, scene[0].shape)
         result = tracker.register(points, target, viewpoint=scene[1])
         assert result.ok and result.proposer == proposer and result.inferred_viewpoint is None
 
 
 def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target, scene, monkeypatch):
-    memory, given = Memory(), []
+    memory, given = PreviousPoses(), []
     memory.keep([se3.inverse(T_SOURCE_TARGET), np.eye(4)])
-    method = MemoryFirst(memory, Calibration.shipped(Memory.name), Registrar(RegistrarConfig(num_threads=1)))
+    method = TrackingRegistrar(memory, Registrar(ONE_THREAD))
 
     def nothing(scene, target, poses, *settings):
         given.append(poses)
@@ -200,17 +176,17 @@ def test_a_scene_without_a_viewpoint_is_looked_for_where_the_last_one_lay(target
 @pytest.fixture
 def of_views(target, scene):
     """A tracker that has a pose of the scene, whose camera it inferred."""
-    made = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    made = Tracker(seeing(0.97))
     assert made.register(scene[0], target).inferred_viewpoint is not None
     return made
 
 
 def test_the_next_view_is_compared_with_what_is_remembered_and_not_taken_for_bone(of_views, target, scene, monkeypatch):
-    monkeypatch.setattr(MemoryFirst, "_as_bone", lambda *_: pytest.fail("it was taken for bone"))
+    monkeypatch.setattr(TrackingRegistrar, "_as_bone", lambda *_: pytest.fail("it was taken for bone"))
     monkeypatch.setattr(clutter, "propose", lambda *_: pytest.fail("a region was asked"))
     shift, first = np.array([2.0, -3.0, 1.0]), of_views._memory.place
     found = of_views.register(scene[0] + shift, target)
-    assert found.ok and found.proposer == Memory.name and found.confidence <= RegistrarConfig().limits.most
+    assert found.ok and found.proposer == PreviousPoses.name
     assert found.inferred_viewpoint == pytest.approx(first + shift, abs=30.0)
     truth = se3.inverse(T_SOURCE_TARGET) @ se3.exp([*-shift, 0.0, 0.0, 0.0])
     error = se3.pose_error(found.T_target_source, truth, scene[0][: scene[2]] + shift)
@@ -229,63 +205,39 @@ def test_of_several_places_the_one_near_the_last_is_asked_first(of_views, target
 
 
 def test_a_view_that_a_check_refuses_is_no_answer_by_itself(of_views, target, scene, monkeypatch):
-    def refuse(assessment, config):
-        why = Refusal(RegistrationStatus.LOW_CONFIDENCE, "grown")
-        return assessment.with_refusal(why, config.rules) if assessment.proposer == Memory.name else assessment
-
-    monkeypatch.setattr(checks, "unless_grown", refuse)
+    monkeypatch.setattr(image, "log_ratio", lambda a, *_: -1.0 if a.proposer == PreviousPoses.name else np.inf)
     assert of_views.register(scene[0] + 0.01, target).proposer == clutter.NAME
 
 
-@pytest.mark.parametrize(("odds", "proposer"), [(2.9, clutter.NAME), (3.0, Memory.name)])  # .948 and .953
-def test_what_is_remembered_of_a_view_has_to_be_sure(of_views, target, scene, monkeypatch, odds, proposer):
-    monkeypatch.setattr(of_views._tracking, "_scene_calibration", Calibration("scene", Additive(odds, ()), {}))
+@pytest.mark.parametrize(("probability", "proposer"), [(0.79, clutter.NAME), (0.81, PreviousPoses.name)])
+def test_what_is_remembered_of_a_view_has_to_stand(of_views, target, scene, monkeypatch, probability, proposer):
+    monkeypatch.setattr(of_views._tracking, "classifier", judging(probability))
     assert of_views.register(scene[0] + 0.01, target).proposer == proposer
 
 
 def test_in_a_stream_of_views_an_unsure_one_is_no_bone_that_speaks_against_it(of_views, target, scene, monkeypatch):
-    """As bone alone it is nonsense (less than .01); the stream would need eight sure views to believe one again."""
-    unsure = Calibration("scene", Additive(1.0, ()), {})
-    alone = Registrar(RegistrarConfig(num_threads=1), scene_calibration=unsure).register(scene[0] + 0.01, target)
-    assert alone.inferred_viewpoint is None and alone.confidence < 0.01, "a source by itself is refused as bone"
+    """As bone alone it is nonsense; nor does such nonsense speak against the views."""
+    alone = seeing(0.02).register(scene[0] + 0.01, target)
+    assert alone.inferred_viewpoint is None and alone.confidence < 0.02, "a source by itself is refused as bone"
     with monkeypatch.context() as changed:
-        changed.setitem(of_views._tracking.__dict__, "scene_calibration", unsure)
+        changed.setattr(of_views._tracking, "classifier", judging(0.02))
         result = of_views.register(scene[0] + 0.01, target)
-    assert not result.ok and result.inferred_viewpoint is not None and 0.5 < result.confidence < 0.85
+    assert not result.ok and result.inferred_viewpoint is not None
     assert [of_views.register(scene[0] + shift, target) for shift in (0.02, 0.03)][-1].ok
 
 
-@pytest.mark.parametrize(("was_view", "probability", "counts"), [(1, 0.1, 0), (0, 0.1, 1), (1, 0.6, 1)])
-def test_what_was_refused_as_bone_says_nothing_in_a_stream_of_views(
-    of_views, method, target, scene, was_view, probability, counts
-):
-    if not was_view:
-        of_views._memory.place = None
-    as_bone = replace(method.of_bone_alone().assess(scene[0], target), refusal=None, probability=probability)
-    before = of_views._evidence._sum
-    found = of_views._with_evidence(as_bone, fingerprint(scene[0] + 0.01))
-    assert (of_views._evidence._sum != before) == (found is not as_bone) == bool(counts)
+def test_what_was_refused_as_bone_says_nothing_in_a_stream_of_views(of_views, target, scene):
+    nonsense = np.random.default_rng(0).uniform(-40.0, 40.0, (300, 3))
+    alone = of_views.register(scene[0] + 0.01, target).confidence
+    of_views.reset()
+    of_views.register(scene[0], target)
+    assert not of_views.register(nonsense, target).ok
+    assert of_views.register(scene[0] + 0.01, target).confidence == pytest.approx(alone)
 
 
 def test_a_given_place_or_an_answer_as_bone_ends_a_stream_of_views(of_views, target, scene):
     assert of_views.register(scene[0] + 0.01, target, viewpoint=scene[1]).ok
     assert of_views._memory.place is None
-
-
-def test_frames_that_spoke_against_the_bone_refuse_an_inferred_pose(target, scene):
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
-    tracker.register(scene[0], target)
-    for _ in range(3):
-        tracker._evidence.add(0.3, agrees=True)
-    result = tracker.register(scene[0] + 0.01, target)
-    assert not result.ok and result.confidence < 0.85 and result.inferred_viewpoint is not None
-    assert "0.85 is asked for, as nobody said where the camera was" in result.reason
-
-
-def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
-    unbelieving = Calibration("scene", Additive(-3.0, ()), {})
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1), scene_calibration=unbelieving))
-    assert tracker._tracking.scene_calibration is unbelieving and not tracker.register(scene[0], target).ok
 
 
 @pytest.mark.parametrize(
@@ -298,27 +250,28 @@ def test_a_tracker_judges_a_scene_by_the_model_that_it_was_given(target, scene):
         ((0.09, 0.09, 0.09, 0.09), None, 4),
     ],
 )
-def test_two_hopeless_rounds_of_what_may_be_no_scene_are_the_last(
-    target, scene, monkeypatch, probabilities, most, asked
-):
-    of_one, left = scene_rounds._assessed, list(probabilities)
-    monkeypatch.setattr(
-        scene_rounds, "_assessed", lambda *given: replace(of_one(*given), probability=left.pop(0), refusal=None)
-    )
+def test_two_hopeless_rounds_of_what_may_be_no_scene_are_the_last(target, scene, probabilities, most, asked):
+    left = list(probabilities)
+
+    class Scripted(Classifier):
+        def judge(self, kind, features):
+            return Judgement(float(logit(left.pop(0))), 3.0)
+
     config = RegistrarConfig(num_threads=1, clutter=ClutterConfig(seeds=(2, 1), middle_poses=50, final_poses=10))
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), config)
-    model = Calibration.shipped(clutter.NAME)
-    found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), model, config, Clock(), most)
+    found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), Scripted({}, {}), config, Clock(), most)
     assert found.rounds == asked == len(probabilities) - len(left)
 
 
-def test_a_wound_on_the_model_of_the_other_side_is_refused(femur, target, scene):
+def test_a_wound_on_the_model_of_the_other_side_is_refused(femur, target, scene, monkeypatch):
     """Only the mirrored scene, registered as one, shows it; three of 38 were accepted."""
     other = Surface(femur.points * [-1.0, 1.0, 1.0], femur.faces[:, ::-1])
     rising = Curve("free_space_score", np.array([0.0, 0.2]), np.array([0.0, 2.0]))
-    by_score = Calibration("scene", Additive(0.0, (rising,)), {})
-    anything = RulesConfig(largest_turn_deg=180.0, largest_shift_mm=1000.0, largest_scale_z=100.0, equal_mm=0.0)
-    method = Registrar(RegistrarConfig(num_threads=1, rules=anything), scene_calibration=by_score)
+    by_score = replace(judging(0.5), pose={SCENE: Additive(0.0, (rising,)), BONE: Additive(-5.0, ())})
+    for name in ("LARGEST_TURN_DEG", "LARGEST_SHIFT_MM"):
+        monkeypatch.setattr(table, name, 1e3)
+    monkeypatch.setattr(table, "EQUAL_MM", 0.0)
+    method = Registrar(ONE_THREAD, classifier=by_score)
     result = method.register(scene[0], method.prepare(other), viewpoint=scene[1])
     assert not result.ok and "the mirror image of the source fits the bone better" in result.reason
     assert method.register(scene[0], target, viewpoint=scene[1]).ok
@@ -327,7 +280,7 @@ def test_a_wound_on_the_model_of_the_other_side_is_refused(femur, target, scene)
 @pytest.fixture
 def tracker(target, scene):
     """It has a pose of the scene."""
-    made = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    made = Tracker(seeing(0.97))
     first = made.register(scene[0], target, viewpoint=scene[1])
     assert first.ok and first.proposer == clutter.NAME and made._has_track
     return made
@@ -337,7 +290,7 @@ def test_the_next_scene_is_compared_with_what_is_remembered_and_no_region_propos
     monkeypatch.setattr(clutter, "propose", lambda *_: pytest.fail("a region was asked"))
     shift = np.array([2.0, -3.0, 1.0])
     found = tracker.register(scene[0] + shift, target, viewpoint=scene[1] + shift)
-    assert found.ok and found.proposer == Memory.name and len(found.hypotheses) > 1
+    assert found.ok and found.proposer == PreviousPoses.name and len(found.hypotheses) > 1
     truth = se3.inverse(T_SOURCE_TARGET) @ se3.exp([*-shift, 0.0, 0.0, 0.0])
     error = se3.pose_error(found.T_target_source, truth, scene[0][: scene[2]] + shift)
     assert error.rte_mm < 1.0 and error.rre_deg < 1.0
@@ -345,9 +298,9 @@ def test_the_next_scene_is_compared_with_what_is_remembered_and_no_region_propos
 
 
 def test_every_so_many_scenes_one_is_registered_in_full(target, scene):
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)), recheck=2)
+    tracker = Tracker(seeing(0.97), recheck=2)
     found = [tracker.register(scene[0] + 0.01 * n, target, viewpoint=scene[1]).proposer for n in range(4)]
-    assert found == [clutter.NAME, Memory.name, clutter.NAME, Memory.name]
+    assert found == [clutter.NAME, PreviousPoses.name, clutter.NAME, PreviousPoses.name]
 
 
 def test_regions_propose_where_what_is_remembered_is_not_sure(tracker, target, scene, monkeypatch):
@@ -361,7 +314,7 @@ def test_regions_propose_where_what_is_remembered_is_not_sure(tracker, target, s
     monkeypatch.setattr(clutter, "propose", noted)
     monkeypatch.setattr(tracker, "_is_sure", False)  # so that nothing but a sure answer stands
     monkeypatch.setattr(tracker._tracking, "config", replace(tracker.config, sure=1.1))
-    remembered = tracker._memory.now
+    remembered = tracker._memory.poses
     found = tracker.register(scene[0] + 0.01, target, viewpoint=scene[1])
     assert found.proposer == clutter.NAME and np.array_equal(asked[0], remembered)
 
@@ -371,13 +324,13 @@ def test_a_remembered_pose_has_no_more_support_than_the_last_full_registration_g
     """Of four remembered poses its own is a quarter; of all that regions propose, a right one is a fiftieth."""
     tracker._memory.support = most
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), tracker.config)
-    how = tracker._tracking.scene_calibration, tracker.config, Clock()
-    found = scene_rounds.of_remembered(seen, target, tracker._memory.now, most, *how)
+    how = tracker.registrar.classifier, tracker.config, Clock()
+    found = scene_rounds.of_remembered(seen, target, tracker._memory.poses, most, *how)
     assert found.features["support"] <= most and (found.features["support"] == most or most == 0.5)
 
 
 def test_what_a_full_registration_found_of_support_is_remembered(target, scene):
-    tracker = Tracker(Registrar(RegistrarConfig(num_threads=1)))
+    tracker = Tracker(Registrar(ONE_THREAD))
     first = tracker.register(scene[0], target, viewpoint=scene[1])
     assert tracker._memory.support == first.features["support"] > 0.0
     tracker.register(scene[0] + 0.01, target, viewpoint=scene[1])
@@ -390,59 +343,6 @@ def test_regions_propose_where_only_one_remembered_pose_is_left(tracker, target,
     assert tracker.register(scene[0] + 0.01, target, viewpoint=scene[1]).proposer == clutter.NAME
 
 
-def saying(tracker, monkeypatch, probabilities):
-    """The answers to scenes that have these probabilities by themselves, at one place."""
-    of_one, left = tracker.registrar.assess_from, list(probabilities)
-
-    def said(*given):
-        return replace(of_one(*given), probability=left.pop(0))
-
-    monkeypatch.setattr(tracker.registrar, "assess_from", said)
-    monkeypatch.setattr(tracker, "recheck", 1)
-    return lambda points, target, viewpoint: tracker.register(points, target, viewpoint=viewpoint)
-
-
-def test_after_a_scene_that_was_hardly_believed_five_are_not_sure(tracker, target, scene, monkeypatch):
-    """Another subject's femur in a wound: of 16 scenes most had less than .9, some of them .4, and one .96."""
-    ask = saying(tracker, monkeypatch, [0.99, 0.49] + [0.99] * 6)
-    rng, shown = np.random.default_rng(1), []
-    for _ in range(8):
-        found = ask(scene[0] + rng.normal(0.0, 0.05, scene[0].shape), target, scene[1])
-        shown.append((found.confidence >= 0.9, limits.DOUBTED in found.contributions))
-    assert shown == [(True, False), (False, False)] + [(False, True)] * 5 + [(True, False)]
-
-
-def test_a_scene_that_its_stream_hardly_believes_is_a_doubt_too(tracker, target, scene, monkeypatch):
-    ask = saying(tracker, monkeypatch, [0.99, 0.99])
-    monkeypatch.setattr(tracker._evidence, "add", lambda *_: 0.49)
-    assert not ask(scene[0] + 0.05, target, scene[1]).ok
-    monkeypatch.setattr(tracker._evidence, "add", lambda probability, *_: probability)
-    assert limits.DOUBTED in ask(scene[0] + 0.1, target, scene[1]).contributions
-
-
-def test_a_scene_that_is_sent_again_does_not_end_the_doubt(tracker, target, scene, monkeypatch):
-    ask = saying(tracker, monkeypatch, [0.49] + [0.99] * 9)
-    ask(scene[0] + 0.05, target, scene[1])
-    assert all(ask(scene[0], target, scene[1]).confidence < 0.9 for _ in range(8))
-
-
-def test_half_believed_is_no_doubt_and_a_reset_ends_it(tracker, target, scene, monkeypatch):
-    ask = saying(tracker, monkeypatch, [0.5, 0.99, 0.49, 0.99])
-    rng = np.random.default_rng(1)
-    found = [ask(scene[0] + rng.normal(0.0, 0.05, scene[0].shape), target, scene[1]) for _ in range(3)]
-    assert not any(limits.DOUBTED in each.contributions for each in found) and tracker._scenes_since_doubt == 0
-    tracker.reset()
-    assert limits.DOUBTED not in tracker.register(scene[0], target, viewpoint=scene[1]).contributions
-
-
-def test_looks_of_a_collection_are_not_doubted_for_the_first_of_them(tracker, target, scene, monkeypatch):
-    """One look says less than four."""
-    for twin in (tracker.sharing_points(), tracker.sharing_points().of_bone_alone()):
-        ask = saying(twin, monkeypatch, [0.49, 0.99])
-        found = [ask(scene[0] + 0.05 * n, target, scene[1]) for n in range(2)]
-        assert limits.DOUBTED not in found[1].contributions
-
-
 def test_several_looks_are_always_registered_in_full(tracker, target, scene):
     looks = np.where(np.arange(len(scene[0]))[:, None] % 2, scene[1], scene[1] + [60.0, 0.0, 0.0])
     assert tracker.register(scene[0], target, viewpoint=looks).proposer == clutter.NAME
@@ -451,7 +351,7 @@ def test_several_looks_are_always_registered_in_full(tracker, target, scene):
 def test_a_cloud_that_is_sure_as_bone_is_not_asked_for_its_camera(target, femur, monkeypatch):
     monkeypatch.setattr(clutter, "inferred_places", lambda *_: pytest.fail("asked"))
     seen = femur.sample(3000, np.random.default_rng(5))[0]
-    assert Registrar(RegistrarConfig(num_threads=1)).register(seen, target).ok
+    assert Registrar(ONE_THREAD).register(seen, target).ok
 
 
 def test_what_is_not_sure_as_a_camera_s_either_keeps_its_first_refusal(target, scene):
@@ -465,7 +365,7 @@ def test_what_is_not_sure_as_a_camera_s_either_keeps_its_first_refusal(target, s
 def test_both_ends_of_the_line_of_sight_are_tried(target, scene, monkeypatch):
     ways = clutter.inferred_places(prepare(scene[0], in_scene=True), RegistrarConfig())
     monkeypatch.setattr(clutter, "inferred_places", lambda *_: ways[::-1])  # as if the wrong one was likelier
-    result = Registrar(RegistrarConfig(num_threads=1)).register(scene[0], target)
+    result = Registrar(ONE_THREAD).register(scene[0], target)
     assert result.ok
     np.testing.assert_array_equal(result.inferred_viewpoint, ways[0][0])
 
@@ -475,14 +375,14 @@ def test_a_refusal_of_clutter_with_a_viewpoint_behind_the_surface_asks_to_check_
     points, normals = femur.sample(6000, np.random.default_rng(5))
     seen = points[normals @ [0.0, 1.0, 0.0] > 0.3]
     viewpoint = seen.mean(axis=0) - [0.0, 400.0, 0.0]
-    result = Registrar(RegistrarConfig(num_threads=1)).register(seen, target, viewpoint=viewpoint)
+    result = Registrar(ONE_THREAD).register(seen, target, viewpoint=viewpoint)
     assert result.status is RegistrationStatus.CLUTTER and "where the viewpoint" in result.reason
 
 
 def test_a_refused_cloud_that_lies_on_the_bone_is_not_called_clutter(target, femur):
     shaft = femur.sample(4000, np.random.default_rng(5))[0]
     along = np.abs(shaft[:, 2] - shaft[:, 2].mean())
-    result = Registrar(RegistrarConfig(num_threads=1)).register(shaft[along < 40.0], target)
+    result = Registrar(ONE_THREAD).register(shaft[along < 40.0], target)
     assert not result.ok and result.status is not RegistrationStatus.CLUTTER
 
 
@@ -513,23 +413,21 @@ def in_the_frame_of_its_camera(scene):
     return (points - viewpoint) @ Rotation.align_vectors([[0.0, 0.0, 1.0]], [ahead])[0].as_matrix().T
 
 
-@pytest.mark.parametrize("settings", [{}, {"origin_deg": 0.0}])
-def test_the_frame_of_a_camera_says_where_it_was_where_its_surface_does_not(target, scene, settings):
-    """With `least_cos` 1 no cloud is seen so squarely that the surface says it."""
-    config = ClutterConfig(least_cos=1.0, **settings)
-    result = Registrar(RegistrarConfig(num_threads=1, clutter=config)).register(
-        in_the_frame_of_its_camera(scene), target
-    )
-    assert result.ok is not bool(settings)
-    if result.ok:
-        assert np.array_equal(result.inferred_viewpoint, np.zeros(3)) and 0.85 <= result.confidence <= 0.89
+@pytest.mark.parametrize("origin_deg", [35.0, 0.0])
+def test_the_frame_of_a_camera_says_where_it_was_where_its_surface_does_not(target, scene, monkeypatch, origin_deg):
+    """With `LEAST_COS` 1 no cloud is seen so squarely that the surface says it."""
+    monkeypatch.setattr(clutter, "LEAST_COS", 1.0)
+    monkeypatch.setattr(clutter, "ORIGIN_DEG", origin_deg)
+    result = seeing(0.9).register(in_the_frame_of_its_camera(scene), target)
+    assert result.ok is bool(origin_deg)
+    assert not result.ok or np.array_equal(result.inferred_viewpoint, np.zeros(3))
 
 
 def test_the_origin_comes_first_and_has_rounds_of_its_own(scene):
-    config = ClutterConfig(origin_rounds=3, inferred_rounds=(2, 1))
     source = prepare(in_the_frame_of_its_camera(scene), in_scene=True)
-    places = clutter.inferred_places(source, RegistrarConfig(clutter=config))
-    assert [rounds for _, rounds in places] == [3, 2, 1] and not places[0][0].any()
+    places = clutter.inferred_places(source, ONE_THREAD)
+    assert [rounds for _, rounds in places] == [clutter.ORIGIN_ROUNDS, *clutter.INFERRED_ROUNDS]
+    assert not places[0][0].any()
 
 
 def test_a_pose_that_was_given_is_not_weighed_against_nothing(method, target, scene, monkeypatch):

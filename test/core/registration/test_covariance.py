@@ -28,7 +28,6 @@ def known(monkeypatch):
     return change
 
 
-NO_COMMON_BIAS = replace(CONFIG, long_share=0.0, linear_share=0.0)
 NOTHING = Errors(offset_mm=0.0, standoff_mm=0.0, noise_mm=1e-6, bias_mm=0.0, scale=0.0)
 
 
@@ -71,7 +70,7 @@ def drawn(kind, fit, rng, count=4000):
     if kind == "beam scale":  # a point moves along the beam by its depth
         depth = (points - points[inlier].mean(axis=0)) @ beam_of(fit)
         return rng.normal(size=(count, 1)) * depth * (fit.gradients @ beam_of(fit))
-    length_mm = CONFIG.local_correlation_mm if kind == "local_mm" else CONFIG.correlation_mm
+    length_mm = covariance.LOCAL_CORRELATION_MM if kind == "local_mm" else covariance.CORRELATION_MM
     correlation = bias_field.smooth_correlation(points, points, length_mm)
     return rng.multivariate_normal(np.zeros(len(points)), correlation, count, method="eigh")
 
@@ -92,17 +91,18 @@ def arms(fit):
     [("noise_mm", 0.7), ("bias_mm", 0.3), ("standoff_mm", 0.3), ("scale", 0.03), ("local_mm", 0.3),
      ("beam standoff_mm", 0.3), ("beam scale", 0.03)],
 )  # fmt: skip
-def test_each_error_spreads_the_pose_as_its_term_says(kind, size, corrected_mm):
+def test_each_error_spreads_the_pose_as_its_term_says(known, kind, size, corrected_mm):
     """Sizes other than 1: entering as b instead of b^2, or not at all, fails. So does another sign of the gain."""
+    known(long_share=0.0, linear_share=0.0)
     fit = curved_fit(bias_mm=corrected_mm)
     noise_mm = size if kind == "noise_mm" else 0.5
-    fields = bias_field.fields(fit, CONFIG.correlation_mm, 80)
+    fields = bias_field.fields(fit, covariance.CORRELATION_MM, 80)
     twists = solved(fit, size * drawn(kind, fit, np.random.default_rng(1)), noise_mm, fields) * arms(fit)
     along_beam, name = kind.startswith("beam"), kind.removeprefix("beam ")
     errors = replace(NOTHING, along_beam=along_beam, **{"noise_mm": noise_mm, name: size})
-    predicted = covariance.sandwich(fit, fields, errors, NO_COMMON_BIAS)
+    predicted = covariance.sandwich(fit, fields, errors, CONFIG)
     if kind != "noise_mm":
-        predicted = predicted - covariance.sandwich(fit, fields, replace(NOTHING, noise_mm=noise_mm), NO_COMMON_BIAS)
+        predicted = predicted - covariance.sandwich(fit, fields, replace(NOTHING, noise_mm=noise_mm), CONFIG)
     predicted = predicted * np.outer(arms(fit), arms(fit))
     sampled = twists.T @ twists / len(twists)
     assert np.abs(sampled - predicted).max() < 0.08 * np.abs(predicted).max()
@@ -112,7 +112,7 @@ def test_each_error_spreads_the_pose_as_its_term_says(kind, size, corrected_mm):
 def test_noise_counts_by_the_weights_of_the_fit():
     """Of two points that say the same, one of weight 1 and one of weight 1/2, least squares takes 2 to 1."""
     fit = curved_fit()
-    fields = bias_field.fields(fit, CONFIG.correlation_mm, 80)
+    fields = bias_field.fields(fit, covariance.CORRELATION_MM, 80)
     gain, _ = covariance.gain_of(fit, fields, 0.5)
     inlier = fit.weights > 0.0
     even, _ = covariance.gain_of(replace(fit, weights=np.where(inlier, 1.0, 0.0)), fields, 0.5)
@@ -214,10 +214,11 @@ def test_a_view_from_several_sides_has_no_beam():
     assert covariance.directions(replace(fit, weights=np.zeros(300)), True, 0.3)[0].shape == (0,)
 
 
-def test_what_the_bias_has_in_common_is_a_standoff_of_its_own():
+def test_what_the_bias_has_in_common_is_a_standoff_of_its_own(known):
+    known(linear_share=0.0)
     fit, fields = curved_fit(), np.zeros((300, 1))
-    shared = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), replace(CONFIG, linear_share=0.0))
-    standoff = covariance.sandwich(fit, fields, replace(NOTHING, standoff_mm=0.8 * CONFIG.long_share), CONFIG)
+    shared = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), CONFIG)
+    standoff = covariance.sandwich(fit, fields, replace(NOTHING, standoff_mm=0.8 * covariance.LONG_SHARE), CONFIG)
     np.testing.assert_allclose(shared, standoff, rtol=1e-9, atol=1e-15)
 
 
@@ -231,7 +232,7 @@ def test_a_model_that_is_too_thick_is_a_standoff_along_the_normals_for_every_sen
         np.testing.assert_allclose(thick, standoff, rtol=1e-9, atol=1e-15)
 
 
-def test_what_the_bias_has_in_common_also_strains_the_source():
+def test_what_the_bias_has_in_common_also_strains_the_source(known):
     """Errors of 0.8 mm x 0.7: symmetric matrices whose entries vary by 1 on the diagonal, by sqrt(1/2) beside it."""
     fit, fields, rng = curved_fit(), np.zeros((300, 1)), np.random.default_rng(2)
     inlier = fit.weights > 0.0
@@ -241,8 +242,8 @@ def test_what_the_bias_has_in_common_also_strains_the_source():
     matrices = (entries + entries.transpose(0, 2, 1)) / 2.0  # off the diagonal the variance halves
     errors_mm = 0.56 * np.einsum("ni,kij,nj->kn", fit.gradients, matrices, away / size_mm)
     twists = solved(fit, errors_mm, 1e-6, fields) * arms(fit)
-    only_strain = replace(CONFIG, long_share=0.0, linear_share=0.7)
-    predicted = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), only_strain)
+    known(long_share=0.0, linear_share=0.7)
+    predicted = covariance.sandwich(fit, fields, replace(NOTHING, bias_mm=0.8), CONFIG)
     predicted = predicted * np.outer(arms(fit), arms(fit))
     sampled = twists.T @ twists / len(twists)
     assert np.abs(sampled - predicted).max() < 0.08 * np.abs(predicted).max()
@@ -251,22 +252,23 @@ def test_what_the_bias_has_in_common_also_strains_the_source():
     assert covariance.strains(nothing_seen).shape == (0, 6)
 
 
-def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by():
+def test_a_strain_of_known_size_adds_what_it_moves_the_pose_by(known):
     """As strains in proportion to the bias do, about the middle of the points that were compared."""
     fit = curved_fit()
     errors = replace(NOTHING, bias_mm=0.8)
     fields = covariance.fields(fit, covariance.CORRELATION_MM, covariance.CENTRES)
-    strained, rigid = (
-        covariance.sandwich(fit, fields, errors, replace(CONFIG, long_share=0.0, linear_share=share))
-        for share in (0.7, 0.0)
-    )
-    found = covariance.covariance_added_by(fit, 0.56 * covariance.strains(fit), CONFIG)
+    spread = []
+    for share in (0.7, 0.0):
+        known(long_share=0.0, linear_share=share)
+        spread.append(covariance.sandwich(fit, fields, errors, CONFIG))
+    strained, rigid = spread
+    found = covariance.covariance_added_by(fit, 0.56 * covariance.strains(fit))
     np.testing.assert_allclose(found, strained - rigid, rtol=1e-6, atol=1e-9)
     some = np.arange(300) < 200
     of_some = (each[some] for each in (fit.signed_mm, fit.weights, fit.gradients, fit.elements, fit.moved))
     drawn = refinement.Fit(fit.T, fit.sigma_mm, *of_some, whole=fit)
     about = drawn.moved.mean(axis=0) - fit.moved.mean(axis=0)
-    same = covariance.covariance_added_by(drawn, 0.56 * covariance.strains(fit), CONFIG)
+    same = covariance.covariance_added_by(drawn, 0.56 * covariance.strains(fit))
     np.testing.assert_allclose(same, covariance_about(about, found))
 
 

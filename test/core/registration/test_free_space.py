@@ -1,11 +1,8 @@
 """What a camera saw says where the bone is and where it cannot be."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from gapr_core.config import FreeSpaceConfig
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.registration.scenes.free_space import compare, see
 
@@ -66,14 +63,6 @@ def test_a_surface_of_another_direction_is_not_explained_where_it_crosses(image)
 def test_the_nearer_to_the_measured_surface_the_better_it_is_explained(image):
     one, two = (seen(image, moved(z_mm=z), on_mm=3.0)[0] for z in (1.0, 2.0))
     assert one == pytest.approx(1.0 - 1.0 / 9.0, abs=1e-3) and two == pytest.approx(1.0 - 4.0 / 9.0, abs=1e-3)
-
-
-def test_a_score_takes_off_what_was_seen_otherwise_and_what_was_seen_through(image):
-    dearer = replace(image, config=FreeSpaceConfig(misfit_costs=0.3, violation_costs=5.0))
-    poses = np.stack([moved(z_mm=-2.0), moved(z_mm=-10.0)])
-    for seen_by, costs in ((image, [-0.2, -2.0]), (dearer, [-0.3, -5.0])):
-        found = compare(poses, *wall(), seen_by, on_mm=1.0, front_mm=4.0)
-        assert found.score == pytest.approx(costs, abs=1e-3)
 
 
 def test_a_step_in_depth_forbids_nothing_at_its_edge():

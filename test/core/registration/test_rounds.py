@@ -5,20 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import logit
 
 from gapr_core import Accumulator, Registrar, RegistrarConfig, RegistrationStatus
 from gapr_core.benchmark import methods
-from gapr_core.config import LimitsConfig
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.geometry import se3
-from gapr_core.registration import registrar as registrars
-from gapr_core.registration.checks import costly as checks
-from gapr_core.registration.confidence.additive import Additive
-from gapr_core.registration.confidence.classifier import Calibration
-from gapr_core.registration.fit import mirror
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.proposals.network import NetworkProposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
@@ -45,34 +38,26 @@ def pair(femur):
     return make_pair("L1", Specimen(femur, "femur", "parametric-3", "parametric"), seed=5)
 
 
-def test_a_sure_answer_ends_the_rounds(pair):
-    right, never = Fixed("network", pair.T_target_source[None]), Fixed("search", np.eye(4)[None])
-    of_both = [replace(Calibration.shipped("search"), proposer=name) for name in ("network", "search")]
-    registrar = Registrar(ONE_THREAD, [right, never], of_both)
-    target = registrar.prepare(pair.target)
-    result = registrar.register(pair.source, target)
-    assert result.ok and result.rounds == 1
-    assert (right.prepared, right.asked, never.prepared, never.asked) == (1, 1, 1, 0)
+SURE_BONE = replace(ONE_THREAD, other_bone_prior=0.0)
 
 
 @pytest.mark.parametrize(("probability", "settings", "rounds"), [
-    (0.85, {}, 1), (0.75, {}, 2), (0.75, {"searched_below": 0.7}, 1), (0.85, {"searched_below": 0.9}, 2),
-    (0.85, {"min_confidence": 0.9}, 2), (0.85, {"sure": 1.1}, 1), (0.75, {"sure": 0.7}, 1), (0.92, {}, 2),
-    (0.96, {}, 1), (0.92, {"sure": 0.9}, 1), (0.92, {"limits": LimitsConfig(most=0.93)}, 1),
-    (0.92, {"searched_below": 0.5}, 2),
+    (0.96, {}, 1), (0.94, {}, 2), (0.92, {"sure": 0.9}, 1), (0.96, {"sure": 0.97}, 2), (0.96, {"sure": 1.1}, 2),
+    (0.8, {"sure": 0.7}, 1), (0.8, {"sure": 0.7, "min_confidence": 0.85}, 2),
+    (0.96, {"other_bone_prior": 0.95}, 2),
 ])  # fmt: skip
-def test_the_next_proposer_is_asked_for_what_is_doubtful_and_for_what_may_be_sure(pair, probability, settings, rounds):
-    proposers = [Fixed(name, pair.T_target_source[None]) for name in ("network", "search")]
-    as_probable = [Calibration(each.name, Additive(float(logit(probability)), ()), {}) for each in proposers]
-    registrar = Registrar(replace(ONE_THREAD, **settings), proposers, as_probable)
-    assert registrar.register(pair.source, registrar.prepare(pair.target)).rounds == rounds
+def test_the_next_proposer_is_asked_for_what_is_not_sure(pair, believing, probability, settings, rounds):
+    first, second = (Fixed(name, pair.T_target_source[None]) for name in ("network", "search"))
+    registrar = Registrar(replace(SURE_BONE, **settings), [first, second], believing(probability))
+    result = registrar.register(pair.source, registrar.prepare(pair.target))
+    assert (result.rounds, result.proposer) == (rounds, ("network", "search")[rounds - 1])
+    assert (first.prepared, second.prepared, first.asked, second.asked) == (1, 1, 1, rounds - 1)
 
 
-def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair):
+def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair, believing):
     near = se3.exp([6.0, -5.0, 4.0, 0.05, 0.05, -0.05]) @ pair.T_target_source
     first, second = Fixed("network", near[None]), Fixed("search", np.eye(4)[None])
-    config = RegistrarConfig(num_threads=1, searched_below=1.1, sure=1.1)
-    registrar = Registrar(config, [first, second])
+    registrar = Registrar(ONE_THREAD, [first, second], believing(0.7))
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     assert (first.asked, second.asked, result.rounds) == (1, 1, 2)
     assert se3.pose_error(result.best, pair.T_target_source, pair.source)[0] < 1.0
@@ -91,23 +76,8 @@ def test_the_shipped_network_and_the_search_are_asked_in_this_order():
     assert isinstance(Registrar().proposers[0], NormalAlignedSearch) and len(Registrar().proposers) == 1
 
 
-def test_each_round_has_the_confidence_model_that_was_fitted_for_it():
-    network, search = Registrar.from_pretrained(ONE_THREAD).calibrations
-    assert (network.proposer, search.proposer) == ("network", "search")
-    assert network.model.constant != search.model.constant
-
-
-def test_a_proposer_that_nobody_fitted_a_confidence_for_is_refused_and_works_with_one_of_its_own(pair):
-    mine = Fixed("mine", pair.T_target_source[None])
-    with pytest.raises(MethodUnavailableError, match="'mine'.*gapr_core.calibration"):
-        Registrar(ONE_THREAD, [mine])
-    registrar = Registrar(ONE_THREAD, [mine], [Calibration("mine", Additive(3.0, ()), {})])
-    assert registrar.register(pair.source, registrar.prepare(pair.target)).ok
-
-
-def test_a_confidence_that_is_no_number_is_a_refusal(pair):
-    broken = Calibration("network", Additive(np.nan, ()), {})
-    registrar = Registrar(ONE_THREAD, [Fixed("network", pair.T_target_source[None])], [broken])
+def test_a_confidence_that_is_no_number_is_a_refusal(pair, believing):
+    registrar = Registrar(ONE_THREAD, [Fixed("network", pair.T_target_source[None])], believing(np.nan))
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     assert not result.ok and result.T_target_source is None
 
@@ -118,19 +88,9 @@ def test_the_network_alone_finds_a_one_sided_view(pair):
     assert se3.pose_error(result.best, pair.T_target_source, pair.source)[0] < 1.0
 
 
-def test_as_many_confidence_models_as_proposers_are_needed():
-    with pytest.raises(ConfigError, match="2 for 1"):
-        Registrar(calibrations=[Calibration.shipped("search")] * 2)
+def test_at_least_one_proposer_is_needed():
     with pytest.raises(ConfigError, match="at least one proposer"):
         Registrar(proposers=[])
-    with pytest.raises(ConfigError, match="one confidence model"):
-        Registrar(calibrations=[])
-
-
-@pytest.mark.parametrize("other", ["network", "scene"])
-def test_the_confidence_model_of_another_proposer_is_refused(other):
-    with pytest.raises(ConfigError, match=f"model of 'search'.*one of '{other}'"):
-        Registrar(calibrations=[Calibration.shipped(other)])
 
 
 def test_a_gpu_that_is_not_there_and_a_missing_torch_are_named(monkeypatch):
@@ -162,23 +122,6 @@ def test_a_clean_piece_of_the_target_itself_is_found_and_accepted(registrar, fem
     assert np.abs(se3.apply(result.T_target_source, se3.apply(motion, piece)) - piece).max() < 0.1
 
 
-@pytest.mark.parametrize(("probability", "is_checked"), [(0.17, True), (0.15, False)])
-def test_what_a_stream_may_still_accept_is_checked_against_its_image_and_corrected(
-    pair, monkeypatch, probability, is_checked
-):
-    """A stream raises p to sqrt(p) at most: with a threshold of .4, answers from .16 on."""
-    done = []
-    monkeypatch.setattr(checks.mirror, "image_margin", lambda *_: done.append("mirror") or mirror.LIMITS[1])
-    monkeypatch.setattr(registrars, "bias_corrected", lambda assessment, _: done.append("bias") or assessment)
-    config = replace(ONE_THREAD, min_confidence=0.4, rules=replace(ONE_THREAD.rules, mirrored_below=0.0))
-    calibration = Calibration("fixed", Additive(float(logit(probability)), ()), {})
-    poses = np.stack([pair.T_target_source, se3.exp([0.0, 0.0, 40.0, 0.0, 0.0, 2.0]) @ pair.T_target_source])
-    registrar = Registrar(config, [Fixed("fixed", poses)], [calibration])
-    found = registrar.assess(pair.source, registrar.prepare(pair.target))
-    assert found.refusal is None and found.probability == pytest.approx(probability)
-    assert done == (["mirror", "bias"] if is_checked else [])
-
-
 def test_a_path_in_place_of_the_settings_names_where_weights_go():
     with pytest.raises(ConfigError, match=r"expected a RegistrarConfig; got 'net.safetensors'; .*from_weights"):
         Registrar.from_pretrained("net.safetensors")
@@ -194,10 +137,10 @@ def test_an_answer_and_a_refusal_name_their_method(pair, name):
     assert together.method == "gapr_accumulator"
 
 
-def test_a_given_pose_may_be_a_tensor_with_a_gradient(pair):
+def test_a_given_pose_may_be_a_tensor_with_a_gradient(pair, believing):
     torch = pytest.importorskip("torch", reason="tensors: pip install torch")
     T, fixed = pair.T_target_source, Fixed("fixed", pair.T_target_source[None])
-    registrar = Registrar(ONE_THREAD, [fixed], [Calibration("fixed", Additive(9.0, ()), {})])
+    registrar = Registrar(ONE_THREAD, [fixed], believing(0.99))
     target = registrar.prepare(pair.target)
     assert registrar.register(pair.source, target, initial=torch.tensor(T, requires_grad=True)).ok
     with pytest.raises(InvalidPointCloudError, match="a finite .* initial pose"):
@@ -205,14 +148,13 @@ def test_a_given_pose_may_be_a_tensor_with_a_gradient(pair):
 
 
 @pytest.mark.parametrize(("proposed", "rounds"), [("far", 2), ("near", 1)])
-def test_a_given_pose_to_which_no_proposer_came_does_not_end_the_rounds(pair, proposed, rounds):
+def test_a_given_pose_to_which_no_proposer_came_does_not_end_the_rounds(pair, believing, proposed, rounds):
     """It is weighed against the poses of one proposer, which missed it, and may have missed the right one."""
     truth = pair.T_target_source
     near = se3.exp([4.0, -3.0, 2.0, 0.02, 0.02, -0.02], pair.target.mean(axis=0)) @ truth
     far = se3.exp([0.0, 0.0, 90.0, 0.0, 0.0, 1.5], pair.target.mean(axis=0)) @ truth
     first, second = Fixed("network", (near if proposed == "near" else far)[None]), Fixed("search", near[None])
-    sure = [Calibration(each.name, Additive(9.0, ()), {}) for each in (first, second)]
-    registrar = Registrar(ONE_THREAD, [first, second], sure)
+    registrar = Registrar(ONE_THREAD, [first, second], believing(0.99))
     target = registrar.prepare(pair.target)
     result = registrar.register(pair.source, target, initial=truth)
     assert (result.rounds, second.asked) == (rounds, rounds - 1)

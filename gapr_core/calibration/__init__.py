@@ -1,1 +1,1 @@
-"""The confidence: pairs to learn from, records of answers, the fit."""
+"""Calibration of the confidence: pairs to learn from, records of answers, the fit."""

@@ -1,7 +1,7 @@
-"""Fit additive models: a convex problem with one solution, so no seed and no luck are in the fit.
+"""The fit of additive models: a convex problem with one solution, so the fit depends on no seed.
 
-Every feature gets a piecewise linear curve over its own quantiles. Its steps from knot to knot are the unknowns: a
-ridge keeps them small, a second one keeps neighbouring slopes alike, and a sign where physics gives one.
+Every feature gets a piecewise linear curve over its own quantiles. Its steps from knot to knot are the unknowns. A
+ridge keeps them small, a second one keeps neighbouring slopes alike, and a sign bounds them where physics gives one.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from scipy.special import expit
 from gapr_core.registration.confidence.additive import Additive, Curve
 
 Array = NDArray[np.float64]
-Loss = Callable[[Array], tuple[float, Array]]  # of the model's values (N,): the mean loss, and its gradient (N,)
+Loss = Callable[[Array], tuple[float, Array]]  # mean loss of the model's values (N,), and its gradient (N,)
 
-QUANTILES = (0.005, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.995)  # of a feature, where the curve may bend
+QUANTILES = (0.005, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.995)  # knots of a feature's curve
 RIDGE = 1.0  # of each step, in records
 BENDING = 3.0  # of the difference of neighbouring steps, in records
-HUBER = 0.7  # of the residual in log units from which it counts linearly
+HUBER = 0.7  # residual in log units from which it counts linearly
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +32,8 @@ class Basis:
     Attributes:
         names: (F,) features.
         knots: (F,) arrays (K_f,), ascending.
-        columns: (N, S) how much of each step a record has taken, 0 to 1; S is the sum of K_f - 1.
-        owner: (S,) which feature a step is of.
+        columns: (N, S) share of each step that a record has taken, 0 to 1; S is the sum of K_f - 1.
+        owner: (S,) feature of each step.
     """
 
     names: tuple[str, ...]
@@ -43,7 +43,7 @@ class Basis:
 
 
 def basis_of(table: Array, names: tuple[str, ...]) -> Basis:
-    """Steps between the quantiles of each column of (N, F) features."""
+    """Build steps between the quantiles of each column of (N, F) features."""
     knots = tuple(_knots(column) for column in table.T)
     steps = [np.clip((column[:, None] - at[:-1]) / np.diff(at), 0.0, 1.0)
              for column, at in zip(table.T, knots, strict=True)]  # fmt: skip
@@ -52,13 +52,13 @@ def basis_of(table: Array, names: tuple[str, ...]) -> Basis:
 
 
 def fit_log_odds(table: Array, right: NDArray[np.bool_], names: tuple[str, ...], signs: Mapping[str, int]) -> Additive:
-    """The model whose value is the log odds that an answer is right: penalised maximum likelihood.
+    """Fit the model of the log odds that an answer is right, by penalised maximum likelihood.
 
     Args:
         table: (N, F) features.
-        right: (N,) whether the answer is right; no record counts more than another.
-        names: (F,) of the features.
-        signs: +1 where more of a feature can only speak for the pose, -1 where only against.
+        right: (N,) mask of the right answers; all records weigh the same.
+        names: (F,) names of the features.
+        signs: +1 for a feature that can only raise the odds as it grows, -1 for one that can only lower them.
     """
 
     def loss(values: Array) -> tuple[float, Array]:
@@ -68,7 +68,7 @@ def fit_log_odds(table: Array, right: NDArray[np.bool_], names: tuple[str, ...],
 
 
 def fit_centre(table: Array, wanted: Array, names: tuple[str, ...]) -> Additive:
-    """The model of the middle of numbers (N,) that depend on features (N, F): Huber's loss, few outliers count."""
+    """Fit the model of the middle of numbers (N,) by features (N, F), with Huber's loss against outliers."""
 
     def loss(values: Array) -> tuple[float, Array]:
         off = values - wanted
@@ -98,7 +98,7 @@ def _fit(basis: Basis, loss: Loss, signs: Mapping[str, int]) -> Additive:
 
 
 def _centred(basis: Basis, x: Array) -> Additive:
-    """Curves that add nothing on the average over the records, so that a contribution compares with the usual."""
+    """Centre the curves on the records: a contribution then compares with the usual one."""
     constant, curves = float(x[0]), []
     for number, (name, knots) in enumerate(zip(basis.names, basis.knots, strict=True)):
         own = basis.owner == number
@@ -109,5 +109,5 @@ def _centred(basis: Basis, x: Array) -> Additive:
 
 
 def _knots(column: Array) -> Array:
-    """Distinct quantiles of a feature (N,); one knot where it never varies."""
+    """Compute distinct quantiles of a feature (N,); one knot where it never varies."""
     return np.unique(np.round(np.quantile(column, QUANTILES), 6))

@@ -1,4 +1,4 @@
-"""Records of one kind of answer as columns, and folds by subject and by sensor family."""
+"""Answers of one kind as columns, and folds by subject and by sensor family."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class Answers:
     """Answers of one kind, N of them.
 
     Attributes:
-        feature_names: F names.
-        names: (N,) of the pairs.
-        rounds: (N,) round that answered: network, search, track or scene.
-        features: (N, F).
-        right: (N,) within 4 mm and 5 deg.
-        refused: (N,) a finding refuses the pose.
-        family, seen_as, what, bone: (N,) sensor family, view, whose bone the source is of, bone.
-        people: N tuples, everybody whose bone the points are of, the target's first.
-        true_mm, tre_mm, tre95_mm: (N,) true error over the whole bone, the predicted one and its bound; NaN where no
+        feature_names: names of the F features.
+        names: (N,) names of the pairs.
+        rounds: (N,) round of the answer: network, search, track or scene.
+        features: (N, F) features.
+        right: (N,) mask of poses within 4 mm and 5 deg.
+        refused: (N,) mask of poses that a finding refuses.
+        family, seen_as, what, bone: (N,) sensor family, view, owner of the source's bone, bone.
+        people: N tuples of all subjects whose bones the points are of, the target's first.
+        true_mm, tre_mm, tre95_mm: (N,) true error over the whole bone, predicted error and its bound; NaN where no
             pose is right.
         nees: (N,) normalised error squared of the pose.
     """
@@ -78,7 +78,7 @@ class Answers:
         return replace(self, feature_names=names, features=self.features[:, chosen])
 
     def people_folds(self) -> Iterator[tuple[Mask, Mask]]:
-        """(fitted on, judged) masks (N,): nobody of a judged target is in any pair that the model is fitted on."""
+        """Yield (fitted on, judged) masks (N,): no subject of a judged target is in any pair of the fit."""
         people = [tuple(map(first_of_twins, group)) for group in self.people]
         everybody = sorted({person for group in people for person in group})
         drawn = np.random.default_rng(0).permutation(len(everybody)) % FOLDS
@@ -113,7 +113,7 @@ def answers_of(records: Sequence[dict[str, Any]], kind: str) -> Answers:
 
 
 def round_of(name: str) -> str:
-    """Name the round that answered, such as scene of "scene 1"."""
+    """Name the round of an answer, such as scene of "scene 1"."""
     return name.split()[0]
 
 
@@ -137,14 +137,14 @@ def together(groups: Sequence[Answers]) -> Answers:
 def of_models_that_saw_no_subject(
     answers: Answers, known: Mask, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
 ) -> Array:
-    """(N, ...) predictions, each by a model that was fitted to the known answers (N,) without the pair's subject."""
+    """Predict (N, ...) by models fitted to the known answers (N,) without the pair's subject."""
     return _predicted(answers, [(judged, fitted & known) for fitted, judged in answers.people_folds()], fit, predict)
 
 
 def of_models_that_saw_neither(
     answers: Answers, known: Mask, fit: Callable[[Answers], Model], predict: Callable[[Model, Answers], Array]
 ) -> Array:
-    """(N, ...) predictions by models of the known answers (N,) without the pair's subject and its sensor family."""
+    """Predict (N, ...) by models of the known answers (N,) without the pair's subject and its sensor family."""
     folds = []
     for family in np.unique(answers.family):
         of_it: Mask = answers.family == family
@@ -158,22 +158,22 @@ def _predicted(
     fit: Callable[[Answers], Model],
     predict: Callable[[Model, Answers], Array],
 ) -> Array:
-    """(N, ...) predictions of the judged answers of each fold by a model of its fitted ones."""
-    found: list[tuple[Mask, Array]] = []
+    """Predict (N, ...) the judged answers of each fold by a model of its fitted ones."""
+    predictions: list[tuple[Mask, Array]] = []
     for judged, fitted in folds:
         if judged.any():
-            found.append((judged, predict(fit(_enough(answers.of(fitted))), answers.of(judged))))
-    result = np.full((len(answers), *found[0][1].shape[1:]), np.nan)
-    for judged, values in found:
+            predictions.append((judged, predict(fit(_enough(answers.of(fitted))), answers.of(judged))))
+    result = np.full((len(answers), *predictions[0][1].shape[1:]), np.nan)
+    for judged, values in predictions:
         result[judged] = values
     return result
 
 
 def _enough(answers: Answers) -> Answers:
-    """The answers that a model is fitted to, if there are any.
+    """Return the answers for a fit, if there are any.
 
     Raises:
-        ConfigError: none is of other subjects and other sensors than those that are judged.
+        ConfigError: none is of other subjects and other sensors than the judged ones.
     """
     if not len(answers):
         raise ConfigError("answers of other subjects and sensors to fit to", "none", "collect more pairs (--count)")

@@ -1,4 +1,4 @@
-"""The card of the models as a page: what they were fitted on, and how they do on what they have not seen."""
+"""The card of the models as a page: the data of the fit, and their quality on unseen data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRECISION = {
 
 
 def as_markdown(cards: Mapping[str, Any], made: Mapping[str, Any]) -> str:
-    """The page for all models of one run."""
+    """Write the page for all models of one run."""
     views = {name: share for of_family in SEEN_AS.values() for name, share in of_family.items()}
     parts = [
         "# Confidence and precision: card",

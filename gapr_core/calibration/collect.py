@@ -1,6 +1,6 @@
-"""Records to learn from: every pair registered in each way that an answer can come about, and judged.
+"""Records to learn from: every pair registered by every kind of round, and judged.
 
-The registrars here accept everything (`ACCEPTING`): no model of the confidence may decide which records it is fitted
+The registrars here accept everything (`ACCEPTING`): no model of the confidence may select the records that it is fitted
 to. Finished pairs stay in the records file, so that a stopped run goes on where it was.
 """
 
@@ -52,12 +52,12 @@ Record = dict[str, Any]
 Shared = tuple[str, str, pairs.Bones]  # folder, split and the bones of both
 STEP_MM, STEP_DEG = 10.0, 10.0  # of a stream: the largest motion from source to source
 FOLLOWED = 0.5  # share of the pairs that become a stream
-LOOKED_AT = 3  # every third cloud of bone alone is registered as a scene as well, where one camera may have seen it
+LOOKED_AT = 3  # every third cloud of bone alone is also registered as a scene, where one camera may have seen it
 ALONE = 4  # every fourth pair is searched without the network's poses, as a user without torch does
-FORGOTTEN = 0.25  # share of the streams whose best pose is not remembered
-AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # what is refused as bone is recorded as that
+FORGOTTEN = 0.25  # share of the streams whose best pose is forgotten
+AS_IT_IS = ClutterConfig(infer_viewpoint=False)  # a cloud refused as bone alone is recorded as such
 SETTINGS = RegistrarConfig(num_threads=1, clutter=AS_IT_IS)
-# log odds of 0.9 and a sure bone: above `min_confidence`, below `sure`, so that every round is asked
+# log odds of 0.9 and a sure bone: above `min_confidence`, below `sure`, so that every round runs
 ACCEPTING = Classifier(dict.fromkeys(FEATURES_OF, Additive(2.2, ())), dict.fromkeys(FEATURES_OF, Additive(9.0, ())))
 
 
@@ -65,10 +65,10 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = Non
     """Register every pair that the records file does not hold yet, or holds of other bones, models or settings.
 
     Args:
-        tasks: of one folder and split.
-        path: of the records, one JSON object a line.
+        tasks: tasks of one folder and split.
+        path: file of the records, one JSON object a line.
         jobs: processes.
-        dask: address of a Dask cluster that registers them instead; its workers see the folder of the bones.
+        dask: address of a Dask cluster to use instead; its workers see the folder of the bones.
 
     Returns:
         The records of these tasks.
@@ -81,9 +81,9 @@ def collect(tasks: Sequence[Task], path: Path, jobs: int, dask: str | None = Non
     left = [task for task in tasks if _name(task) not in done]
     where = (tasks[0].folder, tasks[0].split)
     shared = *where, pairs.bones_of(*where) if left else {}
-    found = _on_cluster(left, dask, shared) if dask else _in_processes(left, jobs, shared)
+    records = _on_cluster(left, dask, shared) if dask else _in_processes(left, jobs, shared)
     with path.open("a") as file:
-        for made in tqdm(found, total=len(left), unit="pair"):
+        for made in tqdm(records, total=len(left), unit="pair"):
             record = made | {"made_of": made_of[_is_stream(made)]}
             file.write(json.dumps(record) + "\n")
             file.flush()
@@ -113,7 +113,7 @@ def _records_of(tasks: Sequence[Task], shared: Shared) -> list[Record]:
 
 
 def record_of(task: Task) -> Record:
-    """One pair registered in every way, or the frames of a stream one after another; judged, with their features."""
+    """Register and judge one pair in every way, or the frames of a stream one after another."""
     named = {"name": _name(task), "anatomy": _anatomy(task), "split": task.split, "commit": origin.commit(),
              "settings": origin.settings(SETTINGS)}  # fmt: skip
     if task.family == STREAM:
@@ -126,7 +126,7 @@ def record_of(task: Task) -> Record:
 
 
 def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple[str, Record]]:
-    """(round, what it answered and how right that is)."""
+    """Yield (round, answer of the round and its errors)."""
     rng = np.random.default_rng([task.seed, task.number, 17])
     registrars = _registrars(drawn.sensor)
     if drawn.family in pairs.SCENES or task.number % LOOKED_AT == 0:
@@ -151,7 +151,7 @@ def _answers(drawn: Drawn, target: PreparedTarget, task: Task) -> Iterator[tuple
 
 
 def _viewpoints(pair: Pair) -> Array:
-    """(N, 3) mm: where the camera was, or every place where the registrar would look for the one of this cloud.
+    """Return (N, 3) mm: the place of the camera, or every place that the registrar would infer for this cloud.
 
     Of a cloud that is refused as bone both ends of its line of sight are tried, the wrong one too.
     """
@@ -167,7 +167,7 @@ def _viewpoints(pair: Pair) -> Array:
 
 
 def judged_answer(assessment: Assessment, pair: Pair) -> Record:
-    """Features of an answer, what a rule says against it, and its errors where there is a truth."""
+    """Record the features of an answer, its refusal, and its errors where there is a truth."""
     features = {name: round(value, 6) for name, value in assessment.features.items()}
     refusal = assessment.refusal.check if assessment.refusal else None
     record: Record = {"features": features, "refusal": refusal, "right": False}
@@ -188,7 +188,7 @@ def judged_answer(assessment: Assessment, pair: Pair) -> Record:
 
 
 def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Generator) -> tuple[Pair, PreviousPoses]:
-    """The next source of a stream, and what a `Tracker` remembers of the last one.
+    """Simulate the next source of a stream, and the previous poses of its `Tracker`.
 
     A part of the view is lost at one side, and the source has moved by up to 10 mm and 10 deg about its centroid. In
     one case of four the best pose is forgotten: the tracker followed a rival.
@@ -208,7 +208,7 @@ def moved_on(pair: Pair, hypotheses: Sequence[Hypothesis], rng: np.random.Genera
 
 @dataclass(eq=False)
 class AskedOnce:
-    """A proposer whose last answer is kept: two registrars ask it for the same source."""
+    """A proposer whose last answer is kept for two registrars with the same source."""
 
     proposer: Proposer
 
@@ -217,11 +217,11 @@ class AskedOnce:
         self._last: tuple[Array, Array, Proposals] | None = None
 
     def prepare(self, target: PreparedTarget) -> None:
-        """As the proposer."""
+        """Prepare the proposer."""
         self.proposer.prepare(target)
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """As the proposer, or what it said of the same points and target before."""
+        """Propose as the proposer, or return its last answer for the same points and target."""
         last = self._last
         if last is None or last[1] is not target.points or not np.array_equal(last[0], source.points):
             self._last = last = source.points, target.points, self.proposer.propose(source, target, rng)
@@ -229,7 +229,7 @@ class AskedOnce:
 
 
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig = AS_IT_IS) -> Registrar:
-    """Make a registrar that asks all proposers, accepts every answer and leaves its covariance as computed."""
+    """Make a registrar that uses all proposers, accepts every answer and leaves its covariance as computed."""
     config = replace(SETTINGS, sensor=SensorConfig(kind=sensor), clutter=clutter_config)
     return Registrar(config, proposers, ACCEPTING, Precision.unscaled())
 
@@ -242,7 +242,7 @@ def _proposers() -> tuple[Proposer, Proposer]:
 
 @cache
 def _registrars(sensor: str) -> dict[str, Registrar]:
-    """The two rounds, as they are when the answer of the first one is doubtful, and what users may ask for instead.
+    """Return the default registrar, its slower second pass, and those that users may ask for instead.
 
     "first round" is that of a scene, of which "search" answers after the last one.
     """
@@ -255,11 +255,11 @@ def _registrars(sensor: str) -> dict[str, Registrar]:
     }
 
 
-_last_target: list[tuple[Array, PreparedTarget]] = []  # the last cloud and what was prepared of it
+_last_target: list[tuple[Array, PreparedTarget]] = []  # the last cloud and its prepared target
 
 
 def _prepared(cloud: Array) -> PreparedTarget:
-    """The prepared target; the last one is kept, since pairs in a row share a target."""
+    """Prepare a target; the last one is kept, since pairs in a row share a target."""
     if not _last_target or _last_target[0][0] is not cloud:
         _last_target[:] = [(cloud, _registrars("unknown")["search"].prepare(cloud))]
     return _last_target[0][1]
@@ -270,12 +270,12 @@ def _name(task: Task) -> str:
 
 
 def _anatomy(task: Task) -> str:
-    """The folder's own name, which is the same on all machines."""
+    """Return the folder's own name, which is the same on all machines."""
     return Path(task.folder).resolve().name
 
 
 def _read(path: Path) -> list[Record]:
-    """Every whole record; a last line that was cut off is taken out of the file, so that the next one begins a line."""
+    """Read every whole record, and cut an incomplete last line out of the file."""
     if not path.is_file():
         return []
     *whole, cut_off = path.read_text().split("\n")
@@ -290,7 +290,7 @@ def _read(path: Path) -> list[Record]:
 
 
 def _made_of(folder: str) -> dict[bool, str]:
-    """A short text that changes with the folder's bones, and the network (False) or, for streams, any model (True)."""
+    """Digest the folder's bones and the network (False) or, for streams, any model (True), as short texts."""
     bones = origin.digest_of(sorted(path for path in Path(folder).glob("*") if path.suffix in (".npz", ".json")))
     return {False: f"{bones} {origin.digest_of([SHIPPED])}", True: f"{bones} {origin.shipped_weights()}"}
 

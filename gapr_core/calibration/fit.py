@@ -1,4 +1,4 @@
-"""Fit the two numbers of the confidence, and judge them on subjects and sensor families that no fit has seen."""
+"""The fit of the two numbers of the confidence, judged on unseen subjects and sensor families."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ANOTHER_BONE = ("person", "scaled")  # of `pairs.WHAT`: another subject's bone, 
 
 
 class Models(NamedTuple):
-    """The models of both numbers for one kind of answer: log odds of the pose, log likelihood ratio of the bone."""
+    """Models of both numbers for one kind of answer: log odds of the pose, log likelihood ratio of the bone."""
 
     pose: Additive
     bone: Additive
 
 
 def known_families(answers: Answers) -> NDArray[np.bool_]:
-    """(N,) mask of the answers that models are fitted to."""
+    """Mark the answers (N,) that models are fitted to."""
     return ~np.isin(answers.family, HELD_OUT)
 
 
@@ -46,39 +46,39 @@ def fit(answers: Answers) -> Models:
 
 
 def of_own_bone(answers: Answers) -> NDArray[np.bool_]:
-    """(N,) mask of the answers to which there is a right pose."""
+    """Mark the answers (N,) to which there is a right pose."""
     return np.isfinite(answers.true_mm)
 
 
 def is_another_bone(answers: Answers) -> NDArray[np.bool_]:
-    """(N,) mask of the answers to a source of another subject's bone, or of one of another size."""
+    """Mark the answers (N,) to a source of another subject's bone, or of one of another size."""
     return np.isin(answers.what, ANOTHER_BONE)
 
 
 def numbers(models: Models, answers: Answers) -> Array:
-    """(N, 2) log odds of the pose and log10 likelihood ratio of the bone, as `Classifier.judge` gives them."""
+    """Predict (N, 2) log odds of the pose and log10 likelihood ratios of the bone, as `Classifier.judge`."""
     pose = np.clip(models.pose.values(answers.features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
     bone = models.bone.values(answers.features) / np.log(10.0)
     return np.column_stack([pose, np.clip(bone, -LARGEST_EVIDENCE, LARGEST_EVIDENCE)])
 
 
 def confidences(found: Array, prior: float = PRIOR) -> Array:
-    """(N,) P(pose | bone) x P(bone) of numbers (N, 2), as `classifier.joint` gives them."""
+    """Compute (N,) P(pose | bone) x P(bone) of numbers (N, 2), as `classifier.joint`."""
     return np.asarray(expit(found[:, 0]) * expit(np.log(10.0) * found[:, 1] - np.log(prior / (1.0 - prior))))
 
 
 def of_unseen_people(answers: Answers) -> Array:
-    """(N, 2) numbers, each by models fitted without the pair's subject and the held-out families."""
+    """Predict (N, 2) numbers by models fitted without the pair's subject and the held-out families."""
     return of_models_that_saw_no_subject(answers, known_families(answers), fit, numbers)
 
 
 def of_unseen_families(answers: Answers) -> Array:
-    """(N, 2) numbers, each by models that have seen neither the subject nor the sensor family."""
+    """Predict (N, 2) numbers by models without the pair's subject and its sensor family."""
     return of_models_that_saw_neither(answers, known_families(answers), fit, numbers)
 
 
 def quality(answers: Answers, found: Array) -> dict[str, Any]:
-    """Measure how well numbers (N, 2) rank right above wrong, and whether confidences are probabilities.
+    """Measure the ranking of right above wrong by numbers (N, 2), and the calibration of the confidence.
 
     AUROC and ECE are of the pose's probability, over own bones. `wrong` counts wrong poses accepted at 0.5 or more,
     `wrong_sure` at 0.9 or more: no finding refuses them.

@@ -1,4 +1,4 @@
-"""Where a mirrored bone lies on the bone: the pose of its other side, for bones that are their own mirror image."""
+"""The pose of a mirrored bone on the bone itself, for bones that are their own mirror image."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ MODEL_POINTS = 6000
 
 
 def on_own_side(mirrored: Specimen, specimen: Specimen) -> Array:
-    """(4, 4) rigid motion that lays a mirrored bone on the bone, mm: trimmed ICP from all turns of its main axes."""
+    """Lay a mirrored bone on the bone by trimmed ICP from all turns of its main axes: (4, 4), mm."""
     rng = np.random.default_rng(0)
     moving, fixed = mirrored.sample(POINTS, rng)[0], specimen.sample(MODEL_POINTS, rng)[0]
     tree = cKDTree(fixed)
-    found = [_icp(start, moving, fixed, tree) for start in _turns(moving, fixed)]
-    return min(found, key=lambda each: each[1])[0]
+    fits = [_icp(start, moving, fixed, tree) for start in _turns(moving, fixed)]
+    return min(fits, key=lambda each: each[1])[0]
 
 
 def _turns(moving: Array, fixed: Array) -> list[Array]:
-    """(4, 4) the four rotations that lay the principal axes of one on those of the other."""
+    """Compute the four rotations (4, 4) that lay the principal axes of one on those of the other."""
     of_moving, of_fixed = (extent.principal(points).axes.T for points in (moving, fixed))
     turns = [of_fixed @ np.diag(signs) @ of_moving.T for signs in product((1.0, -1.0), repeat=3)]
     rotations = [turn for turn in turns if np.linalg.det(turn) > 0.0]
@@ -35,7 +35,7 @@ def _turns(moving: Array, fixed: Array) -> list[Array]:
 
 
 def _icp(T: Array, moving: Array, fixed: Array, tree: cKDTree) -> tuple[Array, float]:
-    """A pose and the root mean square of the nearer 90 % of the distances, mm."""
+    """Refine a pose; returns it and the root mean square of the nearer 90 % of the distances, mm."""
     for _ in range(ROUNDS):
         gaps, nearest = tree.query(se3.apply(T, moving))
         near = gaps <= np.quantile(gaps, 0.9)

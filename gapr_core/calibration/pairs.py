@@ -1,4 +1,4 @@
-"""The pairs that the confidence and the precision learn from: who is drawn, how it is seen, and what is wrong with it.
+"""The pairs that the confidence and the precision learn from: subjects, views, and wrong bones.
 
 Each pair is a pure function of the folder, the split, a seed and a number. Its bone is of a subject of the split, a
 parametric one, or drawn from the shape models of the subjects of the split. Shares are stated below and nowhere else.
@@ -32,12 +32,12 @@ T = TypeVar("T")
 Bones = Mapping[str, Sequence[Specimen]]
 _KEPT: dict[tuple[str, str], Bones] = {}
 BONES = ("femur", "tibia", "pelvis", "thoracic")
-LOOK_ALIKES = ("femur", "tibia")  # of which a patch of one subject is much like that of another
+LOOK_ALIKES = ("femur", "tibia")  # bones whose patches are much alike in different subjects
 LOOK_ALIKE_SEEDS = 500  # added to the seed, so that no pair of the long list comes twice
-MADE = ("drawn", "parametric")  # cohorts of bones that are nobody's, and easier to distinguish than subjects' bones
+MADE = ("drawn", "parametric")  # cohorts of artificial bones, easier to distinguish than subjects' bones
 SYMMETRIC = ("pelvis",)  # a mirrored one is the other side of the same: judged against that side's pose
 PARAMETRIC_PEOPLE = 9  # for each bone, besides the subjects of the folder
-DRAWN_PEOPLE, DRAWN_SEED = {True: 40, False: 8}, 9  # new ones: of shape models, or parametric where there is none
+DRAWN_PEOPLE, DRAWN_SEED = {True: 40, False: 8}, 9  # new subjects of shape models, or parametric ones without a model
 TWINS = ({"llp26_2008_0054", "llp26_2008_0032", "llp26_2008_0103"}, {"jhu_25", "jhu_15"})  # alike to 1 or 2 mm, not 7
 
 SEEN_AS = {
@@ -59,31 +59,31 @@ SEEN_AS = {
     "covered": {"covered": 4.0},
     "moving": {"moving": 4.0},
     "scene": {"scene-C1": 2.0, "scene-C2": 2.0, "scene-C3": 2.0},
-}  # family: how a bone is seen, and how often
+}  # family: views of a bone, and their weights
 SCENES = {
     "scene": SEEN_AS["scene"],
     "scene-stereo": {"scene-stereo": 1.0},
     "scene-layers": {"scene-layers": 1.0},
     "scene-joint": {"scene-joint": 1.0},
     "scene-bare": {"depth-camera": 2.0, "stereo": 1.0},
-}  # those of `SEEN_AS`, and families that only lists of their own have
-AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # how a bone is seen with its neighbour, and where that cannot be
-HELD_OUT = ("laser", "structured-light")  # families that no model is fitted on, only judged
-WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # whose bone the source is of
+}  # the scenes of `SEEN_AS`, and families of separate lists
+AT_A_JOINT, ELSEWHERE = "scene-joint", "scene-C2"  # view of a bone with its neighbour, and its substitute without one
+HELD_OUT = ("laser", "structured-light")  # families that are judged, and in no fit
+WHAT = {"own": 66.0, "person": 16.0, "bone": 5.0, "mirrored": 7.0, "scaled": 6.0}  # owner of the source's bone
 SHAPE_SHARE = 0.02  # of all pairs
-TARGETS = {"own": 60.0, "short": 25.0, "scanned": 15.0}  # what the target is: the whole bone, an end, another scan
-DESCRIBED = 0.5  # share of the sensors' sources of which the user says what measured them
+TARGETS = {"own": 60.0, "short": 25.0, "scanned": 15.0}  # kinds of targets: the whole bone, an end, another scan
+DESCRIBED = 0.5  # share of the sensors' sources with a stated sensor
 IN_A_ROW = 4  # pairs that share a target
-OWN_TARGET = ("paper", "incomplete")  # whose source is cut out of its own target
+OWN_TARGET = ("paper", "incomplete")  # views whose source is cut out of its own target
 SHORTEST = (0.15, 0.6)  # share of the bone's length that a short scan holds
-SCALES = (0.03, 0.07)  # by which a bone of a wrong scale is larger or smaller: beyond what ultrasound errs by
+SCALES = (0.03, 0.07)  # relative error of a bone of a wrong scale: larger than ultrasound's
 
 
 @dataclass(frozen=True)
 class Task:
-    """Which pair: number `number` of the list that folder, split and seed define; or of a list of one family only.
+    """A pair to register: number `number` of the list of a folder, split and seed, or of one family's list.
 
-    With `what` (a key of `WHAT`) the source is of that bone, whatever the shares say; with `real` both bones are of
+    With `what` (a key of `WHAT`) the source is of that bone, whatever the shares. With `real` both bones are of
     subjects of the folder, where it has any.
     """
 
@@ -103,9 +103,9 @@ class Setting:
     Attributes:
         specimen: the bone, or one end of it.
         whole: the bone.
-        end: (share, upper) of the end that a short scan holds; None for the whole bone.
-        cloud: (8192, 3) mm, centred; of another scan of the bone where that was drawn.
-        origin_mm: (3,) what was subtracted from the cloud.
+        end: (share, upper) of the end in a short scan; None for the whole bone.
+        cloud: (8192, 3) mm, centred; of another scan of the bone, if drawn.
+        origin_mm: (3,) subtracted centre of the cloud.
     """
 
     specimen: Specimen
@@ -117,15 +117,15 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A pair and how it came to be.
+    """A pair and its origin.
 
     Attributes:
         pair: source and target; the truth is all NaN where no pose is right.
-        family: of the sensor or level, by which coverage is judged.
+        family: family of the sensor or level, for the tables of coverage.
         seen_as: protocol or view of the source.
         what: a key of `WHAT`, or "shape".
-        people: everybody whose bone the points are of, the target's first.
-        sensor: what the user says of the sensor: its kind, or "unknown".
+        people: all subjects whose bones the points are of, the target's first.
+        sensor: stated kind of the sensor, or "unknown".
     """
 
     pair: Pair
@@ -137,17 +137,17 @@ class Drawn:
 
 
 def scenes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """So many scenes of each family; those at a joint are of subjects, of whom more than one bone is known."""
+    """List `count` scenes of each family; those at a joint are of subjects with more than one known bone."""
     families = [(family, family == AT_A_JOINT) for family in SCENES for _ in range(count)]
     return [Task(folder, split, seed, i % count, family, real=real) for i, (family, real) in enumerate(families)]
 
 
 def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Three times `count` sources of subjects, half of them against another subject's bone: femora, tibiae, rib cages.
+    """List 3 `count` sources of subjects, half of them against another subject's bone: femora, tibiae, rib cages.
 
-    So many are seen as at L3, where they are hardest to distinguish, so many by all other families in turn, half as
-    many are thinned, since another subject's ridges look like noise where neighbours are far apart, and three of ten
-    are a camera's clouds. Two of ten are rib cages at L3.
+    `count` are seen as at L3, where they are hardest to distinguish, and `count` by all other families in turn. Half of
+    `count` are thinned, since another subject's ridges look like noise where neighbours are far apart. Three of ten are
+    a camera's clouds, and two of ten rib cages at L3.
     """
     row, turn, whats = IN_A_ROW, IN_A_ROW * len(BONES), ("own", "person")
     bones = {number: BONES[number // row % len(BONES)] for number in range(turn * count)}
@@ -167,12 +167,12 @@ def look_alikes(folder: str, split: str, seed: int, count: int) -> list[Task]:
 
 
 def _in_turn(families: Sequence[str], count: int) -> list[str]:
-    """`count` names, each family twice in a row: once for the own bone and once for another subject's."""
+    """Name `count` families, each twice in a row: for the own bone and for another subject's."""
     return [families[number // 2 % len(families)] for number in range(count)]
 
 
 def draw(task: Task) -> Drawn:
-    """The pair of a task; the same task always gives the same pair."""
+    """Draw the pair of a task; the same task always gives the same pair."""
     rng = np.random.default_rng([task.seed, task.number, 62])
     if rng.random() < SHAPE_SHARE and not task.family:
         shape = sorted(SHAPES)[int(rng.integers(len(SHAPES)))]
@@ -197,7 +197,7 @@ def draw(task: Task) -> Drawn:
 
 @lru_cache(maxsize=2)
 def setting_of(folder: str, split: str, seed: int, number: int, real: bool = False) -> Setting:
-    """Target `number` of the list; bones come in turn, so that each has its share."""
+    """Draw target `number` of the list; bones come in turn, so that each has its share."""
     rng = np.random.default_rng([seed, number, 61])
     bones = bones_of(folder, split)[BONES[number % len(BONES)]]
     whole = _one_of(of_subjects(bones) if real else bones, rng)
@@ -211,7 +211,7 @@ def setting_of(folder: str, split: str, seed: int, number: int, real: bool = Fal
 
 
 def source_of(task: Task, setting: Setting, rng: np.random.Generator) -> tuple[str, Specimen]:
-    """(key of `WHAT`, whose bone the source is of); only one end of it where the target is short."""
+    """Draw (key of `WHAT`, bone of the source); only one end of it where the target is short."""
     what = task.what or _choose(WHAT, rng)
     if what == "mirrored" and (setting.whole.bone == "thoracic" or setting.whole.bone in SYMMETRIC and setting.end):
         what = "own"  # a rib cage's other side differs by 2 to 4 mm, and half of a pelvis has none: no pose is known
@@ -223,30 +223,30 @@ def source_of(task: Task, setting: Setting, rng: np.random.Generator) -> tuple[s
 
 
 def of_subjects(bones: Sequence[Specimen]) -> Sequence[Specimen]:
-    """Those of subjects; all where there are none."""
+    """Select the bones of subjects; all where there are none."""
     return [each for each in bones if each.cohort not in MADE] or bones
 
 
 def without_twins(specimen: Specimen, others: Sequence[Specimen]) -> list[Specimen]:
-    """The others without those who are so nearly the same subject that their bone is no wrong answer."""
+    """Remove subjects so nearly the same that their bone is no wrong answer."""
     own, person = first_of_twins(specimen.person), specimen.person
     return [other for other in others if other.person == person or first_of_twins(other.person) != own]
 
 
 def first_of_twins(person: str) -> str:
-    """One name for subjects that are alike: who is judged must not have been learned from as somebody else."""
+    """Give subjects that are alike one name: no judged subject may be in the fit under another name."""
     return next((min(group) for group in TWINS if person in group), person)
 
 
 def view(seen_as: str, specimen: Specimen, seed: int, around: Sequence[Specimen] = ()) -> Pair:
-    """A bone against itself, seen by a protocol or one of `VIEWS`; at a joint with one of those around it."""
+    """Pair a bone with its view by a protocol or one of `VIEWS`; at a joint with a neighbour."""
     if seen_as in VIEWS:
         return replace(VIEWS[seen_as](specimen, np.random.default_rng([seed, 11])), protocol=seen_as)
     return protocols.make_pair(seen_as, specimen, seed, around)
 
 
 def before(setting: Setting, stranger: Specimen, what: str, pair: Pair) -> Pair:
-    """A source before the setting's target; of another subject's bone no pose is right."""
+    """Pair a source with the setting's target; of another subject's bone no pose is right."""
     truth = np.full((4, 4), np.nan)
     if what == "own" or (what == "mirrored" and setting.whole.bone in SYMMETRIC):
         truth = pair.T_target_source.copy()
@@ -276,7 +276,7 @@ def _one_of(specimens: Sequence[Specimen], rng: np.random.Generator) -> Specimen
 
 
 def _choose_view(rng: np.random.Generator, only: str) -> tuple[str, str]:
-    """(family, how the bone is seen); of one family where that is named."""
+    """Draw (family, view of the bone); of one family where that is named."""
     families = {only: (SEEN_AS | SCENES)[only]} if only else SEEN_AS
     shares = {(family, name): share for family, views in families.items() for name, share in views.items()}
     return _choose(shares, rng)
@@ -288,14 +288,14 @@ def _choose(shares: Mapping[T, float], rng: np.random.Generator) -> T:
 
 
 def bones_of(folder: str, split: str) -> Bones:
-    """Every bone that pairs are drawn from: of the subjects of the split, parametric, and new ones of shape models."""
+    """Return every bone for the pairs: of the split's subjects, parametric, and new ones of shape models."""
     if (folder, split) not in _KEPT:
         _KEPT[folder, split] = {bone: _made(bone, folder, split) for bone in BONES}
     return _KEPT[folder, split]
 
 
 def keep(folder: str, split: str, bones: Bones) -> None:
-    """Draw from these bones: what worker processes start with, since making the bones takes minutes."""
+    """Use these bones from now on, as worker processes do: making the bones takes minutes."""
     _KEPT[folder, split] = bones
 
 

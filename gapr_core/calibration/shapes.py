@@ -1,4 +1,4 @@
-"""Shapes of which no pose can be known: solids of revolution and boxes."""
+"""Shapes without a knowable pose: solids of revolution and boxes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def turned_pair(seed: int) -> Pair:
-    """A solid of revolution, seen from one side: the spin about its axis cannot be known, so no pose is right."""
+    """Pair a solid of revolution with a view from one side: its spin is unknowable, so no pose is right."""
     rng = np.random.default_rng([seed, 7])
     length, radius, waist = rng.uniform(40.0, 300.0), rng.uniform(8.0, 35.0), rng.uniform(0.0, 0.4)
     phase = rng.uniform(0.0, 2.0 * np.pi)
@@ -37,7 +37,7 @@ def turned_pair(seed: int) -> Pair:
 
 
 def box_pair(seed: int) -> Pair:
-    """A side or a corner of a box, smooth or of voxels: flat, straight, and alike in four poses: none is right."""
+    """Pair a box, smooth or of voxels, with a side or a corner: alike in four poses, so none is right."""
     rng = np.random.default_rng([seed, 43])
     sides_mm, turn = np.exp(rng.uniform(np.log(20.0), np.log(250.0), 3)), se3.random_rotation(rng)
     corners = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * sides_mm @ turn.T

@@ -1,7 +1,7 @@
-"""Streams that the evidence of a `Tracker` learns from: how alike the numbers of their frames are.
+"""Streams that the evidence of a `Tracker` learns from: the correlation of the numbers of their frames.
 
-The frames are answered by the models that are installed: those of single answers are fitted first. Each stream has its
-own noise, and a smooth bias of one kind, drawn again for each frame or, as that of soft tissue, the same in all.
+The installed models answer the frames: those of single answers are fitted first. Each stream has its own noise and a
+smooth bias of one kind, drawn again for each frame or, as that of soft tissue, the same in all.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ Array = NDArray[np.float64]
 
 FRAMES = 12
 UNKNOWN_RHO = 0.8
-JUMPS = 0.2  # share of the streams in which the bone is somewhere else halfway
+JUMPS = 0.2  # share of the streams in which the bone jumps halfway
 BIASES = {
     "wave": {"wave": 1.5},
     "waves": {"waves-peak": 1.5, "waves-rms": 1.06},
     "gp": {"gp-peak": 1.5, "gp-rms": 1.06},
 }  # family: kinds of smooth bias, and the largest size of each, mm, that of L3
-STREAM_SEEDS = 900  # added to the seed: other targets than those of single pairs
+STREAM_SEEDS = 900  # added to the seed, for other targets than those of single pairs
 
 
 def tasks(folder: str, split: str, seed: int, count: int) -> list[Task]:
-    """Every other one as `pairs.WHAT` says; the others are of a subject's femur or tibia on that of another subject.
+    """List streams: every other one by `pairs.WHAT`, the others of a femur or tibia on that of another subject.
 
-    Most frames of other bones are refused by a rule and say nothing: with fewer, almost all that is left is right.
+    Most frames of other bones are refused by a rule and do not count: with fewer, almost all that count are right.
     """
     bones = len(pairs.BONES)
     long = [number for number in range(bones * count) if pairs.BONES[number % bones] in pairs.LOOK_ALIKES]
@@ -67,7 +67,7 @@ def record_of_stream(task: Task) -> dict[str, Any]:
 
 
 class OneByOne(Evidence):
-    """Keeps the numbers of each frame, and leaves them as they are."""
+    """Evidence that keeps the numbers of each frame and leaves them as they are."""
 
     def reset(self) -> None:
         """Forget all frames."""
@@ -81,7 +81,10 @@ class OneByOne(Evidence):
 
 
 def draw_stream(task: Task) -> tuple[str, str, tuple[str, ...], list[Pair]]:
-    """(family of the bias, key of `pairs.WHAT`, everybody whose bone it is, frames on one target); always the same."""
+    """Draw (family of the bias, key of `pairs.WHAT`, all subjects of the bones, frames on one target).
+
+    The same task always gives the same stream.
+    """
     rng = np.random.default_rng([task.seed, task.number, 63, len(task.what)])
     setting = pairs.setting_of(task.folder, task.split, task.seed + STREAM_SEEDS, task.number, task.real)
     what, source = pairs.source_of(task, setting, rng)
@@ -139,7 +142,7 @@ def correlations(records: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
 
 
 def _components(streams: Sequence[Array]) -> Array:
-    """(2,) variance between streams and within them, weighted with the number of streams."""
+    """Estimate (2,) the variance between streams and within them, weighted with the number of streams."""
     if len(streams) < 2:
         return np.zeros(2)
     counts = np.array([len(each) for each in streams], dtype=float)

@@ -1,4 +1,4 @@
-"""Views of a bone that no protocol has, and that only the models of confidence and precision learn from."""
+"""Views of a bone outside of the protocols, for the models of confidence and precision only."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from gapr_core.geometry import sampling
 from gapr_core.geometry.sampling import log_uniform
 
 VOXELS_MM = (4.0, 12.0)  # edges of the grid that thins a cloud
-DENSE = 20000  # points before that
+DENSE = 20000  # points before thinning
 
 
 def patch_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """A one-sided view of 1 to 12 % of the bone, of few points."""
+    """Draw a one-sided view of 1 to 12 % of the bone, of few points."""
     share, points = (log_uniform(limits, rng) for limits in ((0.01, 0.12), (60.0, 1500.0)))
     noise_mm, bias_mm, outliers = rng.uniform(0.2, 1.5), rng.uniform(0.0, 1.5), rng.uniform(0.0, 0.2)
     level = protocols.Level((share, share), "seen", noise_mm, bias_mm, outliers, int(points))
@@ -27,7 +27,7 @@ def patch_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
 
 
 def mixed_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """Between and beyond the protocols: from many clean points to tiny, noisy, biased, dirty views."""
+    """Draw a view between and beyond the protocols: from many clean points to tiny, noisy, biased, dirty views."""
     share = rng.uniform(0.1, 0.9)
     noise_mm, bias_mm, outliers = (rng.uniform(0.0, most) * (rng.random() < 0.7) for most in (2.0, 1.5, 0.25))
     share_of = str(rng.choice(["seen", "region"]))
@@ -37,7 +37,7 @@ def mixed_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
 
 
 def crop_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """Clean points of a region of the bone, from all sides, as a piece that was cut out of a model."""
+    """Cut clean points of a region out of the bone, from all sides, as a piece of a model."""
     cloud, _ = specimen.sample(2 * TARGET_POINTS, rng)
     distance = ((cloud - cloud[rng.integers(len(cloud))]) ** 2).sum(axis=1)
     source = cloud[distance <= np.quantile(distance, rng.uniform(0.1, 0.9))]
@@ -47,7 +47,7 @@ def crop_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
 
 
 def thinned_view(specimen: Specimen, rng: np.random.Generator) -> Pair:
-    """A one-sided view in a grid of 4 to 12 mm: what tools do to a cloud that is too large for them.
+    """Draw a one-sided view in a grid of 4 to 12 mm, as tools thin clouds that are too large.
 
     Of each voxel either the mean of its points, as by PCL's and Open3D's filters, or one of them is left.
     """

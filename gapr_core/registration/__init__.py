@@ -8,9 +8,9 @@
 | `fit` | verification and refinement of poses, and the same for changed sources |
 | `uncertainty` | covariance, correction of a smooth bias, errors at targets |
 | `confidence` | features and the classifier |
-| `checks` | checks of a pose and the answer that they lead to |
+| `checks` | checks of a pose, and the answer that follows |
 | `scenes` | a camera's cloud, most of which may not be bone |
 | `streams` | `Tracker`, `Accumulator`, `LookAccumulator` |
 
-`guidance` says where to measure next; `check_points` tests a pose where the source was not.
+`guidance` ranks where to measure next; `check_points` tests a pose with points outside the source.
 """

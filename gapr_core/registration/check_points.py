@@ -1,14 +1,14 @@
-"""Check points: does an accepted pose hold where the source was not? Points of the bone that took no part in it say so.
+"""Check points: a test of an accepted pose with points of the bone that took no part in it.
 
-Under a right pose, with covariance C, the signed distances d of n points from the bone's surface are normal with
-covariance S = J C J^T + R: J is their derivative by the pose's error, and R holds what the sensor and the model err by.
-Then d^T S^-1 d is chi-square with n degrees of freedom. That they are as small as expected says much only if an error
-of the pose would have shown: points on one side of a shaft never notice a slide along it. So the answer has the error
-over the bone that the points alone leave open, by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P, too, and where
-another point would lower it most (`precision` for errors over the bone).
+Under a right pose with covariance C, the signed distances d of n points from the bone's surface are normal with
+covariance S = J C J^T + R. J is their derivative by the error of the pose; R is the covariance of sensor and model.
+Then d^T S^-1 d is chi-square with n degrees of freedom. Small distances confirm a pose only if an error would have
+shown: points on one side of a shaft never show a slide along it. So the answer has the error over the bone that the
+points alone leave open, by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P. It also has the point that would
+lower this error most (`precision` for errors over the bone).
 
-A pose with a wide covariance allows large distances, and yet they show that it is off: registration and points together
-put its error at C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. What that error is over the bone counts.
+A pose with a wide covariance allows large distances, which still show its error. Registration and points together put
+it at C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. The test takes its size over the bone.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from gapr_core.results import PointCheck, RegistrationResult, Verdict
 
 Array = NDArray[np.float64]
 
-SURPRISING = 0.01  # a right pose is contradicted so often
-LOOSE_MM, LOOSE_DEG = 20.0, 20.0  # standard deviations of a pose of which only the check points are known
-MOST_POINTS = 1000  # all pairs of them are looked at
-CANDIDATES = 500  # places of the bone that are compared for the next point
-SAME_MM = 1e-3  # from a point of the source: it is that point, and not another contact
+SURPRISING = 0.01  # rate at which right poses are contradicted
+LOOSE_MM, LOOSE_DEG = 20.0, 20.0  # standard deviations of a pose known from check points alone
+MOST_POINTS = 1000  # every pair of points is compared
+CANDIDATES = 500  # places of the bone compared for the next point
+SAME_MM = 1e-3  # a check point this near to a source point is that point, not another contact
 
 
 def check_points(
@@ -49,20 +49,20 @@ def check_points(
     config: RegistrarConfig | None = None,
     within_mm: float = se3.RIGHT_MM,
 ) -> PointCheck:
-    """Whether points of the bone that took no part in a registration lie on it under the accepted pose.
+    """Test whether points of the bone that took no part in a registration lie on it under the accepted pose.
 
     Args:
-        points: (N, 3) mm, in the frame of the source, one or more; rows that are not finite are dropped. A point that
-            the registration used says nothing here.
-        target: the bone, as it was registered.
+        points: (N, 3) mm, in the frame of the source, one or more; rows that are not finite are dropped. Points of the
+            registration test nothing.
+        target: the registered bone.
         result: the answer, `OK` and with a covariance.
-        config: the sensor that measured the points (`sensor`), and how far the bone's model may be off
+        config: the sensor that measured the points (`sensor`), and the error of the bone's model
             (`covariance.model_mm`); the defaults when not given.
-        within_mm: an error over the bone that matters: a pose holds where the points alone would have shown it, and
+        within_mm: error over the bone that matters: a pose holds where the points alone would have shown it, and
             with the registration bound it to less.
 
     Raises:
-        InvalidPointCloudError: no points, too many, a wrong shape or type, most of them points of the source; a target
+        InvalidPointCloudError: no points, too many, a wrong shape or type, most of them points of the source. A target
             that is not prepared, or a result without a pose or its covariance.
         ConfigError: `within_mm` is not above 0, or something else than a `RegistrarConfig`.
     """
@@ -103,7 +103,7 @@ def check_points(
 
 
 def _accepted(result: RegistrationResult) -> tuple[Array, Array, Array]:
-    """Pose (4, 4), covariance (6, 6) and its centre (3,) of an answer.
+    """Return the pose (4, 4), the covariance (6, 6) and its centre (3,) of an answer.
 
     The covariance is widened as its bound was: 95 % of errors of known size stay below that.
     """
@@ -133,7 +133,7 @@ def _check_new(points: Array, result: RegistrationResult) -> None:
 
 
 def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
-    """Signed distances (N,), mm, of points (N, 3) to the surface under a pose, NaN where none is near; its normals.
+    """Measure signed distances (N,), mm, of points (N, 3) to the surface under a pose, and its normals.
 
     They are exact where the target is a mesh. Off the edge of a model that was cut off, what a point lies beyond it
     counts as well.
@@ -145,10 +145,10 @@ def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, 
 
 
 def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarConfig) -> Array:
-    """(n, n) covariance of what the distances of points err by under the true pose, mm^2.
+    """Compute the (n, n) covariance of the distances of points under the true pose, mm^2.
 
-    Noise, a smooth bias that near points share, a stand-off and an error of the model that all share, another size,
-    which moves a point along its normal by its place, and an error of the tracker, which moves all as one body.
+    It sums noise, a smooth bias of near points, and a stand-off and an error of the model that all share. Another size
+    moves a point along its normal by its place; an error of the tracker moves all as one body.
     """
     alike = smooth_correlation(moved, moved, CORRELATION_MM)
     grown = np.einsum("ni,ni->n", moved - moved.mean(axis=0), normals) if len(moved) else np.empty(0)
@@ -162,9 +162,9 @@ def _errors_of(moved: Array, normals: Array, errors: Errors, config: RegistrarCo
 
 
 def _probability(distance_mm: Array, S: Array) -> float:
-    """That n normal distances with covariance S (n, n) lie as far off or farther: the smaller of two tests', times two.
+    """Compute the probability that n normal distances with covariance S (n, n) are this large or larger.
 
-    All together (chi-square), and the farthest of all by itself, which many good ones would hide (Bonferroni).
+    The smaller of two tests', times two: of all together (chi-square), and of the farthest alone (Bonferroni).
     """
     together = chdtrc(len(distance_mm), distance_mm @ np.linalg.solve(S, distance_mm))
     farthest = 2.0 * ndtr(-np.abs(distance_mm / np.sqrt(np.diag(S))).max()) * len(distance_mm)
@@ -172,19 +172,19 @@ def _probability(distance_mm: Array, S: Array) -> float:
 
 
 def _verdict(probability: float, shown_mm: float, open_mm: float, within_mm: float) -> Verdict:
-    """What points say that show one error over the bone, mm, and leave another one open, where one matters."""
+    """Judge points that show one error over the bone, mm, and leave another one open, against one that matters."""
     if probability < SURPRISING or shown_mm > within_mm:
         return Verdict.CONTRADICTED
     return Verdict.HOLDS if open_mm <= within_mm else Verdict.SAYS_LITTLE
 
 
 def _loose() -> Array:
-    """(6, 6) covariance of a pose of which nothing is known but that it is near, mm and rad."""
+    """Return the (6, 6) covariance of a pose that is only known to be near, mm and rad."""
     return np.diag([LOOSE_MM**2] * 3 + [np.radians(LOOSE_DEG) ** 2] * 3)
 
 
 def _next(covariance: Array, target: PreparedTarget, centre: Array, variance_mm2: float) -> int:
-    """The target point where a point of this variance lowers the mean square error over the bone most.
+    """Choose the target point where a measurement of this variance lowers the mean square error over the bone most.
 
     A distance with derivative j takes C j j^T C / (s^2 + j^T C j) off the covariance C of the pose (Kalman 1960).
     """

@@ -1,9 +1,9 @@
-"""Where to look next: which patch of the bone would make the answer most precise and exclude the rivals.
+"""Where to look next: the patch of the bone that makes the pose most precise and excludes its rivals.
 
-A look at a patch of m points with residual Jacobians J, white noise of variance s^2 and a bias of variance b^2 that is
-common to the patch adds the Fisher information J^T (s^2 I + b^2 1 1^T)^-1 J to the inverse covariance C^-1 of the pose
-(Sherman and Morrison 1950 for the inverse). What then remains is the 95 % bound of the error over the bone, to which
-every rival pose that the look would not exclude adds its own distance, weighted with its probability.
+A look at a patch of m points has residual Jacobians J, white noise of variance s^2 and a bias of variance b^2 that all
+its points share. It adds the Fisher information J^T (s^2 I + b^2 1 1^T)^-1 J to the inverse covariance C^-1 of the pose
+(Sherman and Morrison 1950 for the inverse). A patch is ranked by the 95 % bound of the error over the bone that then
+remains. Every rival pose that the look would not exclude adds its own distance, weighted with its probability.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from gapr_core.results import Guidance, Hypothesis, Patch
 
 Array = NDArray[np.float64]
 
-PATCH_MM, PATCHES = 30.0, 250  # diameter of a look's patch, and places that are compared
-LOOK_POINTS, NOISE_MM, BIAS_MM = 60, 0.5, 0.7  # of a look: points, least white noise, least bias that all share
+PATCH_MM, PATCHES = 30.0, 250  # diameter of a patch, and number of patches
+LOOK_POINTS, NOISE_MM, BIAS_MM = 60, 0.5, 0.7  # of a look: points, least white noise, least shared bias
 SEEN_MM = 6.0  # a target point with a source point this near counts as seen
-MOST_RIVALS = 50  # the likeliest other poses that a look is to exclude
-FACING_COS = 0.3  # least cosine between normals of a patch and that of its centre
-SEEN_SHARE = 0.5  # of a patch, from which there is nothing new to see
+MOST_RIVALS = 50  # likeliest other poses
+FACING_COS = 0.3  # least cosine between the normals of a patch and of its centre
+SEEN_SHARE = 0.5  # of a patch, from which it counts as seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Patches:
 
 
 def guide(assessment: Assessment) -> Guidance | None:
-    """Patches of the target ranked by what a look there would gain; None where the whole bone was seen.
+    """Rank patches of the target by the gain of a look there; None where the source covers the whole bone.
 
     Args:
         assessment: the best pose so far, its covariance and its rivals.
@@ -72,13 +72,13 @@ def guide(assessment: Assessment) -> Guidance | None:
 
 
 def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array:
-    """(..., 6, 6) Fisher information of a look at patches.
+    """Compute the (..., 6, 6) Fisher information of a look at patches.
 
     Args:
         J: (..., n, 6) Jacobians of the residuals at places spread over a patch.
-        points: m, how many points the look gives, evenly over these places.
+        points: m, number of points of the look, evenly over these places.
         noise_mm: s, white noise of a point.
-        bias_mm: b, standard deviation of the bias that all of them share.
+        bias_mm: b, standard deviation of the bias that all points share.
     """
     inner = points * np.einsum("...na,...nb->...ab", J, J) / J.shape[-2]
     total = points * J.mean(axis=-2)
@@ -87,7 +87,7 @@ def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array
 
 
 def _patches(target: PreparedTarget) -> Patches:
-    """Balls around evenly spread points, less what faces another way than the centre."""
+    """Cut balls around evenly spread points, without points that face away from the centre's normal."""
     centres = sampling.thin(target.points, PATCHES)
     balls = target.tree.query_ball_point(target.points[centres], PATCH_MM / 2.0)
     members = [np.array(ball)[target.normals[ball] @ target.normals[i] > FACING_COS]
@@ -96,22 +96,22 @@ def _patches(target: PreparedTarget) -> Patches:
 
 
 def _unseen(patches: Patches, assessment: Assessment) -> Patches:
-    """Those of which the source shows less than half."""
-    fit = assessment.fit.rests_on
+    """Select the patches of which the source shows less than half."""
+    fit = assessment.fit.full_fit
     seen = fit.moved[fit.counts]
     if not len(seen):
         return patches
-    surface = assessment.target.elements[:, :3]  # where a sensor with a stand-off sees the bone
+    surface = assessment.target.elements[:, :3]  # farther out by the stand-off
     near = cKDTree(seen).query(surface)[0] < SEEN_MM
     kept = [k for k, members in enumerate(patches.members) if near[members].mean() < SEEN_SHARE]
     return Patches(patches.centres[kept], [patches.members[k] for k in kept])
 
 
 def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: float, bias_mm: float) -> Array:
-    """(K,) 95 % bound of the error over the bone after a look of so many points at each patch."""
+    """Compute (K,) 95 % bounds of the error over the bone after a look of `points` points at each patch."""
     target, centre = assessment.target, assessment.centre_mm
     known, anchors = np.linalg.inv(assessment.uncertainty.covariance), target.points[target.anchors]
-    over_all = assessment.tre95_mm / assessment.bound_mm(anchors)  # a few points stand for the bone
+    over_all = assessment.tre95_mm / assessment.bound_mm(anchors)  # the anchors represent the bone
     bounds = []
     for members in patches.members:
         J = distance_jacobian(target.points[members], target.normals[members], centre)
@@ -123,11 +123,11 @@ def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: 
 def _of_rivals(
     assessment: Assessment, rivals: Sequence[Hypothesis], patches: Patches, noise_mm: float, bias_mm: float
 ) -> tuple[float, Array, Array]:
-    """What rivals add to the squared bound, mm^2, now and (K,) after a look at each patch; (K,) share it excludes."""
+    """Compute the rivals' part of the squared bound, mm^2, now and (K,) after each look; (K,) excluded shares."""
     if not rivals:
         return 0.0, np.zeros(len(patches.centres)), np.ones(len(patches.centres))
     target, best = assessment.target, assessment.hypotheses[0]
-    seen_at = target.elements[:, :3]  # where a sensor with a stand-off sees the bone, as in `distances_mm`
+    seen_at = target.elements[:, :3]  # farther out by the stand-off, as in `distances_mm`
     in_source = se3.apply(se3.inverse(best.T_target_source), seen_at)
     distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
     weights = np.array([rival.probability for rival in rivals])
@@ -138,23 +138,23 @@ def _of_rivals(
 
 
 def _apart_mm(best: Hypothesis, rival: Hypothesis, target: PreparedTarget) -> float:
-    """Root-mean-square distance over the bone between where two hypotheses put it."""
+    """Measure the root-mean-square distance over the bone between its places under two hypotheses."""
     motion = best.T_target_source @ se3.inverse(rival.T_target_source)
     return se3.rms_apart_mm(np.eye(4), motion, target.points[target.anchors])
 
 
 def _excluded(patch: Array, rivals: Sequence[Hypothesis], target: PreparedTarget, variance: float) -> Array:
-    """(R,) share of each rival's probability that a look at the patch would take.
+    """Compute the (R,) share of each rival's probability that a look at the patch excludes.
 
-    Under a rival the patch (n, 3), by the best pose in the source's frame, lies d off the surface; its likelihood falls
-    by exp(-d^2 / 2 (s^2 + b^2)), with that variance, mm^2. What slides along the surface tells nothing, however far.
+    Under a rival the patch (n, 3), by the best pose in the source's frame, lies d off the surface. Its likelihood falls
+    by exp(-d^2 / 2 (s^2 + b^2)); `variance` is s^2 + b^2, mm^2. A slide along the surface is never excluded.
     """
     off = [distances_mm(rival.T_target_source, patch, target) for rival in rivals]
     return np.array([1.0 - np.exp(-0.5 * (d**2).mean() / variance) for d in off])
 
 
 def _spread(target: PreparedTarget, patches: Patches, gain: Array) -> Array:
-    """(M,) the gain at every target point: that of the nearest patch; 0 for what was seen."""
+    """Spread the gain to every target point (M,): that of the nearest patch; 0 outside of all patches."""
     distance, nearest = cKDTree(target.points[patches.centres]).query(target.points)
     inside = np.zeros(len(target.points), dtype=bool)
     inside[np.concatenate(patches.members)] = True

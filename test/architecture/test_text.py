@@ -22,7 +22,6 @@ TO_DO = (  # packages whose docstrings are still to be shortened: this list only
     "gapr_core/formats",
     "gapr_core/model",
     "gapr_core/pages",
-    "gapr_core/registration",
     "gapr_core/results.py",
     "gapr_core/surface.py",
     "gapr_core/training",

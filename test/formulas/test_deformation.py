@@ -240,7 +240,7 @@ def deformed(seen, *names, whole=False):
 def test_what_is_believed_widens_the_covariance_by_what_it_may_move_the_pose_by(seen, names, found, whole):
     """Several may be found, and add up; the surest is named. What is below its limit is not believed."""
     fit = deformed(seen, *names, whole=whole)
-    measured, limits = of_deformations(fit.rests_on), {"strained": STRAINED, "apart": APART, "layered": LAYERED}
+    measured, limits = of_deformations(fit.full_fit), {"strained": STRAINED, "apart": APART, "layered": LAYERED}
     believed = {name: each for name, each in measured.items() if each.shown.log_ratio > limits[name]}
     assert set(believed) == found
     if not names:

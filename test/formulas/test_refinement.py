@@ -184,8 +184,8 @@ def test_a_pose_of_some_points_comes_to_rest_with_all_of_them(target, points):
     assert found.T == pytest.approx(expected, abs=1e-9) and len(found.signed_mm) == len(some)
     assert found.whole.T == pytest.approx(found.T, abs=1e-12) and len(found.whole.signed_mm) == len(points)
     plain = refinement.evaluate(found.T, points, target, CONFIG)
-    assert found.whole.weights == pytest.approx(plain.weights * trust) and found.rests_on is found.whole
-    assert refinement.rest_on_whole(off, SimpleNamespace(is_part=False), target, CONFIG) is off is off.rests_on
+    assert found.whole.weights == pytest.approx(plain.weights * trust) and found.full_fit is found.whole
+    assert refinement.rest_on_whole(off, SimpleNamespace(is_part=False), target, CONFIG) is off is off.full_fit
 
 
 def test_a_pose_in_the_basin_is_brought_home_and_rests(target, points):

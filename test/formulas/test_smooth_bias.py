@@ -53,7 +53,7 @@ def biased():
 @pytest.mark.parametrize("fitted", [1500, 200])
 def test_each_step_is_that_of_generalised_least_squares_about_the_centroid_of_all_points(biased, fitted):
     fit, source, target = biased(fitted)
-    found, before = corrected_fit(fit, LOOSE, source, target, CONFIG), fit.rests_on
+    found, before = corrected_fit(fit, LOOSE, source, target, CONFIG), fit.full_fit
     assert (fit.whole is not None) is (fitted < 600)
     trust = None if fit.whole is None else refinement.trust_of_whole(fit, source, CONFIG.refinement)
     spanned, now = fields(before, CORRELATION_MM, CENTRES), before
@@ -68,9 +68,9 @@ def test_each_step_is_that_of_generalised_least_squares_about_the_centroid_of_al
             now = refinement.evaluate_trusted(T, source.whole, target, CONFIG.refinement, trust)
         equations = NormalEquations.of(now, spanned).with_design_effect(first.design_effect)  # that of the first stays
     np.testing.assert_allclose(found.T, T, atol=1e-12)
-    assert found.bias_mm == found.rests_on.bias_mm == pytest.approx(size_mm)
-    assert len(found.moved) == len(source.points) and len(found.rests_on.moved) == 600
-    assert np.array_equal(found.rests_on.weights, now.weights)
+    assert found.bias_mm == found.full_fit.bias_mm == pytest.approx(size_mm)
+    assert len(found.moved) == len(source.points) and len(found.full_fit.moved) == 600
+    assert np.array_equal(found.full_fit.weights, now.weights)
 
 
 def test_a_bias_is_believed_from_its_evidence_on(biased):

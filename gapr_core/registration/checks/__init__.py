@@ -1,1 +1,1 @@
-"""Checks of a pose, and the answer that they lead to."""
+"""Checks of a pose, and the answer."""

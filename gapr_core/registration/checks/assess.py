@@ -1,4 +1,4 @@
-"""From a refined pose to its assessment: covariance, features, the two numbers, and the checks of geometry."""
+"""Assessment of a refined pose: covariance, features, the two numbers, and the checks of geometry."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def assess_fit(
     Args:
         fit: the refined pose and its residuals.
         candidates: the distinct poses, best first.
-        source: what was registered.
+        source: the registered source.
         target: the bone.
-        classifier: of the two numbers.
-        config: every setting.
+        classifier: model of the two numbers.
+        config: settings of the registration.
     """
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, source.around)
     features = measure(fit, candidates, uncertainty, source, target, config)
@@ -45,7 +45,7 @@ def assess_fit(
 
 
 def checked_geometry(assessment: Assessment, config: RegistrarConfig) -> Assessment:
-    """Ask the checks of geometry; the costly ones only where the pose may still be accepted."""
+    """Apply the checks of geometry; the costly ones only where the pose may still be accepted."""
     for check in table.GEOMETRY:
         assessment = check(assessment, config)
     for check in table.COSTLY:
@@ -56,11 +56,10 @@ def checked_geometry(assessment: Assessment, config: RegistrarConfig) -> Assessm
 
 def bias_corrected(assessment: Assessment, config: RegistrarConfig) -> Assessment:
     """Move the pose to where a smooth bias does not pull it; the same object without evidence of a bias."""
-    a = assessment
-    fit = corrected_fit(a.fit, a.uncertainty.covariance, a.source, a.target, config)
-    if fit is a.fit:
-        return a
-    misfits_mm = a.uncertainty.smooth_mm, a.uncertainty.short_mm  # those that were assessed
-    eye = covariance.eye_of(fit.T, a.viewpoint, config.sensor)
+    fit = corrected_fit(assessment.fit, assessment.uncertainty.covariance, assessment.source, assessment.target, config)
+    if fit is assessment.fit:
+        return assessment
+    misfits_mm = assessment.uncertainty.smooth_mm, assessment.uncertainty.short_mm  # of the assessed fit
+    eye = covariance.eye_of(fit.T, assessment.viewpoint, config.sensor)
     uncertainty = covariance.estimate(fit, config.covariance, config.sensor, None, misfits_mm, eye)
-    return replace(a, fit=fit, uncertainty=with_looks(uncertainty, fit, a.look))
+    return replace(assessment, fit=fit, uncertainty=with_looks(uncertainty, fit, assessment.look))

@@ -1,7 +1,7 @@
-"""The best pose of a source on a target and all that is known of it, on its way to the answer.
+"""The assessment of a pose: the best pose of a source on a target and everything known of it.
 
-Two steps change an assessment after the fit: `judge` sets its two numbers, and `with_finding` adds what a check found.
-`conclude` folds both into the answer.
+Two steps change an assessment after the fit: `judge` sets its two numbers, and `with_finding` adds the finding of a
+check. `conclude` folds both into the answer.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from gapr_core.results import Effect, Finding, Hypothesis, LookAnswer, Residuals
 
 Array = NDArray[np.float64]
 
-INDEPENDENT_POINTS = 30.0  # independent residuals that a source counts for where hypotheses share the probability
+INDEPENDENT_POINTS = 30.0  # independent residuals of a source, where hypotheses share the probability
 
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """The best pose of a source on a target, and all that is known about it.
+    """The best pose of a source on a target, and everything known about it.
 
     Attributes:
         fit: the refined pose with its residuals.
-        candidates: the distinct poses that were compared, best first.
+        candidates: the compared distinct poses, best first.
         uncertainty: covariance of the pose.
         features: measurements from which the two numbers are computed.
         judgement: the two numbers, and the log odds that each feature adds to the first.
         other_bone_prior: probability, before the data, that the source is of another subject's bone.
-        source, target: what was registered to what.
-        findings: of the checks, in the order in which they were asked.
-        proposer: name of the last proposer that was asked.
-        rounds: how many were asked.
-        seen: the whole cloud, where `source` is only the part of it that the pose explains; else None.
+        source, target: the registered source and its target.
+        findings: findings of the checks, in the order of the checks.
+        proposer: name of the last proposer used.
+        rounds: number of proposers used.
+        seen: the whole cloud, where `source` is only the part that the pose explains; else None.
         members: (N,) mask of that part in `seen`; None with it.
-        viewpoint: (3,) mm, source frame: where `seen` was seen from, of several places their mean; None with it.
+        viewpoint: (3,) mm, source frame: place of the camera of `seen`, the mean of several; None with it.
         look: (N,) number of the look that each point of `source` is of; None for a single one.
-        inferred_viewpoint: (3,) mm, source frame: `viewpoint`, where nobody gave it; else None.
-        factor95: takes the bound of the covariance to one that 95 % of the true errors stay below.
-        looks: of several looks, how each fits the pose (`look_agreement`); else ().
+        inferred_viewpoint: (3,) mm, source frame: `viewpoint`, if it was inferred; else None.
+        factor95: bound of 95 % of the true errors, over that of the covariance.
+        looks: fit of each of several looks (`look_agreement`); else ().
     """
 
     fit: Fit
@@ -80,12 +80,12 @@ class Assessment:
 
     @property
     def refusal(self) -> Finding | None:
-        """The first finding that refuses the pose; None when none does."""
+        """First finding that refuses the pose; None without one."""
         return next((each for each in self.findings if each.effect is Effect.REFUSE), None)
 
     @property
     def centre_mm(self) -> Array:
-        """(3,) mean of the source points in the target frame: what the covariance's rotation turns about."""
+        """(3,) mean of the source points in the target frame: the centre of rotation of the covariance."""
         return np.asarray(self.fit.moved.mean(axis=0))
 
     @property
@@ -99,20 +99,20 @@ class Assessment:
         return self.bound_mm(self.target.points)
 
     def bound_mm(self, points: Array) -> float:
-        """95 % bound of the error over points (M, 3) of the target frame, mm; one point for one named target."""
+        """Bound the error over points (M, 3) of the target frame at 95 %, mm; one point for one named target."""
         return self.factor95 * target_error.bound_mm(self.uncertainty.covariance, points, self.centre_mm)
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """All distinct poses, best first; the first one is the refined one."""
+        """Distinct poses, best first; the first one is the refined pose."""
         poses = (self.fit.T, *self.candidates.poses[1:])
         return tuple(map(Hypothesis, poses, shared_probability(self.confidence, self.candidates.scores)))
 
     @property
     def residuals(self) -> Residuals:
-        """Of every source point under the best pose."""
+        """Residuals of every source point under the best pose."""
         if self.seen is None or self.members is None:
-            fit = self.fit.rests_on
+            fit = self.fit.full_fit
             points = self.source.points if fit is self.fit else self.source.whole
             exact = self.target.mesh_distances(se3.apply(fit.T, points))
             return Residuals(points, exact[0] if exact else fit.signed_mm, fit.counts)
@@ -124,18 +124,18 @@ class Assessment:
         return Residuals(self.seen.points, distance_mm, counts)
 
     def reaches(self, limit: float) -> bool:
-        """True when no finding refuses the pose and its confidence reaches `limit`."""
+        """Return True when no finding refuses the pose and its confidence reaches `limit`."""
         return self.refusal is None and self.confidence >= limit
 
     def with_finding(self, finding: Finding | None, added: Array | None = None) -> Assessment:
-        """The same with one more finding, if any; `added` (6, 6) joins the covariance of one that widens it."""
+        """Add a finding, if any; `added` (6, 6) joins the covariance of one that widens it."""
         if finding is None:
             return self
         wider = self.uncertainty if added is None else self.uncertainty.with_more(added)
         return replace(self, findings=(*self.findings, finding), uncertainty=wider)
 
     def corrected(self, learned: Precision) -> Assessment:
-        """The same with the covariance and the bound scaled by the learned errors."""
+        """Scale the covariance and the bound by the learned errors."""
         variance_scale = learned.scale(self.features, self.tre_mm) ** 2
         covariance = variance_scale * self.uncertainty.covariance
         factor95 = learned.factor95(self.confidence)
@@ -143,11 +143,11 @@ class Assessment:
 
 
 def shared_probability(best: float, scores: Array, independent_points: float = INDEPENDENT_POINTS) -> tuple[float, ...]:
-    """Probabilities of ranked hypotheses.
+    """Share the probability among ranked hypotheses.
 
     A rival's likelihood relative to the best is exp(-n / 2 (s / s_best - 1)): that of n independent residuals whose
-    variance is the best one's mean square. What the best leaves of 1 is shared in these proportions, but no rival gets
-    more than its likelihood times the best one's probability.
+    variance is the best one's mean square. The remainder of the best's probability to 1 is shared in these proportions.
+    No rival gets more than its likelihood times the best one's probability.
 
     Args:
         best: probability of the best, 0 to 1.

@@ -1,7 +1,7 @@
 """Hollow bones: a model with an inner and an outer cortex, and sources that follow both.
 
-No probe sees the inner cortex, so a source is registered to the outer one alone. A source that was cut out of such a
-model follows both; the residuals show it.
+No probe sees the inner cortex, so a source is registered to the outer one alone. A source cut out of such a model
+follows both; the residuals show it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ SHARE, NOISE = 0.82, 1.5  # residual scale to both cortices over that to the out
 
 
 def follows_both(assessment: Assessment, config: RegistrarConfig) -> bool:
-    """True when the inner cortex explains what the outer one leaves open, down to the noise of the source.
+    """Return True when the inner cortex explains the remaining residuals, down to the noise of the source.
 
-    Two nearby sheets shrink the residuals of any bad fit, such as that of another subject's bone; only a source that
+    Two nearby sheets shrink the residuals of any bad fit, such as that of another subject's bone. Only a source that
     lies on both leaves nothing but its noise.
     """
     both = assessment.target.both_cortices

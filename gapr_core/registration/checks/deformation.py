@@ -1,4 +1,4 @@
-"""Is the source one rigid piece of bone? Strains, halves, layers and looks that err widen the covariance.
+"""Deformations of the source: strains, halves, layers and looks that err widen the covariance.
 
 A scan that drifts, or slices that lie too far apart, strain the source. In a scan of two that do not fit, or of a bone
 that is bent or broken, one half lies in another pose. Under tissue that grows thicker the distance from the bone
@@ -21,7 +21,7 @@ from gapr_core.results import Effect, Finding, RegistrationStatus
 
 Array = NDArray[np.float64]
 
-# log likelihood ratios beyond which a deformation is believed, and its text
+# least log likelihood ratios of a detection, and its text
 STRAINED, APART, LAYERED = 3.0, 6.0, 4.0
 TEXTS = {
     "strained": "the source is longer, wider or slanted against the bone",
@@ -36,8 +36,8 @@ class Deformation(NamedTuple):
 
     Attributes:
         shown: evidence of the residuals.
-        changes: (n, k) derivatives of the inliers' residuals by each of its unknowns, of 1 mm.
-        limit: log ratio beyond which it is believed.
+        changes: (n, k) derivatives of the inliers' residuals by its unknowns, of 1 mm each.
+        limit: least log ratio of a detection.
     """
 
     shown: Shown
@@ -46,19 +46,19 @@ class Deformation(NamedTuple):
 
 
 def deformation(fit: Fit) -> tuple[Finding, Array] | None:
-    """Find deformations of a source, and the (6, 6) that they add to the covariance of its pose.
+    """Find deformations of a source, and the covariance (6, 6) that they add to that of its pose.
 
     Several may be found at once: a bent source is strained, too. The finding names the surest.
     """
-    found = {name: each for name, each in of_deformations(fit.rests_on).items() if each.shown.log_ratio > each.limit}
-    if not found:
+    detected = {name: each for name, each in of_deformations(fit.full_fit).items() if each.shown.log_ratio > each.limit}
+    if not detected:
         return None
     added = np.zeros((6, 6))
-    for name, each in found.items():
+    for name, each in detected.items():
         added += covariance_added_by(fit, each.shown.size_mm * each.changes)
         if name == "apart":
             added += covariance_of_half(fit, each.shown.size_mm)
-    name, surest = max(found.items(), key=lambda item: item[1].shown.log_ratio)
+    name, surest = max(detected.items(), key=lambda item: item[1].shown.log_ratio)
     finding = Finding(
         name, Effect.WIDEN, surest.shown.log_ratio, surest.limit, RegistrationStatus.OK, TEXTS[name], ADVICE
     )
@@ -68,8 +68,8 @@ def deformation(fit: Fit) -> tuple[Finding, Array] | None:
 def of_deformations(fit: Fit) -> dict[str, Deformation]:
     """Measure each deformation; {} of few points.
 
-    `strained`: see `covariance.strains`. `apart`: the pair of `halves` for which the residuals speak most. `layered`:
-    see `a_layer`. A stand-off is no deformation: it is taken out with the pose.
+    `strained`: see `covariance.strains`. `apart`: the most likely pair of `halves`. `layered`: see `a_layer`. A
+    stand-off is no deformation: it is projected out with the pose.
     """
     count = np.count_nonzero(fit.counts)
     if count < FEWEST_POINTS:
@@ -87,7 +87,7 @@ def of_deformations(fit: Fit) -> dict[str, Deformation]:
 
 
 def halves(fit: Fit) -> list[Array]:
-    """(n, 6) for each principal axis of the inliers: derivatives by a motion of one half against the other."""
+    """Compute derivatives by a motion of one half against the other, (n, 6) for each principal axis of the inliers."""
     feet = fit.feet[fit.counts]
     along = feet @ extent.principal(feet).axes.T
     above, moved = np.where(along > np.median(along, axis=0), 0.5, -0.5), motions(fit)
@@ -95,7 +95,7 @@ def halves(fit: Fit) -> list[Array]:
 
 
 def a_layer(fit: Fit) -> Array:
-    """(n, 4) derivatives of the inliers' residuals by a layer on the bone: its growth along x, y and z, and its mean.
+    """Compute (n, 4) derivatives by a layer on the bone: its growth along x, y and z, and its mean.
 
     No residual shows the mean. A layer that grows evenly from nothing has a mean of root 3 times its standard
     deviation.
@@ -109,14 +109,14 @@ def with_looks(uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64] |
     """Add the errors of looks against each other, each a motion of its own, to an uncertainty.
 
     Args:
-        uncertainty: of the pose that all looks have in common.
-        fit: that pose.
-        look: (N,) number of the look that each point is of; None of a single one.
+        uncertainty: covariance of the common pose of all looks.
+        fit: the common pose.
+        look: (N,) number of each point's look; None of a single one.
     """
-    found = None if look is None else of_looks(fit, look)
-    if found is None or not found.shown.log_ratio > found.limit:
+    looks = None if look is None else of_looks(fit, look)
+    if looks is None or not looks.shown.log_ratio > looks.limit:
         return uncertainty
-    return uncertainty.with_more(covariance_added_by(fit, found.shown.size_mm * found.changes))
+    return uncertainty.with_more(covariance_added_by(fit, looks.shown.size_mm * looks.changes))
 
 
 def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
@@ -130,13 +130,13 @@ def of_looks(fit: Fit, look: NDArray[np.int64]) -> Deformation | None:
     numbers, group = np.unique(of_inliers, return_inverse=True)
     moved, group = motions(fit), group.reshape(-1)
     changes = np.column_stack([np.where(group == k, 1.0, 0.0)[:, None] * moved for k in range(len(numbers))])
-    (found,) = shown(blocks(fit, fit.jacobian[fit.counts], [changes], group))
-    return Deformation(found, changes, 0.0)
+    (evidence,) = shown(blocks(fit, fit.jacobian[fit.counts], [changes], group))
+    return Deformation(evidence, changes, 0.0)
 
 
 def covariance_of_half(fit: Fit, size_mm: float) -> Array:
-    """(6, 6) of either half against the pose between both, where they move against each other by `size_mm`."""
-    rests = fit.rests_on
-    moved = rests.moved[rests.counts]
+    """Compute the (6, 6) covariance of the pose of either half, where they move apart by `size_mm`."""
+    full = fit.full_fit
+    moved = full.moved[full.counts]
     deviations = 0.5 * size_mm * np.array([1.0] * 3 + [1.0 / extent.radius_mm(moved)] * 3)
     return covariance_about(fit.moved.mean(axis=0) - moved.mean(axis=0), np.diag(deviations**2))

@@ -1,9 +1,8 @@
-"""Test the residuals for further unknowns besides a pose: a motion, a strain, a layer, looks that err.
+"""Tests of the residuals for further unknowns besides a pose: a motion, a strain, a layer, looks that err.
 
-The restricted likelihood of their best size is compared with that of none, and
-the pose is integrated out (Patterson and Thompson 1971). A smooth bias of any size and an error that neighbours share
-are allowed for in both, as they look similar. Averages over blocks of neighbours are compared: a single point's normal
-errs with its residual.
+The restricted likelihood of their best size is compared with that of none, with the pose integrated out (Patterson and
+Thompson 1971). Both allow for a smooth bias of any size and an error that neighbours share, as they look similar.
+Averages over blocks of neighbours are compared: a single point's normal errs with its residual.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ from gapr_core.registration.uncertainty.linear_model import smooth_correlation
 
 Array = NDArray[np.float64]
 
-FEWEST_POINTS = 200  # inliers without which nothing is looked for
-CELLS = 40  # over which residuals are averaged
+FEWEST_POINTS = 200  # least inliers for a test
+CELLS = 40  # number of cells of the averages
 CORRELATION_MM = 20.0  # l of a smooth bias's correlation exp(-d^2 / 2 l^2)
-BIASES_MM = np.array([0.0, 0.15, 0.3, 0.6, 1.2, 2.4])  # of the smooth bias, to choose from
-SHARED_MM = np.array([0.05, 0.2, 0.5, 1.0])  # of what the points of a block share
-SIZES_MM = np.array([0.0, 0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0, 12.0])  # of the further unknowns
+BIASES_MM = np.array([0.0, 0.15, 0.3, 0.6, 1.2, 2.4])  # candidate sizes of the smooth bias
+SHARED_MM = np.array([0.05, 0.2, 0.5, 1.0])  # candidate sizes of the shared error of a block
+SIZES_MM = np.array([0.0, 0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0, 12.0])  # candidate sizes of the further unknowns
 
 
 class Shown(NamedTuple):
-    """What the residuals say of further unknowns.
+    """Evidence of the residuals for further unknowns.
 
     Attributes:
         log_ratio: log likelihood of their best size over that of none; 0 where none is best.
-        size_mm: root mean square of the size of each, given the residuals; before them all `SIZES_MM` are as likely.
+        size_mm: posterior root mean square of the size of each; all `SIZES_MM` are equally likely before.
     """
 
     log_ratio: float
@@ -52,10 +51,10 @@ class Blocks:
 
     Attributes:
         residuals: (n,) mm.
-        free: (n, j) how they change by what is not in question: a motion of the source, at least.
-        more: (n, m, k) how they change by the further unknowns, of 1 mm each: m alternatives of k at most, others 0.
-        variances: (n,) what the noise of a point leaves in them, mm^2.
-        feet: (n, 3) their places, mm.
+        free: (n, j) derivatives by the nuisance unknowns: a motion of the source, at least.
+        more: (n, m, k) derivatives by the further unknowns, of 1 mm each: m alternatives of k at most, others 0.
+        variances: (n,) variances by the noise of the points, mm^2.
+        feet: (n, 3) mean foot points, mm.
     """
 
     residuals: Array
@@ -66,11 +65,11 @@ class Blocks:
 
 
 def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64]) -> Blocks:
-    """Averages of the inliers (n) of a fit, weighted as they count: over cells around points that are spread evenly.
+    """Average the inliers (n) of a fit over cells around evenly spread points, by their weights.
 
     Args:
         fit: the residuals.
-        free: (n, j) derivatives of the inliers' residuals by what is not in question.
+        free: (n, j) derivatives of the inliers' residuals by the nuisance unknowns.
         more: m times (n, k), the same by the further unknowns; k may differ.
         group: (n,) number of a group; a block holds points of one.
     """
@@ -90,7 +89,7 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64]) -
 
 
 def motions(fit: Fit) -> Array:
-    """(n, 6) how the residuals of the inliers change by shifts and by turns about their middle, of 1 mm each.
+    """Compute (n, 6) changes of the inliers' residuals by shifts and by turns about their middle, of 1 mm each.
 
     A turn of 1 mm is one by 1 mm over their root mean square distance from the middle.
     """
@@ -100,7 +99,7 @@ def motions(fit: Fit) -> Array:
 
 
 def shown(found: Blocks) -> list[Shown]:
-    """What the blocks say of each of the m alternatives, whatever the bias and what the points of a block share."""
+    """Test each of the m alternatives, whatever the bias and the shared error of a block."""
     noise, correlation = np.diag(found.variances), smooth_correlation(found.feet, found.feet, CORRELATION_MM)
     shared = SHARED_MM[:, None, None] ** 2 * np.eye(len(noise))
     V = np.concatenate([noise + bias_mm**2 * correlation + shared for bias_mm in BIASES_MM])
@@ -109,7 +108,7 @@ def shown(found: Blocks) -> list[Shown]:
 
 
 def _of_sizes(log_likelihood: Array) -> Shown:
-    """The finding by (errors, K) log likelihoods of each of `SIZES_MM`."""
+    """Compute the evidence from (errors, K) log likelihoods of each of `SIZES_MM`."""
     best = log_likelihood.max(axis=0)
     posterior = np.exp(log_likelihood - log_likelihood.max()).sum(axis=0)
     size_mm = float(np.sqrt(posterior @ SIZES_MM**2 / posterior.sum()))
@@ -117,14 +116,14 @@ def _of_sizes(log_likelihood: Array) -> Shown:
 
 
 def _log_likelihoods(found: Blocks, V: Array) -> Array:
-    """(e, m, K) restricted log likelihood of each of `SIZES_MM`, of residuals whose other errors have covariances V.
+    """Compute (e, m, K) restricted log likelihoods of each of `SIZES_MM`, with other errors of covariances V.
 
-    With what is not in question projected out, the further unknowns have the information M and the score s: in the
-    axes of M, y^T V^-1 y falls by sum h^2 s_i^2 / (1 + h^2 m_i), and log det grows by sum log(1 + h^2 m_i).
+    With the nuisance unknowns projected out, the further unknowns have the information M and the score s. In the axes
+    of M, y^T V^-1 y falls by sum h^2 s_i^2 / (1 + h^2 m_i), and log det grows by sum log(1 + h^2 m_i).
 
     Args:
         found: the n blocks, with m alternatives.
-        V: (e, n, n) covariances of the residuals without what is in question, mm^2.
+        V: (e, n, n) covariances of the residuals without the further unknowns, mm^2.
     """
     root = np.linalg.cholesky(V)
     columns = np.column_stack([found.free, found.more.reshape(len(found.more), -1), found.residuals])
@@ -140,7 +139,7 @@ def _log_likelihoods(found: Blocks, V: Array) -> Array:
     score = (axes.swapaxes(2, 3) @ (more @ residuals[:, None, :, None]))[..., 0]
     variances = SIZES_MM[:, None] ** 2
     gain = 1.0 + variances * np.maximum(information, 0.0)[:, :, None]
-    log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)  # of V, and of what is projected out of it
+    log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)  # of V, and of its projected part
     log_det += 2.0 * np.log(np.where(shows, singular, 1.0)).sum(axis=1)
     alone = -0.5 * ((residuals**2).sum(axis=1) + log_det)
     more_alike = 0.5 * (variances * score[:, :, None] ** 2 / gain - np.log(gain)).sum(axis=3)

@@ -1,6 +1,6 @@
-"""An additive model: a number as the sum of one piecewise linear curve for each feature.
+"""Additive models: a number as the sum of one piecewise linear curve for each feature.
 
-The sum can be read: each feature's share is a line through a few points (Hastie and Tibshirani 1986). A new pair far
+The sum can be read: each feature's share is a line through a few points (Hastie and Tibshirani 1986). A value far
 outside the fitted range counts as its edge.
 """
 
@@ -24,12 +24,12 @@ FIT_AGAIN = "fit it again: python -m gapr_core.calibration --anatomy DIR --out D
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """What one feature adds: linear between the knots, constant beyond the first and the last.
+    """The contribution of one feature: linear between the knots, constant beyond the first and the last.
 
     Attributes:
         feature: its name.
         knots: (K,) values of the feature, ascending.
-        adds: (K,) what it adds there.
+        adds: (K,) contributions at the knots.
     """
 
     feature: str
@@ -37,7 +37,7 @@ class Curve:
     adds: Array
 
     def at(self, values: Any) -> Array:
-        """What it adds at any values (...) of the feature."""
+        """Evaluate the contribution at any values (...) of the feature."""
         return np.asarray(np.interp(values, self.knots, self.adds))
 
 
@@ -50,35 +50,35 @@ class Additive:
 
     @property
     def features(self) -> tuple[str, ...]:
-        """The names of the features, in the order of the curves."""
+        """Names of the features, in the order of the curves."""
         return tuple(curve.feature for curve in self.curves)
 
     def contributions(self, features: Mapping[str, float]) -> dict[str, float]:
-        """What each feature adds; with the constant their sum is the model's value."""
+        """Evaluate each feature's contribution; with the constant their sum is the model's value."""
         return {curve.feature: float(curve.at(features[curve.feature])) for curve in self.curves}
 
     def value(self, features: Mapping[str, float]) -> float:
-        """The sum for one answer's features."""
+        """Sum the contributions of one answer's features."""
         return self.constant + sum(self.contributions(features).values())
 
     def values(self, table: Array) -> Array:
-        """(N,) sums for features (N, F) in the order of the curves."""
+        """Evaluate (N,) sums for features (N, F) in the order of the curves."""
         columns = [curve.at(column) for curve, column in zip(self.curves, table.T, strict=True)]
         return self.constant + np.sum(columns, axis=0) if columns else np.full(len(table), self.constant)
 
 
 def as_dict(model: Additive) -> dict[str, Any]:
-    """The model as plain lists, for a file."""
+    """Convert a model to plain lists, for a file."""
     curves = [{"feature": curve.feature, "knots": np.round(curve.knots, 6).tolist(),
                "adds": np.round(curve.adds, 5).tolist()} for curve in model.curves]  # fmt: skip
     return {"constant": round(model.constant, 5), "curves": curves}
 
 
 def from_dict(data: Mapping[str, Any]) -> Additive:
-    """The model that `as_dict` wrote.
+    """Build the model that `as_dict` wrote.
 
     Raises:
-        ValueError: knots that do not ascend, or as many additions as there are not knots, or numbers that are none.
+        ValueError: knots that do not ascend, another number of additions than of knots, or values that are not finite.
     """
     curves = tuple(Curve(str(c["feature"]), np.array(c["knots"], float), np.array(c["adds"], float))
                    for c in data["curves"])  # fmt: skip
@@ -94,11 +94,11 @@ def from_dict(data: Mapping[str, Any]) -> Additive:
 
 
 def read(path: Path, kind: str) -> dict[str, Any]:
-    """The content of a model's file.
+    """Read the content of a model's file.
 
     Args:
         path: a JSON file.
-        kind: what it must say that it is, for example "confidence".
+        kind: required kind in the file, for example "confidence".
 
     Raises:
         WeightsError: no such file, a damaged one, or one of another format or kind.

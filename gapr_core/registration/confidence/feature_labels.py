@@ -1,4 +1,4 @@
-"""Features of the confidence in plain words."""
+"""Labels of the features of the confidence, in plain words."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FEATURE_LABELS = {
 
 
 def against(contributions: Mapping[str, float]) -> str:
-    """Name the features that speak most against a pose, by their log odds; "" where none does.
+    """Name the features with the most negative log odds; "" where none is below `WORTH_NAMING`.
 
     Returns:
         Such as "fit of the mirrored source, size of the residuals".

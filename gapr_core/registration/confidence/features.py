@@ -1,4 +1,4 @@
-"""Measurements of a refined pose among its rivals, from which the two numbers are computed."""
+"""Features of a refined pose among its rivals, from which the two numbers are computed."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ SIGNS = {
     "log_shift_sd": -1, "log_turn_sd": -1, "normal_agreement": 1, "scale_z": -1, "size_margin": 1,
     "near_size_margin": 1, "mirror_margin": 1, "margin": 1, "log_hypotheses": 1, "free_space_score": 1,
     "explained_of_compared": 1, "violating_of_compared": -1, "rival_margin": 1,
-}  # fmt: skip  # +1: more of it can only speak for the pose, -1: only against
-NEAR_SIZES = (0.9725, 1.0275)  # between these and 1: a source of this size fits in 1 as well as in `SIZES`
-FEWEST_FOR_SIZE = 8  # inliers without which nothing is known of the size
+}  # fmt: skip  # +1: larger values can only raise the probability, -1: only lower it
+NEAR_SIZES = (0.9725, 1.0275)  # halfway: a source of this size fits in size 1 as well as in `SIZES`
+FEWEST_FOR_SIZE = 8  # least inliers for an estimate of the size
 WIDEST, STANDOFF_MM = 0.3, 0.5  # prior standard deviations of the relative size, and of a stand-off
 SURE_SIZE, USUAL_SIZE = 0.005, 0.05  # standard deviations of the model's size, and of other subjects' bones
 ERROR_OF_MEDIAN = float(np.sqrt(np.pi / 2.0))  # standard error of a median over that of a mean
-LEAST_NOISE_MM = 0.1  # a source without noise counts as having so much
+LEAST_NOISE_MM = 0.1  # lower bound on the noise of a source
 LARGEST_SCALE_Z = 10.0  # clipped: larger values add no information
-RIVAL_IF_ALONE = 2.0  # a pose alone counts as having a rival of so many times its mean square
-LEAST_MARGIN = 1e-3  # added to the share by which the rival is worse, so that its logarithm is finite
+RIVAL_IF_ALONE = 2.0  # mean square of the assumed rival of a pose alone, over its own
+LEAST_MARGIN = 1e-3  # added to the relative lead over the rival, so that its logarithm is finite
 
 
 def measure(
@@ -68,10 +68,10 @@ def measure(
     Args:
         fit: the refined pose and its residuals.
         candidates: the distinct poses, best first.
-        uncertainty: of the pose.
-        source: what was registered.
+        uncertainty: covariance of the pose.
+        source: the registered source.
         target: the bone.
-        config: how a mirrored source is refined, and how far a smooth bias reaches.
+        config: settings of the refinement of changed sources, and the sensor.
     """
     second = candidates.scores[1] if len(candidates.scores) > 1 else RIVAL_IF_ALONE * candidates.scores[0]
     values = of_the_fit(fit, candidates, uncertainty, source, source.flatness_mm, target, config) | {
@@ -92,7 +92,7 @@ def of_the_fit(
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """Measure the features that both kinds share; `source` was fitted, `flatness_mm` (N,) is of the whole cloud."""
+    """Measure the features that both kinds share; `flatness_mm` (N,) is of the whole cloud, `source` was fitted."""
     inlier = fit.counts
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
     return {
@@ -111,16 +111,16 @@ def of_the_fit(
 
 
 def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
-    """Noise of a point, mm, as its neighbours show it: the upper end of what it may be.
+    """Estimate the noise of a point, mm, from its neighbours: the upper end of its likely range.
 
-    Neighbours are off their plane by noise, and since the bone is curved. Their foot points show the second alone, and
-    variances add up. The median of what is left has the standard error of one of as many independent patches.
+    Noise and the curvature of the bone take neighbours off their plane. Their foot points show the curvature alone, and
+    variances add up. The median of the remainder has the standard error of one of as many independent patches.
     """
-    curved_mm = fit_planes(fit.rests_on.feet, source.patches)[1]
+    curved_mm = fit_planes(fit.full_fit.feet, source.patches)[1]
     left_mm2 = flatness_mm**2 - curved_mm**2
     middle_mm2 = float(np.median(left_mm2))
     spread_mm2 = SD_OF_MEDIAN * float(np.median(np.abs(left_mm2 - middle_mm2)))
-    patches = max(len(fit.rests_on.feet) / source.patches.shape[1], 1.0)
+    patches = max(len(fit.full_fit.feet) / source.patches.shape[1], 1.0)
     most_mm2 = middle_mm2 + SURE_SIGMAS * ERROR_OF_MEDIAN * spread_mm2 / np.sqrt(patches)
     return float(np.sqrt(max(most_mm2, 0.0)))
 
@@ -128,7 +128,7 @@ def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
 def of_another_bone(
     fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> dict[str, float]:
-    """Measure whether the bone is of another size, side of the body or subject."""
+    """Measure the fit of sources of another size, side of the body or subject."""
     trial = Trial.of(fit.T, source, target, config)
     scale, scale_sd = scale_of(fit)
     usual = max(SURE_SIZE, sensor.errors(config.sensor, len(source.points)).scale)
@@ -144,19 +144,19 @@ def of_another_bone(
 
 
 def scale_of(fit: Fit) -> tuple[float, float]:
-    """Estimate by how much the source would have to grow to fit best, and the standard deviation of that.
+    """Estimate the growth with which the source fits best, and its standard deviation.
 
-    Generalised least squares of a similarity and a smooth bias (see `linear_model`): the pose's six motions, the size,
-    by which a residual grows as n . (q - c) at its foot point q, and a stand-off that all points share, which looks
-    much like another size on a patch seen from one side. The size of the bias follows from what these leave.
+    Generalised least squares with a smooth bias (see `linear_model`), of the pose's six motions, the size, by which a
+    residual grows as n . (q - c) at its foot point q, and a shared stand-off. That looks much like another size on a
+    patch seen from one side. The size of the bias follows from the remaining residuals.
 
     Returns:
         The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
     """
-    fit = fit.rests_on
+    fit = fit.full_fit
     if np.count_nonzero(fit.counts) < FEWEST_FOR_SIZE:
         return 0.0, 1.0
-    growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # the points hold the noise too
+    growth = np.einsum("ni,ni->n", fit.gradients, fit.feet - fit.moved.mean(axis=0))  # feet: points carry noise
     more = np.column_stack([growth, np.ones_like(growth)])
     bias = CORRELATION_MM, CENTRES
     equations = equations_of(fit, *bias).extended(fit, fields(fit, *bias), more, (WIDEST, STANDOFF_MM))

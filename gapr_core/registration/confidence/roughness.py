@@ -1,11 +1,10 @@
 """The misfit that changes within centimetres: a sign of another bone, or of a wrong pose.
 
-What a sensor gets wrong over a region (soft tissue, a warped scan) it gets wrong for all of it: residuals 12 to 16 mm
-apart are nearly as alike as those of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the
-covariance of the residuals at short range, less that at longer range, tells the two apart (an empirical covariogram;
-Matheron 1963). Noise takes no part: it is independent from point to point. Large residuals are damped: a few of them
-would decide. What counts is the upper end of what the difference may be: few pairs say little, and a misfit that nobody
-could see is not a small one.
+A sensor errs over whole regions (soft tissue, a warped scan): residuals 12 to 16 mm apart are nearly as alike as those
+of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the covariance of the residuals at
+short range, less that at longer range, tells the two apart (an empirical covariogram; Matheron 1963). Noise takes no
+part: it is independent from point to point. Large residuals are damped: a few of them would decide. The feature is the
+upper end of the likely difference. It stays large if there are too few pairs: unseen misfit is never treated as zero.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ Array = NDArray[np.float64]
 NEAR_MM, FAR_MM = (0.0, 6.0), (12.0, 16.0)  # between foot points on the bone; others: docs/tried.md
 LIMITS_MM = np.array([NEAR_MM, FAR_MM])
 CENTRES = 600  # inliers, evenly spread, of which each is compared with all
-LARGEST_SIGMAS = 4.0  # a residual of so many standard deviations counts as none
-SURE_SIGMAS = 1.645  # above what is measured: the difference is larger in 5 % of the cases
-DIGITS = 6  # of a foot point, mm: what is less must not decide which points are near
+LARGEST_SIGMAS = 4.0  # standard deviations from which a residual counts as none
+SURE_SIGMAS = 1.645  # above the measured difference: it is larger in 5 % of the cases
+DIGITS = 6  # of a foot point, mm: smaller differences must not decide which points are near
 
 
 def rough_misfit_mm(fit: Fit) -> float:
-    """Root, mm, of the most by which the covariance over less than 6 mm exceeds that over 12 to 16 mm; with its sign.
+    """Bound the excess of the covariance over less than 6 mm above that over 12 to 16 mm.
 
-    A product of two independent residuals of variance s^2 has a standard deviation of s^2, a mean of m of them
-    s^2 / sqrt(m); `products_mm2` counts a pair of two centres twice. The most is s^2: it is all that is known where no
-    two inliers are so near, or none so far apart.
+    Returns its root, mm, with its sign. A product of two independent residuals of variance s^2 has a standard deviation
+    of s^2, a mean of m of them s^2 / sqrt(m). `products_mm2` counts a pair of two centres twice. The bound is at most
+    s^2, and s^2 where no two inliers are so near, or none so far apart.
     """
     feet, damped = on_the_bone(fit)
     largest_mm2 = float((damped**2).mean()) if len(damped) else fit.sigma_mm**2
@@ -46,7 +45,7 @@ def rough_misfit_mm(fit: Fit) -> float:
 
 
 def on_the_bone(fit: Fit) -> tuple[Array, Array]:
-    """(M, 3) foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm.
+    """Compute (M, 3) foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm.
 
     Foot points: noise must not decide which points are near. Rounded: nor must the last bits of a pose.
     """
@@ -57,23 +56,23 @@ def on_the_bone(fit: Fit) -> tuple[Array, Array]:
 
 
 def signed_root(difference_mm2: float) -> float:
-    """Root, mm, of the size of a difference of covariances, with its sign."""
+    """Compute the root, mm, of the size of a difference of covariances, with its sign."""
     return float(np.sign(difference_mm2) * np.sqrt(abs(difference_mm2)))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def products_mm2(points, residuals, others, other_residuals, limits_mm, own):  # type: ignore[no-untyped-def]
-    """Products of two residuals, one of the points (N, 3) and one of the others (M, 3), by their distance.
+    """Sum products of two residuals, one of points (N, 3) and one of others (M, 3), by their distance.
 
-    The inner loops have no branch, and read memory in order: compilers turn them into wide instructions.
+    The inner loops have no branch and read memory in order: compilers vectorise them.
 
     Returns:
-        (K,) sums and (K,) counts of those within limits (K, 2), mm; `own` (N,) says which of the others is the point
-        itself and takes no part, -1 where none is.
+        (K,) sums and (K,) counts of those within limits (K, 2), mm. `own` (N,) is the index of the point itself among
+        the others, which takes no part; -1 where none is.
     """
     total, count = np.zeros(len(limits_mm)), np.zeros(len(limits_mm))
     squared, apart = limits_mm**2, np.empty(len(others))
-    beyond = squared.max() + 1.0  # infinity is no number to compare with where mathematics is fast
+    beyond = squared.max() + 1.0  # fast mathematics cannot compare with infinity
     x, y, z = others[:, 0].copy(), others[:, 1].copy(), others[:, 2].copy()
     for i in range(len(points)):
         px, py, pz = points[i]

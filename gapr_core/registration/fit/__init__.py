@@ -1,1 +1,1 @@
-"""Poses compared and refined on the target, and the same for changed sources."""
+"""Comparison and refinement of poses on the target, and the same for changed sources."""

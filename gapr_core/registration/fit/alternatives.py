@@ -1,7 +1,7 @@
-"""Would the source lie as well otherwise: mirrored, in another size, off the bone, or pushed aside?
+"""Fits of changed sources and poses: mirrored, in another size, off the bone, or pushed aside.
 
-Each question changes the source, the surface or the pose, refines from there on the same few points, and compares the
-misfit with the one of the source's own pose. The answer is a log ratio of mean squares: below 0 the change fits better.
+Each function changes the source, the surface or the pose, refines on the same few points, and compares the misfit with
+that of the source's own pose. The answer is a log ratio of mean squares: below 0 the change fits better.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from gapr_core.registration.problem.target import PreparedTarget
 Array = NDArray[np.float64]
 
 CLIPPED = (-1.5, 4.0)  # of a log ratio: larger margins add no information
-LEAST_MM = 0.1  # residuals below it say nothing of side or size
-SIZES = (0.945, 1.055)  # far enough from 1 that noise and a sensor's bias fit neither better
+LEAST_MM = 0.1  # smaller residuals carry no information on side or size
+SIZES = (0.945, 1.055)  # far enough from 1 that neither fits better through noise or a sensor's bias
 STANDOFFS_MM = (-3.0, -2.0, -1.5, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0, 4.5, 6.0)
 PLANES = 6  # through the bone's long axis, evenly turned
-OWN_IMAGE_SHARE = 0.02  # of the half extent: a bone whose image lies so near, as a median, is its own mirror image
+OWN_IMAGE_SHARE = 0.02  # median distance of a bone to its own mirror image, at most, over the half extent
 SYMMETRIC_MM = 0.4  # median distance of a bone and its image; .08 to .38 in an atlas, .65 or more of scanned ones
-POINTS = 400  # of the bone, for that
-PUSHED_MOTIONS, PUSH = 3, 1.5  # weakest motions, and how far, in units of `same_pose_mm`
+POINTS = 400  # of the bone, in this comparison
+PUSHED_MOTIONS, PUSH = 3, 1.5  # number of weakest motions, and length of a push in units of `same_pose_mm`
 FLIP = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
@@ -42,7 +42,7 @@ class Trial:
         T: (4, 4) T_target_source, mm.
         points: (N, 3) mm, source frame.
         target: the bone.
-        config: every setting.
+        config: settings of refinement and verification.
     """
 
     T: Array
@@ -58,7 +58,7 @@ class Trial:
     def refined(
         self, poses: Array, points: Array | None = None, target: PreparedTarget | None = None
     ) -> tuple[Array, Array]:
-        """(K, 4, 4) poses and (K,) mean squares, mm^2, refined from poses (K, 4, 4), of other points or surfaces."""
+        """Refine poses (K, 4, 4), of other points or surfaces if given; returns them and (K,) mean squares, mm^2."""
         limits_mm = np.linspace(*self.config.verification.middle_limits_mm)
         some, surface = self.points if points is None else points, target or self.target
         return refine_many(poses, some, surface, limits_mm, self.config.num_threads)
@@ -69,17 +69,17 @@ class Trial:
         return float(self.refined(self.T[None])[1][0])
 
     def log_ratio(self, changed_mm2: float) -> float:
-        """Log of a mean square, mm^2, over the own one."""
+        """Compute the log of a mean square, mm^2, over that of the own pose."""
         return log_ratio(changed_mm2, self.own_mm2)
 
 
 def log_ratio(changed_mm2: float, own_mm2: float) -> float:
-    """Log of one mean square residual over another, clipped."""
+    """Compute the log of one mean square residual over another, clipped."""
     return float(np.clip(np.log((changed_mm2 + LEAST_MM**2) / (own_mm2 + LEAST_MM**2)), *CLIPPED))
 
 
 def other_size(trial: Trial, sizes: Sequence[float] = SIZES) -> float:
-    """Log ratio of the source in the best of other sizes, grown about its centroid.
+    """Compute the log ratio of the source in the best of other sizes, grown about its centroid.
 
     Residuals grow with the source, so they count in its own size: a mean square over s^2.
     """
@@ -90,7 +90,7 @@ def other_size(trial: Trial, sizes: Sequence[float] = SIZES) -> float:
 
 
 def standoff(trial: Trial, standoffs_mm: Sequence[float] = STANDOFFS_MM) -> tuple[float, float]:
-    """Stand-off, mm, outwards, with which the source fits best, and its log ratio."""
+    """Find the stand-off, mm, outwards, with which the source fits best, and its log ratio."""
 
     def misfit_mm2(mm: float) -> float:
         surface = offset_surface(trial.target, SensorConfig(standoff_mm=mm))
@@ -102,9 +102,9 @@ def standoff(trial: Trial, standoffs_mm: Sequence[float] = STANDOFFS_MM) -> tupl
 
 
 def pushed(trial: Trial, fit: Fit) -> float:
-    """Least mean square, mm^2, of the pose pushed along its weakest motions, where it rests elsewhere; else infinite.
+    """Compute the least mean square, mm^2, of the pose pushed along its weakest motions and at rest elsewhere.
 
-    A hypothesis in a flat valley stays where it began, so no other one shows that the valley is there.
+    Infinite where every push comes back. No other hypothesis shows a flat valley, since each stays where it began.
     """
     same_mm = trial.config.verification.same_pose_mm
     pushes, centre = _weakest_motions(fit) * PUSH * same_mm, fit.moved.mean(axis=0)
@@ -115,7 +115,7 @@ def pushed(trial: Trial, fit: Fit) -> float:
 
 
 def _weakest_motions(fit: Fit) -> Array:
-    """(K, 6) twists about the moved source's centroid, of 1 mm over it, that the residuals say least about."""
+    """Compute the (K, 6) twists, of 1 mm over the moved source, that the residuals determine least."""
     J, offsets = fit.jacobian, fit.moved - fit.moved.mean(axis=0)
     scale = np.repeat([1.0, 1.0 / extent.radius_mm(fit.moved)], 3)
     motions = np.linalg.eigh((J * fit.weights[:, None] * scale).T @ (J * scale))[1].T[:PUSHED_MOTIONS] * scale
@@ -124,12 +124,12 @@ def _weakest_motions(fit: Fit) -> Array:
 
 
 def flipped(points: Array) -> Array:
-    """Points (N, 3), or one, mirrored at z = 0."""
+    """Mirror points (N, 3), or one, at z = 0."""
     return points * FLIP.diagonal()[:3]
 
 
 def mirrored(trial: Trial) -> float:
-    """Log ratio of the mirrored source near the pose: below 0 it fits better, about 0 nothing tells left from right.
+    """Compute the log ratio of the mirrored source near the pose: below 0 it fits better, about 0 as well.
 
     A bone that is its own mirror image as a whole (a pelvis, a rib cage) has no other side: that image does not count.
     """
@@ -142,9 +142,9 @@ def mirrored(trial: Trial) -> float:
 
 
 def on_own_image(trial: Trial) -> float:
-    """Log ratio of the mirrored source on the image of a bone that is nearly its own; 4 for any other bone.
+    """Compute the log ratio of the mirrored source on the bone's own mirror image; 4 without such an image.
 
-    Of mean squares and of robust variances the larger: chance lets a few gross points more lie near an image.
+    The larger of the ratios of mean squares and of robust variances: a few gross points may fit an image by chance.
     """
     image = _kept_image(trial)
     if image is None:
@@ -157,7 +157,7 @@ def on_own_image(trial: Trial) -> float:
 
 
 def is_symmetric(trial: Trial) -> bool:
-    """True for a model whose halves are mirror images of each other: a flipped source of it is no mistake."""
+    """Return True for a model whose halves are mirror images of each other: a flipped source of it is no mistake."""
     target, image = trial.target, _kept_image(trial)
     key = "symmetric", target.offset_mm, trial.config.verification
     if image is None:
@@ -170,7 +170,7 @@ def is_symmetric(trial: Trial) -> bool:
 
 
 def _kept_image(trial: Trial) -> Array | None:
-    """(4, 4) motion with a reflection that lays the bone on itself, found once for a target; None without one."""
+    """Find the (4, 4) motion with a reflection that lays the bone on itself, once per target; None without one."""
     target = trial.target
     key = "own image", target.offset_mm, trial.config.verification  # targets share their cache with other stand-offs
     if key not in target.cache:
@@ -182,12 +182,12 @@ def _kept_image(trial: Trial) -> Array | None:
 
 
 def _some_of(target: PreparedTarget) -> Array:
-    """(N, 3) points of the bone, as a sensor with a stand-off sees them."""
+    """Select (N, 3) points of the bone, where a sensor with a stand-off sees them."""
     return target.elements[:: max(1, len(target.points) // POINTS), :3]
 
 
 def _reflections(trial: Trial) -> list[Array]:
-    """(4, 4) reflections, target frame: at planes through the bone's long axis and at the source's own main planes."""
+    """Compute (4, 4) reflections, target frame, at planes through the bone's long axis and the source's main planes."""
     (_, middle, shortest), centre = trial.target.main_axes, trial.target.centre_mm
     angles = np.arange(PLANES) * np.pi / PLANES
     of_bone = [np.cos(angle) * shortest + np.sin(angle) * middle for angle in angles]
@@ -197,7 +197,7 @@ def _reflections(trial: Trial) -> list[Array]:
 
 
 def _reflection(normal: Array, through: Array) -> Array:
-    """(4, 4) p -> p - 2 n (n . (p - c))."""
+    """Compute the (4, 4) reflection p -> p - 2 n (n . (p - c))."""
     H = np.eye(4)
     H[:3, :3] -= 2.0 * np.outer(normal, normal)
     H[:3, 3] = 2.0 * normal * (normal @ through)
@@ -205,7 +205,7 @@ def _reflection(normal: Array, through: Array) -> Array:
 
 
 def _is_own_image(image: Array, target: PreparedTarget) -> bool:
-    """True when a motion with a reflection lays the whole bone on itself."""
+    """Return True when a motion with a reflection lays the whole bone on itself."""
     some = target.points[:: max(1, len(target.points) // POINTS)]
     limit_mm = OWN_IMAGE_SHARE * target.half_extent_mm  # twice as far is infinitely far: no median of two gets below it
     gaps_mm = target.tree.query(some @ image[:3, :3].T + image[:3, 3], distance_upper_bound=2.0 * limit_mm)[0]

@@ -1,8 +1,8 @@
 """Normal equations and scores of a pose, block by block.
 
-The elements near a block of points are laid side by side first. What is then computed of them has no branch and reads
-memory in order, which compilers turn into wide instructions. A block is one array of columns of a fixed length, since
-compilers have to know that what is written is not what is read.
+The elements near a block of points are laid side by side first. The rest has no branch and reads memory in order, which
+compilers vectorise. A block is one array of columns of a fixed length: compilers have to know that the written columns
+are not those read.
 """
 
 # mypy: ignore-errors
@@ -33,7 +33,7 @@ END = ROWS + 7 * B
 
 @numba.njit(**FAST)
 def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
-    """Normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle of the source."""
+    """Fill the normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle."""
     centre = moved(T, middle)
     block, reach = np.empty(END), ELEMENT_RADIUS * spacing
     H[:], g[:] = 0.0, 0.0
@@ -49,7 +49,7 @@ def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, sp
 
 @numba.njit(**FAST)
 def mean_square(T, points, trust, elements, nearest, origin, per_cell, spacing, limit):
-    """Mean squared distance of the moved points to the surface, truncated; `trust` does not count."""
+    """Compute the mean squared distance of the moved points to the surface, truncated; `trust` does not count."""
     block, reach, total = np.empty(END), ELEMENT_RADIUS * spacing, 0.0
     for start in range(0, len(points), B):
         stop = min(start + B, len(points))
@@ -60,11 +60,11 @@ def mean_square(T, points, trust, elements, nearest, origin, per_cell, spacing, 
 
 @numba.njit(**FAST)
 def gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, block):
-    """Lay side by side each moved point, its offset from the element near it, this element, and the point's trust.
+    """Lay side by side each moved point, its offset from the element near it, this element, and its trust.
 
-    Points with none near are left out; returns how many there are.
+    Points with none near are left out; returns the number of the others.
     """
-    count = np.int64(0)  # of a plain 0 Numba would compile what it is given to once more
+    count = np.int64(0)  # a plain 0 would make Numba compile its callees once more
     for p in range(start, stop):
         x, y, z = moved(T, points[p])
         q = element_near(x, y, z, nearest, origin, per_cell)
@@ -83,7 +83,7 @@ def gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, b
 
 @numba.njit(inline="always", **FAST)
 def distance_of(block, c, reach, variance):
-    """`distance` of point c of a block."""
+    """Compute the `distance` of point c of a block."""
     return distance(
         block[DX + c], block[DY + c], block[DZ + c],
         block[NX + c], block[NY + c], block[NZ + c],
@@ -95,9 +95,9 @@ def distance_of(block, c, reach, variance):
 
 @numba.njit(**FAST)
 def fill_rows(block, count, centre, reach, limit, variance):
-    """Derivatives of the residuals by the twist about `centre` (3), and the residuals, times the roots of the weights.
+    """Fill the rows: derivatives of the residuals by the twist about `centre` (3), and the residuals.
 
-    A weight is the trust times Tukey's, and where the noise's variance is given its share in that of the residual.
+    Both are times root w: w is the trust times Tukey's weight, and the noise's share in the variance if that is given.
     """
     noise, known = (variance, 1.0) if variance > 0.0 else (1.0, 0.0)
     cx, cy, cz = centre
@@ -138,7 +138,7 @@ def add_up(block, count, H, g):
 
 @numba.njit(**FAST)
 def squares(block, count, reach, limit):
-    """Sum of the squared distances of a block's points, each truncated."""
+    """Sum the squared distances of a block's points, each truncated."""
     total = 0.0
     for c in range(count):
         r, _, _, _, aside = distance_of(block, c, reach, 0.0)

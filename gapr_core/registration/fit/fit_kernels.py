@@ -1,6 +1,6 @@
-"""Compiled loops over the residuals of a pose: the weights that follow from them, and the means of patches.
+"""Compiled loops over the residuals of a pose: weights, and means of patches.
 
-No fast mathematics here: where no surface is near a residual is NaN, and counts as infinitely large.
+No fast mathematics here: a residual is NaN where no surface is near, and counts as infinitely large.
 """
 
 # mypy: ignore-errors
@@ -14,7 +14,7 @@ from gapr_core.geometry.quadric_kernels import EXACT
 
 @numba.njit(**EXACT)
 def share_beyond(residuals, limit):
-    """Share of (N,) residuals that are larger than `limit`."""
+    """Compute the share of (N,) residuals that are larger than `limit`."""
     count = 0
     for p in range(len(residuals)):
         count += not abs(residuals[p]) <= limit
@@ -23,9 +23,9 @@ def share_beyond(residuals, limit):
 
 @numba.njit(**EXACT)
 def weights(residuals, aside, nearest, elements, variance, limit):
-    """(N,) Tukey's weights, times the share of the noise's variance in that of a residual.
+    """Compute (N,) Tukey's weights, times the share of the noise's variance in that of a residual.
 
-    `nearest` (N,) are rows of `elements`, whose last column is a variance; -1 where none is near.
+    `nearest` (N,) are rows of `elements`, whose last column is a variance; -1 without a near one.
     """
     out = np.zeros(len(residuals))
     for p in range(len(residuals)):
@@ -38,7 +38,7 @@ def weights(residuals, aside, nearest, elements, variance, limit):
 
 @numba.njit(**EXACT)
 def patch_means(residuals, weights, neighbours):
-    """(N,) weighted means of the residuals of each point's neighbours (N, k), which count where they have a weight."""
+    """Compute (N,) weighted means of the residuals of each point's neighbours (N, k) that have a weight."""
     out = np.empty(len(neighbours))
     for p in range(len(neighbours)):
         total, weight = 0.0, 1e-9
@@ -52,9 +52,9 @@ def patch_means(residuals, weights, neighbours):
 
 @numba.njit(**EXACT)
 def leading_means(values, counts, neighbours, count):
-    """(N,) means of `values` over the first `count` of each point's neighbours (N, k) that count; NaN where too few do.
+    """Average `values` over the first `count` of each point's neighbours (N, k) that count.
 
-    `counts` (N,) says which points count.
+    Returns (N,), NaN where too few count; `counts` (N,) marks the points that count.
     """
     out = np.full(len(neighbours), np.nan)
     for p in range(len(neighbours)):
@@ -71,7 +71,7 @@ def leading_means(values, counts, neighbours, count):
 
 @numba.njit(**EXACT)
 def shared_out(values, patches, count):
-    """(count,) means of the `values` (N,) of the patches (N, k) that each point is in; 0 for one in none."""
+    """Average the `values` (N,) of the patches (N, k) of each point; (count,), 0 for a point in none."""
     total, found = np.zeros(count), np.zeros(count)
     for p in range(len(patches)):
         for q in patches[p]:

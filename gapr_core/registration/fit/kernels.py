@@ -1,9 +1,8 @@
 """Compiled inner loops of the refinement: nearest surface element, residual, normal equations, one step.
 
-A residual is the signed distance of a moved source point to the quadric that stands for the surface near it. Isotropic
-noise of variance s^2 lifts the expected distance to a curved surface by -s^2 tr(shape) / 2 (outwards where it is
-convex); given that variance, the offset is taken away. Without it the pose of a one-sided cloud is pushed along the
-direction of view.
+A residual is the signed distance of a moved source point to the quadric of the surface near it. Isotropic noise of
+variance s^2 lifts the expected distance to a curved surface by -s^2 tr(shape) / 2 (outwards where it is convex). Given
+that variance, the offset is subtracted. Without it the pose of a one-sided cloud is pushed along the direction of view.
 """
 
 # mypy: ignore-errors
@@ -16,17 +15,17 @@ from gapr_core.registration.fit.block_kernels import accumulate, mean_square
 from gapr_core.registration.fit.surface_kernels import FAST, element_near, moved, residual
 
 LARGEST_TURN_RAD = 0.35  # of one step
-DAMPING = 1e-4  # of each point's say in a shift, and of the information on a turn: what nothing observes stays
-TURN_DAMPING_MM2 = 1.0  # and so much more of a turn
+DAMPING = 1e-4  # of a point's weight in a shift and of the information on a turn: unobserved motions stay 0
+TURN_DAMPING_MM2 = 1.0  # added to that of a turn
 
 
 @numba.njit(**FAST)
 def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spacing, limits, variances):
-    """Gauss-Newton from every pose (K, 4, 4); one iteration per entry of `limits` (Tukey scale) and `variances`.
+    """Iterate Gauss-Newton from every pose (K, 4, 4), once per entry of `limits` (Tukey scale) and `variances`.
 
-    `trust` (N,) are weights of the points as well as Tukey's. Where the variance of the noise is given, a residual also
-    weighs as much as the noise's share in its variance; the rest is the element's. Returns the poses and their mean
-    squared distances, truncated at the last limit.
+    `trust` (N,) are weights of the points, on top of Tukey's. With a variance of the noise, a residual also weighs as
+    much as the noise's share in its variance; the rest is the element's. Returns the poses and their mean squared
+    distances, truncated at the last limit.
     """
     out, scores = poses.copy(), np.empty(len(poses))
     surface = elements, nearest, origin, per_cell, spacing
@@ -43,7 +42,7 @@ def refine_batch(poses, points, trust, elements, nearest, origin, per_cell, spac
 
 @numba.njit(**FAST)
 def step(T, middle, H, g, count):
-    """Solve, limit the turn, move T in place; H is overwritten, g becomes the twist about the moved `middle`."""
+    """Solve, limit the turn and move T in place; H is overwritten, g becomes the twist about the moved `middle`."""
     for a in range(3):
         H[a, a] += DAMPING * count
         H[a + 3, a + 3] += DAMPING * H[a + 3, a + 3] + TURN_DAMPING_MM2
@@ -67,7 +66,7 @@ def step(T, middle, H, g, count):
 
 @numba.njit(**FAST)
 def solve(A, b):
-    """Solve A x = b in place, A symmetric and positive definite: Cholesky on its lower triangle, x stands in b.
+    """Solve A x = b in place, A symmetric and positive definite: Cholesky on its lower triangle, x replaces b.
 
     By hand, since Numba compiles a call of LAPACK for 13 s.
     """
@@ -88,7 +87,7 @@ def solve(A, b):
 
 @numba.njit(**FAST)
 def rotation(vector, angle):
-    """Rodrigues' formula for a rotation vector of known length."""
+    """Apply Rodrigues' formula to a rotation vector of known length."""
     R = np.eye(3)
     if angle < 1e-12:
         return R
@@ -102,7 +101,7 @@ def rotation(vector, angle):
 
 @numba.njit(**FAST)
 def residuals_at(T, points, elements, nearest, origin, per_cell, spacing, variance):
-    """(N,) signed distances (NaN beyond the field), (N, 3) gradients, (N,) distances aside, (N,) elements."""
+    """Measure (N,) signed distances (NaN beyond the field), (N, 3) gradients, (N,) distances aside, (N,) elements."""
     n = len(points)
     signed, gradient = np.full(n, np.nan), np.zeros((n, 3))
     aside, element = np.zeros(n), np.full(n, -1)
@@ -119,9 +118,9 @@ def residuals_at(T, points, elements, nearest, origin, per_cell, spacing, varian
 
 @numba.njit(**FAST)
 def distinct(moved_points, order, tolerance, most):
-    """Indices of at most `most` poses, in `order`, each farther than `tolerance` (rms) from those before it.
+    """Select at most `most` poses, in `order`, each farther than `tolerance` (rms) from those before it.
 
-    `moved_points` (K, P, 3) are the same few source points under every pose.
+    `moved_points` (K, P, 3) are the same few source points under every pose. Returns indices.
     """
     kept = np.empty(most, dtype=np.int64)
     count, points = 0, moved_points.shape[1]

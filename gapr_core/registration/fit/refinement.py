@@ -1,8 +1,8 @@
 """Robust point-to-surface refinement: many poses coarsely, a few to the end.
 
-Point-to-plane (Chen and Medioni 1992) with second-order surface elements, Tukey's biweight at a scale that follows
-the residuals, and the offset that noise causes on curved surfaces taken away (see `kernels`). In the end
-elements that fit their surroundings badly weigh less, and a patch of the source that is off as a whole weighs nothing.
+Point-to-plane (Chen and Medioni 1992) with second-order surface elements and Tukey's biweight at a scale that follows
+the residuals. The offset that noise causes on curved surfaces is subtracted (see `kernels`). In the end elements that
+fit their surroundings badly weigh less, and a patch of the source that is off as a whole weighs nothing.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from gapr_core.runtime.parallel import in_pieces
 Array = NDArray[np.float64]
 
 SD_OF_MEDIAN = 1.4826  # standard deviation of normal residuals over the median of their absolute values
-FAR_SIGMAS = 3.0  # beyond so many standard deviations lies an outlier, or noise with a long tail
-WORTH_A_THREAD = 100_000  # points moved, some 3 ms: a second thread costs more than it saves below that
-PATCH_POINTS = SourceConfig().normal_neighbours  # of a source that was not prepared
+FAR_SIGMAS = 3.0  # standard deviations beyond which lie outliers, or noise with a long tail
+WORTH_A_THREAD = 100_000  # points moved, some 3 ms: below, a second thread costs more than it saves
+PATCH_POINTS = SourceConfig().normal_neighbours  # of an unprepared source
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A pose and how the source lies on the target under it.
+    """A pose and the residuals of the source on the target under it.
 
     Attributes:
         T: (4, 4) T_target_source, mm.
         sigma_mm: robust standard deviation of the residuals.
         signed_mm: (N,) signed distances to the surface, NaN where none is near.
-        weights: (N,) of the points in the normal equations, 0 for outliers.
+        weights: (N,) weights of the points in the normal equations, 0 for outliers.
         gradients: (N, 3) unit surface normals at the foot points, target frame.
         elements: (N,) indices of the nearest target points, -1 where none is near.
         moved: (N, 3) source points in the target frame.
-        bias_mm: standard deviation of the smooth bias for which the pose is corrected; 0 for plain least squares.
-        whole: the same pose with all points of a source of which only some are here; None where all are.
+        bias_mm: standard deviation of the smooth bias that the pose is corrected for; 0 for plain least squares.
+        whole: the same pose with all points of the source; None where all are here.
     """
 
     T: Array
@@ -57,8 +57,8 @@ class Fit:
     whole: Fit | None = None
 
     @property
-    def rests_on(self) -> Fit:
-        """The same pose with all points that it rests on."""
+    def full_fit(self) -> Fit:
+        """Fit of the same pose with all points of the source."""
         return self.whole or self
 
     @cached_property
@@ -110,14 +110,14 @@ def refine_fully(
     config: RefinementConfig,
     neighbours: NDArray[np.int64] | None = None,
 ) -> Fit:
-    """Refine one pose on all points until it rests; the scale of the weights follows the residuals.
+    """Refine one pose on all points until it converges; the scale of the weights follows the residuals.
 
     Args:
         T: (4, 4) T_target_source within the basin, mm.
         points: (N, 3) source points, mm.
         target: the prepared target.
         config: iterations and scales.
-        neighbours: (N, k) of each point, itself among them, that make its patch, as `PreparedSource.neighbours`; looked
+        neighbours: (N, k) patch of each point, itself included, as `PreparedSource.neighbours`; looked
             up when None.
     """
     if neighbours is None:
@@ -136,7 +136,7 @@ def refine_fully(
 
 
 def rest_on_whole(fit: Fit, source: PreparedSource, target: PreparedTarget, config: RefinementConfig) -> Fit:
-    """The fit of a source of which only some points are fitted, moved to where all rest: their noise averages out."""
+    """Move the fit of some points of a source to where all its points fit best: their noise averages out."""
     if not source.is_part:
         return fit
     limits = np.full(config.iterations, tukey_limit(fit.signed_mm, fit.sigma_mm, config))
@@ -147,19 +147,19 @@ def rest_on_whole(fit: Fit, source: PreparedSource, target: PreparedTarget, conf
 
 
 def trust_of_whole(fit: Fit, source: PreparedSource, config: RefinementConfig) -> Array:
-    """(M,) `patch_trust` of all points of a source: the mean over the patches that each is in, 0 for one in none."""
+    """Average `patch_trust` over the patches of each point of the whole source; (M,), 0 for a point in none."""
     trust = patch_trust(fit, source.neighbours, config)
     return np.asarray(fit_kernels.shared_out(trust, source.patches, len(source.whole)))
 
 
 def distances_mm(T: Array, points: Array, target: PreparedTarget) -> Array:
-    """(N,) distances of points (N, 3) to the surface under a pose; infinite where none is near, or beyond its end."""
+    """Measure (N,) distances of points (N, 3) to the surface under a pose; infinite without a near one."""
     signed, _, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     return np.hypot(np.nan_to_num(signed, nan=np.inf), aside)
 
 
 def evaluate(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig) -> Fit:
-    """Residuals, scale and weights of a pose as it is; no patch is distrusted."""
+    """Compute residuals, scale and weights of a pose as it is; every patch is trusted."""
     signed, *_ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
     sigma_mm = _robust_sigma(signed, config)
     limit_mm = tukey_limit(signed, sigma_mm, config)
@@ -169,7 +169,7 @@ def evaluate(T: Array, points: Array, target: PreparedTarget, config: Refinement
 
 
 def evaluate_trusted(T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, trust: Array) -> Fit:
-    """`evaluate` of a pose, made exactly rigid, with a known trust (N,) of the points in the weights."""
+    """Evaluate a pose, made exactly rigid, with a known trust (N,) of the points in the weights."""
     fit = evaluate(se3.nearest_rigid(T), points, target, config)
     return replace(fit, weights=fit.weights * trust)
 
@@ -177,16 +177,16 @@ def evaluate_trusted(T: Array, points: Array, target: PreparedTarget, config: Re
 def evaluate_with_patches(
     T: Array, points: Array, target: PreparedTarget, config: RefinementConfig, neighbours: NDArray[np.int64]
 ) -> Fit:
-    """`evaluate` of a pose, made exactly rigid, with the patches' trust in the weights."""
+    """Evaluate a pose, made exactly rigid, with the patches' trust in the weights."""
     fit = evaluate(se3.nearest_rigid(T), points, target, config)
     return replace(fit, weights=fit.weights * patch_trust(fit, neighbours, config))
 
 
 def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfig) -> Array:
-    """(N,) Tukey weights of the patches' mean residuals, whose scale is their own median.
+    """Compute (N,) Tukey weights of the patches' mean residuals, whose scale is their own median.
 
-    A dent, a filled hole or soft tissue takes a patch off the surface as a whole by less than its points' noise: what
-    no point shows alone its neighbours show together.
+    A dent, a filled hole or soft tissue takes a whole patch off the surface by less than its points' noise. The mean
+    shows it where no single point does.
     """
     means = fit_kernels.patch_means(fit.signed_mm, fit.weights, neighbours)
     by_noise = fit.sigma_mm / np.sqrt(neighbours.shape[1])
@@ -195,17 +195,17 @@ def patch_trust(fit: Fit, neighbours: NDArray[np.int64], config: RefinementConfi
 
 
 def _robust_sigma(signed: Array, config: RefinementConfig) -> float:
-    """From the median absolute residual, those without a surface near counted as large; within the limits set."""
+    """Compute the scale from the median absolute residual, within the limits; NaN residuals count as large."""
     spread = SD_OF_MEDIAN * _median_size(signed)
     return min(max(spread, config.smallest_sigma_mm), config.largest_sigma_mm)
 
 
 def _median_size(residuals: Array) -> float:
-    """Median of the absolute values of (N,) residuals; NaN, where no surface is near, counts as infinitely large."""
+    """Compute the median of the absolute values of (N,) residuals; NaN counts as infinitely large."""
     return float(np.median(np.nan_to_num(np.abs(residuals), nan=np.inf, posinf=np.inf)))
 
 
 def tukey_limit(signed: Array, sigma_mm: float, config: RefinementConfig) -> float:
-    """Where Tukey's weight ends, mm: far out, and so more efficient, where almost no residual is beyond."""
+    """Choose the end of Tukey's weight, mm: farther out, so more efficient, where almost no residual is beyond."""
     beyond = fit_kernels.share_beyond(signed, FAR_SIGMAS * sigma_mm)
     return sigma_mm * (config.clean_tukey_scale if beyond < config.clean_share else config.tukey_scale)

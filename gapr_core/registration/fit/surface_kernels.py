@@ -7,13 +7,13 @@ import numba
 import numpy as np
 
 ELEMENT_RADIUS = 2.0  # of a surface element, in point spacings; beyond it the quadric is not extrapolated
-WIDE = 16  # columns that a compiler may take at a time: sums go over a multiple of so many
+WIDE = 16  # columns that a compiler may take at a time: sums go over a multiple of it
 FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}  # a check of divisors is a branch
 
 
 @numba.njit(inline="always", **FAST)
 def moved(T, p):
-    """Point p (3,) moved by T (4, 4)."""
+    """Move point p (3,) by T (4, 4)."""
     return (
         T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3],
         T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3],
@@ -23,7 +23,7 @@ def moved(T, p):
 
 @numba.njit(inline="always", **FAST)
 def element_near(x, y, z, nearest, origin, per_cell):
-    """Index of the target point near (x, y, z), -1 where there is none."""
+    """Look up the index of the target point near (x, y, z); -1 without one."""
     i = int(np.floor((x - origin[0]) * per_cell + 0.5))
     j = int(np.floor((y - origin[1]) * per_cell + 0.5))
     k = int(np.floor((z - origin[2]) * per_cell + 0.5))
@@ -34,7 +34,7 @@ def element_near(x, y, z, nearest, origin, per_cell):
 
 @numba.njit(inline="always", **FAST)
 def residual(x, y, z, q, elements, spacing, variance):
-    """Signed distance to element q, its gradient, and how far aside of the element's disc the point lies.
+    """Compute the signed distance to element q, its gradient, and the distance aside of the element's disc.
 
     A row of `elements` is point (3), normal (3), shape xx xy xz yy yz zz, variance.
     """
@@ -47,7 +47,7 @@ def residual(x, y, z, q, elements, spacing, variance):
 
 @numba.njit(inline="always", **FAST)
 def distance(dx, dy, dz, nx, ny, nz, xx, xy, xz, yy, yz, zz, reach, variance):
-    """`residual` of a point (dx, dy, dz) off the element, whose disc ends at `reach`; without a branch."""
+    """Compute `residual` of a point (dx, dy, dz) off the element, whose disc ends at `reach`, without a branch."""
     height = nx * dx + ny * dy + nz * dz
     tx, ty, tz = dx - height * nx, dy - height * ny, dz - height * nz
     aside = np.sqrt(tx * tx + ty * ty + tz * tz)
@@ -66,12 +66,12 @@ def distance(dx, dy, dz, nx, ny, nz, xx, xy, xz, yy, yz, zz, reach, variance):
 
 @numba.njit(inline="always", **FAST)
 def padded(count):
-    """The next multiple of `WIDE`."""
+    """Round up to the next multiple of `WIDE`."""
     return (count + WIDE - 1) // WIDE * WIDE
 
 
 @numba.njit(inline="always", **FAST)
 def tukey(square, limit):
-    """Tukey's biweight of a squared residual; without a branch, which a processor would often guess wrong."""
+    """Compute Tukey's biweight of a squared residual, without a branch that a processor would often mispredict."""
     inside = max(1.0 - square / (limit * limit), 0.0)
     return inside * inside

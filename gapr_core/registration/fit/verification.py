@@ -1,4 +1,4 @@
-"""From many hypotheses to a few distinct, refined and ranked poses."""
+"""Verification: from many hypotheses to a few distinct, refined and ranked poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Candidates:
         scores: (K,) small is good: mean squared distance of the drawn source points, truncated, mm^2; of a camera's
             cloud 1 / the score of lines of sight (`clutter.small_is_good`).
         support: (K,) share of the hypotheses refined halfway that ended within `same_pose_mm` of the pose.
-        hypotheses: number of those that competed.
+        hypotheses: number of hypotheses that competed.
     """
 
     poses: Array
@@ -37,13 +37,13 @@ class Candidates:
 def verify(
     poses: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
 ) -> Candidates:
-    """Refine all on a few points, the distinct best on more, the best of those on all that were drawn.
+    """Refine all poses on a few points, the distinct best on more, and the best of those on all.
 
     Args:
         poses: (K, 4, 4) hypotheses T_target_source, mm, K >= 1.
         source: the prepared source.
         target: the prepared target.
-        config: how many survive each stage.
+        config: numbers of points and poses of each stage.
         num_threads: 0 for all cores.
     """
     count = len(poses)
@@ -62,13 +62,13 @@ def verify(
 def mean_square_mm2(
     T: Array, source: PreparedSource, target: PreparedTarget, config: VerificationConfig, num_threads: int = 0
 ) -> float:
-    """What `verify` would score a pose (4, 4) with, mm^2, whatever it was chosen by."""
+    """Score a pose (4, 4) as `verify` does, mm^2."""
     scores = refine_many(T[None], source.points, target, np.linspace(*config.final_limits_mm), num_threads)[1]
     return float(scores[0])
 
 
 def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same_pose_mm: float) -> Array:
-    """(K,) share of the crowd (M, 4, 4) within `same_pose_mm` of each pose (K, 4, 4), over `count` markers."""
+    """Compute the (K,) share of the crowd (M, 4, 4) within `same_pose_mm` of each pose, over `count` markers."""
     ends, others = (markers(T, source, count) for T in (poses, crowd))
     gaps = np.linalg.norm(ends[:, None] - others[None], axis=3)
     return np.asarray((np.sqrt((gaps**2).mean(axis=2)) < same_pose_mm).mean(axis=1))
@@ -77,12 +77,12 @@ def support(poses: Array, crowd: Array, source: PreparedSource, count: int, same
 def _distinct(
     poses: Array, scores: Array, source: PreparedSource, config: VerificationConfig, most: int
 ) -> tuple[Array, Array]:
-    """The best poses, none within `same_pose_mm` (root mean square over the markers) of a better one."""
+    """Select the best poses, none within `same_pose_mm` (root mean square over the markers) of a better one."""
     ranked = np.argsort(scores, kind="stable")
     kept = distinct(markers(poses, source, config.markers), ranked, config.same_pose_mm, most)
     return poses[kept], scores[kept]
 
 
 def markers(poses: Array, source: PreparedSource, count: int) -> Array:
-    """(K, min(count, N), 3) the same spread points of a source (N, 3) under poses (K, 4, 4), mm, target frame."""
+    """Move the same spread points of a source (N, 3) by poses: (K, min(count, N), 3), mm, target frame."""
     return np.asarray(np.einsum("kij,nj->kni", poses[:, :3, :3], source.subset(count)) + poses[:, None, :3, 3])

@@ -1,1 +1,1 @@
-"""What is registered to what: source, target, sensor, and the checks of inputs."""
+"""Source, target, sensor and crop: the inputs of a registration, cleaned and prepared."""

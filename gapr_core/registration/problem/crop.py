@@ -1,4 +1,4 @@
-"""Regions of interest: a box around the wound, or what lies around the last pose."""
+"""Regions of interest: a box around the wound, or the surroundings of the last pose."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ Array = NDArray[np.float64]
 
 
 class Findable(Protocol):
-    """A bone whose nearest points can be looked for, as those of a `PreparedTarget`."""
+    """A bone with a search tree, such as a `PreparedTarget`."""
 
     @property
     def tree(self) -> cKDTree:
-        """Of its points, mm."""
+        """K-d tree of its points, mm."""
         ...
 
 
 def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, highest: ArrayLike) -> Array:
-    """The points in a box.
+    """Select the points in a box.
 
     Args:
         points: (N, 3), mm, in their own frame.
         T_box_points: (4, 4) pose of that frame in the box's frame, mm.
-        lowest: (3,) corner of the box, mm, box frame; it belongs to the box.
-        highest: (3,) the opposite corner.
+        lowest: (3,) corner of the box, mm, box frame; included.
+        highest: (3,) opposite corner.
 
     Returns:
-        (K, 3) in the points' own frame; none of those that are not finite.
+        (K, 3) in the points' own frame, finite ones only.
 
     Raises:
         ConfigError: when a corner is not (3,) numbers or `lowest` is not below `highest`.
@@ -51,16 +51,16 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
 
 
 def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: Findable, margin_mm: float) -> Array:
-    """The points within `margin_mm` of the bone as it lay last.
+    """Select the points within `margin_mm` of the bone under its last pose.
 
     Args:
         points: (N, 3), mm, source frame.
         T_target_source: (4, 4) last accepted pose, mm.
         target: from `Registrar.prepare`.
-        margin_mm: how far the bone may have moved, and a little more.
+        margin_mm: largest motion of the bone since, and a little more.
 
     Returns:
-        (K, 3), mm, source frame; none of those that are not finite.
+        (K, 3), mm, source frame, finite ones only.
 
     Raises:
         ConfigError: for a margin that is not positive.

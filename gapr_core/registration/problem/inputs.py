@@ -1,4 +1,4 @@
-"""What a caller gives besides clouds: poses, places, corners."""
+"""Inputs of a caller besides clouds: poses, places, corners."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ MOST_SHOWN = 16  # values of an array in a message
 
 
 def numbers(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> Array:
-    """The values as an array (a copy) of this shape.
+    """Copy the values into a float64 array of a required shape.
 
     Args:
         values: a list, an array or a tensor.
-        shape: that it must have.
-        what: it is called in the message.
-        how: to do it right.
+        shape: required shape.
+        what: name of the values in the message.
+        how: advice in the message.
 
     Raises:
         InvalidPointCloudError: another shape, or a value that is no finite number.
@@ -35,7 +35,7 @@ def numbers(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> A
 
 
 def rigid(pose: ArrayLike, what: str, how: str = "pass T_target_source in mm") -> Array:
-    """The rigid (4, 4) nearest to a pose that is rigid but for rounding.
+    """Return the rigid (4, 4) nearest to a pose that is rigid but for rounding.
 
     Raises:
         InvalidPointCloudError: another shape, or a pose with a scale, a reflection or another last row.

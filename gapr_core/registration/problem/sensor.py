@@ -1,4 +1,4 @@
-"""What is known of a sensor before its residuals are seen: its stand-off, noise, smooth bias and scale."""
+"""Errors of a sensor, known before its residuals: stand-off, noise, smooth bias and scale."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from gapr_core.registration.problem.target import PreparedTarget
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of what no residual shows, or few points cannot.
+    """Standard deviations of errors that no residual shows, or that few points cannot show.
 
     Attributes:
         offset_mm: mean stand-off, outwards; it is subtracted.
-        standoff_mm: of the stand-off about that mean, the same in all points.
-        noise_mm: of a point.
+        standoff_mm: stand-off about that mean, the same in all points.
+        noise_mm: noise of a point.
         bias_mm: typical size of the smooth bias.
-        scale: of the relative error of the size.
-        local_mm: of an error that near points share and others do not: a slice that the tracker puts elsewhere.
+        scale: relative error of the size.
+        local_mm: error that only near points share, such as a slice that the tracker misplaces.
         along_beam: stand-off and scale act along one beam, as depths of an image do, not along each point's normal.
-        tracking_mm: of an error of the whole cloud's place, along each axis.
-        tracking_deg: of an error of its attitude about its centroid, about each axis.
+        tracking_mm: error of the whole cloud's place, along each axis.
+        tracking_deg: error of its attitude about its centroid, about each axis.
     """
 
     offset_mm: float
@@ -43,12 +43,12 @@ class Errors:
         return np.diag(np.repeat(np.square([self.tracking_mm, np.radians(self.tracking_deg)]), 3))
 
 
-LEAST_STANDOFF_MM = 0.1  # standard deviation: that of the surest kind
-STATED = ("noise_mm", "bias_mm", "scale", "tracking_mm", "tracking_deg")  # that the user may know better
+LEAST_STANDOFF_MM = 0.1  # standard deviation of the surest kind
+STATED = ("noise_mm", "bias_mm", "scale", "tracking_mm", "tracking_deg")  # values that the user may state
 KINDS = {
-    # pictures of unknown making are wrong by .3 % of their size
+    # models of unknown origin are wrong by .3 % of their size
     "unknown": Errors(offset_mm=0.0, standoff_mm=0.5, noise_mm=0.5, bias_mm=0.1, scale=0.003),
-    # a real one lies .34 to .62 mm outside
+    # measured pointers lie .34 to .62 mm outside
     "pointer": Errors(offset_mm=0.5, standoff_mm=0.35, noise_mm=0.4, bias_mm=0.15, scale=0.0),
     # sound is 1 to 3 % faster or slower than assumed, and a tracked slice lies .1 to .5 mm off
     "ultrasound": Errors(
@@ -57,7 +57,7 @@ KINDS = {
     # its range is wrong by 1 %, and light enters wet bone before it comes back
     "depth_camera": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.7, bias_mm=0.2, scale=0.01),
     "laser": Errors(offset_mm=0.0, standoff_mm=0.1, noise_mm=0.15, bias_mm=0.15, scale=0.002),
-    # a tracked scanner is placed to a fifth of a millimetre
+    # a tracked scanner is located to 0.2 mm
     "structured_light": Errors(
         offset_mm=0.0, standoff_mm=0.1, noise_mm=0.2, bias_mm=0.15, scale=0.001, tracking_mm=0.2, tracking_deg=0.2
     ),
@@ -65,10 +65,10 @@ KINDS = {
 
 
 def errors(sensor: SensorConfig, points: int) -> Errors:
-    """The errors to expect of a source of so many points; what the user states replaces what is usual.
+    """Return the errors to expect of a source of `points` points; stated values replace the usual ones.
 
-    Who names no sensor and brings up to 2000 points (`sparse_points`) may have touched the bone: a pointer read at
-    60 Hz gives as many in half a minute. A denser cloud is a camera's or a laser's, but no surer than a named one.
+    An unnamed sensor with up to 2000 points (`sparse_points`) may have touched the bone: a pointer read at 60 Hz gives
+    as many in half a minute. A denser cloud is a camera's or a laser's, but no surer than a named one.
     """
     usual = KINDS[sensor.kind]
     if sensor.kind == "unknown":
@@ -82,11 +82,10 @@ def errors(sensor: SensorConfig, points: int) -> Errors:
 
 
 def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarget:
-    """The target whose surface elements lie where the sensor sees them: farther out by the stand-off.
+    """Move the target's surface elements to where the sensor sees them: farther out by the stand-off.
 
     The residual of a point becomes its signed distance to the bone less the stand-off. Everything else of the target
-    stays, and so does the target itself where the stand-off is 0. That of a target that lies farther out already is
-    added to its own.
+    stays; a stand-off of 0 returns the same object. A target that lies farther out already adds its own offset.
     """
     offset_mm = errors(sensor, 0).offset_mm
     if offset_mm == 0.0:

@@ -1,4 +1,4 @@
-"""The intra-operative cloud as registration sees it."""
+"""The intra-operative cloud, cleaned, thinned and described."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gapr_core.results import Refusal, RegistrationStatus
 Array = NDArray[np.float64]
 Found = tuple[Array, NDArray[np.int64]]  # distances and indices (N, k) of neighbours
 
-SPREAD_OUT = 512  # points that are spread evenly, before the others in any order
-TRUSTED_SHARE = 0.8  # of the points, those most in the middle of their neighbours: of them the spread-out ones are
-FAR_OUT = 4.0  # a point so many times farther from the middle than most is looked at; at the end of a bar it is 2
-CONTACT_MM = 1.0  # a pointer that is held still measures one contact again and again
-CROWD = 5, 5.0  # points that are kept of it: so many, or so many times those of a typical mm
-SMALLEST_MM = 1.0  # across: less is a cloud in metres, and not too short a piece
-SPARE_NEIGHBOURS = 6  # of a point, for means over those that lie on the bone
+SPREAD_OUT = 512  # evenly spread points at the head of the order
+TRUSTED_SHARE = 0.8  # of the points most in the middle of their neighbours; the spread-out ones are among them
+FAR_OUT = 4.0  # a point so many times the median distance from the middle is an outlier; the end of a bar has 2
+CONTACT_MM = 1.0  # size of one contact, which a pointer at rest measures repeatedly
+CROWD = 5, 5.0  # points kept of a contact: a number, or a multiple of those of a typical mm
+SMALLEST_MM = 1.0  # extent below which a cloud is in metres, not too short a piece
+SPARE_NEIGHBOURS = 6  # of a point, for means over neighbours on the bone
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +31,15 @@ class PreparedSource:
     """A cleaned source.
 
     Attributes:
-        points: (N, 3) float64, mm, in the source frame: what is fitted and assessed.
+        points: (N, 3) float64, mm, source frame: the points that are fitted and assessed.
         normals: (N, 3) unit normals, of arbitrary sign unless `oriented`.
         flatness_mm: (N,) root-mean-square distance of a point's neighbours to their plane.
         around: (N, k) indices of each point's nearest points, itself first, and a few more than give a normal.
-        whole: (M, 3), mm, the cloud that the points are of, or a part of: `patches` are of it, and the network sees it.
-        patches: (N, k) indices into `whole` of what gave each normal.
+        whole: (M, 3), mm, the cloud that `points` are drawn from: `patches` index it, and the network sees it.
+        patches: (N, k) indices into `whole` of the points that gave each normal.
         order: (N,) indices such that every prefix is spread over the whole cloud, trustworthy points first.
         spacing_mm: median distance between neighbouring points of the whole.
-        oriented: the normals point out of the body, to where the sensor was, so that their sign says something.
+        oriented: the normals point out of the body, towards the sensor, so their sign has a meaning.
     """
 
     points: Array
@@ -54,7 +54,7 @@ class PreparedSource:
 
     @property
     def is_part(self) -> bool:
-        """True where only some of the whole are fitted."""
+        """True where only some points of the whole are fitted."""
         return len(self.points) < len(self.whole)
 
     @property
@@ -63,7 +63,7 @@ class PreparedSource:
         return self.around[:, : self.patches.shape[1]]
 
     def axes(self, chosen: NDArray[np.int64]) -> Array:
-        """(K, 3, 3) local frames of the chosen (K,) points; rows are two tangents and the unit normal.
+        """Compute (K, 3, 3) local frames of the chosen (K,) points; rows are two tangents and the unit normal.
 
         The normal's sign is that of `normals` where these are oriented, else arbitrary.
         """
@@ -79,7 +79,7 @@ class PreparedSource:
         return float(np.median(self.flatness_mm))
 
     def facing(self, viewpoint: Array) -> PreparedSource:
-        """The same with normals that point to the viewpoint, mm, (3,) or one for each point (N, 3).
+        """Turn the normals to the viewpoint, mm, (3,) or one for each point (N, 3).
 
         A sensor sees surfaces from outside.
         """
@@ -87,7 +87,7 @@ class PreparedSource:
         return replace(self, normals=self.normals * np.where(away, -1.0, 1.0)[:, None], oriented=True)
 
     def subset(self, count: int) -> Array:
-        """(min(count, N), 3) of its points, spread over the whole cloud."""
+        """Return (min(count, N), 3) of its points, spread over the whole cloud."""
         return self.points[self.order[:count]]
 
 
@@ -98,12 +98,12 @@ def prepare(
 
     Args:
         source: (N, 3), mm.
-        config: how it is cleaned and thinned.
+        config: sizes of the cleaning and the thinning.
         num_threads: 0 for all cores.
         in_scene: all points are fitted, since few of them may be bone; else `config.fitted_points` of them at most.
 
     Returns:
-        The prepared source, or why there is too little of it.
+        The prepared source, or the refusal of too small a one.
 
     Raises:
         InvalidPointCloudError: for a wrong shape or type, or an extent that cannot be a piece of a bone in mm.
@@ -127,9 +127,9 @@ def prepare(
 
 
 def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedSource | Refusal:
-    """`fitted_points` of many points (N, 3), mm, drawn at random; the neighbours among all give their normals.
+    """Draw `fitted_points` of many points (N, 3), mm, at random; neighbours among all give their normals.
 
-    Not evenly spread: some stay so near to each other that what near residuals share is seen (`roughness`).
+    Not evenly spread: some stay so near to each other that shared errors of near residuals show (`roughness`).
     """
     is_clean = len(points) <= config.most_points and not _has_outliers(points)
     whole = points if is_clean else without_isolated(points, config)
@@ -149,7 +149,7 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
 
 
 def _drawn(points: Array, most: int) -> NDArray[np.int64]:
-    """Ascending indices of at most `most` of the points (N, 3), drawn at random: the same points in every frame.
+    """Draw at most `most` of the points (N, 3) at random: the same in every frame; ascending indices.
 
     The draw is among their distances to the centroid, which no frame changes, and not in the order of coordinates.
     """
@@ -159,7 +159,7 @@ def _drawn(points: Array, most: int) -> NDArray[np.int64]:
 
 
 def _too_little(points: Array, config: SourceConfig) -> Refusal | None:
-    """Why these points (N, 3), mm, are too few or a line; None where they are neither.
+    """Refuse points (N, 3), mm, that are too few or a line; None for others.
 
     Raises:
         InvalidPointCloudError: their extent cannot be that of a piece of a bone in mm.
@@ -179,11 +179,11 @@ def _too_little(points: Array, config: SourceConfig) -> Refusal | None:
 
 
 def without_isolated(points: Array, config: SourceConfig) -> Array:
-    """Points (N, 3), mm, without those far from all others: far echoes, flying pixels.
+    """Remove points that are far from all others (N, 3), mm: far echoes, flying pixels.
 
-    A point is isolated when its sixth nearest neighbour (`companions`) is farther than 12 mm and than five times what
-    is typical of the cloud: Open3D's `remove_radius_outlier` with a radius that follows the spacing. Of a sparse cloud,
-    such as a pointer gives, every point counts: it stays as it is.
+    A point is isolated when its sixth nearest neighbour (`companions`) is farther than 12 mm and than five times the
+    typical distance of the cloud: Open3D's `remove_radius_outlier` with a radius that follows the spacing. A sparse
+    cloud, such as a pointer's, stays as it is: every point counts.
     """
     if len(points) < config.dense_points:
         return points
@@ -192,18 +192,18 @@ def without_isolated(points: Array, config: SourceConfig) -> Array:
 
 
 def _has_outliers(points: Array) -> bool:
-    """True where one of the points (N, 3) is so far from most that it would change the extent of the cloud."""
+    """Return True where one of the points (N, 3) is far enough from most to change the cloud's extent."""
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return bool(away.max() > FAR_OUT * np.median(away))
 
 
 def _has_companions(gaps: Array, config: SourceConfig) -> NDArray[np.bool_]:
-    """Which points are not isolated, from the distances (N,), mm, to the last companion of each."""
+    """Mark the points that are not isolated, from the distances (N,), mm, to the last companion of each."""
     return gaps <= max(config.isolated_mm, config.isolated_gaps * float(np.median(gaps)))
 
 
 def _looked_up(points: Array, config: SourceConfig, num_threads: int) -> tuple[Array, Found | None]:
-    """`without_isolated`, and the neighbours of what stays where one look-up gives both; else None.
+    """Remove isolated points and keep the neighbours of the others where one look-up gives both, else None.
 
     A point whose neighbours all stay keeps them.
     """
@@ -226,13 +226,13 @@ def _looked_up(points: Array, config: SourceConfig, num_threads: int) -> tuple[A
 
 
 def describe(points: Array, config: SourceConfig, found: Found | None = None, num_threads: int = 1) -> PreparedSource:
-    """Normals, neighbours and order of points (N, 3), mm, that are clean and thin already.
+    """Compute normals, neighbours and order of points (N, 3), mm, that are clean and thin already.
 
     Args:
         points: (N, 3), mm.
-        config: how many neighbours give a normal.
+        config: number of neighbours for a normal.
         found: distances and indices of the neighbours, where they are known.
-        num_threads: that look them up; 0 for all cores.
+        num_threads: threads of the look-up; 0 for all cores.
     """
     gaps, around = found or quadrics.nearest(points, _around_count(len(points), config), num_threads=num_threads)
     patches = np.ascontiguousarray(around[:, : _neighbour_count(len(points), config)])
@@ -242,7 +242,7 @@ def describe(points: Array, config: SourceConfig, found: Found | None = None, nu
 def _described(
     points: Array, around: NDArray[np.int64], gaps: Array, whole: Array, patches: NDArray[np.int64]
 ) -> PreparedSource:
-    """Points (N, 3) with what their patches (N, k) of the whole (M, 3), whose points are `gaps` (N, k) away, say."""
+    """Describe points (N, 3) by their patches (N, k) of the whole (M, 3), whose distances are `gaps` (N, k)."""
     normals, flatness_mm, means = fit_planes(whole, patches)
     isolation = np.linalg.norm(points - means, axis=1) / np.maximum(gaps[:, -1], 1e-9)
     order, spacing_mm = _spread_order(points, isolation), float(np.median(gaps[:, 1]))
@@ -250,17 +250,17 @@ def _described(
 
 
 def _neighbour_count(count: int, config: SourceConfig) -> int:
-    """How many points give a normal: of few points a quarter, so that it stays one of a part of the source."""
+    """Choose the number of points for a normal: a quarter of a few points, so that a patch stays local."""
     return min(config.normal_neighbours, max(count // 4, config.fewest_points), count)
 
 
 def _around_count(count: int, config: SourceConfig) -> int:
-    """How many neighbours are looked up: a few more, so that enough are left where some turn out not to be bone."""
+    """Choose the number of neighbours to look up: a few spare ones, since some may not be bone."""
     return min(_neighbour_count(count, config) + SPARE_NEIGHBOURS, count)
 
 
 def _spread_order(points: Array, isolation: Array) -> NDArray[np.int64]:
-    """Points in the middle of their neighbours first, farthest-point order among them; then the rest, shuffled."""
+    """Order points: those in the middle of their neighbours by farthest-point order, then the rest, shuffled."""
     trusted = np.flatnonzero(isolation <= np.quantile(isolation, TRUSTED_SHARE))
     start = int(np.linalg.norm(points[trusted] - points[trusted].mean(axis=0), axis=1).argmin())
     spread_out = sampling.farthest_points(points[trusted], SPREAD_OUT, start)

@@ -1,4 +1,4 @@
-"""All that is static about the pre-operative bone, computed once when it is loaded."""
+"""Everything static about the pre-operative bone, computed once at loading."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-DENSER = 4  # times as many points are drawn on a mesh as are kept, so that they can be kept evenly
-FLAT = 1e-3  # spread along an axis over that along the longest, below which there is no extent
-LEAST_SHELL = 0.5  # share of the points that are seen from outside; with fewer, no shell is believed
-DOUBLES_MM = 0.02  # points of a cloud that are this close are one: the spacing is that of the surface
+DENSER = 4  # points drawn on a mesh over those kept, so that they can be kept evenly
+FLAT = 1e-3  # spread along an axis over the largest spread, below which there is no extent
+LEAST_SHELL = 0.5  # least share of points seen from outside for a shell
+DOUBLES_MM = 0.02  # points of a cloud this close are one: the spacing is that of the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +37,15 @@ class PreparedTarget:
     """The bone as registration sees it: its outer shell as oriented, curved surface elements.
 
     Attributes:
-        points: (M, 3) float64, mm, evenly thinned; only what is visible from outside.
+        points: (M, 3) float64, mm, evenly thinned, visible from outside.
         normals: (M, 3) unit, outward.
         shapes: (M, 3, 3) second fundamental forms, 1/mm (see `quadrics.fit_quadrics`).
         tree: k-d tree of the points.
         field: nearest points and distances on a grid.
         anchors: (A,) indices of evenly spread points where the search places the source.
         spacing_mm: median distance between neighbouring points.
-        surface: what was loaded, mm, for display.
-        both_cortices: of a hollow bone the same with its inner cortex, for a source that follows both; else None.
+        surface: the loaded surface, mm, for display.
+        both_cortices: the same with the inner cortex of a hollow bone, for a source that follows both; else None.
         elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
             surroundings, at an edge or a thin blade) side by side, for the compiled loops.
         cache: what proposers keep per target (a network's features).
@@ -99,7 +99,7 @@ class PreparedTarget:
 
     @cached_property
     def half_extent_mm(self) -> float:
-        """Largest distance of a point to the centroid: the one scale of a pair."""
+        """Largest distance of a point to the centroid: the scale of a pair."""
         return extent.half_extent_mm(self.points)
 
     @cached_property
@@ -128,7 +128,7 @@ def prepare(
         num_threads: 0 for all cores; the answer does not depend on it.
 
     Raises:
-        InvalidPointCloudError: when it cannot be read, cannot be a bone, or is a plane, a line or too small a set.
+        InvalidPointCloudError: a file that cannot be read, no bone, a plane, a line or too few points.
     """
     config = config or TargetConfig()
     surface = clouds.load(target, units)
@@ -152,13 +152,13 @@ def prepare(
 def _described(
     points: Array, normals: Array, surface: Surface, config: TargetConfig, num_threads: int
 ) -> PreparedTarget:
-    """Everything that follows from points (M, 3) with outward normals (M, 3)."""
+    """Describe points (M, 3) with outward normals (M, 3)."""
     tree = cKDTree(points)
     count = max(config.quadric_neighbours, 1 + config.misfit_neighbours)
     gaps, around = quadrics.nearest(points, count, tree, num_threads)
     neighbours = np.ascontiguousarray(around[:, : config.quadric_neighbours])
     spacing_mm = float(np.median(gaps[:, 1]))
-    for _ in range(2):  # the second fit knows better which neighbours are on the other side of a blade
+    for _ in range(2):  # the second fit excludes neighbours on the other side of a blade
         normals, shapes = quadrics.fit_quadrics(points, normals, neighbours, num_threads)
     others = around[:, 1 : 1 + config.misfit_neighbours]
     misfit = quadrics.misfit_mm(points, normals, shapes, others, num_threads=num_threads)
@@ -178,7 +178,7 @@ def _described(
 
 
 def _surface_elements(surface: Surface, config: TargetConfig, num_threads: int) -> tuple[Array, Array]:
-    """Evenly thinned points (M, 3) with unit normals of arbitrary sign."""
+    """Draw evenly thinned points (M, 3) with unit normals of arbitrary sign."""
     if surface.faces is not None and len(surface.faces):
         points, normals = surface.sample(DENSER * config.most_points, np.random.default_rng(0))
         keep = sampling.thin(points, config.most_points)
@@ -199,7 +199,7 @@ def _check_is_a_body(points: Array, config: TargetConfig) -> None:
 
 
 def _flat_shape(points: Array) -> str:
-    """What points (N, 3) are that have no extent in some direction: a line, a plane; "" for others."""
+    """Name the shape of points (N, 3) without extent in some direction, line or plane; "" for others."""
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
     if spread[0] >= FLAT * spread[2]:
         return ""
@@ -209,7 +209,7 @@ def _flat_shape(points: Array) -> str:
 def _outer_shell(
     points: Array, normals: Array, spacing_mm: float, config: TargetConfig, num_threads: int
 ) -> tuple[Array, Array]:
-    """Points visible from outside with outward normals; everything, should that be less than half of them."""
+    """Select points visible from outside with outward normals; all points if fewer than half are visible."""
     votes, counts = visibility.outward_votes(
         points, normals, spacing_mm, config.view_directions, num_threads=num_threads
     )
@@ -221,7 +221,7 @@ def _outer_shell(
 def _without_flat_ends(
     points: Array, normals: Array, spacing_mm: float, config: TargetConfig, warns: bool = True
 ) -> tuple[Array, Array]:
-    """Points and normals that are not on a flat end of the model; everything, should no body be left."""
+    """Drop points and normals on a flat end of the model; keep everything if no body would be left."""
     if not config.flat_end_mm2:
         return points, normals
     on_end = flat_ends(points, normals, spacing_mm, config.flat_end_mm2)
@@ -240,10 +240,10 @@ def _without_flat_ends(
 def _outer_cortex(
     points: Array, normals: Array, spacing_mm: float, config: TargetConfig, num_threads: int
 ) -> tuple[Array, Array] | None:
-    """Points and outward normals of a hollow bone's outer cortex; None for a bone of one surface."""
-    found = visibility.outer_layer(points, normals, spacing_mm, config.view_directions, num_threads)
-    if found is None:
+    """Select points and outward normals of a hollow bone's outer cortex; None for a bone of one surface."""
+    layer = visibility.outer_layer(points, normals, spacing_mm, config.view_directions, num_threads)
+    if layer is None:
         return None
-    points, outward = points[found[0]], found[1][found[0]]
+    points, outward = points[layer[0]], layer[1][layer[0]]
     _, neighbours = quadrics.nearest(points, config.normal_neighbours, num_threads=num_threads)
     return points, quadrics.orient(quadrics.local_frames(points, neighbours, num_threads).normals, outward)

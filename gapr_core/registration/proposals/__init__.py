@@ -1,1 +1,1 @@
-"""Where hypotheses come from: each proposer gives poses, none of them decides."""
+"""Proposers of pose hypotheses; none of them decides."""

@@ -1,4 +1,4 @@
-"""What every source of pose hypotheses offers."""
+"""The interface of every proposer of pose hypotheses."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Proposer(Protocol):
 
     @property
     def name(self) -> str:
-        """The name in tables and logs."""
+        """Name in tables and logs."""
         ...
 
     def prepare(self, target: PreparedTarget) -> object:
-        """Do once what a target needs, so that the first `propose` is as fast as later ones; kept in its `cache`."""
+        """Prepare a target, so that the first `propose` is as fast as later ones; kept in its `cache`."""
         ...
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """Hypotheses for one pair; may be empty."""
+        """Propose hypotheses for one pair; may be empty."""
         ...

@@ -1,4 +1,4 @@
-"""Poses from correspondences: per-patch consensus (local to global) and RANSAC, both with several answers."""
+"""Poses from correspondences: consensus per patch (local to global) and RANSAC, both with several answers."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 
-SHRINKING = (2.0, 1.5, 1.0, 0.7)  # radii, one after the other, within which a correspondence counts in `sharpened`
-ROUNDS = 5  # fits with each of them
+SHRINKING = (2.0, 1.5, 1.0, 0.7)  # successive radii of `sharpened`, over `radius_mm`
+ROUNDS = 5  # fits with each radius
 REFITS = 4  # of a pose to the correspondences that agree with it
 APART_MM, APART_DEG = 8.0, 8.0  # poses within both are the same
 
@@ -36,20 +36,20 @@ class Correspondences:
 
     @cached_property
     def products(self) -> Array:
-        """(C, 9) outer products of each pair, what a weighted covariance sums."""
+        """(C, 9) outer products of each pair, the terms of a weighted covariance."""
         return (self.source[:, :, None] * self.target[:, None, :]).reshape(-1, 9)
 
 
 def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -> tuple[Array, Array]:
-    """One weighted SVD per patch pair, scored on all correspondences, refined on its inliers (GeoTransformer's LGR).
+    """Fit a pose per patch pair by weighted SVD, score all, and refine on inliers (GeoTransformer's LGR).
 
     Args:
         found: the correspondences.
-        radius_mm: within it a correspondence agrees with a pose.
+        radius_mm: distance up to which a correspondence agrees with a pose.
         count: most poses returned.
 
     Returns:
-        (K, 4, 4) distinct T_target_source, best first, and (K,) the summed score of what agrees with each.
+        (K, 4, 4) distinct T_target_source, best first, and (K,) summed scores of the agreeing correspondences.
     """
     patches = np.unique(found.patch, return_counts=True)
     large = patches[0][patches[1] >= 3]
@@ -60,7 +60,7 @@ def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -
 def ransac(
     found: Correspondences, radius_mm: float, rng: np.random.Generator, draws: int = 2000, count: int = 32
 ) -> tuple[Array, Array]:
-    """Poses of random triples of correspondences (Fischler and Bolles 1981), drawn by score, with equal sides.
+    """Fit poses to random triples of correspondences (Fischler and Bolles 1981), drawn by score, with equal sides.
 
     Args and returns: as `local_to_global`; `draws` triples are tried.
     """
@@ -74,7 +74,7 @@ def ransac(
 
 
 def sharpened(pose: Array, found: Correspondences, radius_mm: float) -> Array:
-    """The pose (4, 4) fitted to the correspondences near it by Tukey's weights, within a radius that shrinks.
+    """Refit a pose (4, 4) to the correspondences near it by Tukey's weights, within a radius that shrinks.
 
     A correspondence within `radius_mm` can be that far off. Those of a pose that is nearly right agree better.
     """
@@ -88,7 +88,7 @@ def sharpened(pose: Array, found: Correspondences, radius_mm: float) -> Array:
 
 
 def _converge(poses: Array, found: Correspondences, radius_mm: float, count: int) -> tuple[Array, Array]:
-    """The best poses, each refitted to the correspondences it explains, near-copies dropped."""
+    """Refit the best poses to the correspondences that agree with them, and drop near-copies."""
     if len(poses) == 0:
         return np.empty((0, 4, 4)), np.empty(0)
     centroid = found.source.mean(axis=0)
@@ -105,9 +105,7 @@ def _converge(poses: Array, found: Correspondences, radius_mm: float, count: int
 
 
 def distinct(poses: Array, scores: Array, centroid: Array, count: int) -> NDArray[np.int64]:
-    """Rows of up to `count` poses, best first, none within `APART_MM` (at the source's centroid) and `APART_DEG` of a
-    better one.
-    """
+    """Select up to `count` rows, best first, none within `APART_MM` (centroid) and `APART_DEG` of a better one."""
     order = np.argsort(-scores, kind="stable")
     rotations = np.ascontiguousarray(poses[order, :3, :3])
     places = rotations @ centroid + poses[order, :3, 3]
@@ -124,14 +122,14 @@ def distinct(poses: Array, scores: Array, centroid: Array, count: int) -> NDArra
 
 
 def _support(poses: Array, found: Correspondences, radius_mm: float) -> Array:
-    """(K, C) the score of every correspondence that agrees with a pose, else 0."""
+    """Compute (K, C) scores: that of every correspondence that agrees with a pose, else 0."""
     columns = np.ascontiguousarray(found.source.T), np.ascontiguousarray(found.target.T)
     return _agreeing(np.ascontiguousarray(poses), *columns, found.score, radius_mm**2)
 
 
 @numba.njit(cache=True, nogil=True)
 def _agreeing(poses, source, target, score, limit):  # type: ignore[no-untyped-def]
-    """`_support` of the columns (3, C) of both clouds: compilers turn the inner loop into wide instructions."""
+    """Compute `_support` of the columns (3, C) of both clouds: compilers vectorise the inner loop."""
     weights = np.empty((len(poses), len(score)))
     for k in range(len(poses)):
         T = poses[k]
@@ -145,7 +143,7 @@ def _agreeing(poses, source, target, score, limit):  # type: ignore[no-untyped-d
 
 
 def _batched_kabsch(found: Correspondences, weights: Array) -> Array:
-    """Weighted SVD of all correspondences under each row of weights (K, C)."""
+    """Fit poses to all correspondences under each row of weights (K, C), by SVD."""
     total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
     p_mean, q_mean = weights @ found.source / total, weights @ found.target / total
     covariance = (weights @ found.products / total).reshape(-1, 3, 3) - p_mean[:, :, None] * q_mean[:, None]

@@ -23,7 +23,7 @@ from gapr_core.registration.proposals.consensus import Correspondences, local_to
 
 Array = NDArray[np.float64]
 METHODS = ("local_to_global", "ransac")
-RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # a correspondence agrees with a pose within so many first voxels
+RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # radius of agreement of a correspondence, over the first voxel
 SHIPPED = Path(__file__).parents[2] / "weights" / "gapr_net.safetensors"
 
 
@@ -32,10 +32,10 @@ class NetworkProposer:
 
     Args:
         network: in evaluation mode, on any device.
-        method: `local_to_global`, or `ransac` as the paper says.
+        method: `local_to_global`, or `ransac` as in the paper.
         count: most poses for one pair.
-        weights_name: what the target's share of the work is kept under, with the device, so that networks of the
-            same weights share it; without a name it is the network's alone.
+        weights_name: key of the target's cached features, with the device, so that networks of the
+            same weights share them; without a name they are the network's alone.
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class NetworkProposer:
             raise ConfigError(f"method one of {', '.join(METHODS)}", repr(method), "choose one of these")
         self.network, self.method, self.count = network.eval(), method, count
         self.name = "network"
-        self.is_shipped = False  # its weights are those that the shipped confidence was fitted to
-        self._key = "network", weights_name or network  # the network itself: an id may come again
+        self.is_shipped = False  # the shipped confidence was fitted to these weights
+        self._key = "network", weights_name or network  # the network itself: an id may recur
         _survive_forks()
 
     @classmethod
     def from_weights(cls, path: str | Path = SHIPPED, device: str = "cpu", **options: Any) -> NetworkProposer:
-        """The network in a safetensors file, the shipped one when no path is given.
+        """Load the network of a safetensors file; the shipped one without a path.
 
         Raises:
             WeightsError: the file is missing, damaged or of another format.
@@ -66,7 +66,7 @@ class NetworkProposer:
         return proposer
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """Distinct poses, best first; none where the source is too small or too large for the network."""
+        """Propose distinct poses, best first; none where the source is too small or too large for the network."""
         frame, cloud, features = self.prepare(target)
         try:
             moving = build_cloud(source.whole, frame, self.network.config)
@@ -77,7 +77,7 @@ class NetworkProposer:
         return Proposals(*consensus(self.method, found, radius_mm, rng, self.count))
 
     def prepare(self, target: PreparedTarget) -> tuple[Frame, Cloud, Features]:
-        """The target's share: its pyramid and its features, computed once and kept with it."""
+        """Compute the target's pyramid and features once, and keep them with it."""
         import torch
 
         key = *self._key, str(self._device)
@@ -90,7 +90,7 @@ class NetworkProposer:
         return target.cache[key]
 
     def match(self, source: Cloud, target: Cloud, features: Features) -> Correspondences:
-        """Correspondences in mm, from clouds on the CPU."""
+        """Match clouds on the CPU; returns correspondences in mm."""
         import torch
 
         with torch.inference_mode():
@@ -98,7 +98,7 @@ class NetworkProposer:
         return correspondences_mm(output.matches, source, target)
 
     def bone(self, source: PreparedSource, target: PreparedTarget) -> Array:
-        """(N,) the probability of every fitted source point to be bone, as the head says; 1 without a head.
+        """Predict (N,) the probability of every fitted source point to be bone; 1 without a head.
 
         Raises:
             InvalidPointCloudError: the source is too small or too large for the network.
@@ -122,7 +122,7 @@ class NetworkProposer:
 def consensus(
     method: str, found: Correspondences, radius_mm: float, rng: np.random.Generator | None = None, count: int = 32
 ) -> tuple[Array, Array]:
-    """Poses (K, 4, 4), best first, and their scores (K,) from correspondences, by a method of `METHODS`."""
+    """Compute poses (K, 4, 4), best first, and their scores (K,) from correspondences, by a method of `METHODS`."""
     if method == "ransac":
         return ransac(found, radius_mm, rng or np.random.default_rng(0), count=count)
     return local_to_global(found, radius_mm, count=count)
@@ -130,10 +130,10 @@ def consensus(
 
 @cache
 def _survive_forks() -> None:
-    """From now on, forked processes run torch in one thread.
+    """Let forked processes run torch in one thread from now on.
 
-    OpenMP's threads do not come along with a fork, and a child that waits for them hangs. torch's own data loader does
-    the same in its workers.
+    OpenMP's threads do not survive a fork, and a child that waits for them hangs. torch's own data loader does the same
+    in its workers.
     """
     import torch
 
@@ -141,7 +141,7 @@ def _survive_forks() -> None:
 
 
 def _available(device: str) -> str:
-    """The device meant; "auto" is the GPU where there is one."""
+    """Resolve a device's name; "auto" is the GPU where there is one."""
     import torch
 
     if device == "auto":
@@ -154,7 +154,7 @@ def _available(device: str) -> str:
 
 
 def correspondences_mm(matches: Matches, source: Cloud, target: Cloud) -> Correspondences:
-    """Matches of a single pair, from the clouds' units to mm."""
+    """Convert matches of a single pair from the clouds' units to mm."""
     scale = float(source.scale_mm[0])
     p = matches.source.double().cpu().numpy() * scale + source.centre_mm.cpu().numpy()
     q = matches.target.double().cpu().numpy() * scale + target.centre_mm.cpu().numpy()

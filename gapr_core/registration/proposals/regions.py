@@ -1,9 +1,9 @@
-"""Hypotheses from small regions: where most of a cloud is not bone, a part of it may be nothing else.
+"""Hypotheses from small regions: where most of a cloud is not bone, a part of it may be bone alone.
 
 The cloud is cut into segments where its surface bends or steps: at the rim of a wound, at the edge of an instrument
 (smoothness constraint: Rabbani, van den Heuvel, Vosselman 2006). The parts of a segment within balls of several sizes
-are sources of their own for the exhaustive search. One on bone proposes the pose; which one that is, the whole cloud
-decides later.
+are sources of their own for the exhaustive search. A region on bone proposes the pose; the whole cloud later decides
+which region that is.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from gapr_core.registration.proposals.search import NormalAlignedSearch
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SPREAD_OUT = 64  # points of a region that are spread evenly, before the others in the order of the whole cloud
-TRIES = 3  # seeds for each region that is asked for, since some grow too small a region, or one that another grew
+SPREAD_OUT = 64  # evenly spread points of a region, before the others in the order of the whole cloud
+TRIES = 3  # seeds for each requested region, since some grow too small a region or a copy of another
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Region:
 
     Attributes:
         source: its points as a source of their own.
-        centre: (3,) the point that it was grown from, mm, source frame.
+        centre: (3,) its seed, mm, source frame.
     """
 
     source: PreparedSource
@@ -47,13 +47,13 @@ class Region:
 
 
 def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Region]]:
-    """The regions of one round after the other, at most `config.seeds` of each radius; none comes twice.
+    """Yield the regions of each round, at most `config.seeds` of each radius, without repetition.
 
-    There is a first round, even an empty one; they end where nothing more grows.
+    There is a first round, even an empty one; the rounds end where nothing more grows.
 
     Args:
         source: the scene.
-        config: radii, how many regions, and where a surface ends.
+        config: radii, numbers of regions, and limits of a surface.
     """
     joined, tree = smooth_neighbours(source, config), cKDTree(source.points)
     seeds = _seeds(source, joined, TRIES * max(config.seeds) * config.rounds, config.region_fewest_points)
@@ -67,7 +67,7 @@ def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Regio
 
 
 def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_array:
-    """(N, N) adjacency: neighbours whose normals agree and of which each lies near the other's tangent plane.
+    """Build the (N, N) adjacency of neighbours with agreeing normals, each near the other's tangent plane.
 
     The planes are those of so few neighbours that a fold is one: the normals of the source turn more slowly.
     """
@@ -85,7 +85,7 @@ def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_arra
 def _grown(
     source: PreparedSource, tree: cKDTree, joined: csr_array, seeds: Indices, radius_mm: float, config: ClutterConfig
 ) -> Iterator[Region]:
-    """Of every seed the part of its segment within a ball, where it is large enough and new."""
+    """Grow a region from every seed: the part of its segment within a ball, if large enough and new."""
     known = set()
     for seed in seeds:
         ball = np.sort(tree.query_ball_point(source.points[seed], radius_mm))
@@ -99,7 +99,7 @@ def _grown(
 
 
 def _seeds(source: PreparedSource, joined: csr_array, count: int, fewest: int) -> Indices:
-    """The middle of every segment, the largest first; then points that are spread over the source."""
+    """Choose the middle of every segment, the largest first; then points that are spread over the source."""
     _, segment = connected_components(joined, directed=False)
     sizes = np.bincount(segment)
     large = [k for k in np.argsort(-sizes, kind="stable") if sizes[k] >= fewest]
@@ -110,12 +110,12 @@ def _seeds(source: PreparedSource, joined: csr_array, count: int, fewest: int) -
 
 
 def _middle(points: Array, some: Indices) -> int:
-    """Of some of the points the one nearest to their mean."""
+    """Find the point nearest to the mean of some of the points."""
     return int(some[np.linalg.norm(points[some] - points[some].mean(axis=0), axis=1).argmin()])
 
 
 def _part(source: PreparedSource, members: Indices) -> PreparedSource:
-    """Some of the points of a source, with what is known of them."""
+    """Cut some of the points out of a source, with everything known of them."""
     rank = np.empty(len(source.points), dtype=np.int64)
     rank[source.order] = np.arange(len(source.points))
     points = source.points[members]
@@ -134,7 +134,7 @@ def _part(source: PreparedSource, members: Indices) -> PreparedSource:
 
 
 def search(region: Region, target: PreparedTarget, config: ClutterConfig) -> Proposals:
-    """Hypotheses of one region."""
+    """Search hypotheses of one region."""
     few = SearchConfig(
         references=config.references,
         spins=config.spins,

@@ -1,9 +1,9 @@
-"""The weight-free proposer: every way to lay a source normal on a target normal.
+"""The weight-free proposer: every placement of a source normal on a target normal.
 
 A reference point of the source is put on an anchor of the target, normal on normal, and turned about the normal in
-steps. Each pose is scored by the distances of a few probe points of the source in the target's distance field. The
-sign of a source normal is unknown (one-sided clouds look alike from both sides), so both are tried, unless the sensor's
-place has decided it.
+steps. Each pose is scored by the distances of a few probe points of the source in the target's distance field. The sign
+of a source normal is unknown (one-sided clouds look alike from both sides), so both are tried unless the sensor's place
+decides it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gapr_core.runtime.parallel import in_threads
 
 Array = NDArray[np.float64]
 
-CANDIDATES = 8  # points of the spread order that each reference is chosen from
+CANDIDATES = 8  # points of the spread order for each reference to choose from
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class NormalAlignedSearch:
     name: str = "search"
 
     def prepare(self, target: PreparedTarget) -> None:
-        """Nothing: the distance field is part of every prepared target."""
+        """Prepare nothing: the distance field is part of every prepared target."""
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """The best spin of every (reference, sign, anchor), best `keep` of them all."""
+        """Find the best spin of every (reference, sign, anchor), and return the best `keep` of them all."""
         references = _references(source, self.config.references)
         signs = np.array([1.0] if source.oriented else [1.0, -1.0])
         anchor_axes = _anchor_axes(target)
@@ -69,20 +69,20 @@ class NormalAlignedSearch:
 
 
 def _references(source: PreparedSource, count: int) -> NDArray[np.int64]:
-    """Points far apart, of the half of the first ones in the spread order that has the flattest surroundings."""
+    """Choose points far apart, of the flatter half of the first ones in the spread order."""
     candidates = source.order[: CANDIDATES * count]
     flat = candidates[np.argsort(source.flatness_mm[candidates], kind="stable")[: max(count, len(candidates) // 2)]]
     return flat[sampling.farthest_points(source.points[flat], count)]
 
 
 def _anchor_axes(target: PreparedTarget) -> Array:
-    """(A, 3, 3): rows are two tangents and the outward normal of every anchor."""
+    """Compute (A, 3, 3) frames of the anchors: rows are two tangents and the outward normal."""
     normals = target.normals[target.anchors]
     return np.concatenate([quadrics.tangent_basis(normals), normals[:, None]], axis=1)
 
 
 def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config: SearchConfig) -> NDArray[np.float32]:
-    """(probes, 3, spins) probe points in the frame of one reference, turned about its normal."""
+    """Turn the probe points about one reference's normal; (probes, 3, spins) in its frame."""
     probes = (source.subset(config.probes) - source.points[reference]) @ _signed_axes(source, reference, sign).T
     angle = 2.0 * np.pi * np.arange(config.spins) / config.spins
     x, y, z = probes.T[:, :, None]
@@ -107,7 +107,7 @@ def _poses(
     anchor_axes: Array,
     anchors: NDArray[np.intp],
 ) -> Array:
-    """(K, 4, 4): R = axes_anchor^T Rz(angle) axes_reference, the reference point on the anchor."""
+    """Compute (K, 4, 4) poses: R = axes_anchor^T Rz(angle) axes_reference, the reference point on the anchor."""
     c, s, o, i = np.cos(angles), np.sin(angles), np.zeros_like(angles), np.ones_like(angles)
     turn = np.stack([c, -s, o, s, c, o, o, o, i], axis=1).reshape(-1, 3, 3)
     flip = np.stack([i, signs, signs], axis=1)[:, :, None]
@@ -120,10 +120,10 @@ def _poses(
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _best_spins(local, anchors, axes, distance, origin, per_cell, first, limit):  # type: ignore[no-untyped-def]
-    """For every anchor the lowest mean probe distance (in field steps) over the spins, and that spin.
+    """Find for every anchor the lowest mean probe distance (in field steps) over the spins, and that spin.
 
     `local` (probes, 3, spins); `origin` is the corner of the field's first cell. All spins go side by side, which
-    compilers turn into wide instructions; after the `first` probes only those within `limit` go on.
+    compilers vectorise; after the `first` probes only those within `limit` go on.
     """
     probes, _, spins = local.shape
     worst = FARTHEST * probes

@@ -1,1 +1,1 @@
-"""A camera's cloud, most of which may not be bone."""
+"""Registration of a camera's cloud, most of which may not be bone."""

@@ -1,9 +1,8 @@
-"""Registration of a cloud that a camera took of a wound: most of it may be something else than the bone.
+"""Registration of a camera's cloud of a wound, most of which may not be bone.
 
-Regions propose, lines of sight decide. Every region of the cloud proposes poses as if it were bone; all of them are
-ranked by what the camera would have seen of the target, first roughly, then, refined on more and more points, at the
-scale of the noise. What is left of soft tissue lies in front of the bone, never inside it: there a point has to be
-nearer to count.
+Regions propose, lines of sight decide. Every region of the cloud proposes poses as if it were bone. All poses are
+ranked by the camera's view of the target: first roughly, then, refined on more and more points, at the scale of the
+noise. Soft tissue lies in front of the bone, never inside it: there a point has to be nearer to count.
 """
 
 from __future__ import annotations
@@ -32,24 +31,24 @@ from gapr_core.runtime.parallel import in_pieces, in_threads
 Array = NDArray[np.float64]
 
 NAME = "scene"
-INFERRED_POINTS, INFERRED_ROUNDS = 2000, (2, 1)  # points that show the camera's place; rounds for each, likelier first
+INFERRED_POINTS, INFERRED_ROUNDS = 2000, (2, 1)  # points that show the camera's place; rounds per place, likelier first
 LEAST_COS = 0.3  # cosine of incidence that nearly all points of a camera's cloud exceed
-ORIGIN_DEG, ORIGIN_COS = 35.0, 0.15  # a cloud so near to the z axis may be in the frame of its camera
+ORIGIN_DEG, ORIGIN_COS = 35.0, 0.15  # a cloud this near to the z axis may be in the frame of its camera
 ORIGIN_ROUNDS = 4  # rounds of regions for that place
 AT_THE_BONE = ("pointer", "ultrasound")  # sensors without lines of sight
 GIVEN = -1  # in place of the index of a region
-SMALLEST_SCORE = 1e-4  # a score below, and so one below 0, counts as this
+SMALLEST_SCORE = 1e-4  # lower scores, negative ones too, count as this
 
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Hypotheses on their way.
+    """Hypotheses between two stages.
 
     Attributes:
         poses: (K, 4, 4) T_target_source, mm.
-        region: (K,) index of the region that proposed each; `GIVEN` for a pose that was given.
-        scores: (K,) of lines of sight (`Visible.score`), large is good; 0 before the first stage, and comparable within
-            one stage, since each has tolerances of its own.
+        region: (K,) index of the region that proposed each; `GIVEN` for a given pose.
+        scores: (K,) scores of lines of sight (`Visible.score`), large is good; 0 before the first stage. Comparable
+            within one stage, since each has tolerances of its own.
     """
 
     poses: Array
@@ -65,16 +64,16 @@ class Pool:
 
 
 def sees_from_afar(config: RegistrarConfig) -> bool:
-    """Whether the place of a camera is to be inferred at all: not of a sensor that is at the bone."""
+    """Return True where the place of a camera may be inferred: not for a sensor at the bone."""
     return config.clutter.infer_viewpoint and config.sensor.kind not in AT_THE_BONE
 
 
 def inferred_places(source: PreparedSource, config: RegistrarConfig) -> list[tuple[Array, int]]:
-    """Where a cloud was seen from if nobody says it: (3,) mm, source frame, and rounds of regions; the likeliest first.
+    """Infer the places, (3,) mm, source frame, that a cloud may be seen from, the likeliest first.
 
     The origin, where the cloud may be in the frame of its camera, and both ends of the line of sight that its surface
-    shows. None where it cannot be a camera's: too few points, some that are grazed from wherever the others are seen,
-    or a sensor that sees nothing from afar.
+    shows. Each comes with its rounds of regions. None for a cloud that cannot be a camera's: too few points, points
+    grazed from the common place, or a sensor that sees nothing from afar.
     """
     if not sees_from_afar(config) or len(source.points) < config.source.dense_points:
         return []
@@ -90,12 +89,12 @@ def inferred_places(source: PreparedSource, config: RegistrarConfig) -> list[tup
 
 
 def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:
-    """The same scene with the regions of one round after the other; no region comes twice."""
+    """Yield the scene with the regions of each round; no region comes twice."""
     return (replace(scene, regions=found) for found in regions.rounds(scene.source, config))
 
 
 def propose(scene: Scene, target: PreparedTarget, start: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
-    """Hypotheses of all regions, each refined on its own region; and those to start from (K, 4, 4)."""
+    """Propose hypotheses of all regions, each refined on its own region, and the start poses (K, 4, 4)."""
     steps = steps_on(target, config.region_limits_mm, config)
 
     def work(region: Region) -> Array:
@@ -108,7 +107,7 @@ def propose(scene: Scene, target: PreparedTarget, start: Array, config: ClutterC
 
 
 def has_proposed(pool: Pool) -> bool:
-    """Whether any of the hypotheses is a region's own: what was given alone has no rival."""
+    """Return True when any of the hypotheses is a region's own: given poses alone have no rival."""
     return bool((pool.region != GIVEN).any())
 
 
@@ -120,9 +119,9 @@ def verify(
     num_threads: int = 0,
     start: Array | None = None,
 ) -> Candidates:
-    """From all hypotheses to a few distinct ones, refined and ranked; the best comes first.
+    """Reduce all hypotheses to a few distinct ones, refined and ranked; the best comes first.
 
-    Poses to start from (K, 4, 4) reach the last step as they are, too: around them there may be little bone.
+    Start poses (K, 4, 4) reach the last step as they are, too: around them there may be little bone.
     """
     crowd = refine_around(rank_roughly(pool, scene, target, config, num_threads), scene, target, config, num_threads)
     best = _best_distinct(crowd, scene, config, config.final_poses)
@@ -132,16 +131,16 @@ def verify(
 
 
 def small_is_good(scores: Array) -> Array:
-    """(K,) scores of lines of sight as those of `Candidates`, where mean squares stand for other sources: 1 / score.
+    """Invert (K,) scores of lines of sight to those of `Candidates`, where small is good: 1 / score.
 
-    What reads them, a rule or a feature, compares a rival with the best by their ratio. A pose that explains half as
-    much of the bone is a rival of twice the score, just as one that leaves twice the mean square.
+    Rules and features compare a rival with the best by their ratio. A pose that explains half as much of the bone is a
+    rival of twice the score, just as one of twice the mean square.
     """
     return np.asarray(1.0 / np.maximum(scores, SMALLEST_SCORE))
 
 
 def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Pool:
-    """The best distinct ones by what the camera would have seen, at the scale of what a region leaves open."""
+    """Rank the distinct poses by the camera's view, within the tolerance of a fit to a region."""
     pool = _scored(pool, scene, target, config.coarse_points, config.coarse_on_mm, config.coarse_front_mm, num_threads)
     return _best_distinct(pool, scene, config, config.middle_poses)
 
@@ -149,7 +148,7 @@ def rank_roughly(pool: Pool, scene: Scene, target: PreparedTarget, config: Clutt
 def refine_around(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
-    """Each refined on what lies around its region and hardly in front of the bone, and scored again."""
+    """Refine each pose on the points around its region and hardly in front of the bone, and score it again."""
     steps = steps_on(target, config.middle_limits_mm, config, config.front_share)
     tree = cKDTree(scene.source.points[scene.source.order])
     poses = pool.poses.copy()
@@ -169,9 +168,9 @@ def refine_around(
 def refine_on_all(
     pool: Pool, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0
 ) -> Pool:
-    """Each refined on all points whose normals agree, ranked at the scale of the noise.
+    """Refine each pose on all points whose normals agree, and rank at the scale of the noise.
 
-    Twice: on those hardly in front of the bone, which tissue pulls at less, and on both sides alike, which noise does
+    Twice: on points hardly in front of the bone, which tissue pulls at less, and on both sides alike, which noise does
     not shift. The score decides.
     """
     some, refined = scene.source.order[: config.final_points], []
@@ -184,7 +183,7 @@ def refine_on_all(
 
 
 def seen_of(poses: Array, scene: Scene, target: PreparedTarget, config: ClutterConfig, num_threads: int = 0) -> Visible:
-    """What the camera saw of the target under poses (K, 4, 4), at the scale of the noise."""
+    """Compare the camera's view with the target under poses (K, 4, 4), at the scale of the noise."""
     points, normals = spread(target, config.final_target_points)
     return scene.compare(poses, points, normals, config.on_mm, config.front_mm, num_threads)
 
@@ -196,9 +195,9 @@ def _around(tree: cKDTree, centre: Array, config: ClutterConfig) -> NDArray[np.i
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Gauss-Newton steps on a target: one per row of limits (I, 2), mm, on points whose normals agree up to a cosine.
+    """Gauss-Newton steps on a target, on points whose normals agree up to a cosine.
 
-    The limits are those of points inside and outside of the target.
+    One step per row of limits (I, 2), mm, those of points inside and outside of the target.
     """
 
     target: PreparedTarget
@@ -206,7 +205,7 @@ class Steps:
     same_surface_cos: float
 
     def refined(self, poses: Array, source: PreparedSource, some: NDArray[np.int64]) -> Array:
-        """Poses (K, 4, 4) refined on some of the points."""
+        """Refine poses (K, 4, 4) on some of the points."""
         points, normals, surface = source.points[some], source.normals[some], self.target.kernel_view
         how = source.oriented, *surface, self.limits_mm, self.same_surface_cos
         return np.asarray(refine_agreeing(np.ascontiguousarray(poses), points, normals, *how))
@@ -215,7 +214,7 @@ class Steps:
 def steps_on(
     target: PreparedTarget, limits_mm: tuple[float, float, int], config: ClutterConfig, front_share: float = 1.0
 ) -> Steps:
-    """Of falling limits (first, last, how many), mm, and a share of each for points in front of the bone."""
+    """Build steps of falling limits (first, last, number), mm, scaled by `front_share` in front of the bone."""
     both = np.outer(np.linspace(*limits_mm), [1.0, front_share])
     return Steps(target, both, SAME_SURFACE_COS)
 
@@ -229,7 +228,7 @@ def _scored(
 
 
 def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
-    """At most `count` evenly spread points of the target, where its sensor sees them, and normals; kept with it."""
+    """Spread at most `count` points over the target, where its sensor sees them, with normals; kept with it."""
     key = "spread", count, target.offset_mm
     if key not in target.cache:
         some = sampling.thin(target.points, count)
@@ -239,7 +238,7 @@ def spread(target: PreparedTarget, count: int) -> tuple[Array, Array]:
 
 
 def given(poses: Array) -> Pool:
-    """Hypotheses (K, 4, 4) that no region proposed."""
+    """Pool hypotheses (K, 4, 4) that no region proposed."""
     return Pool(poses, np.full(len(poses), GIVEN), np.zeros(len(poses)))
 
 

@@ -1,8 +1,8 @@
-"""Light travels straight: what a camera saw says where the bone is and where it cannot be.
+"""Lines of sight: a camera's image shows where the bone is and where it cannot be.
 
 Between the camera and a measured point there is nothing. A pose that puts bone there is impossible, whatever else it
-explains; bone behind a measured point may be hidden, and outside the image nothing is known. So each point of the
-target's surface is compared with what was measured on its own line of sight.
+explains. Bone behind a measured point may be hidden, and outside the image nothing is known. So each point of the
+target's surface is compared with the measured point on its own line of sight.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from gapr_core.runtime.parallel import in_pieces
 
 Array = NDArray[np.float64]
 
-SMALLEST_PIXEL, MOST_PIXELS = 0.003, 160_000  # least width as the tangent of an angle; pixels grow beyond so many
-REACH = 0.006  # tangent up to which a point speaks for a line of sight
+SMALLEST_PIXEL, MOST_PIXELS = 0.003, 160_000  # least width, tangent of an angle; pixels grow to stay below the number
+REACH = 0.006  # tangent of the angle up to which a point counts for a line of sight
 WIDEST_COS = 0.25  # cosine to the middle of the view up to which points are seen
 FACING_COS = 0.2  # cosine to the line of sight from which a surface is measured
 HIDDEN_MM = 3.0  # bone farther behind the measured point is hidden
 SLANT_MM = 9.0  # largest difference in depth to a point in whose plane bone lies
 SAME_SURFACE_COS = 0.6  # cosine of normals up to which they are of one surface
-VIOLATION_COSTS, MISFIT_COSTS = 2.0, 0.2  # of a share that the camera looked through, and that lies off the surface
+VIOLATION_COSTS, MISFIT_COSTS = 2.0, 0.2  # costs of the violating share, and of the share off the surface
 
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """The source as its camera saw it: a pinhole image that looks at the middle of the cloud.
+    """A source as a pinhole image of its camera, which looks at the middle of the cloud.
 
     Attributes:
         T_camera_source: (4, 4), mm; the camera looks along its z.
@@ -53,12 +53,12 @@ class DepthImage:
 
 @dataclass(frozen=True, eq=False)
 class Visible:
-    """How poses explain an image, as shares of the target's surface.
+    """Agreement of poses with an image, as shares of the target's surface.
 
     Attributes:
-        explained: (K,) share that faces the camera and lies on what was measured.
-        violating: (K,) share that lies clearly in front of what was measured.
-        compared: (K,) share that faces the camera and could have been seen: neither outside the image nor hidden.
+        explained: (K,) share that faces the camera and lies on the measured surface.
+        violating: (K,) share that lies clearly in front of the measured surface.
+        compared: (K,) share that faces the camera and is visible: neither outside the image nor hidden.
     """
 
     explained: Array
@@ -67,7 +67,7 @@ class Visible:
 
     @property
     def score(self) -> Array:
-        """(K,) explained share, less what the camera saw otherwise and, dearer, what it saw through.
+        """(K,) explained share, less the misfitting and, at a higher price, the violating share.
 
         Large is good: 1 at most, and below 0 where the camera saw more against the pose than for it.
         """
@@ -76,14 +76,14 @@ class Visible:
 
 
 def average(seen: Sequence[Visible]) -> Visible:
-    """The mean of the shares of several images, each of which counts alike."""
+    """Average the shares of several images, each of which counts alike."""
     names = ("explained", "violating", "compared")
     explained, violating, compared = (np.mean([getattr(each, name) for each in seen], axis=0) for name in names)
     return Visible(explained, violating, compared)
 
 
 def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
-    """The image of a cloud.
+    """Build the image of a cloud.
 
     Args:
         points: (N, 3), mm, source frame.
@@ -91,7 +91,7 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
         viewpoint: (3,), mm, source frame.
 
     Raises:
-        InvalidViewpointError: when the viewpoint lies in the middle of the points, so that no camera sees them.
+        InvalidViewpointError: a viewpoint in the middle of the points, where no camera sees them.
     """
     eye = np.asarray(viewpoint, dtype=np.float64)
     T = _looking_at(eye, points)
@@ -107,9 +107,9 @@ def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
 
 
 def _nearest_rays(rays: Array) -> tuple[NDArray[np.int64], Array, float]:
-    """Of an image of all rays (N, 2), x / z and y / z: (rows, columns) the ray of each pixel, N for none.
+    """Assign the nearest of rays (N, 2), x / z and y / z, to each pixel; N for none.
 
-    And (2,) the middle of its first pixel, and the edge of a pixel: that of the rays' spacing, within the limits set.
+    Also returns (2,) the middle of the first pixel, and the edge of a pixel: the rays' spacing, within the limits set.
     """
     tree, origin, size = cKDTree(rays), rays.min(axis=0), np.ptp(rays, axis=0)
     pixel = max(SMALLEST_PIXEL, float(np.median(tree.query(rays, k=2)[0][:, 1])))
@@ -122,7 +122,7 @@ def _nearest_rays(rays: Array) -> tuple[NDArray[np.int64], Array, float]:
 
 
 def _looking_at(eye: Array, points: Array) -> Array:
-    """T_camera_source of a camera at `eye` that looks at the middle of the points."""
+    """Compute T_camera_source of a camera at `eye` that looks at the middle of the points."""
     ahead = points.mean(axis=0) - eye
     length = float(np.linalg.norm(ahead))
     ahead = ahead / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
@@ -131,7 +131,7 @@ def _looking_at(eye: Array, points: Array) -> Array:
 
 
 def _pixels(nearest: NDArray[np.int64], points: Array, normals: Array) -> NDArray[np.float32]:
-    """Pixels (rows, columns, 6) from the index of each one's point; the index behind the last one means none."""
+    """Fill pixels (rows, columns, 6) from the index of each one's point; the index behind the last one means none."""
     offsets = np.einsum("ni,ni->n", points, normals)
     rows = np.vstack([np.column_stack([normals, offsets, points[:, 2], points[:, 2]]), np.zeros(6)])
     pixels = rows[nearest].astype(np.float32)
@@ -155,9 +155,9 @@ def compare(
         poses: (K, 4, 4) T_target_source, mm.
         points: (M, 3) of the target, evenly spread, mm.
         normals: (M, 3) unit, outward.
-        image: what the camera saw.
-        on_mm: how far from a measured surface a point is explained by it.
-        front_mm: how far in front of what was measured there can be no bone.
+        image: image of the camera.
+        on_mm: distance from the measured surface up to which it explains a point.
+        front_mm: distance in front of the measured surface from which bone is impossible.
         num_threads: 0 for all cores.
     """
     inverse = poses[:, :3, :3].transpose(0, 2, 1)

@@ -16,10 +16,10 @@ OFFSET, DEPTH, FRONT = 3, 4, 5  # columns of a pixel after its normal, as in `fr
 def compare_with_image(
     poses, cloud, pixels, left, top, per_pixel, on_mm, front_mm, facing_cos, hidden_mm, slant_mm, same_surface_cos
 ):
-    """Shares of a target (M, 6: points, normals) explained, violating, compared, under poses (K, 3, 4) T_camera_target.
+    """Compute shares of a target (M, 6) explained, violating, compared, under poses (K, 3, 4) T_camera_target.
 
-    All float32. A point is explained when it faces the camera, lies within `on_mm` of the plane measured on its line
-    of sight and has its normal; it violates when it lies `front_mm` in front of all that was measured around there.
+    All float32. A point is explained when it faces the camera, lies within `on_mm` of the plane measured on its line of
+    sight and has its normal. It violates when it lies `front_mm` in front of every measurement around there.
     """
     rows, columns = pixels.shape[0], pixels.shape[1]
     out = np.zeros((len(poses), 3), dtype=np.float32)
@@ -66,10 +66,10 @@ def compare_with_image(
 
 @numba.njit(**FAST)
 def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same):
-    """Gauss-Newton from every pose (K, 4, 4) on the points (N, 3) whose normals (N, 3) agree with the surface's.
+    """Iterate Gauss-Newton from every pose (K, 4, 4) on the points (N, 3) whose normals agree with the surface.
 
-    One iteration per row of `limits` (I, 2), the Tukey scales of points inside and outside of the surface; normals
-    agree from the cosine `same`.
+    One iteration per row of `limits` (I, 2), the Tukey scales of points inside and outside of the surface. Normals (N,
+    3) agree from the cosine `same`.
     """
     out = poses.copy()
     surface = elements, nearest, origin, per_cell, spacing
@@ -88,7 +88,7 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
 def accumulate_agreeing(
     T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same, middle, rows, H, g
 ):
-    """Normal equations H twist = g about the moved `middle` (3,), filled in place; returns the sum of the weights."""
+    """Fill the normal equations H twist = g about the moved `middle` (3,); returns the sum of the weights."""
     middle = moved(T, middle)
     count, total = 0, 0.0
     for p in range(len(points)):
@@ -114,7 +114,7 @@ def accumulate_agreeing(
 
 @numba.njit(inline="always", **FAST)
 def put_row(rows, i, w, x, y, z, middle, r, nx, ny, nz):
-    """Column i of `rows`: derivatives of a residual r by the twist about `middle` (3), and r, times the root of w."""
+    """Fill column i of `rows`: derivatives of a residual r by the twist about `middle` (3), and r, times root w."""
     root = np.sqrt(w)
     nx, ny, nz = root * nx, root * ny, root * nz
     x, y, z = x - middle[0], y - middle[1], z - middle[2]
@@ -125,9 +125,9 @@ def put_row(rows, i, w, x, y, z, middle, r, nx, ny, nz):
 
 @numba.njit(**FAST)
 def normal_equations(rows, count, H, g):
-    """Normal equations (6, 6) and (6,) of the first `count` columns of `rows` (7, N), filled in place.
+    """Compute the normal equations (6, 6) and (6,) of the first `count` columns of `rows` (7, N), in place.
 
-    One product of whole rows after the other, and padded, so that the compiler takes several columns at a time.
+    One product of whole, padded rows after the other, so that the compiler takes several columns at a time.
     """
     columns = padded(count)
     rows[:, count:columns] = 0.0

@@ -1,8 +1,8 @@
-"""Do the looks of a camera show the bone in one place? It or its reference may move between two of them.
+"""Agreement of the looks of a camera: the bone or its reference may move between two of them.
 
-The pose that all looks have in common then fits only some of them, or none exactly. So each look is laid on the bone by
-itself, from that pose. Where far more of the surface lies on it elsewhere, where it looked through the bone here, or
-agrees far less than the others, it may be apart. A look with an error of its own seems so, too: it is registered in
+The common pose of all looks then fits only some of them, or none exactly. So each look is laid on the bone by itself,
+from that pose. It may be apart for three reasons: far more of the surface lies on it elsewhere, it looked through the
+bone here, or it agrees far less than the others. A look with an error of its own seems apart, too. It is registered in
 full, and fits where its own pose is accepted and nearly the same. A look that could not have shown the bone here is
 blind: something was in the way, or the bone is far.
 """
@@ -29,25 +29,25 @@ Array = NDArray[np.float64]
 Alone = Callable[[Scene], Assessment | None]  # registers one look in full
 
 CHECK = "looks apart"
-# All chosen on scenes of train subjects, looks at rest and moved.
-GAINED, AWAY_MM = 0.25, 2.0  # share of what a look could show that lies on it only in its own pose, and how far that is
-SEEN_THROUGH = 0.15  # share in front of what it measured
-LEAST_NEAR, LEAST_ON = 0.5, 0.3  # of the share of the best look: what lies near what a look shows, and on it
-LEAST_COMPARED = 0.1  # of what the look with the widest view could show
-SAME_POSE_MM, SAME_POSE_DEG = 3.0, 3.0  # to the pose of a look that is registered by itself
-REACH_MM = 10.0  # around the bone: what is laid on it from the common pose
-LIMITS_MM = (8.0, 2.0, 8)  # Tukey's, the first, the last and how many steps
-FEWEST_POINTS, MOST_POINTS = 40, 600  # of a look, that are laid on it
+# All limits were chosen on scenes of train subjects, looks at rest and moved.
+GAINED, AWAY_MM = 0.25, 2.0  # least share of a look's view that only its own pose explains, and distance of that pose
+SEEN_THROUGH = 0.15  # largest share in front of the measured surface
+LEAST_NEAR, LEAST_ON = 0.5, 0.3  # least shares near the measured surface and on it, over those of the best look
+LEAST_COMPARED = 0.1  # least compared share, over that of the look with the widest view
+SAME_POSE_MM, SAME_POSE_DEG = 3.0, 3.0  # between the common pose and that of a look registered by itself
+REACH_MM = 10.0  # distance from the bone of the points that are laid on it from the common pose
+LIMITS_MM = (8.0, 2.0, 8)  # Tukey scales: the first, the last, the number of steps
+FEWEST_POINTS, MOST_POINTS = 40, 600  # points of a look that are laid on the bone
 
 
 class LookShares(NamedTuple):
-    """What one look says by itself, as shares of the target's surface.
+    """Agreement of one look by itself, as shares of the target's surface.
 
     Attributes:
-        compared: it could show under the common pose.
-        on: lies on what it shows, at the scale of the noise (`clutter.on_mm`).
-        near: lies near it (`clutter.middle_on_mm`).
-        seen_through: lies in front of what it measured.
+        compared: share visible to it under the common pose.
+        on: share on its measured surface, at the scale of the noise (`clutter.on_mm`).
+        near: share near that surface (`clutter.middle_on_mm`).
+        seen_through: share in front of that surface.
         own_compared, own_on: the first two under its own pose.
         away_mm: root mean square distance between the two poses, over its points near the bone.
     """
@@ -61,12 +61,12 @@ class LookShares(NamedTuple):
     away_mm: float
 
     def share(self, of_surface: float) -> float:
-        """Share of what it could show."""
+        """Divide a share of the surface by the compared one."""
         return of_surface / max(self.compared, 1e-6)
 
     @property
     def fits_elsewhere(self) -> bool:
-        """True where far more lies on it in its own pose."""
+        """True where far more of the surface lies on it in its own pose."""
         gained = (self.own_on - self.on) / max(self.compared, self.own_compared, 1e-6)
         return gained > GAINED and self.away_mm > AWAY_MM
 
@@ -74,46 +74,46 @@ class LookShares(NamedTuple):
 def unless_apart(
     assessment: Assessment, scene: Scene, target: PreparedTarget, alone: Alone, config: RegistrarConfig
 ) -> Assessment:
-    """The same with what each look of its scene says of it; refused where one is apart, or half of them are blind.
+    """Add the fit of each look of a scene; refuse where one is apart, or half of them are blind.
 
     Args:
-        assessment: the pose that all looks have in common.
-        scene: what was seen from one place or from several.
+        assessment: the common pose of all looks.
+        scene: views from one place or from several.
         target: the bone.
-        alone: registers one of the looks in full; asked of each that seems to be apart.
-        config: limits of the registration, and what an accepted pose has to reach.
+        alone: registers one of the looks in full; used for each that seems to be apart.
+        config: limits of the registration, and least confidence of an accepted pose.
     """
     if len(scene.given) < 2:
         return assessment
     fits = [LookFit.TOO_SMALL] * len(scene.given)
-    found = _fits(assessment, scene, target, alone, config)
-    for name, fit in zip(scene.names, found, strict=True):
+    own_fits = _fits(assessment, scene, target, alone, config)
+    for name, fit in zip(scene.names, own_fits, strict=True):
         fits[name] = fit
     answers = tuple(map(LookAnswer, scene.given, fits))
-    do_not_fit = LookFit.APART in found or 2 * found.count(LookFit.BLIND) >= len(found)
+    do_not_fit = LookFit.APART in own_fits or 2 * own_fits.count(LookFit.BLIND) >= len(own_fits)
     return replace(assessment, looks=answers).with_finding(_apart(answers) if do_not_fit else None)
 
 
 def is_refused(assessment: Assessment) -> bool:
-    """True where a scene was refused for its looks."""
+    """Return True where a scene was refused for its looks."""
     return any(finding.check == CHECK for finding in assessment.findings)
 
 
 def _fits(
     assessment: Assessment, scene: Scene, target: PreparedTarget, alone: Alone, config: RegistrarConfig
 ) -> list[LookFit]:
-    """How each of the K looks fits; a pose that is refused anyway says nothing about them."""
+    """Judge the fit of each of the K looks; not asked where the pose is refused anyway."""
     if not assessment.reaches(config.worth_checking):
         return [LookFit.NOT_ASKED] * len(scene.images)
-    found = look_fits(assessment.fit.T, scene, target, config)
-    for number, fit in enumerate(found):
+    fits = look_fits(assessment.fit.T, scene, target, config)
+    for number, fit in enumerate(fits):
         if fit is LookFit.APART and _has_same_pose(alone(scene.each[number]), assessment, config):
-            found[number] = LookFit.FITS
-    return found
+            fits[number] = LookFit.FITS
+    return fits
 
 
 def _has_same_pose(own: Assessment | None, common: Assessment, config: RegistrarConfig) -> bool:
-    """True where a look by itself has an accepted pose, nearly the one that all have in common."""
+    """Return True where a look by itself has an accepted pose, nearly the common one."""
     if own is None or not own.reaches(config.min_confidence):
         return False
     shift_mm, turn_deg = se3.pose_error(own.fit.T, common.fit.T, own.source.points)
@@ -121,28 +121,28 @@ def _has_same_pose(own: Assessment | None, common: Assessment, config: Registrar
 
 
 def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> list[LookFit]:
-    """How each of the K looks of a scene fits the pose (4, 4) that they have in common; a single one does."""
+    """Judge the fit of each of K looks to their common pose (4, 4); a single look fits."""
     if len(scene.images) == 1:
         return [LookFit.FITS]
     signed, _, aside, _ = kernels.residuals_at(T, scene.source.points, *target.kernel_view, 0.0)
     close = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < REACH_MM
-    found = [_shares_of_look(T, number, close, scene, target, config) for number in range(len(scene.images))]
-    widest = max(each.compared for each in found)
-    blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in found])
-    seeing = [each for each, is_blind in zip(found, blind, strict=True) if not is_blind]
+    shares = [_shares_of_look(T, number, close, scene, target, config) for number in range(len(scene.images))]
+    widest = max(each.compared for each in shares)
+    blind = np.array([each.compared < LEAST_COMPARED * widest and not each.fits_elsewhere for each in shares])
+    seeing = [each for each, is_blind in zip(shares, blind, strict=True) if not is_blind]
     near = max(each.share(each.near) for each in seeing)
     on = max(each.share(each.on) for each in seeing)
     return [
         LookFit.BLIND if is_blind else LookFit.APART if is_apart(each, near, on) else LookFit.FITS
-        for each, is_blind in zip(found, blind, strict=True)
+        for each, is_blind in zip(shares, blind, strict=True)
     ]
 
 
 def is_apart(look: LookShares, near: float, on: float) -> bool:
-    """True where a look fits far better elsewhere, saw through the bone, or agrees far less than the best one does.
+    """Return True where a look fits far better elsewhere, saw through the bone, or agrees far less than the best.
 
     Args:
-        look: what it says.
+        look: shares of the look.
         near, on: the largest shares of all looks that are not blind.
     """
     disagrees = look.share(look.near) < LEAST_NEAR * near or look.share(look.on) < LEAST_ON * on
@@ -161,7 +161,7 @@ def _apart(answers: tuple[LookAnswer, ...]) -> Finding:
 def _shares_of_look(
     T: Array, number: int, is_close: NDArray[np.bool_], scene: Scene, target: PreparedTarget, config: RegistrarConfig
 ) -> LookShares:
-    """Look `number` of a scene under the common pose (4, 4), and laid on the bone by its points (N,) close to it."""
+    """Measure look `number` under the common pose (4, 4), and refined by its points (N,) close to the bone."""
     source, close = scene.source, np.flatnonzero((scene.look == number) & is_close)
     own, settings, threads = T, config.clutter, config.num_threads
     if len(close) >= FEWEST_POINTS:

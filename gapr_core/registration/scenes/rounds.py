@@ -1,7 +1,7 @@
-"""A scene registered: more and more regions of it propose, its lines of sight decide, until an answer is sure.
+"""Registration of a scene: regions propose round after round, lines of sight decide, until an answer is sure.
 
-Of what may be no scene also until two in a row are hopeless: the rounds after them hardly ever have a pose that is
-accepted. In a stream the last pose and its rivals are compared first, and no region is asked where that is sure.
+A cloud that may be no scene stops after two hopeless rounds in a row: later rounds hardly ever have an accepted pose.
+In a stream the last pose and its rivals are compared first; regions propose only where that is not sure.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ def register(
     clock: Clock,
     rounds: int | None = None,
 ) -> Assessment | None:
-    """The best pose of what a camera saw, before the costly checks; None where no region proposes any.
+    """Register a camera's view before the costly checks; None where no region proposes a pose.
 
     Args:
-        seen: from one place or several, without regions.
+        seen: view from one place or several, without regions.
         target: the bone.
         poses: (K, 4, 4) T_target_source, mm, to try as well.
-        classifier: of the two numbers.
-        config: every setting.
-        clock: of the call.
-        rounds: of regions at most, of what may be no scene; `ClutterConfig.rounds`, hopeless or not, when not given.
+        classifier: model of the two numbers.
+        config: settings of the registration.
+        clock: stage times of the call.
+        rounds: most rounds for a cloud that may be no scene; else `ClutterConfig.rounds`, hopeless or not.
     """
     settings, threads = replace(config.clutter, rounds=rounds or config.clutter.rounds), config.num_threads
     assessment, hopeless = None, 0
@@ -55,7 +55,7 @@ def register(
         pool = clutter.propose(scene, target, poses, settings, threads)
         clock.lap("propose")
         if not clutter.has_proposed(pool):
-            continue  # a pose that was given is not weighed against nothing
+            continue  # a given pose needs a rival
         start = poses if assessment is None else None
         candidates = clutter.verify(pool, scene, target, settings, threads, start)
         poses = candidates.poses
@@ -77,19 +77,19 @@ def of_remembered(
     config: RegistrarConfig,
     clock: Clock,
 ) -> Assessment | None:
-    """The best of the poses that the scene before had, its rivals among them; no region is asked.
+    """Compare the poses of the scene before, its rivals among them, without regions.
 
     None where only one is left: nothing would compete with it.
 
     Args:
         poses: (K, 4, 4) T_target_source, mm.
-        most_support: share of the hypotheses that came to the pose when regions were asked last. Of a few remembered
+        most_support: share of the hypotheses that came to the pose in the last round of regions. Of a few remembered
             ones, its own is a large share.
         seen, target, classifier, config, clock: as `register`.
     """
     pool = clutter.given(poses)
-    found = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
-    candidates = replace(found, support=np.minimum(found.support, most_support))
+    verified = clutter.verify(pool, seen, target, config.clutter, config.num_threads, poses)
+    candidates = replace(verified, support=np.minimum(verified.support, most_support))
     clock.lap("verify")
     return None if len(candidates.poses) < 2 else _assessed(candidates, seen, target, classifier, config, clock)
 
@@ -102,7 +102,7 @@ def _assessed(
     config: RegistrarConfig,
     clock: Clock,
 ) -> Assessment:
-    """The first of the candidates, refined on what it explains, and how sure it is."""
+    """Refine the first of the candidates on its part of the scene, and assess it."""
     part = explained.refine(candidates.poses[0], scene, target, config)
     clock.lap("refine")
     assessment = explained.assess_part(part, candidates, scene, target, classifier, config)
@@ -111,14 +111,14 @@ def _assessed(
 
 
 def of_unknown(source: ArrayLike, config: RegistrarConfig) -> PreparedSource | None:
-    """A source of which nobody said where it was seen from, as what a camera may have seen.
+    """Prepare a source without a viewpoint as a possible view of a camera.
 
-    None where it cannot be that.
+    None where it cannot be one.
     """
     if not (config.clutter.infer_viewpoint and clutter.sees_from_afar(config)):
         return None
     try:
         scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
     except InvalidPointCloudError:
-        return None  # of all points some are metres away; those that were looked at as bone are not
+        return None  # some of all points are metres away; the fitted ones are not
     return scene if isinstance(scene, PreparedSource) else None

@@ -1,7 +1,7 @@
-"""A scene: what a camera saw, from one place or from several.
+"""A scene: a camera's view from one place or from several.
 
-One image shows one side of a wound, with one set of errors. The camera moves a little, and it shows more bone, what hid
-it, and other errors. The images are one cloud in one frame in which the bone rests; each keeps its lines of sight.
+One image shows one side of a wound, with one set of errors. A camera that moves a little shows more bone, the tissue in
+front of it, and other errors. The images are one cloud in one frame in which the bone rests; each keeps its own lines.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ HOW = "pass x, y, z in mm: where the camera was, or where it was for each point"
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What was seen from one place.
+    """A view from one place.
 
     Attributes:
         points: (N, 3), mm, source frame.
-        viewpoint: (3,), mm, source frame: where the camera was.
+        viewpoint: (3,), mm, source frame: place of the camera.
     """
 
     points: Array
@@ -46,7 +46,7 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where a camera was for each point of a cloud; two of the places may be the same.
+    """Places of the camera for each point of a cloud; two of the places may be the same.
 
     Attributes:
         viewpoints: (K, 3), mm, source frame.
@@ -58,7 +58,7 @@ class Places:
 
     @classmethod
     def of(cls, seen: Sequence[Look]) -> Places:
-        """Those of looks whose points follow each other in one cloud."""
+        """Collect the places of looks whose points follow each other in one cloud."""
         viewpoints = np.reshape([look.viewpoint for look in seen], (-1, 3))
         return cls(viewpoints, np.repeat(np.arange(len(seen)), [len(look.points) for look in seen]))
 
@@ -68,17 +68,17 @@ Viewpoint = ArrayLike | Places  # (3,) or (N, 3) mm, or places by their numbers
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a camera saw from K places.
+    """A camera's view from K places.
 
     Attributes:
         source: the cloud, with normals towards the camera.
-        images: the same as its camera saw it, one for each place.
+        images: image of each place.
         viewpoints: (K, 3) mm, source frame: the places.
-        look: (N,) index of the place that each point of the source was seen from.
+        look: (N,) index of each point's place.
         regions: parts of it that may be bone alone.
-        each: what was seen from each place, as a scene of its own; () of a single one.
-        names: (K,) number of each place among those that were given.
-        given: (G, 3) mm, source frame: the places that were given; from some of them too few points were seen.
+        each: view from each place, as a scene of its own; () of a single one.
+        names: (K,) number of each place among the given ones.
+        given: (G, 3) mm, source frame: the given places, also those with too few points.
     """
 
     source: PreparedSource
@@ -92,27 +92,27 @@ class Scene:
 
     @property
     def viewpoint(self) -> Array:
-        """(3,) mm, the middle of the places."""
+        """(3,) mm, middle of the places."""
         return np.asarray(self.viewpoints.mean(axis=0))
 
     def part(self, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
-        """Some of its points as a source of its own, its normals towards the camera."""
+        """Cut some of its points into a source of their own, with normals towards the camera."""
         part = sources.describe(self.source.points[members], config.source)
         return part.facing(self.viewpoints[self.look[members]])
 
     def compare(
         self, poses: Array, points: Array, normals: Array, on_mm: float, front_mm: float, num_threads: int = 0
     ) -> Visible:
-        """What the camera saw of a target under poses (K, 4, 4), the mean over its places; see `free_space.compare`."""
+        """Compare a target under poses (K, 4, 4) with the views, averaged over the places; see `free_space.compare`."""
         how = points, normals
         seen = [free_space.compare(poses, *how, image, on_mm, front_mm, num_threads) for image in self.images]
         return free_space.average(seen)
 
 
 def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
-    """A cloud (N, 3) by where its camera was: one place for all, or one for each point; mm.
+    """Split a cloud (N, 3), mm, by the place of its camera: one place for all, or one for each point.
 
-    Points that are not finite are dropped, and what was said of where they were seen from with them.
+    Points that are not finite are dropped, with their viewpoints.
 
     Raises:
         InvalidPointCloudError: a viewpoint of another shape, or one that is not finite; more than `MOST_PLACES` places.
@@ -126,12 +126,12 @@ def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
     if len(places) > MOST_PLACES:
         how = "pass the last images, or those from places that differ most"
         raise InvalidPointCloudError(f"at most {MOST_PLACES} places of a camera", f"{len(places)}", how)
-    found = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
-    return found or [Look(points, np.zeros(3))]  # of no point at all
+    looks = [Look(finite_points(points[look == i]), place) for i, place in enumerate(places)]
+    return looks or [Look(points, np.zeros(3))]  # of no point at all
 
 
 def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
-    """The finite points (N, 3) of a cloud, the different places (K, 3), sorted, and (N,) the place of each point."""
+    """Return the finite points (N, 3) of a cloud, its different places (K, 3), sorted, and (N,) each point's place."""
     points, of_points = as_points(source), as_array(viewpoint, "a viewpoint", HOW)
     usable = is_point(points)
     if of_points.shape == points.shape and of_points.dtype.kind == "f":
@@ -143,18 +143,18 @@ def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, ND
 
 
 def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
-    """The scene of looks, but for those of too few points; the first one's refusal where all are.
+    """Prepare the scene of looks, without those of too few points; the first one's refusal where all have too few.
 
     With others a look needs the points of a region (`ClutterConfig.region_fewest_points`): an image of a few is all
     holes.
 
     Raises:
-        InvalidViewpointError: a viewpoint in the middle of what was seen from it.
+        InvalidViewpointError: a viewpoint in the middle of its own points.
     """
-    found = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
-    seen = {name: source for name, source in enumerate(found) if isinstance(source, PreparedSource)}
+    clouds = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
+    seen = {name: source for name, source in enumerate(clouds) if isinstance(source, PreparedSource)}
     if not seen:
-        return next(source for source in found if isinstance(source, Refusal))
+        return next(source for source in clouds if isinstance(source, Refusal))
     fewest = config.clutter.region_fewest_points
     seen = {name: source for name, source in seen.items() if len(source.points) >= fewest} or seen
     each = [scene_from(source, looks[name].viewpoint, config) for name, source in seen.items()]
@@ -165,10 +165,10 @@ def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
 
 
 def scene_from(source: PreparedSource, viewpoint: Array, config: RegistrarConfig) -> Scene:
-    """The scene that a camera saw from one viewpoint (3,), mm, source frame; no regions yet.
+    """Build the scene seen from one viewpoint (3,), mm, source frame; no regions yet.
 
     Raises:
-        InvalidViewpointError: a viewpoint in the middle of what was seen from it.
+        InvalidViewpointError: a viewpoint in the middle of its own points.
     """
     settings, seen = config.clutter, source.facing(viewpoint)
     image = free_space.see(_levelled(seen, settings.levelled_by), seen.normals, viewpoint)
@@ -176,7 +176,7 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: RegistrarConfig
 
 
 def _together(each: Sequence[Scene], config: RegistrarConfig) -> Scene | Refusal:
-    """Scenes of one place each, in one frame, as a scene of several; a refusal where they are no body together."""
+    """Join scenes of one place each, in one frame; a refusal where they are no body together."""
     viewpoints = np.concatenate([scene.viewpoints for scene in each])
     points = np.concatenate([scene.source.points for scene in each])
     together = sources.prepare(points, config.source, config.num_threads, in_scene=True)
@@ -189,6 +189,6 @@ def _together(each: Sequence[Scene], config: RegistrarConfig) -> Scene | Refusal
 
 
 def _levelled(source: PreparedSource, count: int) -> Array:
-    """(N, 3) points, mm, moved along their normals to the mean of `count` neighbours: the noise is averaged."""
+    """Move points (N, 3), mm, along their normals to the mean of `count` neighbours: the noise is averaged."""
     around = source.points[source.neighbours[:, :count]].mean(axis=1) - source.points
     return source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]

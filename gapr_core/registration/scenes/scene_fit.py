@@ -1,4 +1,4 @@
-"""What a pose explains of a scene: the part of the cloud that is bone, and how well it is separated from the rest."""
+"""The part of a scene that a pose explains, and the assessment of the pose by it."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from gapr_core.results import Effect, Finding, RegistrationStatus
 
 Array = NDArray[np.float64]
 
-ROUNDS, FEWEST_POINTS = 2, 30  # of choosing the part and refining on it; a smaller part is the whole cloud
-AGREEING_COS = 0.7  # of normals, up to which a point may lie on the bone
-CROWD, MOST_ALONE = 12, 0.5  # neighbours that must lie on it, too, and their share
+ROUNDS, FEWEST_POINTS = 2, 30  # rounds of choice and refinement; least points of a part, else the whole cloud
+AGREEING_COS = 0.7  # least cosine of normals of a point on the bone
+CROWD, MOST_ALONE = 12, 0.5  # compared neighbours, and the share of them that must lie on the bone, too
 MOSTLY_CLUTTER, MOSTLY_OFF = 0.5, 0.4  # least share that counts for the pose; the same without a viewpoint
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
 SAY_WHERE = ", or say where the camera was (viewpoint)"
-RIVAL_IF_ALONE = 1.0  # a pose alone counts as having a rival that is as good: the careful choice
+RIVAL_IF_ALONE = 1.0  # score of the assumed rival of a pose alone, over its own: as good, the careful choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Explained:
 
     Attributes:
         source: the part, as a source of its own.
-        members: (N,) mask of the scene's points that are in it.
+        members: (N,) mask of the part's points in the scene.
         fit: the pose, refined on the part alone.
     """
 
@@ -57,7 +57,7 @@ class Explained:
 
 
 def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConfig) -> Explained:
-    """Refine a pose (4, 4) on what it explains; on the whole cloud where that is next to nothing."""
+    """Refine a pose (4, 4) on the part that it explains, or on the whole cloud if that is tiny."""
     for _ in range(ROUNDS):
         members = _on_surface(T, scene.source, target, config)
         if members.sum() < FEWEST_POINTS:
@@ -69,7 +69,7 @@ def refine(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarConf
 
 
 def _on_surface(T: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig) -> NDArray[np.bool_]:
-    """(N,) mask of the points that lie on the surface with most of their neighbours, normals agreeing."""
+    """Mark the points (N,) that lie on the surface with most of their neighbours, normals agreeing."""
     signed, gradients, aside, _ = kernels.residuals_at(T, source.points, *target.kernel_view, 0.0)
     near = np.hypot(np.nan_to_num(signed, nan=np.inf), aside) < config.clutter.part_mm
     same = np.einsum("ni,ni->n", source.normals @ T[:3, :3].T, gradients)
@@ -110,7 +110,7 @@ def assess_part(
 
 
 def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding | None:
-    """Find that most of a cloud is not this bone: the name of its refusal, should it be refused.
+    """Find that most of a cloud is not this bone: a reason for its refusal, if it is refused.
 
     With a viewpoint, by the share that the pose explains; of another dense cloud, by the share that lies on the bone.
     """
@@ -140,17 +140,17 @@ def measure(
     target: PreparedTarget,
     config: RegistrarConfig,
 ) -> dict[str, float]:
-    """The features behind the confidence in a scene (`features.FEATURES_OF`); every one is finite."""
+    """Measure the features of a scene (`features.FEATURES_OF`); every one is finite."""
     seen = clutter.seen_of(explained.fit.T[None], scene, target, config.clutter)
     visible = _visible_features(seen, candidates, target)
-    flatness_mm = scene.source.flatness_mm[explained.members]  # of the part alone it is that of what lies on the bone
+    flatness_mm = scene.source.flatness_mm[explained.members]  # of the whole: that of the part omits tissue
     shared = of_the_fit(explained.fit, candidates, uncertainty, explained.source, flatness_mm, target, config)
     values = visible | shared | {"inlier_ratio": explained.share}
     return {name: values[name] for name in FEATURES_OF[SCENE]}
 
 
 def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:
-    """What lines of sight say: shares of the surface, and the margin to the best distinct rival."""
+    """Measure the lines of sight: shares of the surface, and the margin to the best distinct rival."""
     explained, violating, compared = (float(x[0]) for x in (seen.explained, seen.violating, seen.compared))
     area_mm2 = explained * len(target.points) * target.spacing_mm**2
     rival = candidates.scores[1] / candidates.scores[0] if len(candidates.scores) > 1 else RIVAL_IF_ALONE

@@ -1,1 +1,1 @@
-"""Sources that follow one another: tracked, accumulated, looked at from several places."""
+"""Streams of sources: tracked, accumulated, or seen from several places."""

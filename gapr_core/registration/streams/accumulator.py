@@ -1,4 +1,4 @@
-"""The last sources of a stream registered together: what a probe has collected, in a frame in which the bone rests."""
+"""Registration of the last sources of a stream together: a probe's images, in a frame in which the bone rests."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
-OFF = 2.5  # a source so many times farther off the bone than all together is discarded
-FEWEST_POINTS = 20  # of a source that is checked by itself; a smaller one with those before it
+OFF = 2.5  # distance off the bone of a discarded source, over that of all together
+FEWEST_POINTS = 20  # of a source checked by itself; a smaller one is checked with those before it
 MOST_POINTS = 6000  # kept of one source, and compared with
-POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # the second one fits the sources as well as another
-FEWEST_IN_TIME = 6  # sources that show a motion, as it is refused
-FEWEST_THAT_MAY = 3  # sources in which a motion widens the bound
-MAY_MOVE, MOVES = 1.0, 6.0  # log likelihood ratios from which a bone may move, and moves
+POSED = (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)  # statuses whose pose fits the sources
+FEWEST_IN_TIME = 6  # least sources for a refusal by motion
+FEWEST_THAT_MAY = 3  # least sources for a wider bound by motion
+MAY_MOVE, MOVES = 1.0, 6.0  # least log likelihood ratios of a possible and of a certain motion
 
 
 class Accumulator:
     """Registers each source together with those before it.
 
-    Nothing helps more than seeing more of the bone: images of a probe that say nothing alone determine the pose
-    together. All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. Under
-    an accepted pose each new source is looked at by itself, one of few points together with such ones just before it;
-    what lies off the bone, or lay off it under the accepted pose before, is left out, and refused if it is the newest.
-    After three of them in a row the bone or its reference has moved, and only these three are kept. Where all show that
-    the bone moves (see `motion_test`), the answer is refused, and those since a step or the last third are kept.
+    Images of a probe that determine nothing alone determine the pose together. All sources must be in one frame in
+    which the bone rests, such as that of a reference fixed to it. Under an accepted pose each new source is checked by
+    itself, one of few points together with such ones just before it. A source off the bone under this or the last
+    accepted pose is left out, and the answer refused if it is the newest. After three of them in a row the bone or its
+    reference has moved, and only these three are kept. Where all show that the bone moves (see `motion_test`), the
+    answer is refused, and those since a step or the last third are kept.
 
     Args:
-        method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one
+        method: registers the collected sources; a `Tracker` is not changed but copied to one whose sources count as one
             (`Tracker.sharing_points`).
-        most: how many sources are kept, the newest among them.
+        most: number of sources to keep, the newest included.
 
     Raises:
         ConfigError: `most` is no whole number, or less than 1; a method that cannot register.
@@ -72,11 +72,11 @@ class Accumulator:
 
     @property
     def collected(self) -> Array:
-        """(N, 3) all points that are kept, mm."""
+        """(N, 3) all kept points, mm."""
         return _together(self._kept + self._new)
 
     def together_with(self, source: ArrayLike) -> Array:
-        """(N, 3) mm, what `register` would register with a source (n, 3): the last of those kept, and itself."""
+        """Join the last kept sources and a source (n, 3) as `register` would; (N, 3) mm."""
         return _together([*self._kept, *self._new, np.asarray(source, dtype=np.float64)][-self.most :])
 
     def reset(self) -> None:
@@ -91,10 +91,10 @@ class Accumulator:
             self.method.reset()
 
     def collect(self, source: ArrayLike) -> None:
-        """Keep a source (N, 3), mm, without registering; the oldest one goes when there are too many.
+        """Keep a source (N, 3), mm, without registering; beyond `most` the oldest goes.
 
-        An empty source, and one that is there already, changes nothing. One that is metres away from the others cannot
-        be of the same bone in the same frame: it is left out, and the third in a row restarts the collection.
+        An empty source, or a repeated one, changes nothing. One that is metres away from the others cannot be of the
+        same bone in the same frame: it is left out, and the third in a row restarts the collection.
 
         Raises:
             InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
@@ -109,7 +109,7 @@ class Accumulator:
             self._new = [*self._new, points][-self.most :]
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Everything static about a target; see `Registrar.prepare`."""
+        """Compute everything static about a target; see `Registrar.prepare`."""
         return self.method.prepare(target, units)
 
     @single_threaded_libraries
@@ -120,10 +120,10 @@ class Accumulator:
         initial: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
-        """As `Registrar.register`, of all that is collected, this source included.
+        """Register all collected sources, this one included, as `Registrar.register`.
 
-        Another target than before starts a new collection. A source that cannot be registered is not kept, and one
-        without a finite point is refused: what was collected before says nothing about it.
+        Another target than before starts a new collection. A source that cannot be registered is not kept. One without
+        a finite point is refused: the others show nothing about it.
 
         Raises:
             ConfigError: a viewpoint is given; the collected sources were seen from many.
@@ -147,21 +147,21 @@ class Accumulator:
         except Exception:
             self._new = before if self._kept is kept else []  # or the collection restarted with this source
             raise
-        found = self._decide_on_new(replace(result, method=self.name), target)
-        self._accepted = found if found.ok else self._accepted
-        return found
+        answer = self._decide_on_new(replace(result, method=self.name), target)
+        self._accepted = answer if answer.ok else self._accepted
+        return answer
 
     def _registered_together(self) -> list[Array]:
-        """The sources that are registered as one, the newest last."""
+        """Return the sources that are registered as one, the newest last."""
         return (self._kept + self._new)[-self.most :]
 
     def _decide_on_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
-        """The answer, once the new sources that lie on the bone under its pose are kept; without a pose all are.
+        """Keep the new sources that lie on the bone under the answer's pose; without a pose keep all.
 
-        It is a refusal where the newest source lies off the bone, or so many in a row that the bone has moved.
+        The answer is refused where the newest source lies off the bone, or so many in a row that the bone has moved.
         """
         T = result.best if result.status in POSED else None
-        if T is None:  # it says nothing of any source, nor of a row of those off the bone
+        if T is None:  # no evidence on any source, nor on a row of those off the bone
             for source in self._new:
                 self._join_small_ones(source)
             self._kept, self._new = self._registered_together(), []
@@ -178,9 +178,9 @@ class Accumulator:
         return self._unless_it_moves(result, T, target)
 
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
-        """The answer; a refusal where the sources show that the bone moves, a wider bound where they hardly exclude it.
+        """Refuse where the sources show that the bone moves; widen the bound where they hardly exclude it.
 
-        What it may have moved by is in the covariance then. Those since a step are left; of a steady motion the last
+        The covariance then includes the possible motion. The sources since a step are kept; of a steady motion the last
         third.
         """
         kept = self._kept
@@ -190,27 +190,27 @@ class Accumulator:
         some = slice(None, None, 1 + len(order) // MOST_POINTS)
         points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
         fit = refine_fully(T, points, seen, self.config.refinement)
-        found = motion_test.of_motion(fit, order[some])
-        ratio = found.shown.log_ratio
+        motion = motion_test.of_motion(fit, order[some])
+        ratio = motion.shown.log_ratio
         if ratio <= MAY_MOVE:
             return result
         if ratio <= MOVES or len(kept) < FEWEST_IN_TIME:
-            added = covariance_of_half(fit, found.shown.size_mm)
+            added = covariance_of_half(fit, motion.shown.size_mm)
             return self._widened(result, added, fit.moved.mean(axis=0), target)
         self.reset()
-        self._kept = kept[-(len(kept) // 3) :] if found.rests_from is None else kept[found.rests_from :]
+        self._kept = kept[-(len(kept) // 3) :] if motion.rests_from is None else kept[motion.rests_from :]
         why = "the bone moves against the frame of the sources while they are collected: only the last are kept"
         return _refused(result, f"{why}; look at what is fixed to the bone")
 
     def _widened(
         self, result: RegistrationResult, added: Array, about_mm: Array, target: PreparedTarget
     ) -> RegistrationResult:
-        """An answer with more in its covariance and in its errors; refused where these are too large then.
+        """Add to the covariance of an answer and to its errors; refuse where these become too large.
 
         Args:
             result: an answer.
             added: (6, 6) covariance about a centre of its own.
-            about_mm: (3,) that centre, target frame.
+            about_mm: (3,) its centre, mm, target frame.
             target: the bone.
         """
         if result.covariance is None or result.centre_mm is None:  # as of methods that predict no error
@@ -224,7 +224,7 @@ class Accumulator:
         return replace(result, covariance=covariance, tre_mm=tre_mm, tre95_mm=tre95_mm)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
-        """Which sources lie off the bone under a pose (4, 4), mm: of the new ones, and of small ones judged with them.
+        """Find the sources off the bone under a pose (4, 4), mm: new ones, and small ones judged with them.
 
         Each of them prolongs the row of those off the bone, each other one ends it. One of too few points does neither.
         """
@@ -244,7 +244,7 @@ class Accumulator:
         return off
 
     def _join_small_ones(self, source: Array) -> list[Array]:
-        """Take up a source (N, 3). Returns what is judged: it, or of few points those before it too; [] for too few."""
+        """Add a source (N, 3); returns it to judge, a small one with those before it; [] for too few points."""
         fewest = FEWEST_POINTS
         if len(source) >= fewest:
             self._small = []
@@ -255,7 +255,7 @@ class Accumulator:
         return self._small if sum(map(len, self._small)) >= fewest else []
 
     def _restart(self, result: RegistrationResult) -> RegistrationResult:
-        """Refuse, and keep nothing but the sources in a row that lie off the bone: where it is now."""
+        """Refuse, and keep only the row of sources off the bone: they show its place now."""
         moved = self._off_in_a_row
         self.reset()
         self._kept = moved[-self.most :]
@@ -263,9 +263,9 @@ class Accumulator:
         return _refused(result, reason)
 
     def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget, least_mm: float = 0.0) -> bool:
-        """True when the typical point of a source (N, 3) is much farther off the surface than that of all (M, 3).
+        """Return True when a source (N, 3) lies much farther off the surface than all points (M, 3).
 
-        And farther than `least_mm`.
+        Its median distance counts; it also exceeds `least_mm`.
         """
         refinement = self.config.refinement
         some = np.ascontiguousarray(points[:: 1 + len(points) // MOST_POINTS])
@@ -273,9 +273,9 @@ class Accumulator:
         return own > max(least_mm, OFF * max(of_all, refinement.smallest_sigma_mm))
 
     def _contradicts(self, source: Array, target: PreparedTarget) -> bool:
-        """True when a source (N, 3) lies off the bone under the last accepted pose, farther than that may be off there.
+        """Return True when a source (N, 3) lies off the bone under the last accepted pose, beyond its bound there.
 
-        A large source may pull the pose that it shares with those before along, and lie on the bone then.
+        A large source may pull the common pose along, and lie on the bone then.
         """
         before, last = self._registered_together()[: -len(self._new)], self._accepted
         if not before or last is None:
@@ -288,14 +288,14 @@ class Accumulator:
 
 
 def _of_many_places(method: Registrar | Tracker) -> Registrar | Tracker:
-    """The method for sources of which no camera saw all; others are taken as they are."""
+    """Return the method for sources that no single camera saw; other methods are taken as they are."""
     if isinstance(method, Tracker):
         return method.sharing_points()
     return method.of_bone_alone() if isinstance(method, Registrar) else method
 
 
 def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:
-    """Median distance of (N, 3) points to the surface; what lies beyond its end is off it."""
+    """Compute the median distance of (N, 3) points to the surface; points past its edge are off it."""
     return float(np.median(distances_mm(T, points, target)))
 
 
@@ -308,11 +308,11 @@ def _is_among(source: Array, others: list[Array]) -> bool:
 
 
 def _was_sent(source: Array, before: list[Array]) -> bool:
-    """True where one of those before is the same, in any order of its points."""
+    """Return True where one of those before is the same, in any order of its points."""
     new = fingerprint(source)
     return any(len(each) == len(source) and new.is_of_same(fingerprint(each)) for each in before)
 
 
 def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
-    """Refuse the pose of a bone that is no longer where all sources together have it."""
+    """Refuse a pose when the bone has moved away from the collected sources."""
     return result.refused(RegistrationStatus.LOW_CONFIDENCE, reason)

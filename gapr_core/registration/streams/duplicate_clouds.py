@@ -1,4 +1,4 @@
-"""Is a cloud one that was there before? A driver that sends the last one again measures nothing new."""
+"""Detection of repeated clouds: a driver that sends the last one again measures nothing new."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SAME_MM = 1e-4  # what rounding to single precision leaves; of a new measurement the noise alone moves the mean farther
+SAME_MM = 1e-4  # rounding to single precision; the noise of a new measurement moves the mean farther
 
 
 class Fingerprint(NamedTuple):
-    """What stays of a cloud in any order of its points, and where they are rounded otherwise.
+    """Properties of a cloud that survive another order of its points and rounding.
 
     Attributes:
-        number: of points.
+        number: number of points.
         mean: (3,) mm.
         spread: (3,) standard deviation along x, y and z, mm.
     """
@@ -26,7 +26,7 @@ class Fingerprint(NamedTuple):
     spread: Array
 
     def is_of_same(self, other: Fingerprint) -> bool:
-        """True where both are of the same points."""
+        """Return True where both are of the same points."""
         if self.number != other.number:
             return False
         apart_mm = np.abs([self.mean - other.mean, self.spread - other.spread])
@@ -34,7 +34,7 @@ class Fingerprint(NamedTuple):
 
 
 def fingerprint(points: Array) -> Fingerprint:
-    """The fingerprint of points (N, 3), mm."""
+    """Compute the fingerprint of points (N, 3), mm."""
     if not len(points):
         return Fingerprint(0, np.zeros(3), np.zeros(3))
     return Fingerprint(len(points), points.mean(axis=0), points.std(axis=0))

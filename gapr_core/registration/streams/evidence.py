@@ -1,7 +1,7 @@
-"""One evidence of a stream, for both numbers: this pose, and this bone.
+"""Evidence of a stream for both numbers: this pose, and this bone.
 
-The log odds of frame k are a + b + e_k: a is true of all frames (right or wrong), b an effect of this pair of bones and
-of how it is measured, e_k an effect of the frame. With variances s_b^2 and s_e^2 alike for right and wrong, n frames of
+The log odds of frame k are a + b + e_k. a is true of all frames (right or wrong), b an effect of this pair of bones and
+of the measurement, e_k an effect of the frame. With variances s_b^2 and s_e^2 alike for right and wrong, n frames of
 mean m have the log odds m / (rho + (1 - rho) / n), where rho = s_b^2 / (s_b^2 + s_e^2). So frames that agree raise the
 evidence, never beyond m / rho: counting makes nothing certain. `gapr_core.calibration` fits both rho on train streams.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS, Judgement
 
 MEMORY = 10.0  # frames after which a frame's weight has fallen to about 1/e
-AGREE_MM = 15.0  # largest motion between frames (rms) that continues a track
+AGREE_MM = 15.0  # largest motion between frames (rms) of a track
 
 
 class State(NamedTuple):
@@ -37,10 +37,10 @@ EMPTY = State(np.zeros(2), np.zeros(2), 0)
 
 
 class Evidence:
-    """Witness of a stream on one target: observe each frame, reset with another target.
+    """Combined numbers of a stream on one target: observe each frame, reset with another target.
 
     Args:
-        rho_pose, rho_bone: correlation of two frames, 0 independent, 1 the same again.
+        rho_pose, rho_bone: correlation of two frames, 0 independent, 1 identical.
     """
 
     def __init__(self, rho_pose: float, rho_bone: float) -> None:
@@ -56,9 +56,9 @@ class Evidence:
 
         Args:
             frame: the numbers of this frame alone; NaN comes back and is not counted.
-            agrees: its pose continues the last one. After a jump the frames before it say nothing for it: evidence for
+            agrees: its pose continues the last one. After a jump the frames before it do not support it: evidence for
                 pose or bone is forgotten, evidence against them is not.
-            again: it is the last frame once more, which is counted once, as it is now.
+            again: it repeats the last frame, which is counted once, with the new numbers.
         """
         own = np.array([frame.pose_log_odds, frame.bone_evidence])
         if not np.isfinite(own).all():

@@ -1,4 +1,4 @@
-"""The last looks of a camera registered together: a wound seen from several places, in a frame in which it rests."""
+"""Registration of the last looks of a camera together: a wound from several places, in a frame in which it rests."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-STUCK = 10  # refusals in a row from one direction; what the looks before show may be gone
+STUCK = 10  # refusals in a row from one direction; the scene of the looks before may be gone
 
 
 class Newest(Enum):
-    """What the newest look says of the pose of all."""
+    """Verdicts of the newest look on the common pose."""
 
     AGREES = "alone it has the same pose"
     IS_UNCONFIRMED = "alone it has no pose, or there is no other"
@@ -48,7 +48,7 @@ class Newest(Enum):
     CONTRADICTS = "the pose is another one than the last, in a frame in which the bone rests, and it is not sure"
 
 
-STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # the pose stands
+STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # verdicts under which the pose stands
 ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS)
 REFUSED_FOR = {
     Newest.DIFFERS: RegistrationStatus.AMBIGUOUS,
@@ -60,7 +60,7 @@ REFUSED_FOR = {
 
 
 class Direction(NamedTuple):
-    """Where a look was taken: the camera (3,) and the middle (3,) of what it saw, mm."""
+    """Direction of a look: the camera (3,) and the middle (3,) of its points, mm."""
 
     camera: Array
     middle: Array
@@ -71,8 +71,8 @@ class KeptLook(Look):
     """A look of the collection.
 
     Attributes:
-        first: the direction of the first of those whose place it took, one after the other; else its own. A camera
-            that moves on slowly would else push each look out by the next one, and keep one alone.
+        first: direction of the first of the looks that it replaced in turn; else its own. A camera
+            that moves slowly would else replace each look by the next one, and keep one alone.
     """
 
     first: Direction
@@ -82,23 +82,23 @@ class LookAccumulator:
     """Registers each look of a camera together with those before it.
 
     A single image of a wound shows little of the bone, with one set of errors. A few from places some ten degrees apart
-    show more of it and of what hid it. All must be in one frame in which the bone rests, such as that of a reference
-    fixed to it, and the camera's place must be known for each. A look takes the place of one from nearly the same
-    direction, so that those of a video do not push out all others; of a camera that moves on some stay.
+    show more of it and its cover. All must be in one frame in which the bone rests, such as that of a reference
+    fixed to it, and the camera's place must be known for each. A look replaces one from nearly the same direction. So
+    those of a video do not push out all others, and some of a moving camera stay.
 
-    Older looks that show the bone elsewhere than the newest and most others are left out, and the others are asked
+    Older looks that show the bone elsewhere than the newest and most others are left out, and the others are registered
     again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
-    pose, and so is a pose that is not sure and another one than the last. After three in a row that show the bone
-    elsewhere it or its reference has moved, and only these three are kept, whatever their directions; so after three
-    poses in a row that are another. After ten refusals from one direction only the last look is kept.
+    pose. A pose that is not sure and differs from the last is refused, too. After three in a row that show the bone
+    elsewhere it or its reference has moved, and only these three are kept, whatever their directions. The same holds
+    after three poses in a row that differ. After ten refusals from one direction only the last look is kept.
 
-    What all looks share shows in none of them, such as the error of a hand-eye calibration: state it as `tracking_mm`
-    of the sensor (`SensorConfig`).
+    No look shows the errors that all share, such as that of a hand-eye calibration: state it as `tracking_mm` of the
+    sensor (`SensorConfig`).
 
     Args:
-        method: registers what is collected; of a `Tracker`, which stays as it is, one whose sources count as one.
-        most: how many looks are kept, the newest among them; each costs time.
-        apart_deg: between the direction of a look and those of the others whose place it does not take.
+        method: registers the collected looks; a `Tracker` is copied to one whose sources count as one.
+        most: number of looks to keep, the newest included; each costs time.
+        apart_deg: least angle between the directions of two kept looks.
 
     Raises:
         ConfigError: `most` is no whole number from 1 to 16, `apart_deg` no angle from 0 to 90; a method that takes no
@@ -123,11 +123,11 @@ class LookAccumulator:
 
     @property
     def collected(self) -> Array:
-        """(N, 3) all points that are kept, mm."""
+        """(N, 3) all kept points, mm."""
         return _together(self._looks)
 
     def together_with(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> Array:
-        """(N, 3) mm, what `register` would register with a look: those kept, and itself; as `collect`."""
+        """Join the kept looks and this one as `register` would; (N, 3) mm. Arguments as `collect`."""
         newest = _look(source, viewpoint)
         return _together(self._with(newest)[1] if self._is_enough(newest) else self._looks)
 
@@ -143,11 +143,11 @@ class LookAccumulator:
             self.method.reset()
 
     def collect(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> None:
-        """Keep a look (N, 3), mm, and where its camera was (3,), without registering.
+        """Keep a look (N, 3), mm, and the place of its camera (3,), without registering.
 
-        It takes the place of those from nearly the same direction; beyond `most` the oldest goes. A look of fewer
-        points than a pose needs changes nothing. One that is metres away from the others is left out, and the third in
-        a row restarts the collection.
+        It replaces those from nearly the same direction; beyond `most` the oldest goes. A look of fewer points than a
+        pose needs changes nothing. One that is metres away from the others is left out, and the third in a row restarts
+        the collection.
 
         Raises:
             ConfigError: no viewpoint.
@@ -158,7 +158,7 @@ class LookAccumulator:
             self._add(newest)
 
     def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Everything static about a target; see `Registrar.prepare`."""
+        """Compute everything static about a target; see `Registrar.prepare`."""
         return self.method.prepare(target, units)
 
     @single_threaded_libraries
@@ -169,10 +169,10 @@ class LookAccumulator:
         initial: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
     ) -> RegistrationResult:
-        """As `Registrar.register`, of all looks that are kept, this one included.
+        """Register all kept looks, this one included, as `Registrar.register`.
 
-        Another target than before starts a new collection. A look of fewer points than a pose needs is refused: those
-        before say nothing about it. A look with which the others cannot be registered is not kept.
+        Another target than before starts a new collection. A look of fewer points than a pose needs is refused: the
+        others show nothing about it. A look with which the others cannot be registered is not kept.
 
         Raises:
             ConfigError, InvalidPointCloudError: as `collect` and `Registrar.register`.
@@ -192,17 +192,17 @@ class LookAccumulator:
             self._looks = before
             raise
         clock = Clock()
-        said = self._of_newest(result, asked, target)
+        verdict = self._of_newest(result, asked, target)
         clock.lap("compare")
-        found = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
-        if said in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
-            found = found.refused(REFUSED_FOR[said], said.value)
-        return replace(found, reason=found.reason + self._update_looks(said, found, newest, before, asked))
+        answer = replace(result, method=self.name, stage_ms=_added(result.stage_ms, clock.stages))
+        if verdict in REFUSED_FOR:  # the bone is no longer where the looks have it in common, for all that is known
+            answer = answer.refused(REFUSED_FOR[verdict], verdict.value)
+        return replace(answer, reason=answer.reason + self._update_looks(verdict, answer, newest, before, asked))
 
     def _of_those_that_fit(
         self, target: PreparedTarget, initial: ArrayLike | None
     ) -> tuple[RegistrationResult, list[KeptLook]]:
-        """The answer to all looks but older ones that show the bone elsewhere than the newest and most; and these."""
+        """Register the looks but older ones apart from the newest and most; returns the answer and these looks."""
         stage_ms: dict[str, float] = {}
         asked = self._looks
         while True:
@@ -214,7 +214,7 @@ class LookAccumulator:
             asked = [look for look, is_apart in zip(asked, apart, strict=True) if not is_apart]
 
     def _of_newest(self, result: RegistrationResult, asked: list[KeptLook], target: PreparedTarget) -> Newest:
-        """What the newest of the looks that were asked says of the answer."""
+        """Judge the answer by the newest of the registered looks."""
         fits = [look.fit for look in result.looks] or [LookFit.FITS]
         may_be_there = result.status in (RegistrationStatus.OK, RegistrationStatus.AMBIGUOUS)
         if LookFit.APART in fits:
@@ -225,22 +225,22 @@ class LookAccumulator:
             return Newest.SHOWS_NOTHING
         if not result.ok:
             return Newest.IS_REFUSED
-        said = self._of_newest_alone(asked, result, target)
-        is_sure = said is Newest.AGREES and result.confidence >= self.config.sure_from
-        if said in STANDING and not is_sure and self._is_another(result):
+        verdict = self._of_newest_alone(asked, result, target)
+        is_sure = verdict is Newest.AGREES and result.confidence >= self.config.sure_from
+        if verdict in STANDING and not is_sure and self._is_another(result):
             return Newest.CONTRADICTS
-        return Newest.IS_DOUBTFUL if said is Newest.IS_UNCONFIRMED and self._off_in_a_row else said
+        return Newest.IS_DOUBTFUL if verdict is Newest.IS_UNCONFIRMED and self._off_in_a_row else verdict
 
     def _is_another(self, result: RegistrationResult) -> bool:
-        """Whether the pose is another one than the last that was given, since the collection began."""
+        """Return True where the pose differs from the last one given since the collection began."""
         if self._last is None or result.T_target_source is None or self.most == 1:
             return False
         return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
 
     def _of_newest_alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
-        """What the newest look alone says of the pose of all: its own is right if that one is, or it has none.
+        """Judge the common pose by that of the newest look alone: it agrees, differs, or there is none.
 
-        Others from where it was taken confirm nothing.
+        Others from the same direction confirm nothing.
         """
         if len(asked) < 2:
             return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
@@ -259,42 +259,42 @@ class LookAccumulator:
 
     def _update_looks(
         self,
-        said: Newest,
+        verdict: Newest,
         result: RegistrationResult,
         newest: KeptLook,
         before: list[KeptLook],
         asked: list[KeptLook],
     ) -> str:
-        """Decide which looks stay after an answer. Returns how that is said, after the reason.
+        """Decide which looks stay after an answer. Returns a text to add to the reason.
 
         Args:
-            said: what the newest look says; a pose that it does not speak against ends what is counted.
+            verdict: verdict of the newest look; a pose that stands ends all counts.
             result: the answer.
-            newest: the look; among those kept so far.
+            newest: the look, already kept.
             before: the looks before it.
-            asked: those with which it has a pose, itself included; after a refusal all others stay, too.
+            asked: looks of the common pose, itself included; after a refusal all others stay, too.
         """
-        if said in STANDING:
+        if verdict in STANDING:
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
             self._looks, self._off_in_a_row, self._another_in_a_row, self._refused_in_a_row = asked, [], [], []
             self._last = self._last if result.T_target_source is None else result.T_target_source
             return ""
-        if said in ELSEWHERE:
+        if verdict in ELSEWHERE:
             self._off_in_a_row = [*self._off_in_a_row, newest]
             return self._update_row_elsewhere(self._off_in_a_row, before)
-        if said is Newest.CONTRADICTS:
+        if verdict is Newest.CONTRADICTS:
             self._another_in_a_row = [*self._another_in_a_row, newest]
             return self._update_row_elsewhere(self._another_in_a_row, before)
-        if said is not Newest.IS_REFUSED:
+        if verdict is not Newest.IS_REFUSED:
             self._looks = before
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
             self._restart_with([newest])
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
-        return "" if said is Newest.IS_REFUSED else "; left out"
+        return "" if verdict is Newest.IS_REFUSED else "; left out"
 
     def _update_row_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
-        """As `_update_looks`, for the last of a row of looks with which the bone is elsewhere than before."""
+        """Update the looks, as `_update_looks`, after the last of a row that show the bone elsewhere."""
         if len(row) < MOST_OFF:
             self._looks = before
             return "; left out"
@@ -315,11 +315,11 @@ class LookAccumulator:
         self._looks = looks[-self.most :]
 
     def _is_enough(self, look: Look) -> bool:
-        """Whether a look may have a pose at all; fewer points say nothing of it."""
+        """Return True where a look has enough points for a pose."""
         return len(look.points) >= self.config.source.fewest_points
 
     def _add(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
-        """Keep a look. Returns it, and those before it; none where the collection restarts with it."""
+        """Keep a look, and return it and those before it; none where the collection restarts with it."""
         if self._far_away.restarts_with(look.points, self.collected):
             self.reset()
         before = self._looks
@@ -327,7 +327,7 @@ class LookAccumulator:
         return newest, before
 
     def _with(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
-        """A look as it is kept, and all that are, itself the last; the nearest gives its place to it, if it is near."""
+        """Add a look to those kept, in place of a near one; returns it, and all with itself the last."""
         own, others = _direction(look), list(self._looks)
         apart_deg = [_apart_deg(each.first, own) for each in others]
         is_near = bool(others) and min(apart_deg) < self.apart_deg
@@ -343,7 +343,7 @@ def _look(source: ArrayLike, viewpoint: ArrayLike | None) -> Look:
 
 
 def _added(stage_ms: Mapping[str, float], more_ms: Mapping[str, float]) -> dict[str, float]:
-    """Times of stages, ms, and of those that came after them."""
+    """Add the times of further stages, ms, to those of stages."""
     return {stage: stage_ms.get(stage, 0.0) + more_ms.get(stage, 0.0) for stage in [*stage_ms, *more_ms]}
 
 
@@ -356,10 +356,10 @@ def _direction(look: Look) -> Direction:
 
 
 def _apart_deg(first: Direction, second: Direction) -> float:
-    """How different two directions are: the larger of two angles.
+    """Measure the difference of two directions: the larger of two angles.
 
-    That between the cameras, seen from the middle of what both show; and that between what they show, seen from the
-    middle of both cameras.
+    One is between the cameras, seen from the middle of both views; the other between the views, seen from the middle of
+    both cameras.
     """
     cameras = np.stack([first.camera, second.camera])
     shown = np.stack([first.middle, second.middle])
@@ -367,6 +367,6 @@ def _apart_deg(first: Direction, second: Direction) -> float:
 
 
 def _angle_deg(pair: Array) -> float:
-    """Between two directions (2, 3) of any length."""
+    """Measure the angle between two directions (2, 3) of any length."""
     a, b = pair / np.maximum(np.linalg.norm(pair, axis=1, keepdims=True), 1e-9)
     return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))

@@ -1,4 +1,4 @@
-"""The last pose of a stream and its rivals, asked for the next source before all else."""
+"""The last pose of a stream and its rivals: the first proposals for the next source."""
 
 from __future__ import annotations
 
@@ -28,13 +28,12 @@ Array = NDArray[np.float64]
 class PreviousPoses:
     """Proposes the last pose, and the rivals that the last full registration gave it.
 
-    The rivals matter as much as the pose. Without them nothing would compete with it, and a pose that is merely the
-    only one looked at would count as sure.
+    Without the rivals nothing would compete with the pose, and it would count as sure for being the only one.
 
     Attributes:
-        poses: (K, 4, 4) T_target_source of the last source that was assessed, mm, best first.
+        poses: (K, 4, 4) T_target_source of the last assessed source, mm, best first.
         support: share of the hypotheses that came to the pose in the last full registration.
-        place: (3,) mm, frame of the last source: where its camera was inferred to be; None where nobody had to ask.
+        place: (3,) mm, frame of the last source: inferred place of its camera; None if none was inferred.
     """
 
     name = "track"
@@ -45,10 +44,10 @@ class PreviousPoses:
         self.place: Array | None = None
 
     def prepare(self, target: PreparedTarget) -> None:
-        """Nothing of a target is needed."""
+        """Prepare nothing."""
 
     def propose(self, source: PreparedSource, target: PreparedTarget, rng: np.random.Generator) -> Proposals:
-        """The pose first, then its rivals."""
+        """Propose the pose first, then its rivals."""
         return Proposals(self.poses, np.linspace(1.0, 0.0, len(self.poses)))
 
     def keep(self, poses: Sequence[Array]) -> None:
@@ -56,9 +55,9 @@ class PreviousPoses:
         self.poses = np.stack(poses)
 
     def follow(self, pose: Array, source: Array) -> None:
-        """The source (N, 3), mm, has moved from the remembered pose nearest to `pose`, T_before to T_now.
+        """Move all poses with the source (N, 3), mm: the nearest one to `pose`, T_before, becomes T_now.
 
-        All others move with it, R to R inv(T_before) T_now; the nearest one comes first.
+        The others go from R to R inv(T_before) T_now; the nearest one comes first.
         """
         before = self.poses
         nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in before]))
@@ -67,11 +66,11 @@ class PreviousPoses:
 
 
 class TrackingRegistrar(Registrar):
-    """Asks the previous poses first, then the proposers of another registrar.
+    """Uses the previous poses first, then the proposers of another registrar.
 
     Args:
-        memory: what is remembered of the last source.
-        full: registers what the memory knows nothing of: the mirror image of a source.
+        memory: poses of the last source.
+        full: registers the mirror image of a source, for which there are no previous poses.
     """
 
     def __init__(self, memory: PreviousPoses, full: Registrar) -> None:
@@ -87,39 +86,39 @@ class TrackingRegistrar(Registrar):
         clock: Clock,
         enough: Enough = never,
     ) -> Assessment | Refusal:
-        """Where the camera of the last source had to be inferred, this one is compared as its next view at once."""
+        """Assess a source; after a source with an inferred camera, as the next view of that camera first."""
         if viewpoint is None and self._memory.place is not None:
             surface = offset_surface(target, self.config.sensor)
-            found = self._of_next_view(source, surface, start, clock, enough)
-            if found is not None:
-                return found
+            assessment = self._of_next_view(source, surface, start, clock, enough)
+            if assessment is not None:
+                return assessment
         return super().assess_from(source, target, start, viewpoint, clock, enough)
 
     def _of_next_view(
         self, source: ArrayLike, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """A source of which nobody said where it was seen from; None where what is remembered is not sure there."""
+        """Assess a source without a viewpoint as the camera's next view; None where the previous poses are not sure."""
         scene = scene_rounds.of_unknown(source, self.config)
         places = [] if scene is None else self._places_of(scene)
         clock.lap("prepare")
         if scene is None or not places:
             return None
         place, _ = places[0]
-        found = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
-        if found is None or not found.reaches(self.config.min_confidence):
+        assessment = self._remembered(scenes.scene_from(scene, place, self.config), target, start, clock, enough)
+        if assessment is None or not assessment.reaches(self.config.min_confidence):
             return None
-        found = self._checked(replace(found, inferred_viewpoint=place), clock, enough)
-        return found if found.refusal is None else None
+        assessment = self._checked(replace(assessment, inferred_viewpoint=place), clock, enough)
+        return assessment if assessment.refusal is None else None
 
     def _places_of(self, source: PreparedSource) -> list[tuple[Array, int]]:
-        """The one nearest to where the last source was seen from comes first, if that had to be inferred."""
+        """Infer places as the full registrar; the one nearest to the last inferred place comes first."""
         places, last = super()._places_of(source), self._memory.place
         if last is None:
             return places
         return sorted(places, key=lambda place: float(np.linalg.norm(place[0] - last)))
 
     def _of_unsure_views(self, unsure: list[Assessment], clock: Clock) -> Assessment | None:
-        """The surest, in a stream of such views: as bone it is nonsense, which would speak against the bone."""
+        """Return the surest view in a stream of such views; as bone alone it would speak against the bone."""
         if self._memory.place is None or not unsure:
             return None
         surest = max(unsure, key=lambda view: view.confidence)
@@ -128,23 +127,23 @@ class TrackingRegistrar(Registrar):
     def _all_of_scene(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """What is remembered first; of several looks, which may contradict each other, no region is left out."""
+        """Try the previous poses first; of several looks, which may contradict each other, all regions propose, too."""
         poses = np.concatenate([start, self._memory.poses])
         if len(scene.images) > 1:
             return self._in_scene(scene, target, poses, clock)
-        found = self._remembered(scene, target, start, clock, enough)
-        return self._in_scene(scene, target, poses, clock) if found is None else found
+        assessment = self._remembered(scene, target, start, clock, enough)
+        return self._in_scene(scene, target, poses, clock) if assessment is None else assessment
 
     def _remembered(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """The best of what is remembered; None where it is not sure, and regions have to be asked."""
+        """Assess the best of the previous poses; None where it is not sure and regions must propose."""
         poses, how = np.concatenate([start, self._memory.poses]), (self.classifier, self.config, clock)
-        found = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
-        if found is None:
+        assessment = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
+        if assessment is None:
             return None
-        found = replace(found, proposer=PreviousPoses.name, rounds=1)
-        return found if self._needs_no_other_proposer(found) or enough(found) else None
+        assessment = replace(assessment, proposer=PreviousPoses.name, rounds=1)
+        return assessment if self._needs_no_other_proposer(assessment) or enough(assessment) else None
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Candidates | None:
         return self._full._of_image(flipped, target, clock)

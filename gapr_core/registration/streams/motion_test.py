@@ -1,6 +1,6 @@
-"""Did a bone move against the frame of its sources while they were collected: steadily, or once, as after a knock?
+"""Test for a motion of the bone while its sources were collected: steady, or one step, as after a knock.
 
-A bone that creeps moves the pose with time. How much the residuals speak for it: see `checks.unknowns`.
+A bone that creeps moves the pose with time. The evidence in the residuals: see `checks.unknowns`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gapr_core.registration.fit.refinement import Fit
 
 Array = NDArray[np.float64]
 
-GROUPS = 6  # of sources in time, whose residuals are averaged apart
+GROUPS = 6  # groups of sources in time, averaged apart
 
 
 class Motion(NamedTuple):
@@ -31,13 +31,13 @@ class Motion(NamedTuple):
 
 
 def of_motion(fit: Fit, order: NDArray[np.int64]) -> Motion:
-    """Test whether the bone moved while the points were collected: steadily, or once between two groups of sources.
+    """Test whether the bone moved during the collection: steadily, or once between two groups of sources.
 
     The size of a steady motion is that from the first source to the last.
 
     Args:
-        fit: the pose that all points have in common.
-        order: (N,) when each point was measured, as the number of its source: 0, 1, 2 and on.
+        fit: common pose of all points.
+        order: (N,) number of each point's source in time: 0, 1, 2 and on.
     """
     inlier = fit.counts
     if np.count_nonzero(inlier) < FEWEST_POINTS or not order.max() > order.min():
@@ -47,18 +47,18 @@ def of_motion(fit: Fit, order: NDArray[np.int64]) -> Motion:
     group = np.searchsorted(steps, time, side="right")
     moved = motions(fit)
     changes = [when[:, None] * moved for when in [time - 0.5, *(np.where(time < at, -0.5, 0.5) for at in steps)]]
-    found = shown(blocks(fit, fit.jacobian[inlier], changes, group))
-    any_of_steps = np.log(len(steps))  # each of them is as likely as the others, before the residuals
-    ratios = [found[0].log_ratio, *(each.log_ratio - any_of_steps for each in found[1:])]
+    evidence = shown(blocks(fit, fit.jacobian[inlier], changes, group))
+    any_of_steps = np.log(len(steps))  # all are equally likely before the residuals
+    ratios = [evidence[0].log_ratio, *(each.log_ratio - any_of_steps for each in evidence[1:])]
     best = int(np.argmax(ratios))
     if best == 0:
-        return Motion(found[0])
+        return Motion(evidence[0])
     # a step in the first half of a group is found at the edge before it
     at = 0.5 * np.append(steps, 1.0)[best - 1 : best + 1].sum()
     rests_from = int(np.ceil(order.min() + at * (order.max() - order.min())))
-    return Motion(Shown(ratios[best], found[best].size_mm), rests_from)
+    return Motion(Shown(ratios[best], evidence[best].size_mm), rests_from)
 
 
 def step_times(groups: int) -> Array:
-    """(groups,) shares of the time between groups: equal ones, the last of them halved, as the newest matter most."""
+    """Compute (groups,) times between groups, as shares: equal ones, the last halved, as the newest matter most."""
     return np.append(np.arange(1, groups), groups - 0.5) / groups

@@ -1,4 +1,4 @@
-"""What is metres away from all that was collected before: a wrong transform, or a bone that is elsewhere now."""
+"""Detection of sources metres away from all before: a wrong transform, or a bone that is elsewhere now."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from gapr_core.surface import Surface
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-MOST_OFF = 3  # after so many sources in a row that are off the bone it has moved
+MOST_OFF = 3  # sources in a row off the bone after which it has moved
 
 
 class FarInARow:
     """Counts sources that are metres away from those collected: a few are left out, then the collection restarts.
 
     Args:
-        most: with so many in a row it restarts.
-        called: what a source is called in messages.
+        most: number in a row that restarts the collection.
+        called: name of a source in messages.
     """
 
     def __init__(self, most: int, called: str) -> None:
@@ -34,7 +34,7 @@ class FarInARow:
         self._count = 0
 
     def restarts_with(self, points: Array, collected: Array) -> bool:
-        """Whether the collection restarts with a source: it is the last one of a row.
+        """Return True where the collection restarts with a source: it is the last one of a row.
 
         Args:
             points: (N, 3), mm, of the source; at least one.

@@ -1,4 +1,4 @@
-"""One target, a stream of sources: each pose is searched where the last one was, and in full where that is not sure."""
+"""Tracking of one target in a stream of sources: each pose is searched near the last, and in full if unsure."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ STANDS = 0.8  # after a sure source a tracked answer of this confidence needs no
 
 
 class Last(NamedTuple):
-    """The last source that no finding refused.
+    """Last source that no finding refused.
 
     Attributes:
         T_target_source: (4, 4) its pose, mm.
-        cloud: of all its points, source frame.
+        cloud: fingerprint of all its points, source frame.
         agreed: it continued the one before it.
     """
 
@@ -49,12 +49,12 @@ class Tracker:
 
     The last pose and its rivals are refined on the new source first. Where that answer is sure (`RegistrarConfig.sure`)
     it stands. In a stream that is sure, so does one near the last pose that reaches `STANDS`. Else the registrar's
-    proposers are asked as for a single source. So a jump, another frame or a wrong track costs time, not truth. Both
-    numbers of a source also rest on those before it (`Evidence`). Used by one thread at a time.
+    proposers run as for a single source. So a jump, another frame or a wrong track costs time, not truth. Both numbers
+    of a source also rest on those before it (`Evidence`). Used by one thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
-        recheck: of so many sources in a row at least one is registered in full: a wrong track does not live for long.
+        recheck: at least one of this number of sources in a row is registered in full, which ends a wrong track.
 
     Raises:
         ConfigError: `recheck` is no whole number or less than 1, or the registrar is none.
@@ -78,7 +78,7 @@ class Tracker:
 
     @classmethod
     def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu", recheck: int = 10) -> Tracker:
-        """Track with `Registrar.from_pretrained`, which see."""
+        """Track with a `Registrar.from_pretrained`."""
         return cls(Registrar.from_pretrained(config, device), recheck)
 
     @property
@@ -99,7 +99,7 @@ class Tracker:
     def sharing_points(self) -> Tracker:
         """Make a tracker for sources that share their points, as those of an `Accumulator` do: many count as one.
 
-        Nor were the points of one of them seen from one place. It begins a stream of its own.
+        No single camera saw the points of one of them. It begins a stream of its own.
         """
         twin = self.of_bone_alone()
         twin._evidence = Evidence(rho_pose=1.0, rho_bone=1.0)
@@ -152,7 +152,7 @@ class Tracker:
         viewpoint: Viewpoint | None,
         clock: Clock,
     ) -> Assessment | Refusal:
-        """Where the last pose was, or in full; a re-check tries the last pose and its rivals too."""
+        """Assess where the last pose was, or in full; a re-check tries the last pose and its rivals too."""
         if not self._has_track:
             return self.registrar.assess(source, target, initial, viewpoint, clock)
         if self._since_full + 1 < self.recheck:
@@ -160,40 +160,40 @@ class Tracker:
         return self.registrar.assess_from(source, target, self._memory.poses, viewpoint, clock)
 
     def _stands(self, assessment: Assessment) -> bool:
-        """True for a tracked answer that continues a sure track, so that other proposers would hardly add to it."""
+        """Return True for a tracked answer that continues a sure track: other proposers would hardly add to it."""
         stands = assessment.proposer == PreviousPoses.name and assessment.reaches(STANDS)
         return self._was_sure and stands and self._agrees(assessment)
 
     def _agrees(self, assessment: Assessment) -> bool:
-        """True when the pose continues the pose of the last source."""
+        """Return True when the pose continues the pose of the last source."""
         if self._last is None:
             return False
         moved_mm = se3.rms_apart_mm(assessment.fit.T, self._last.T_target_source, assessment.source.points)
         return moved_mm <= AGREE_MM
 
     def _is_no_view(self, assessment: Assessment) -> bool:
-        """True for an answer as bone alone that is refused, where the last one accepted was of a camera's view."""
+        """Return True for a refused answer as bone alone, where the last accepted one was of a camera's view."""
         was_view, is_view = self._memory.place is not None, assessment.seen is not None
         return was_view and not is_view and not assessment.reaches(self.config.min_confidence)
 
     def _with_evidence(self, assessment: Assessment, cloud: Fingerprint) -> Assessment:
-        """Judge an assessment in the light of the frames before it.
+        """Combine the numbers of an assessment with those of the frames before it.
 
-        A frame that a finding refuses says nothing, nor does a camera's view that was taken for bone, and one that is
-        sent again nothing new.
+        A frame that a finding refuses does not count, nor a camera's view taken for bone. A repeated frame adds
+        nothing.
         """
         if assessment.refusal is not None or self._is_no_view(assessment):
             return assessment
-        a, last = assessment, self._last
+        last = self._last
         again = last is not None and cloud.is_of_same(last.cloud)
-        agrees = self._agrees(a) and (last is None or last.agreed or not again)
-        self._last = Last(a.fit.T, cloud, agrees)
-        return replace(a, judgement=self._evidence.observe(a.judgement, agrees, again))
+        agrees = self._agrees(assessment) and (last is None or last.agreed or not again)
+        self._last = Last(assessment.fit.T, cloud, agrees)
+        return replace(assessment, judgement=self._evidence.observe(assessment.judgement, agrees, again))
 
     def _remember(self, result: RegistrationResult, source: Array) -> None:
-        """Follow an accepted pose; a refusal changes nothing, since the bone may be where it was.
+        """Follow an accepted pose; a refusal changes nothing, since the bone may not have moved.
 
-        As it does not count either, a refused full registration is followed by another one.
+        A refused full registration does not count as one, so another follows.
         """
         self._is_sure = result.ok and result.confidence >= self.config.sure_from
         if result.T_target_source is None:

@@ -1,1 +1,1 @@
-"""The covariance of a pose, and the error to expect at targets."""
+"""Covariance of a pose, and errors to expect at targets."""

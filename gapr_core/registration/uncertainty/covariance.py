@@ -1,15 +1,15 @@
-"""How uncertain a refined pose is: noise, smooth bias, and the stand-off and scale that no residual shows.
+"""Covariance of a refined pose: noise, smooth bias, and the stand-off and scale that no residual shows.
 
-A least-squares pose reacts to errors e of the residuals by a gain, G e. With independent noise of variance s^2, a
-smooth bias of variance b^2 and correlation exp(-d^2 / 2 l^2), a stand-off of variance o^2 that all points share and a
-relative error of the size of variance q^2, its covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
+A least-squares pose reacts to errors e of the residuals by a gain, G e. The noise is independent with variance s^2. A
+smooth bias has variance b^2 and correlation exp(-d^2 / 2 l^2). All points share a stand-off of variance o^2, and a
+relative error of the size of variance q^2. The covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
 Censi 2007 for the noise alone); `sandwich` has all terms. A Hessian alone is over-confident. The size of the bias comes
-from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`): an error that wraps around the bone
-hardly moves the pose, and one seen from one side does. What varies more slowly than the correlation is constant or
-linear in place: in proportion to the bias, all points share an offset and the source is strained. Of an image, depths
-are wrong: stand-off and scale act along the beam. Slices of a tracked probe share an error each: another K, of short
-reach. An error of the place of the whole cloud, a tracked scanner's, is one of the pose as it is. A weak prior keeps a
-motion of which nothing was observed uncertain, but finite.
+from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`). An error that wraps around the bone
+hardly moves the pose; one seen from one side does. Errors that vary more slowly than the correlation are constant or
+linear in place: in proportion to the bias, all points share an offset and the source is strained. The depths of an
+image are wrong along the beam, where stand-off and scale then act. Slices of a tracked probe share an error each:
+another K, of short reach. Tracking error adds directly to the pose covariance. A weak prior keeps the variance of an
+unobserved motion finite.
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ SMALLEST_SHARE = 0.03  # least information of a usable field, over the largest
 BIAS_GAIN = 2.1  # bias over the part that the residuals of a robust fit show
 NO_BIAS_MM = 0.035  # bias that residuals without any show on average
 BIAS_SPREAD = 1.0  # log standard deviation of the bias before the residuals
-LONG_SHARE, LINEAR_SHARE = 0.5, 0.6  # of the bias that all points share, and that strains the source, over its size
-LOCAL_CORRELATION_MM, LOCAL_CENTRES = 8.0, 160  # of an error that near points share, such as that of a slice
+LONG_SHARE, LINEAR_SHARE = 0.5, 0.6  # bias shared by all points, and bias that strains the source, over its size
+LOCAL_CORRELATION_MM, LOCAL_CENTRES = 8.0, 160  # of an error that near points share, such as a slice's
 ONE_SIDED = 0.3  # length of the mean normal from which on a view has a beam
-NOISE_POINTS = 4.0  # points that the usual noise of the sensor is worth
-NEIGHBOURS = 30, 12  # points of an average that shows the smooth misfit, and at short range
+NOISE_POINTS = 4.0  # weight of the sensor's usual noise, in points
+NEIGHBOURS = 30, 12  # points of an average for the smooth misfit, and at short range
 
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
-    """Covariance of a pose, and what follows from it.
+    """Covariance of a pose, and the misfits that the residuals show.
 
     Attributes:
         covariance: (6, 6), x y z (mm) rx ry rz (rad), fixed target axes, about the moved source's centroid.
         bias_mm: standard deviation of the smooth bias that the covariance allows for.
-        smooth_mm: the smooth misfit that the residuals show (see `smooth_misfits_mm`).
-        short_mm: the same at a shorter range, which also holds what is rougher: another bone's surface.
+        smooth_mm: smooth misfit of the residuals (see `smooth_misfits_mm`).
+        short_mm: the same at a shorter range, which also holds rougher misfits: another bone's surface.
     """
 
     covariance: Array
@@ -70,7 +70,7 @@ class PoseUncertainty:
     short_mm: float
 
     def with_more(self, covariance: Array) -> PoseUncertainty:
-        """The same with a further independent error, (6, 6), of the pose."""
+        """Add the covariance (6, 6) of a further independent error of the pose."""
         return replace(self, covariance=self.covariance + covariance)
 
     @property
@@ -102,65 +102,65 @@ def estimate(
     misfits_mm: tuple[float, ...] | None = None,
     eye: Array | None = None,
 ) -> PoseUncertainty:
-    """Covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
+    """Estimate the covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
 
     Args:
-        fit: the pose and its residuals; all points that it rests on count, the smooth misfits are those of its own.
-        config: of the errors.
-        sensor: what is known of them before.
-        around: (N, k) neighbours of each point, where they are known (see `smooth_misfits_mm`).
-        misfits_mm: the smooth and the short misfit, where they are known; else they are measured.
-        eye: (3,) mm, target frame: where a camera with wrong ranges was (`eye_of`); None for an error of size alone.
+        fit: the pose and its residuals; all points of its full fit count, its own points alone for the smooth misfits.
+        config: errors of the bone's model.
+        sensor: errors known before the residuals.
+        around: (N, k) neighbours of each point, if known (see `smooth_misfits_mm`).
+        misfits_mm: the smooth and the short misfit, if known; else they are measured.
+        eye: (3,) mm, target frame: place of a camera with wrong ranges (`eye_of`); None for an error of size alone.
     """
-    rests = fit.rests_on
-    count = int(np.count_nonzero(rests.weights))
+    full = fit.full_fit
+    count = int(np.count_nonzero(full.weights))
     known = sensors.errors(sensor or SensorConfig(), count)
-    spanned = fields(rests, CORRELATION_MM, CENTRES)
-    equations = equations_of(rests, CORRELATION_MM, CENTRES)
+    spanned = fields(full, CORRELATION_MM, CENTRES)
+    equations = equations_of(full, CORRELATION_MM, CENTRES)
     bias_mm = BIAS_GAIN * expected_bias_mm(equations, known.bias_mm)
-    sigma_mm = float(np.sqrt(equations.design_effect)) * rests.sigma_mm
+    sigma_mm = float(np.sqrt(equations.design_effect)) * full.sigma_mm
     noise_mm = expected_noise_mm(sigma_mm, count, known.noise_mm, NOISE_POINTS)
     expected = replace(known, noise_mm=noise_mm, bias_mm=bias_mm)
-    covariance = _about_middle(fit, sandwich(rests, spanned, expected, config, eye))
+    covariance = _about_middle(fit, sandwich(full, spanned, expected, config, eye))
     covariance = 0.5 * (covariance + covariance.T) + np.diag([1e-6] * 3 + [1e-10] * 3)
     smooth_mm, short_mm = misfits_mm or smooth_misfits_mm(fit, NEIGHBOURS, around)
     return PoseUncertainty(covariance, bias_mm, smooth_mm, short_mm)
 
 
 def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | None:
-    """(3,) mm, target frame: the camera of a source under a pose (4, 4) whose scale was stated, else None.
+    """Locate the camera of a source under a pose (4, 4), (3,) mm, target frame; None without a stated scale.
 
-    What is usual for a kind is an error of the size alone: cameras differ by more in how wrong their distance is.
+    The usual scale of a kind is an error of the size alone: cameras differ by more in the error of their distance.
     """
     return None if viewpoint is None or sensor.scale is None else se3.apply(T, viewpoint[None])[0]
 
 
 def covariance_added_by(fit: Fit, errors: Array) -> Array:
-    """(6, 6) what independent `errors` (n, k) of the inliers of what the fit rests on add to its covariance, mm."""
-    rests = fit.rests_on
-    spanned = fields(rests, CORRELATION_MM, CENTRES)
-    moved = gain_of(rests, spanned, rests.sigma_mm)[0] @ errors
+    """Compute the (6, 6) covariance that independent `errors` (n, k), mm, of the full fit's inliers add."""
+    full = fit.full_fit
+    spanned = fields(full, CORRELATION_MM, CENTRES)
+    moved = gain_of(full, spanned, full.sigma_mm)[0] @ errors
     return _about_middle(fit, moved @ moved.T)
 
 
 def _about_middle(fit: Fit, covariance: Array) -> Array:
-    """The covariance (6, 6) of what a fit rests on, about the middle of its own points."""
-    if fit.rests_on is fit:
+    """Shift the covariance (6, 6) of a full fit to the middle of the fit's own points."""
+    if fit.full_fit is fit:
         return covariance
-    return covariance_about(fit.moved.mean(axis=0) - fit.rests_on.moved.mean(axis=0), covariance)
+    return covariance_about(fit.moved.mean(axis=0) - fit.full_fit.moved.mean(axis=0), covariance)
 
 
 def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:
-    """Standard deviation of a point, of `count` points whose residuals spread by `sigma_mm` after a fit of 6 unknowns.
+    """Estimate the standard deviation of a point from the spread `sigma_mm` of residuals after a fit of 6 unknowns.
 
-    The sensor's own noise counts as `worth` points: of a dozen points the residuals alone say little.
+    The sensor's own noise counts as `worth` points on top of `count`: a dozen residuals carry little information.
     """
     freedom = max(worth + count - UNKNOWNS, 1.0)
     return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
 
 
 def expected_bias_mm(equations: NormalEquations, typical_mm: float) -> float:
-    """Root mean square of the bias's size under the residuals, log-normal about the sensor's typical one before."""
+    """Estimate the root mean square of the bias's size, with a log-normal prior about the sensor's typical one."""
     log_prior = -0.5 * (np.log(SIZES_MM / max(typical_mm, SIZES_MM[0])) / BIAS_SPREAD) ** 2
     log_prior += np.log(np.gradient(np.log(SIZES_MM)))  # the sizes are not evenly spaced
     log_posterior = log_prior + equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
@@ -168,12 +168,13 @@ def expected_bias_mm(equations: NormalEquations, typical_mm: float) -> float:
 
 
 def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceConfig, eye: Array | None = None) -> Array:
-    """(6, 6) G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P.
+    """Compute the (6, 6) covariance of the fit by all errors.
 
-    G is the gain of the fit, U = 1 1^T what all points share, s the noise, b the bias with fields F, of which all
-    points share a (`long_share`) and h strains the source (`linear_share`, `strains`), e the local error with fields E,
-    o the stand-off and q the scale (see `directions`), m the error of the bone's model (`model_mm`), T what the place
-    of the whole cloud adds and P the prior.
+    It is G (s^2 I + b^2 (F F^T + a^2 U + h^2 S S^T) + e^2 E E^T + o^2 d d^T + m^2 U + q^2 r r^T) G^T + T + P. G is the
+    gain of the fit, U = 1 1^T a shared error, s the noise. b is the bias with fields F; all points share a
+    (`long_share`) of it, and h strains the source (`linear_share`, `strains`). e is the local error with fields E, o
+    the stand-off and q the scale (see `directions`). m is the error of the bone's model (`model_mm`), T that of the
+    cloud's place, P the prior.
     """
     inlier = fit.counts
     gain, prior = gain_of(fit, bias_fields, errors.noise_mm)
@@ -193,13 +194,13 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
 
 
 def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None = None) -> tuple[Array, Array]:
-    """How the residuals (n,) of the inliers change by a stand-off of 1 mm, and by an error of the size of 1.
+    """Compute the changes of the inliers' residuals (n,) by a stand-off of 1 mm and by an error of size.
 
-    A stand-off moves every point along its normal, another size by its distance from the centroid; where the ranges of
-    a camera at `eye` (3,), mm, target frame, are wrong, by that from there: the whole cloud is nearer or farther. Where
-    only depths are wrong, both move a point along the beam d: by n . d, and by (n . d) times its depth. The beam is
-    taken for the mean normal; where that is shorter than `one_sided`, the bone was seen from several sides and no beam
-    is common.
+    A stand-off moves every point along its normal; an error of the size of 1 moves it by its distance from the
+    centroid. With wrong ranges of a camera at `eye` (3,), mm, target frame, the distance from there counts: the whole
+    cloud is nearer or farther. Where only depths are wrong, both move a point along the beam d: by n . d, and by (n .
+    d) times its depth. The beam is the mean normal. Where that is shorter than `one_sided`, the bone was seen from
+    several sides and no beam is common.
     """
     inlier = fit.counts
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
@@ -214,11 +215,11 @@ def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None =
 
 
 def strains(fit: Fit) -> Array:
-    """(n, 6) how the residuals of the inliers change by independent strains of the source about their centroid.
+    """Compute (n, 6) changes of the inliers' residuals by independent strains about their centroid.
 
     A symmetric matrix E moves a point p by E (p - c), and its residual by n . E (p - c). The six are orthogonal, and
-    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. Of p the foot is taken: on
-    a flat piece, what p is off it by would go with the residual, and look like a strain across the piece.
+    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. The foot stands for p: on a
+    flat piece the distance of p would go with the residual, and look like a strain across the piece.
     """
     inlier = fit.counts
     if not inlier.any():
@@ -236,11 +237,11 @@ def _local_fields(fit: Fit, errors: Errors) -> Array:
 
 
 def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array]:
-    """How the pose reacts to errors of the inliers: (6, n) twist per mm, and the prior's (6, 6) covariance.
+    """Compute the reaction of the pose to errors of the inliers: (6, n) twist per mm, and the prior's (6, 6)
+    covariance.
 
-    G = (J^T V^-1 J + P)^-1 J^T V^-1 up to its sign, with V = s^2 W^-1 + c^2 F F^T (Aitken 1935): c is the bias for
-    which the pose is corrected, 0 for plain least squares. V^-1 by Woodbury's identity. P keeps what is not observed
-    finite.
+    G = (J^T V^-1 J + P)^-1 J^T V^-1 up to its sign, with V = s^2 W^-1 + c^2 F F^T (Aitken 1935). c is the bias that the
+    pose is corrected for, 0 for plain least squares. V^-1 by Woodbury's identity. P keeps unobserved motions finite.
     """
     inlier = fit.counts
     J, precision = fit.jacobian[inlier], fit.weights[inlier, None] / noise_mm**2
@@ -257,13 +258,13 @@ def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array
 def smooth_misfits_mm(
     fit: Fit, neighbours: tuple[int, ...], around: NDArray[np.int64] | None = None
 ) -> tuple[float, ...]:
-    """Root mean square of the inliers' locally averaged residuals, less what noise leaves in an average.
+    """Compute the root mean square of the inliers' locally averaged residuals, less the noise left in an average.
 
     Args:
         fit: the residuals.
-        neighbours: of how many points an average is taken, one result for each; with as few inliers, `fit.sigma_mm`.
-        around: (N, k) indices of each point's nearest ones, itself first, inliers or not, where they are known; a point
-            that finds too few inliers among them is looked up.
+        neighbours: numbers of points of an average, one result for each; with as few inliers, `fit.sigma_mm`.
+        around: (N, k) indices of each point's nearest ones, itself first, inliers or not, if known; a point
+            with too few inliers among them is looked up.
     """
     inlier = fit.counts
     points, signed = fit.moved[inlier], fit.signed_mm[inlier]

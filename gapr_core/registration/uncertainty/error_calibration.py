@@ -1,10 +1,9 @@
-"""How large the error at the target is: the predicted one, corrected by what was measured, and its 95 % bound.
+"""Calibration of the error at the target: the predicted error, corrected by measured ones, and its 95 % bound.
 
-The covariance of a pose predicts the root-mean-square error over any points, the root of the mean of their traces of
-J Sigma J^T. How much larger the true error is depends on what the residuals cannot show. An additive model of a few
-features scales the covariance; a factor, found by conformal prediction over subjects and sensor families (Vovk et al.
-2005; Papadopoulos et al. 2002 for the normalised score), takes its 95 % quantile to a bound that 95 % of the true
-errors stay below.
+The covariance of a pose predicts the root-mean-square error over any points: the root of the mean trace of J Sigma J^T.
+The ratio of the true error to it depends on errors that the residuals cannot show. An additive model of a few features
+scales the covariance. A factor takes its 95 % quantile to a bound of 95 % of the true errors. It is found by conformal
+prediction over subjects and sensor families (Vovk et al. 2005; Papadopoulos et al. 2002 for the normalised score).
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ SHIPPED = Path(__file__).parents[2] / "weights" / "precision.json"
 PRECISION_FEATURES = (
     "log_tre", "log_sigma", "log_excess", "smooth_misfit", "short_misfit", "log_points", "extent", "log_turn_sd",
 )  # fmt: skip
-SCALE_LIMITS = (0.9, 6.0)  # of a standard deviation: what was learned may enlarge it, and hardly make it smaller
+SCALE_LIMITS = (0.9, 6.0)  # of a standard deviation: the model may enlarge it, and hardly shrink it
 
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """The correction of predicted errors that was learned from true ones.
+    """A correction of predicted errors, learned from true ones.
 
     Attributes:
-        model: of the logarithm of the scale that a predicted standard deviation needs.
-        confidences: (K,) ascending confidences at which a factor is known.
-        factors: (K,) there: 95 % of the true errors stay below so many predicted 95 % quantiles.
+        model: additive model of the log of the scale of a predicted standard deviation.
+        confidences: (K,) ascending confidences of the factors.
+        factors: (K,) bound of 95 % of the true errors, over the predicted 95 % quantile.
         card: data and fit.
     """
 
@@ -72,7 +71,7 @@ class Precision:
 
         Args:
             features: of the answer (`features.FEATURES_OF`).
-            tre_mm: the whole-bone error that the covariance predicts, mm.
+            tre_mm: whole-bone error predicted by the covariance, mm.
         """
         log_scale = self.model.value({**features, "log_tre": float(np.log(max(tre_mm, 1e-6)))})
         return float(np.clip(np.exp(log_scale), *SCALE_LIMITS))

@@ -1,10 +1,10 @@
-"""A smooth bias as a Gaussian process over the source, and how large the residuals say it is.
+"""A smooth bias as a Gaussian process over the source, and its size by the residuals.
 
 The field has correlation exp(-d^2 / 2 l^2) and is spanned by a few dozen of the inliers (Nystrom). It is a function of
 the foot points: at the points themselves it would change along the normal with their own noise, which then passes for a
-bias. Its size follows from the residuals by restricted maximum likelihood, in which the pose is integrated out
-(Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7). Errors that only near points share, such as the
-windows of a stereo camera, are no such field: they make the noise of sums larger, by a design effect (Kish 1965).
+bias. Its size follows from the residuals by restricted maximum likelihood, with the pose integrated out (Patterson and
+Thompson 1971; Rasmussen and Williams 2006, section 2.7). Errors that only near points share, such as the windows of a
+stereo camera, are no such field. They enlarge the noise of sums by a design effect (Kish 1965).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ Array = NDArray[np.float64]
 DESIGN_EFFECTS = np.geomspace(0.25, 20.0, 16)  # to choose from
 EFFECT_SPREAD = 0.7  # log standard deviation of the design effect about 1 before the scores are seen
 BIASES_MM = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0])
-DETERMINED = 1e-5  # information of a field over the largest, below which its score is rounding
-UNKNOWNS = 6  # of a pose: as few points say nothing of their errors
+DETERMINED = 1e-5  # least information of a field over the largest; below, its score is rounding
+UNKNOWNS = 6  # of a pose: as few points carry no information on their errors
 POSE_PRIOR = np.diag([1e-6] * 3 + [1e-3] * 3)  # information of an unobserved motion, in units of 1 / noise variance
 PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be factored
 
 
-@lru_cache(maxsize=4)  # covariance, size and bias of one fit ask in turn
+@lru_cache(maxsize=4)  # covariance, size and bias of one fit share it
 def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
-    """(N, m) whose products are the correlation of the bias between foot points, from m of the inliers (Nystrom).
+    """Compute (N, m) fields whose products are the correlation of the bias between foot points (Nystrom).
 
-    Read-only: the same fit gets the same array.
+    m of the inliers span them. Read-only: the same fit gets the same array.
     """
     spanned = _spanned(fit.feet, fit.counts, correlation_mm, centres)
     spanned.flags.writeable = False
@@ -54,7 +54,7 @@ def _spanned(points: Array, inlier: NDArray[np.bool_], correlation_mm: float, ce
 
 
 def smooth_correlation(a: Array, b: Array, length_mm: float) -> Array:
-    """(N, M) exp(-d^2 / 2 l^2) between points (N, 3) and (M, 3): how alike a smooth bias is in both."""
+    """Compute the (N, M) correlation exp(-d^2 / 2 l^2) of a smooth bias between points (N, 3) and (M, 3)."""
     exponent = cdist(a, b, "sqeuclidean")
     exponent *= -0.5 / length_mm**2
     return np.asarray(np.exp(exponent, out=exponent))
@@ -66,7 +66,7 @@ class NormalEquations:
 
     Attributes:
         JJ, JF, FF, Jy, Fy: J^T W J and so on; W is the inverse variance of the points.
-        design_effect: by which W is divided, since near points err alike (see `with_design_effect`).
+        design_effect: divisor of W, since near points err alike (see `with_design_effect`).
     """
 
     JJ: Array
@@ -78,7 +78,7 @@ class NormalEquations:
 
     @classmethod
     def of(cls, fit: Fit, fields: Array) -> NormalEquations:
-        """Those of a fit and fields (N, m) of the bias; points without weight count for nothing."""
+        """Build the equations of a fit and fields (N, m) of the bias; points without weight do not count."""
         m, inlier = fields.shape[1], np.flatnonzero(fit.weights)
         root = np.sqrt(fit.weights[inlier])[:, None] / fit.sigma_mm
         R = np.empty((len(inlier), m + 7))
@@ -89,15 +89,15 @@ class NormalEquations:
         return cls(P[m:-1, m:-1] + POSE_PRIOR, P[m:-1, :m], P[:m, :m], P[m:-1, -1], P[:m, -1])
 
     def with_design_effect(self, effect: float) -> NormalEquations:
-        """The same where errors that near points share make sums of points vary `effect` times as much (Kish 1965)."""
+        """Multiply the variance of sums of points by `effect`, for errors that near points share (Kish 1965)."""
         JJ, JF, FF, Jy, Fy = (each / effect for each in (self.JJ, self.JF, self.FF, self.Jy, self.Fy))
         return NormalEquations(JJ, JF, FF, Jy, Fy, self.design_effect * effect)
 
     def expected_design_effect(self) -> float:
-        """Geometric mean of the design effect under the scores, with a smooth bias of any size.
+        """Compute the geometric mean of the design effect under the scores, with a smooth bias of any size.
 
         A score s of a field with information i varies by k i under errors of design effect k, and by b^2 i^2 more under
-        a bias b: the rough fields, of little information, say how large k is, the smooth ones how large b is.
+        a bias b. The rough fields, of little information, determine k; the smooth ones determine b.
         """
         information, score = self._fields_alone
         determined = information > DETERMINED * max(information[-1], 0.0)
@@ -111,7 +111,7 @@ class NormalEquations:
         return float(np.exp(posterior @ log_k / posterior.sum()))
 
     def extended(self, fit: Fit, fields: Array, more: Array, sizes: ArrayLike) -> NormalEquations:
-        """The same with further unknowns, after the six of the motion.
+        """Add further unknowns after the six of the motion.
 
         Args:
             fit: its residuals and motions, as in `of`.
@@ -126,10 +126,10 @@ class NormalEquations:
         return NormalEquations(JJ, JF, self.FF, Jy, self.Fy, self.design_effect)
 
     def log_likelihood(self, sizes_mm: Array, smallest_share: float) -> Array:
-        """(K,) restricted log likelihood of standard deviations (K,) of the bias; 0 without a bias.
+        """Compute the (K,) restricted log likelihood of standard deviations (K,) of the bias; 0 without a bias.
 
         Only the fields that the points determine best count: those with `smallest_share` of the information of the best
-        one. The others are rough, and what the surface's model leaves at edges would pass for a bias.
+        one. The others are rough, and misfits of the surface's model at edges would pass for a bias.
         """
         information, score = self._fields_alone
         smooth = information > smallest_share * max(information[-1], 0.0)
@@ -139,36 +139,36 @@ class NormalEquations:
 
     @cached_property
     def _fields_alone(self) -> tuple[Array, Array]:
-        """(m,) information of independent fields, ascending, and their scores, without what a motion takes up."""
+        """(m,) information of independent fields, ascending, and their scores, with the motion projected out."""
         free = np.linalg.solve(self.JJ, np.column_stack([self.JF, self.Jy]))
         information, directions = np.linalg.eigh(self.FF - self.JF.T @ free[:, :-1])
         return information, directions.T @ (self.Fy - self.JF.T @ free[:, -1])
 
     def step(self, size_mm: float) -> Array:
-        """(6 + k,) x y z (mm) rx ry rz (rad), then the further unknowns: the best fit with a bias of this size."""
+        """Compute the best fit (6 + k,) with a bias of this size: x y z (mm) rx ry rz (rad), further unknowns."""
         taken = self._taken(size_mm)
         return np.asarray(-np.linalg.solve(self.JJ - self.JF @ taken[:, :-1], self.Jy - self.JF @ taken[:, -1]))
 
     def step_covariance(self, size_mm: float) -> Array:
-        """(6 + k, 6 + k) covariance of `step` under the noise and a bias of this size."""
+        """Compute the (6 + k, 6 + k) covariance of `step` under the noise and a bias of this size."""
         return np.asarray(np.linalg.inv(self.JJ - self.JF @ self._taken(size_mm)[:, :-1]))
 
     def _taken(self, size_mm: float) -> Array:
-        """(m, 7 + k) what the bias takes up of the motions and of the residuals."""
+        """Compute the (m, 7 + k) share of the bias in the motions and in the residuals."""
         A = self.FF + np.eye(len(self.FF)) / size_mm**2
         return np.asarray(np.linalg.solve(A, np.column_stack([self.JF.T, self.Fy])))
 
 
 @lru_cache(maxsize=4)  # as `fields`
 def equations_of(fit: Fit, correlation_mm: float, centres: int) -> NormalEquations:
-    """`NormalEquations.of` a fit and its own `fields`, with the design effect that their scores show."""
+    """Build `NormalEquations.of` a fit and its own `fields`, with the design effect of their scores."""
     equations = NormalEquations.of(fit, fields(fit, correlation_mm, centres))
-    if np.count_nonzero(fit.weights) <= UNKNOWNS:  # a motion takes up all that they say; what is left is rounding
+    if np.count_nonzero(fit.weights) <= UNKNOWNS:  # a motion fits them exactly; the rest is rounding
         return equations
     return equations.with_design_effect(equations.expected_design_effect())
 
 
 def root_mean_square(sizes_mm: Array, log_posterior: Array) -> float:
-    """sqrt(E[size^2]) over sizes (K,) with log posterior (K,), which need not be normalised."""
+    """Compute sqrt(E[size^2]) over sizes (K,) with log posterior (K,), which need not be normalised."""
     posterior = np.exp(log_posterior - log_posterior.max())
     return float(np.sqrt(posterior @ np.square(sizes_mm) / posterior.sum()))

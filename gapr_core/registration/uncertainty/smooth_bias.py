@@ -1,10 +1,10 @@
 """The pose corrected for a smooth bias: soft tissue, a warped scan, a badly calibrated probe.
 
-Such a bias moves whole regions along their normals. Plain least squares treats their points as independent witnesses
-and lets the regions pull the pose along. Here the bias is a nuisance: a Gaussian process over the surface with
-correlation exp(-d^2 / 2 l^2), and the pose is that of generalised least squares, which leans on what varies faster than
-the bias can. How large the bias is, and whether there is one, the residuals say themselves by restricted maximum
-likelihood, in which the pose is integrated out (Patterson and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
+Such a bias moves whole regions along their normals. Plain least squares treats their points as independent and lets the
+regions pull the pose along. Here the bias is a nuisance: a Gaussian process over the surface with correlation exp(-d^2
+/ 2 l^2). The pose is that of generalised least squares, which relies on residuals that vary faster than the bias can.
+The residuals determine the size of the bias by restricted maximum likelihood, with the pose integrated out (Patterson
+and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ Array = NDArray[np.float64]
 CORRELATION_MM, CENTRES = 20.0, 60  # l of the correlation exp(-d^2 / 2 l^2), and points that span the bias
 SIZES_MM = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0])  # standard deviations
 EVIDENCE = 2.0  # log likelihood ratio from which a bias is believed
-SMALLEST_SHARE = 0.15  # information of a field over the largest, to have a say
+SMALLEST_SHARE = 0.15  # least information of a usable field, over the largest
 STEPS = 2  # of the pose
-FEWEST_POINTS = 200  # inliers without which no bias is looked for
+FEWEST_POINTS = 200  # least inliers for a bias
 LARGEST_MOVE = 22.5  # largest squared Mahalanobis distance of a move (chi square: 99.9 %)
 
 
 def corrected_fit(
     fit: Fit, covariance: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> Fit:
-    """The fit after some steps of generalised least squares; `fit` itself where its residuals show no bias.
+    """Correct a fit by some steps of generalised least squares; `fit` itself where its residuals show no bias.
 
-    All points that it rests on take part: the more, the better they tell noise from bias. A move that the covariance
-    all but rules out is not made: an answer must stay near what was assessed.
+    All points of its full fit take part: the more, the better they tell noise from bias. A move that the covariance all
+    but rules out is not made: an answer must stay near the assessed pose.
 
     Args:
         fit: from `refinement.refine_fully`, or from `rest_on_whole` after it.
         covariance: (6, 6) of `fit`, as `gapr_core.registration.uncertainty.covariance.estimate` gives it.
-        source, target: what was refined, and on what.
-        config: of the refinement, as `fit` was refined.
+        source, target: the refined source and its target.
+        config: settings with which `fit` was refined.
     """
-    refinement, before = config.refinement, fit.rests_on
+    refinement, before = config.refinement, fit.full_fit
     if np.count_nonzero(before.counts) < FEWEST_POINTS:
         return fit
     trust = None if fit.whole is None else trust_of_whole(fit, source, refinement)
@@ -74,6 +74,6 @@ def corrected_fit(
 
 
 def believed_size_mm(equations: NormalEquations) -> float:
-    """Standard deviation of the bias: its posterior root mean square over `SIZES_MM`; 0 without evidence."""
+    """Compute the standard deviation of the bias: its posterior root mean square; 0 without evidence."""
     log_likelihood = equations.log_likelihood(SIZES_MM, SMALLEST_SHARE)
     return 0.0 if log_likelihood.max() < EVIDENCE else root_mean_square(SIZES_MM, log_likelihood)

@@ -1,7 +1,7 @@
 """The error to expect at targets: from the covariance of the pose to mm at points of the bone.
 
-A pose error e moves a point p by J(p) e with J = [I, -[p - c]x]. The mean square over points, TRE^2 = e^T A e with
-A = mean J^T J, is a weighted sum of chi-square variables when e is normal with covariance C. Its mean is tr(A C)
+A pose error e moves a point p by J(p) e with J = [I, -[p - c]x]. The mean square over points is TRE^2 = e^T A e with A
+= mean J^T J: a weighted sum of chi-square variables when e is normal with covariance C. Its mean is tr(A C)
 (Fitzpatrick 1998). Its 95 % quantile is that of the scaled chi-square with the same mean and variance (Satterthwaite
 1946).
 """
@@ -20,7 +20,7 @@ QUANTILE = 0.95
 
 
 def bound_mm(covariance: Array, points: Array, centre: Array, quantile: float = QUANTILE) -> float:
-    """What the error over points (M, 3) stays below with probability `quantile`, mm.
+    """Bound the error over points (M, 3) with probability `quantile`, mm.
 
     Args:
         covariance: (6, 6) x y z (mm) rx ry rz (rad), rotation about `centre`.

@@ -59,7 +59,11 @@ TESTS = {
     REGISTRATION + "checks/table.py": [f"{FORMULAS}/test_checks.py"],
     REGISTRATION + "checks/conclude.py": [f"{FORMULAS}/test_conclude.py"],
     REGISTRATION + "checks/assessment.py": [f"{FORMULAS}/test_assessment.py"],
-    REGISTRATION + "checks/assess.py": [f"{FORMULAS}/test_assessment.py", f"{FORMULAS}/test_smooth_bias.py", f"{FORMULAS}/test_checks.py"],
+    REGISTRATION + "checks/assess.py": [
+        f"{FORMULAS}/test_assessment.py",
+        f"{FORMULAS}/test_smooth_bias.py",
+        f"{FORMULAS}/test_checks.py",
+    ],
     REGISTRATION + "checks/deformation.py": [f"{FORMULAS}/test_deformation.py"],
     REGISTRATION + "checks/unknowns.py": [f"{FORMULAS}/test_deformation.py"],
     REGISTRATION + "confidence/classifier.py": [f"{CORE}/test_confidence.py"],

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
@@ -26,7 +25,7 @@ from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, Tracker
 from gapr_core.baselines import make
-from gapr_core.config import FollowingConfig, SourceConfig
+from gapr_core.config import SourceConfig
 from gapr_core.data.pair import Pair
 from gapr_core.data.pool import specimens
 from gapr_core.data.protocols import make_pair
@@ -49,7 +48,6 @@ FULL = {protocol: f"register ({protocol})" for protocol in ("paper", "L1", "L2")
 KISS = {protocol: f"KISS-Matcher and refinement, of that pair ({protocol})" for protocol in FULL}
 TRACK, GICP = "track a frame of 4000 points", "small_gicp: thin and align that frame"
 TRACK_SCENE = "track a scene (C2)"
-FOLLOW = "follow a frame of 4000 points, not assessed"
 STAGED = FULL["paper"], TRACK  # whose stages are printed too
 
 
@@ -113,7 +111,6 @@ def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -
         "register a scene (C2)": lambda: registrar.register(scene.source, of_scene, viewpoint=scene.viewpoint),
         TRACK_SCENE: tracked(list(scenes.simulate(bone, 3, SCENES)), registrar),
         TRACK: tracked(frames, registrar),
-        FOLLOW: followed(frames, registrar),
         GICP: aligned(frames, threads),
     }
 
@@ -125,27 +122,6 @@ def tracked(frames: Sequence[Pair], registrar: Registrar) -> Case:
     def call() -> object:
         frame = next(turn)[1]
         return tracker.register(frame.source, target, viewpoint=frame.viewpoint)
-
-    return call
-
-
-def followed(frames: Sequence[Pair], registrar: Registrar) -> Case:
-    """The same without an assessment, after one of the first frame.
-
-    Raises:
-        RuntimeError: of a frame that has to be assessed.
-    """
-    following = FollowingConfig(most_sources=10**3, largest_tre95_mm=np.inf, largest_turn_deg=np.inf)
-    config = replace(registrar.config, following=following)
-    tracker = Tracker(Registrar(config, registrar.proposers, registrar.calibrations))
-    target, turn = registrar.prepare(frames[0].target), to_and_fro(frames)
-    tracker.register(frames[0].source, target)
-
-    def call() -> object:
-        found = tracker.follow(next(turn)[1].source, target)
-        if found is None:
-            raise RuntimeError("a frame has to be assessed")
-        return found
 
     return call
 

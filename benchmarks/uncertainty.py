@@ -28,11 +28,12 @@ from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import error_twist, nees, predicted_rmse_mm
 from gapr_core.pages import markdown
+from gapr_core.registration.checks.assess import bias_corrected
 from gapr_core.registration.fit.refinement import Fit, refine_fully
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.uncertainty.covariance import PoseUncertainty, estimate
-from gapr_core.registration.uncertainty.smooth_bias import bias_corrected, corrected_fit
+from gapr_core.registration.uncertainty.smooth_bias import corrected_fit
 from gapr_core.results import Refusal
 from gapr_core.runtime.console import say
 

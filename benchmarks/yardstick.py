@@ -96,9 +96,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, required=True, help="answers, one JSON object a line (.gz is read, too)")
     parser.add_argument("--against", type=Path, help="frozen answers to compare with")
-    parser.add_argument(
-        "--jitter", type=Path, metavar="DIR", help="folder of the bones: move points by 1e-4 mm"
-    )
+    parser.add_argument("--jitter", type=Path, metavar="DIR", help="folder of the bones: move points by 1e-4 mm")
     args = parser.parse_args()
     if args.jitter is not None:
         say(jitter(str(args.jitter), args.split))

@@ -142,6 +142,8 @@ def fit_precision(kinds: Sequence[tuple[Answers, Array]]) -> tuple[dict[str, Any
     new_subject = conformal.scales_of_unseen_people(answers, known)
     scores = answers.true_mm / (new_subject * answers.tre95_mm)
     at, factors = conformal.factors(scores[known], confidence[known], answers.family[known])
+    if not at:
+        raise ConfigError(f"{conformal.FEWEST} accepted answers in a range of the confidence", "fewer", "raise --count")
     data = {**as_dict(conformal.fit_scale(answers.of(known))), "confidences": np.round(at, 4).tolist(),
             "factors": np.round(factors, 4).tolist()}  # fmt: skip
     factor = np.interp(confidence, at, factors)

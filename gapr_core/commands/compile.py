@@ -56,9 +56,9 @@ def all_ways() -> Iterator[Callable[[], Any]]:
     yield partial(registrar.register, np.concatenate([near, near + [40.0, 0.0, 0.0]]), target, viewpoint=far)
     for number in range(3):
         yield partial(tracker.register, se3.apply(se3.exp([1.0, 0, 0, 0, 0, 0]), near[number:]), target)
-    together = Accumulator(registrar, 2)
-    for number in range(2):
-        yield partial(together.register, near[number::2], target)
+    together = Accumulator(registrar, 3)
+    for number in range(3):
+        yield partial(together.register, near[number::3], target)
     found = consensus.Correspondences(near[:40], near[:40], np.ones(40), np.arange(40) // 20)
     yield partial(consensus.local_to_global, found, 3.0)  # of the network, where torch comes later
     yield partial(lzf.decompress, b"\x00g", 1)

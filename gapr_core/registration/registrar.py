@@ -147,14 +147,14 @@ class Registrar:
             source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
-            viewpoint: (3,) mm, source frame: where the camera was, if there was one; (N, 3) where it was for each
-                point, of a camera that moved in a frame in which the bone rests. Without it the cloud is registered as
-                bone, and where that pose is refused, as a camera's cloud (`ClutterConfig.infer_viewpoint`).
+            viewpoint: (3,) mm, source frame: place of the camera, if there was one; (N, 3) its place for each point, of
+                a camera that moved around a bone at rest. Without it the cloud is registered as bone. Where that pose
+                is refused, it is registered as a camera's cloud (`ClutterConfig.infer_viewpoint`).
 
         Raises:
-            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm; a target
-                that is not prepared; an `initial` that is no rigid pose; a `viewpoint` that is neither, or that sees
-                nothing of the cloud; more than 16 places.
+            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm. Also a
+                target that is not prepared, an `initial` that is no rigid pose, and a `viewpoint` that sees nothing of
+                the cloud or names more than 16 places.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)

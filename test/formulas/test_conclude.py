@@ -157,16 +157,18 @@ def test_a_degenerate_refusal_asks_for_the_unit(a):
 
 @pytest.mark.parametrize(("change", "share"), [
     ({}, 35), ({"off": 60}, None), ({"count": 99}, None), ({"seen": 0.49}, 49), ({"seen": 0.5}, None),
-    ({"seen": 0.49, "apart": True}, None),
+    ({"seen": 0.49, "apart": True}, None), ({"seen": 0.49, "log_odds": 1.0}, None),
 ])  # fmt: skip
 def test_a_dense_cloud_that_is_mostly_not_this_bone_is_named_clutter(change, share):
-    """100 points are dense here: 65 off the bone, or less than half of a scene explained; not of apart looks."""
+    """100 points are dense here: 65 off the bone, or less than half of a scene explained; not of apart looks,
+    nor of a scene whose pose is believed."""
     rng, count, off = np.random.default_rng(0), change.get("count", 100), change.get("off", 65)
     points = np.column_stack([rng.uniform(5.0, 18.0, count), rng.uniform(-18.0, 18.0, count), np.full(count, 9.0)])
     points[off:] *= [-1.0, 1.0, 0.0]
     a = tiny.assessed(points, tiny.plane(size_mm=60.0))
     if "seen" in change:
-        a = replace(a, seen=a.source, features={"inlier_ratio": change["seen"]})
+        judgement = replace(a.judgement, pose_log_odds=change.get("log_odds", -1.0))
+        a = replace(a, seen=a.source, features={"inlier_ratio": change["seen"]}, judgement=judgement)
     if "apart" in change:
         a = a.with_finding(replace(REFUSED, check="looks apart"))
     found = mostly_clutter(a, CONFIG)

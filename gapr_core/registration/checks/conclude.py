@@ -68,7 +68,7 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
             centre_mm=a.centre_mm,
         )
     asked = questions(a, refusal, config)
-    reason = "; ".join(filter(None, (refusal.text, *(each.text for each in asked), refusal.advice)))
+    reason = "; ".join(filter(None, (refusal.text, refusal.advice, *(each.text for each in asked))))
     return replace(common, status=refusal.status, reason=reason, findings=(*findings, *asked))
 
 

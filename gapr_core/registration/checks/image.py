@@ -1,7 +1,9 @@
-"""Does the mirror image of a source fit the bone better: the other side of the body, or a flipped scan?
+"""Does the mirror image of a source fit the bone better?
 
-Near the pose the question is cheap. A nonsensical pose on the bone of the other side has a nonsensical image, so an
-answer that is not sure, or of few points, takes the best pose that the first proposer finds for the mirror image.
+Then it is of the other side of the body, or a scan was flipped.
+
+Near the pose the question is cheap. A nonsensical pose on the bone of the other side has a nonsensical image. So an
+answer that is not sure, or of few points, asks the first proposer for the best pose of the mirror image.
 """
 
 from __future__ import annotations

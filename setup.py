@@ -13,6 +13,7 @@ PACKAGE = "gapr_ros"
 HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file, elsewhere
 
 CORE = [
+    "libigl>=2.6",  # exact distances to a mesh
     "numba",
     "numpy",
     "plyfile",

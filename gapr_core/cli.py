@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 
 from gapr_core import __version__
 from gapr_core.errors import GaprError
+from gapr_core.runtime.console import printable
 
 OK, BAD_INPUT, INTERRUPTED = 0, 1, 130
 COMMANDS = {
@@ -53,7 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         0 for success, 2 for a refusal by the data, 1 for bad input (one line, no traceback), 130 when interrupted.
     """
-    logging.basicConfig(format="gapr: %(message)s", level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Printable("gapr: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
     arguments = sys.argv[1:] if arguments is None else arguments
     command = next(iter(arguments), "")
     try:
@@ -67,9 +70,18 @@ def main(arguments: list[str] | None = None) -> int:
         return OK
     except OSError as error:
         return _complain(f"{error.filename or 'a file'}: {error.strerror or error}")
+    except MemoryError:
+        return _complain("not enough memory: thin or crop the data, or raise the limit (ulimit -v)")
     except KeyboardInterrupt:
         _complain("stopped" + ("; the same command goes on where it was" if command in RESUMED else ""))
         return INTERRUPTED
+
+
+class _Printable(logging.Formatter):
+    """Formats a line of the log without what would steer a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 class _Parser(argparse.ArgumentParser):
@@ -134,7 +146,7 @@ def _which_extra(error: ModuleNotFoundError, command: str) -> str:
 
 
 def _complain(text: str) -> int:
-    sys.stderr.write(f"gapr: {' '.join(text.split())}\n")
+    sys.stderr.write(f"gapr: {printable(' '.join(text.split()))}\n")
     return BAD_INPUT
 
 

@@ -119,9 +119,9 @@ class Residuals:
 
     Attributes:
         points: (N, 3) the source points that were used, source frame, mm.
-        distance_mm: (N,) signed distance to the surface, positive outside; NaN where no surface is near. The stand-off
-            of the sensor is taken off: a pointer's points are near 0 where they lie a stand-off outside of the bone. So
-            is what noise adds on a curved surface, but for a camera's cloud.
+        distance_mm: (N,) signed distance to the mesh, or to the surface of a cloud, positive outside; NaN where no
+            surface is near. The stand-off of the sensor is taken off: a pointer's points are near 0 where they lie a
+            stand-off outside of the bone.
         inlier: (N,) bool, the points that count for the pose.
     """
 

@@ -14,8 +14,8 @@ class Input(NamedTuple):
 
     Attributes:
         message: the type.
-        points: (N, 3) float64 points of a message, in its own unit and frame; rows that are not finite are dropped, and
-            those of a `PointCloud2` that are exactly (0, 0, 0), which depth cameras send for "nothing seen". Raises
+        points: (N, 3) float64 points of a message, in its own unit and frame. Rows that are not finite are dropped. So
+            are exact zeros of a `PointCloud2`, which depth cameras send for "nothing seen". Raises
             `InvalidMessageError` for a message that contradicts itself.
         count: how many points the message has, usable or not.
         grid: (H, W, 3) float64 points of a message that is an image, row by row, usable or not; None for others.

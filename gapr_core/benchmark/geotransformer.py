@@ -4,9 +4,9 @@ git clone https://github.com/qinzheng93/GeoTransformer && pip install easydict e
 python -m gapr_core.training.geotransformer --checkout GeoTransformer --anatomy DIR --pairs 3000 --out runs/peer
 GEOTRANSFORMER=GeoTransformer gapr benchmark --methods geotransformer@runs/peer/weights.safetensors ...
 
-Its network, losses and registration (local to global) run as they are, with the settings of its 3DMatch experiment, but
-at the sizes of a network of ours (channels, superpoints, patches, Sinkhorn steps). `checkout` and `peer`
-say what is ours.
+Its network, losses and registration (local to global) run as they are, with the settings of its 3DMatch experiment.
+The sizes are those of a network of ours (channels, superpoints, patches, Sinkhorn steps). `checkout` and `peer` are
+ours.
 """
 
 from __future__ import annotations

@@ -128,10 +128,10 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
     """Make a new instance of a method.
 
     Args:
-        name: "gapr" (the `Registrar` with the shipped weights), "gapr_search" and "gapr_network" (with one of its two
-            proposers alone), "gapr_tracker", "gapr_paper" (the paper's pipeline; "gapr_paper@WEIGHTS" with those of a
-            run), "geotransformer@WEIGHTS" and "predator@WEIGHTS" (their authors' code, see `peer`), a baseline of
-            `gapr_core.baselines.REGISTRY`, or "package.module:factory" for a callable without arguments that returns a
+        name: "gapr" is the `Registrar` with the shipped weights. "gapr_search" and "gapr_network" have one proposer.
+            "gapr_tracker" is a `Tracker`, "gapr_paper" or "gapr_paper@WEIGHTS" the paper's pipeline.
+            "geotransformer@WEIGHTS" and "predator@WEIGHTS" are their authors' code (see `peer`). Others are baselines
+            of `gapr_core.baselines.REGISTRY`, or "package.module:factory", a callable that returns a
             `RegistrationMethod`.
         config: settings of our own methods.
 

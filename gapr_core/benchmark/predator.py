@@ -5,9 +5,9 @@ python -m gapr_core.training.predator --checkout OverlapPredator --anatomy DIR -
 PREDATOR=OverlapPredator gapr benchmark --methods predator@runs/peer/weights.safetensors ...
 
 Its network and losses run as they are, with the settings of its 3DMatch training, but at the sizes of a network of ours
-(channels, superpoints). Its registration is written again, because its own calls an Open3D of 2020: 1000 points of each
-cloud, drawn by overlap times saliency, for each of the source the most similar feature, and RANSAC, which in later
-versions of Open3D ends by confidence instead of after 1000 validations. `checkout` and `peer` say what else is ours.
+(channels, superpoints). Its registration is written again, because its own calls an Open3D of 2020. It draws 1000
+points of each cloud by overlap times saliency, matches the most similar features, and asks RANSAC. In later versions
+of Open3D that ends by confidence instead of after 1000 validations. `checkout` and `peer` are ours as well.
 """
 
 from __future__ import annotations

@@ -95,8 +95,8 @@ def done(records: Iterable[Record], inputs: Inputs) -> set[tuple[str, str]]:
     """(pair, method) of every record of an earlier, interrupted run.
 
     Raises:
-        ConfigError: a record of none of these pairs, of one of the same name with other clouds or other facts, or of a
-            method with other settings, or made of other weights or code.
+        ConfigError: a record of none of these pairs, or of a pair with other clouds or facts. A record of a method with
+            other settings, weights or code.
     """
     found = set()
     for record in records:

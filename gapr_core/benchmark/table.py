@@ -36,11 +36,11 @@ def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:
 def differences(records: Sequence[Record], methods: Sequence[str], ours: str) -> list[Row]:
     """Compare ours with each other method on the same pairs: one difference of recalls per protocol and method.
 
-    Paired, so that what is hard for both says nothing. A refusal is not right; pairs without a truth are left out.
+    Pairs that are hard for both cancel out. A refusal is not right; pairs without a truth are left out.
 
     Returns:
-        Rows with `protocol`, `method`, `pairs` that both have, how many `ours_alone` and `other_alone` have right, and
-        `difference` of the recall at 4 mm and 5 deg, -1 to 1, with its 95 % bootstrap interval by subject.
+        Rows with `protocol`, `method`, `pairs` that both have, and the counts right for `ours_alone` and `other_alone`.
+        `difference` is that of the recall at 4 mm and 5 deg, -1 to 1, with its 95 % bootstrap interval by subject.
     """
     judged = [r for r in records if r.has_truth]
     own, found = {r.pair: r for r in judged if r.method == ours}, []

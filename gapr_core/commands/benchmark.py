@@ -28,7 +28,7 @@ from gapr_core.data.make_pairs import MANIFEST, read_manifest
 from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
 from gapr_core.pages import benchmark_report, writers
-from gapr_core.runtime import cluster, origin
+from gapr_core.runtime import cluster, files, origin
 from gapr_core.runtime.arguments import a_path, at_least_one, names
 from gapr_core.runtime.console import say
 
@@ -189,10 +189,11 @@ def write(out: Path, plan: Plan) -> list[Row]:
     rows, notes = table.rows(found, plan.methods), _notes(found, plan, conditions)
     apart = table.differences(found, plan.methods, plan.ours)
     ran = {name: " and ".join(values) for name, values in conditions.items()}
-    writers.write_json(out / "table.json", rows, apart, plan, ran)
-    writers.write_csv(out / "table.csv", rows)
-    writers.write_markdown(out / "table.md", rows, apart, plan, ran, notes)
-    benchmark_report.write(out, found, rows, apart, plan, ran, notes)
+    with files.together():
+        writers.write_json(out / "table.json", rows, apart, plan, ran)
+        writers.write_csv(out / "table.csv", rows)
+        writers.write_markdown(out / "table.md", rows, apart, plan, ran, notes)
+        benchmark_report.write(out, found, rows, apart, plan, ran, notes)
     return rows
 
 

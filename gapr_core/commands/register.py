@@ -237,6 +237,11 @@ def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
 
 def _write(args: Namespace, done: Registration, config: RegistrarConfig) -> None:
     """The files that were asked for; those of a pose only where there is one."""
+    with files.together():
+        _write_all(args, done, config)
+
+
+def _write_all(args: Namespace, done: Registration, config: RegistrarConfig) -> None:
     if args.json:
         errors = [asdict(error) for error in done.errors]
         more = {"targets": errors, "guidance": guidance_json(done.result, done.spots)}

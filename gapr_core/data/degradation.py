@@ -21,8 +21,8 @@ def half_edge_mm(points: Array) -> float:
 def vary_density(points: Array, scale: float, rng: np.random.Generator) -> Array:
     """Paper, section III: thin out or fill up balls of 0.10-0.15 x `scale` (`half_edge_mm`) around random points.
 
-    Thinning discards half of a ball, filling adds half as many points again, each alpha p1 + (1 - alpha) p2 of two
-    points of the ball; either with even chance, `ROUNDS` times (the paper says "multiple").
+    Thinning discards half of a ball. Filling adds half as many points again, each alpha p1 + (1 - alpha) p2 of two
+    points of the ball. Either comes with even chance, `ROUNDS` times (the paper says "multiple").
     """
     for _ in range(ROUNDS):
         centre, radius = points[rng.integers(len(points))], scale * rng.uniform(0.10, 0.15)

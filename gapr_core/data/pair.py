@@ -24,9 +24,8 @@ class Pair:
         source: (N, 3) mm, in its own frame.
         target: (M, 3) mm, centred on its mean: surface coordinates minus metadata["origin_mm"].
         T_target_source: (4, 4) truth; all NaN where no pose is right (protocol `wrong`).
-        metadata: how the pair was made: region share, overlap, noise_mm, bias_mm, outlier_share, ...; of a camera's
-            view also `viewpoint` (3,) mm, where the camera is in the source's frame; of several looks (N, 3), for each
-            point.
+        metadata: region share, overlap, noise_mm, bias_mm, outlier_share and others. A camera's view has `viewpoint`
+            (3,) mm, the camera's place in the source's frame; several looks have (N, 3), one for each point.
     """
 
     source: Array

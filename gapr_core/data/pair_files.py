@@ -68,8 +68,8 @@ def load_pair(path: str | Path) -> Pair:
     """Read one pair; a file with `source` and `target` alone is a pair without truth, named after the file.
 
     Raises:
-        InvalidPointCloudError: not a readable .npz with these arrays, or one with no points or some that are not
-            finite, a transform that is not rigid, or landmarks and facts that are none.
+        InvalidPointCloudError: not a readable .npz with these arrays; points that are missing or not finite; a
+            transform that is not rigid; wrong landmarks or facts.
     """
     arrays = _arrays(path)
     clouds = _clouds(arrays, path)

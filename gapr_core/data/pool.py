@@ -45,8 +45,8 @@ def specimens(
 ) -> list[Specimen]:
     """List the bones of one type to make pairs from.
 
-    From `meshes_folder` or `anatomy_folder` everybody of the split; the first `people` parametric ones where neither
-    is given, and where the anatomy folder has no mesh of this bone in any split (its cohort then says "parametric").
+    A `meshes_folder` or an `anatomy_folder` gives everybody of the split. Without one, or if the anatomy folder has no
+    mesh of this bone in any split, the first `people` parametric ones are taken (cohort "parametric").
     """
     if meshes_folder is not None:
         return anatomy.meshes(meshes_folder, bone, split, units)

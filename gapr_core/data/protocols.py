@@ -1,12 +1,16 @@
 """The test protocols: each a pure seeded function from one bone surface to one pair with its true pose.
 
-paper, overlap-40/50/60/70 and incomplete follow section III and the experiments of the paper (arXiv 2606.13488);
-L1, L2 and L3 are one-sided, small, biased and dirty views as a tracked probe gives them, and L2-region and L3-region
-the same of about half the size; L2-wave and so on have another smooth bias; sweep is the band that a probe covers on
-its way; pointer, tracing, ultrasound, depth-camera, laser, structured-light, stereo, photogrammetry, covered and moving
-are simulated sensors (see `sensors`), pointer-50 and ultrasound-4 the same with 50 dots and four slices; scene-C1 and
-so on are what a camera sees of a bone in a wound (see `scenes`), scene-C3-looks and so on from four places, and
-scene-C3-look from the first of these; wrong and scene-wrong ones have no pose.
+| protocol | view |
+|---|---|
+| paper, overlap-K, incomplete | section III and the experiments of the paper (arXiv 2606.13488) |
+| L1, L2, L3 | one-sided, ever smaller and dirtier, as of a tracked probe |
+| L2-region, L3-region; L2-wave and so on | half the size; another smooth bias |
+| sweep | the band of a probe along the bone |
+| pointer, ultrasound, depth-camera and so on | simulated sensors (see `sensors`) |
+| pointer-50, ultrasound-4 | 50 dots, four slices |
+| scene-C1 and so on | a bone in a wound before a camera (see `scenes`) |
+| scene-C3-looks, scene-C3-look and so on | the same from four places; the first of these alone |
+| wrong, scene-wrong and so on | no pose is right |
 """
 
 from __future__ import annotations
@@ -41,11 +45,11 @@ ANOTHER_PERSON = {level: 2 * number + 1 for number, level in enumerate(DEGRADED_
 
 @dataclass(frozen=True)
 class Level:
-    """How hard a one-sided view is.
+    """Difficulty of a one-sided view.
 
-    `share` is of the whole surface's area: of what the probe sees (`seen`), of a band of that along its longest
-    direction ("band"), or of a region around the point that it looks at, whose far side is then cut away ("region"),
-    which leaves about half. `smooth_bias` is a name of `smooth_bias.SMOOTH_BIASES`, which says what `bias_mm` is of.
+    `share` is of the whole surface's area: of the visible points ("seen"), or of a band of them ("band"). With "region"
+    it is of a region whose far side is then cut away, which leaves about half. `smooth_bias` is a name of
+    `smooth_bias.SMOOTH_BIASES`, which defines `bias_mm`.
     """
 
     share: tuple[float, float]

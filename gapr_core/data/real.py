@@ -1,8 +1,8 @@
 """Public real data in the form in which it is published. None of it ships; docs/results/real.md says where it is.
 
-Two forms are known: pairs as NPZ (`source`, `target` and, where it is known, `transform`), such as the RealSense cloud
-of a sawbone femur; and folders of UltraBones100k, `specimenNN/CT_bone_segmentations/BONE.stl` with tracked ultrasound
-in `specimenNN/ultrasound_records/BONE/RECORD/3D_reconstructions/**/*.xyz`, in the frame of the CT.
+Two forms are known. Pairs are NPZ with `source`, `target` and, if it is known, `transform`. Folders of UltraBones100k
+hold `specimenNN/CT_bone_segmentations/BONE.stl` and tracked ultrasound in
+`specimenNN/ultrasound_records/BONE/RECORD/3D_reconstructions/**/*.xyz`, in the frame of the CT.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,7 +18,6 @@ from gapr_core.runtime import files
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 TARGETS, OFF_BONE = "targets.mrk.json", "off_bone.vtk"
 FILES = ("target.vtk", "source.vtk", OFF_BONE, "registered.ply", "pose.tfm", TARGETS, "scene.mrml")  # of `write_slicer`
@@ -97,25 +95,28 @@ def write_slicer(folder: Path, target: Surface, result: RegistrationResult, erro
     """
     if result.T_target_source is None or result.residuals is None:
         raise ValueError("a scene needs a pose and its residuals")
-    residuals, near = result.residuals, np.isfinite(result.residuals.distance_mm)
+    with files.together():
+        _write_scene(folder, target, result.T_target_source, result.residuals, errors)
+
+
+def _write_scene(
+    folder: Path, target: Surface, T_target_source: Array, residuals: Residuals, errors: Sequence[TargetError]
+) -> None:
+    near = np.isfinite(residuals.distance_mm)
     # first: after an interrupted run the folder is known as one of GAPR
     files.write_text(folder / "scene.mrml", _mrml(not near.all(), bool(errors)))
     files.write_text(folder / "target.vtk", _vtk(target.points, target.faces))
     files.write_text(folder / "source.vtk", _vtk(residuals.points[near], None, residuals.distance_mm[near]))
-    if not near.all():
+    if near.all():
+        files.remove(folder / OFF_BONE)
+    else:
         files.write_text(folder / OFF_BONE, _vtk(residuals.points[~near], None))
-    write_coloured(folder / "registered.ply", se3.apply(result.T_target_source, residuals.points), residuals)
-    transforms.write(folder / "pose.tfm", result.T_target_source)
+    write_coloured(folder / "registered.ply", se3.apply(T_target_source, residuals.points), residuals)
+    transforms.write(folder / "pose.tfm", T_target_source)
     if errors:
         planning.save_targets(folder / TARGETS, errors)
-    _warn_of_old(folder / TARGETS, bool(errors), "it has no --targets")
-    _warn_of_old(folder / OFF_BONE, not near.all(), "a surface is near all its points")
-
-
-def _warn_of_old(path: Path, is_written: bool, why: str) -> None:
-    """Warn of a file that another scene in the folder had."""
-    if path.exists() and not is_written:
-        log.warning("%s in %s is of an earlier run, and not in this scene: %s", path.name, path.parent.name, why)
+    else:
+        files.remove(folder / TARGETS)
 
 
 def _vtk(points: Array, faces: NDArray[np.int64] | None, distances: Array | None = None) -> str:

@@ -28,8 +28,8 @@ MOST_ENDS = 24  # a table has six
 def flat_ends(points: Array, normals: Array, spacing_mm: float, least_mm2: float) -> NDArray[np.bool_]:
     """Find the points that lie on a flat end, or on its rounded edge.
 
-    A flat end is a plane that has the whole model on one side (a facet of the convex hull) and points of the model all
-    over an area of `least_mm2` or more. What is left is looked at again: behind the outer face of a table is the inner.
+    A flat end is a facet of the convex hull with points of the model all over an area of `least_mm2` or more. The rest
+    is looked at again: behind the outer face of a table is the inner.
 
     Args:
         points: (N, 3) mm, evenly spread.

@@ -79,8 +79,8 @@ def fit_quadrics(
 ) -> tuple[Array, Array]:
     """Second fundamental form in each point, and the normal corrected by the fit.
 
-    Fits h(u, v) = a + b u + c v + (d u^2 + 2 e u v + f v^2) / 2 over the tangent plane by least squares with weights
-    that fall to zero at the farthest neighbour and for neighbours whose normals disagree (the other side of a blade).
+    Fits h(u, v) = a + b u + c v + (d u^2 + 2 e u v + f v^2) / 2 over the tangent plane by least squares. Weights fall
+    to zero at the farthest neighbour, and for neighbours whose normals disagree (the other side of a blade).
 
     Args:
         points: (N, 3), mm.

@@ -2,9 +2,8 @@
 
 Two depth buffers, for two kinds of cloud. A bone of one surface has nothing to hide: the first lets a point pass unless
 something is clearly before it. A hollow one (a segmentation that follows the cortical bone on both sides) has a second
-surface a few millimetres below the first, within what the first lets pass: the second asks whether anything in front
-of a point lies above that point's own tangent plane, and the few outer points that this loses are found again next to
-those that it keeps.
+surface a few millimetres below, which the first buffer lets pass. So the second asks whether anything in front of a
+point lies above its tangent plane. The few outer points that this loses are found again next to the others.
 """
 
 from __future__ import annotations
@@ -154,8 +153,8 @@ def outward_votes(
         num_threads: 0 for all cores.
 
     Returns:
-        (N, 3) sums of unit view directions, which point out of the body, and (N,) counts; a count of zero marks a
-        point inside the shell, such as the wall of a medullary canal.
+        (N, 3) sums of unit view directions, which point out of the body, and (N,) counts. A count of zero marks a point
+        inside the shell, such as the wall of a medullary canal.
     """
     towards = fibonacci_directions(directions)
     return _sum_of_views(_views(towards, points, normals, spacing_mm, seen_from, num_threads), towards)  # type: ignore[no-any-return]

@@ -1,7 +1,7 @@
 """The physical limit: no unbiased registration of these points can be better (Cramer-Rao bound of the pose).
 
-A source point with white noise of sigma per axis tells about the pose only how far it is off the surface, along the
-surface normal (Censi 2007; Simon's constraint analysis): information J^T J / sigma^2 with rows J = [n, (p - c) x n].
+A source point with white noise of sigma per axis says only how far it is off the surface (Censi 2007; Simon's
+constraint analysis). Its information on the pose is J^T J / sigma^2 with rows J = [n, (p - c) x n].
 Smooth bias and outliers are not noise of this kind: with them the limit is out of reach.
 """
 

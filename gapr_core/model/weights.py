@@ -39,6 +39,7 @@ def save(
         "card": json.dumps(card or {}),
         "sha256": digest,
     }
+    header["signature"] = checksum(tensors, header["config"], header["card"])
     write_tensors(tensors, path, header)
     return digest
 
@@ -68,7 +69,8 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet,
     header, tensors = _read(path)
     if header.get("format") != FORMAT:
         raise WeightsError(f"weights of format {FORMAT}", f"{header.get('format')} in {path}", "export them again")
-    if checksum(tensors) != header.get("sha256"):
+    signed = checksum(tensors, header.get("config", ""), header.get("card", ""))
+    if checksum(tensors) != header.get("sha256") or header.get("signature", signed) != signed:
         raise WeightsError("tensors with the checksum of the header", f"others in {path}", "fetch the file again")
     try:
         network = GAPRNet(ModelConfig.from_dict(json.loads(header["config"])))
@@ -79,9 +81,9 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet,
     return network.to(device).eval(), card
 
 
-def checksum(tensors: dict[str, Tensor]) -> str:
-    """sha256 over names and bytes, in the order of the names."""
-    digest = hashlib.sha256()
+def checksum(tensors: dict[str, Tensor], *texts: str) -> str:
+    """sha256 over texts, names and bytes, in the order of the names."""
+    digest = hashlib.sha256("\0".join(texts).encode())
     for name in sorted(tensors):
         tensor = tensors[name].cpu()
         digest.update(name.encode())

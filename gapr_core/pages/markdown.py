@@ -16,6 +16,6 @@ def head(header: Sequence[object]) -> str:
 
 
 def row(cells: Iterable[object]) -> str:
-    """One line; a `|` in a cell is escaped, since it would end the cell."""
-    escaped = (str(cell).replace("|", r"\|") for cell in cells)
+    """One line; a `|` in a cell, which would end it, and a `<`, which would begin HTML, are escaped."""
+    escaped = (" ".join(str(cell).split()).replace("|", r"\|").replace("<", r"\<") for cell in cells)
     return f"| {' | '.join(escaped)} |"

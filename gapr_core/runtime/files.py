@@ -7,12 +7,15 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from secrets import token_hex
 from tempfile import TemporaryFile, gettempdir
 from typing import Any
 
 from gapr_core.errors import ConfigError
+
+_WAITING: ContextVar[dict[Path, Path | None] | None] = ContextVar("_WAITING", default=None)  # of `together`
 
 
 @contextmanager
@@ -37,12 +40,55 @@ def replacing(path: str | Path) -> Iterator[Path]:
             return
         if into.exists():
             shutil.copymode(into, scratch)
-        os.replace(scratch, into)
+        if (waiting := _WAITING.get()) is not None:
+            waiting[into] = scratch
+        else:
+            os.replace(scratch, into)
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
-        with suppress(OSError):  # no such folder: the error above says more
-            scratch.unlink(missing_ok=True)
+        if (_WAITING.get() or {}).get(into) != scratch:
+            with suppress(OSError):  # no such folder: the error above says more
+                scratch.unlink(missing_ok=True)
+
+
+@contextmanager
+def together() -> Iterator[None]:
+    """Let the files that a block writes appear at its end, once those that they replace are gone.
+
+    Whoever kills the process leaves files of one run alone: some or all of the old ones, or of the new ones. After an
+    error the old files are as they were. A block in another one is part of it.
+
+    Raises:
+        ConfigError: a file cannot be replaced.
+    """
+    if _WAITING.get() is not None:
+        yield
+        return
+    waiting: dict[Path, Path | None] = {}
+    token = _WAITING.set(waiting)
+    try:
+        yield
+        for into in reversed(waiting):
+            into.unlink(missing_ok=True)
+        for into, scratch in waiting.items():
+            if scratch is not None:
+                os.replace(scratch, into)
+    except OSError as error:
+        raise unwritable(next(iter(waiting), Path()), error) from error
+    finally:
+        _WAITING.reset(token)
+        for scratch in filter(None, waiting.values()):
+            with suppress(OSError):
+                scratch.unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file that does not belong to those that are written `together`."""
+    if (waiting := _WAITING.get()) is not None:
+        waiting[Path(os.path.realpath(path))] = None
+    else:
+        path.unlink(missing_ok=True)
 
 
 def is_special(path: Path) -> bool:

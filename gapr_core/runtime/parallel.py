@@ -62,8 +62,8 @@ def single_threaded_libraries(call: Callable[Given, Result]) -> Callable[Given, 
 
     The matrices of a registration are small. Several threads gain little with them, and wait for each other busily: as
     soon as something else wants a core, a registration with two of them takes nine times as long. Threads of our own
-    loops are not affected, nor is OpenMP in other threads of the process; linear algebra is, everywhere, and may keep
-    one thread after calls that overlapped in two threads: each gives back what it found.
+    loops are not affected, nor is OpenMP in other threads. Linear algebra is, in the whole process. It may keep one
+    thread after calls that overlapped in two threads, since each restores the number that it found.
     """
 
     @wraps(call)

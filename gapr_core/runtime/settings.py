@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_ty
 
 from gapr_core.errors import ConfigError
 
+MOST_VALUES = 100_000  # of a file
 T = TypeVar("T")
 S = TypeVar("S", bound="Settings")
 
@@ -156,7 +157,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
     try:
         text = Path(path).read_text(encoding="utf-8")
-        twice = _key_named_twice(yaml.compose(text, Loader=yaml.SafeLoader))
+        twice = _key_named_twice(_composed(text))
         values = yaml.safe_load(text) or {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         why = " ".join(str(getattr(error, "strerror", None) or error).split())
@@ -166,6 +167,35 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"a mapping in {path}", type(values).__name__, "write `name: value` lines")
     return values
+
+
+def _composed(text: str) -> Any:
+    """Compose the tree of YAML nodes of a text.
+
+    Raises:
+        YAMLError: it is nested deeper than settings are, or its aliases stand for too many values.
+    """
+    import yaml
+
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        too_many = _values_in(root, {}) > MOST_VALUES
+    except RecursionError as error:
+        raise yaml.YAMLError("it is nested too deeply") from error
+    if too_many:
+        raise yaml.YAMLError(f"its aliases stand for more than {MOST_VALUES} values")
+    return root
+
+
+def _values_in(node: Any, known: dict[int, int]) -> int:
+    """Count the values that a node stands for, those of its aliases included."""
+    if node is None or isinstance(node.value, str):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = MOST_VALUES  # of an alias within itself
+        inner = [part for pair in node.value for part in pair] if node.id == "mapping" else node.value
+        known[id(node)] = min(1 + sum(_values_in(part, known) for part in inner), MOST_VALUES + 1)
+    return known[id(node)]
 
 
 def _key_named_twice(root: Any) -> str:
@@ -275,6 +305,7 @@ def _parsed(text: str) -> Any:
     import yaml
 
     try:
+        _composed(text)
         value = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError("a value such as 5, 0.5, true, [1, 2]", repr(text), "correct the value") from error

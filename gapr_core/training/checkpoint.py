@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gapr_core.errors import WeightsError
 from gapr_core.model.network import GAPRNet
-from gapr_core.model.weights import write_tensors
+from gapr_core.model.weights import checksum, write_tensors
 
 
 def save_checkpoint(
@@ -28,7 +28,8 @@ def save_checkpoint(
     for index, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": t for name, t in moments.items()}
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
-    write_tensors(contiguous, path, {"state": json.dumps(state)})
+    said = json.dumps(state)
+    write_tensors(contiguous, path, {"state": said, "sha256": checksum(contiguous, said)})
 
 
 def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
@@ -39,8 +40,11 @@ def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch
     """
     try:
         with safe_open(str(path), framework="pt") as file:
-            state = json.loads(file.metadata()["state"])
+            header = file.metadata()
+            state = json.loads(header["state"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}
+        if header.get("sha256", "") not in ("", checksum(tensors, header["state"])):  # older ones have none
+            raise ValueError("its checksum is not that of its content")
         network.load_state_dict(_under(tensors, "network."))
         ema.load_state_dict(_under(tensors, "ema."))
     except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:

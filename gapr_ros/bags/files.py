@@ -98,13 +98,13 @@ def _choose(bag: Bag, topics: Sequence[str]) -> None:
 
 
 def import_type(name: str) -> Any:
-    """The message class of `package/msg/Name`."""
+    """Import the message class of `package/msg/Name`."""
     package, kind, message = name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), message)
 
 
 def recorded_qos(connections: Sequence[Connection]) -> QoSProfile:
-    """The QoS of one publisher that serves every listener of the recorded ones.
+    """Choose the QoS of one publisher that serves every listener of the recorded ones.
 
     Reliable and latched where any of them was, since such a publisher serves best effort and volatile listeners too;
     as many messages as they kept together. Reliable, volatile, keep last 10 where nothing is known.

@@ -91,7 +91,7 @@ class Replay:
             self._node.destroy_publisher(publisher)
 
     def _advertise(self, topic: str) -> Any:
-        """One publisher for all that was recorded on a topic: a bag has a connection for each recorded publisher."""
+        """Advertise one publisher for each topic: a bag has a connection for each recorded publisher."""
         connections = [c for c in self._bag.connections if c.topic == topic]
         first, *others = dict.fromkeys(c.msgtype for c in connections)
         if others:

@@ -29,7 +29,7 @@ NAME_ONE = "name one with --topic, or topic= in Python"
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """The clouds of one topic, joined, in the unit and the frame of the topic; a single one with its camera.
+    """Read the clouds of one topic, joined, in its unit and frame; a single one with its camera.
 
     Raises:
         InvalidPointCloudError: a damaged or empty bag, no such topic, one without clouds, clouds of two frames, or a
@@ -62,7 +62,7 @@ def _short(why: str) -> str:
 
 
 def _topic(bag: Bag, wanted: str) -> str:
-    """The topic that is meant, once it is known to have clouds."""
+    """Find the topic that is meant, once it is known to have clouds."""
     kinds = {connection.topic: connection.msgtype for connection in bag.reader.connections}
     usable = sorted(topic for topic, kind in kinds.items() if kind in READABLE)
     if wanted and wanted not in kinds:
@@ -126,7 +126,7 @@ def _cloud(kind: Input, data: bytes, received_ns: int) -> tuple[str, Array, Arra
 
 
 def _how_to_leave_out(number: int, wanted: range) -> str:
-    """What to do about a malformed cloud of those that are wanted, counted from 0 as --clouds does."""
+    """Say how to leave out a malformed cloud, counted from 0 as --clouds does."""
     parts = [part for part in (range(wanted.start, number), range(number + 1, wanted.stop)) if part]
     if not parts:
         return "record it again"

@@ -30,7 +30,7 @@ UNLIMITED = QosTime(2147483647, 4294967295)
 
 
 def offered(*, reliable: bool = True, latched: bool = False, depth: int = 10) -> Qos:
-    """The QoS that a topic is recorded with, and replayed with."""
+    """Give the QoS with which a topic is recorded and replayed."""
     return Qos(
         QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
         QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
@@ -76,7 +76,7 @@ class BagWriter:
         self.write_raw(topic, type_name(message), serialize_message(message), stamp_ns)
 
     def write_raw(self, topic: str, kind: str, data: bytes, stamp_ns: int) -> None:
-        """The CDR bytes of a message of type `package/msg/Name`."""
+        """Write the CDR bytes of a message of type `package/msg/Name`."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=self._types, offered_qos_profiles=[self._qos]

@@ -65,6 +65,7 @@ def is_message_package(name):
 
 DISTRIBUTIONS = {
     "PIL": "pillow",
+    "igl": "libigl",
     "yaml": "pyyaml",
     "skimage": "scikit-image",
     "vtkmodules": "vtk",

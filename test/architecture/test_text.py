@@ -24,7 +24,6 @@ TO_DO = (  # packages whose docstrings are still to be shortened: this list only
     "gapr_core/results.py",
     "gapr_core/surface.py",
     "gapr_core/training",
-    "gapr_ros/bags",
     "gapr_ros/demo",
     "gapr_ros/node",
     "gapr_ros/parameters.py",
@@ -81,8 +80,10 @@ def is_verb_first(node, text):
 def faults(path):
     for node, text in docstrings(ast.parse(path.read_text(encoding="utf-8"))):
         name = f"{path.relative_to(ROOT)}: {getattr(node, 'name', 'module')}"
-        first, *others = sentences(re.sub(r"`[^`]+`", "code", text.split("\n\n")[0]))
-        if words(first) > FIRST or any(words(s) > LONGEST for s in others):
+        text = re.sub(r"`[^`]+`", "code", text)
+        first = sentences(text.split("\n\n")[0])[0]
+        parts = re.split(r"\n\s*\n|\n *(?=[-*]|\d+\. |\w+: |\()|\|", text)
+        if words(first) > FIRST or any(words(s) > LONGEST for part in parts for s in sentences(part)):
             yield f"{name}: too long: {first}"
         if not is_verb_first(node, text):
             yield f"{name}: no verb first: {first}"

@@ -1,7 +1,7 @@
 """Thoracic cartilage: sternum and costal cartilages 1-10. Frame: x left, y backwards, z up; the jugular notch on top.
 
-Cartilages are laid on the chest wall (an elliptic cylinder before which the sternum lies), from the sternum to the
-bony rib; 8 to 10 end on the one above and make the costal arch.
+Cartilages lie on the chest wall, an elliptic cylinder behind the sternum. They lead from the sternum to the bony rib.
+Numbers 8 to 10 end on the one above and make the costal arch.
 """
 
 from __future__ import annotations

@@ -91,8 +91,8 @@ class Setting(NamedTuple):
 def scene(specimen: Specimen, rng: np.random.Generator, level: SceneLevel) -> Pair:
     """Make one wound of one bone as a camera sees it.
 
-    Its metadata hold `viewpoint` (3,) mm in the source's frame, `is_bone` (N,), `bone_share` and how it was made; of a
-    whole image also `crop_min` and `crop_max` (3,) mm, a box of interest in the source's frame.
+    Its metadata hold `viewpoint` (3,) mm in the source's frame, `is_bone` (N,), `bone_share` and how it was made. A
+    whole image also has `crop_min` and `crop_max` (3,) mm, a box of interest in the source's frame.
 
     Raises:
         ConfigError: a bone on which no wound shows that share of bone.

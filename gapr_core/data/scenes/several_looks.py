@@ -78,8 +78,8 @@ def several_looks(
 ) -> Pair:  # fmt: skip
     """Make one wound as a camera sees it from `LOOKS` places.
 
-    Its metadata hold `viewpoint` (N, 3) mm, where the camera was for each point, in the source's frame; `look` (N,);
-    `is_bone` (N,), `bone_share` of all looks, the `neighbour` at a joint, and how it was made.
+    Its metadata hold `viewpoint` (N, 3) mm, the camera's place for each point in the source's frame. Further keys are
+    `look` (N,), `is_bone` (N,), `bone_share` of all looks, the `neighbour` at a joint, and how it was made.
 
     Raises:
         ConfigError: a bone on which no wound shows that share of bone, or at a joint, no other bone near.

@@ -1,8 +1,8 @@
 """A pointer that is dragged over the bone and read all the time: dense strokes whose samples err alike.
 
 Only the sampling differs from dots: the tracker is read at 20 to 60 Hz. So a second of one contact counts as dozens of
-points, the tip is lifted for a while and not point by point, and what the calibration of the tip is wrong by shifts
-the whole cloud. No residual shows such a shift.
+points, and the tip is lifted for a while, not point by point. An error of the tip's calibration shifts the whole cloud;
+no residual shows it.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapr_core.geometry import se3
 from gapr_core.geometry.twists import predicted_rmse_mm
 from gapr_core.registration.confidence.classifier import Judgement, joint
 from gapr_core.registration.fit import kernels
@@ -113,8 +114,11 @@ class Assessment:
         if self.seen is None or self.members is None:
             fit = self.fit.full_fit
             points = self.source.points if fit is self.fit else self.source.whole
-            return Residuals(points, fit.signed_mm, fit.counts)
-        distance_mm = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
+            exact = self.target.mesh_distances(se3.apply(fit.T, points))
+            return Residuals(points, exact[0] if exact else fit.signed_mm, fit.counts)
+        exact = self.target.mesh_distances(se3.apply(self.fit.T, self.seen.points))
+        on_elements = kernels.residuals_at(self.fit.T, self.seen.points, *self.target.kernel_view, 0.0)[0]
+        distance_mm = exact[0] if exact else on_elements
         counts = np.zeros(len(self.members), dtype=bool)
         counts[self.members] = self.fit.counts
         return Residuals(self.seen.points, distance_mm, counts)

@@ -19,6 +19,8 @@ from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import distance_field, extent, quadrics, sampling, visibility
 from gapr_core.geometry.distance_field import DistanceField
 from gapr_core.geometry.flat_ends import OF_POINT, flat_ends
+from gapr_core.registration.problem import bone_mesh
+from gapr_core.registration.problem.bone_mesh import BoneMesh
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -46,8 +48,9 @@ class PreparedTarget:
         both_cortices: the same with the inner cortex of a hollow bone, for a source that follows both; else None.
         elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
             surroundings, at an edge or a thin blade) side by side, for the compiled loops.
-        cache: results that proposers keep per target (a network's features).
-        offset_mm: distance of the surface that a sensor sees from `points`, outwards; in `elements`.
+        cache: what proposers keep per target (a network's features).
+        drawn: (S, 6) points and normals, `points` among them and those of flat ends and of an inner cortex.
+        offset_mm: how far outside of `points` a sensor sees the surface (`sensor.offset_surface`); in `elements`.
     """
 
     points: Array
@@ -61,6 +64,7 @@ class PreparedTarget:
     elements: Array
     both_cortices: PreparedTarget | None = None
     cache: dict[Any, Any] = dataclasses.field(default_factory=dict)
+    drawn: Array = dataclasses.field(default_factory=lambda: np.empty((0, 6)))
     offset_mm: float = 0.0
 
     def __repr__(self) -> str:
@@ -75,6 +79,23 @@ class PreparedTarget:
     def kernel_view(self) -> tuple[Array, NDArray[np.int32], Array, float, float]:
         """Arguments that every loop of `kernels` takes."""
         return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
+
+    def mesh_distances(self, points: Array) -> tuple[Array, Array] | None:
+        """Give exact distances (N,) of points (N, 3) to the mesh, and their gradients (N, 3); None for a cloud.
+
+        They are signed, mm, positive outside of where a sensor sees the surface (`offset_mm`), and NaN beyond the
+        reach of the field.
+        """
+        if self.faces is None or not len(self.faces):
+            return None
+        if BoneMesh not in self.cache:  # when they are first asked for
+            dropped = self.drawn[self.tree.query(self.drawn[:, :3])[0] > 0.0]
+            self.cache[BoneMesh] = bone_mesh.build(
+                self.surface.points, self.faces, (self.points, self.normals), dropped
+            )
+        distances, gradients = self.cache[BoneMesh].distances(points)
+        distances[np.abs(distances) > self.field.reach_mm] = np.nan
+        return distances - self.offset_mm, gradients
 
     @cached_property
     def half_extent_mm(self) -> float:
@@ -118,11 +139,14 @@ def prepare(
     spacing_mm = quadrics.spacing(points, num_threads=num_threads)
     shell = _outer_shell(points, normals, spacing_mm, config, num_threads)
     whole = _described(*_without_flat_ends(*shell, spacing_mm, config), surface, config, num_threads)
+    whole = replace(whole, drawn=np.hstack(shell))
     outer = _outer_cortex(points, normals, spacing_mm, config, num_threads)
     if outer is None:
         return whole
     outer = _without_flat_ends(*outer, spacing_mm, config, warns=False)
-    return replace(_described(*outer, surface, config, num_threads), both_cortices=whole)
+    return replace(
+        _described(*outer, surface, config, num_threads), both_cortices=whole, drawn=np.hstack([points, normals])
+    )
 
 
 def _described(

@@ -1,9 +1,13 @@
 """From a CT mask to files that other tools read the right way round."""
 
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -297,7 +301,7 @@ def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_
     assert "0.50 mm" in (tmp_path / "targets.mrk.json").read_text() and (tmp_path / "mine.txt").read_text() == "stays"
 
 
-def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(tmp_path, femur, caplog):
+def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(tmp_path, femur):
     """They had a distance of 0, which is white: exactly on the bone."""
     scene.write_slicer(tmp_path, femur, result_with(np.eye(6), residuals()), [])
     shown = (tmp_path / "source.vtk").read_text().split("LOOKUP_TABLE default\n")[1].split()
@@ -310,16 +314,55 @@ def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(t
     near = Residuals(POINTS, np.zeros(20), np.ones(20, dtype=bool))
     scene.write_slicer(tmp_path, femur, result_with(np.eye(6), near), [])
     assert "off_bone" not in (tmp_path / "scene.mrml").read_text()
-    assert "off_bone.vtk in" in caplog.text and "is of an earlier run" in caplog.text
+    assert not (tmp_path / "off_bone.vtk").exists()
 
 
-def test_targets_of_an_earlier_run_in_the_folder_of_a_scene_are_warned_of(tmp_path, femur, caplog):
+def test_targets_of_an_earlier_run_do_not_stay_in_the_folder_of_a_scene(tmp_path, femur):
     result = result_with(np.eye(6), residuals())
     scene.write_slicer(tmp_path, femur, result, [planning.TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)])
-    assert not caplog.messages
     scene.write_slicer(tmp_path, femur, result, [])
-    assert "targets.mrk.json in" in caplog.text and "is of an earlier run" in caplog.text
+    assert not (tmp_path / "targets.mrk.json").exists()
     assert "targets" not in (tmp_path / "scene.mrml").read_text()
+
+
+def test_a_scene_that_is_killed_at_any_step_is_of_one_run_alone(tmp_path, femur):
+    """A new bone under an old pose was 100 mm off."""
+    moved = replace(femur, points=femur.points + 100.0)
+    runs = [(femur, np.eye(4)), (moved, se3.from_rotation_translation(np.eye(3), [100.0, 0.0, 0.0]))]
+    made = []
+    for number, (bone, T) in enumerate(runs):
+        result = replace(result_with(np.eye(6), residuals()), T_target_source=T)
+        scene.write_slicer(tmp_path / str(number), bone, result, [])
+        made.append({path.name: path.read_bytes() for path in (tmp_path / str(number)).iterdir()})
+    finished = False
+    for steps in itertools.count():
+        folder = tmp_path / f"killed {steps}"
+        shutil.copytree(tmp_path / "0", folder)
+        if (child := os.fork()) == 0:
+            kill_after(steps)
+            scene.write_slicer(folder, moved, result, [])
+            os._exit(0)
+        if os.waitpid(child, 0)[1] == 0:
+            break
+        left = {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")}
+        assert any(left.items() <= whole.items() for whole in made), steps
+        finished |= left != made[0]
+    assert steps > 10 and finished
+
+
+def kill_after(steps):
+    """End this process before the step of this number that changes a name in a folder."""
+    left = itertools.repeat(None, steps)
+
+    def dying(change):
+        def step(*arguments, **options):
+            if next(left, "over") == "over":
+                os._exit(9)
+            return change(*arguments, **options)
+
+        return step
+
+    os.replace, Path.unlink = dying(os.replace), dying(Path.unlink)
 
 
 def test_a_refused_registration_writes_no_pose_and_says_that_the_old_one_is_old(tmp_path, femur, capsys):

@@ -17,6 +17,7 @@ from gapr_core.model.encoding import TRANSFORMERS, ptv3
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.model.types import collate
+from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.losses import compute_losses
 from gapr_core.training.targets import join, training_pair
 
@@ -255,11 +256,35 @@ def test_missing_damaged_and_foreign_weights_are_refused(toy, tmp_path):
         weights.load(path)
 
 
+@pytest.mark.parametrize(("entry", "said", "other"), [("config", "0.", "1."), ("card", "a card", "b card")])
+def test_the_signature_of_weights_covers_their_configuration_and_card(toy, tmp_path, entry, said, other):
+    path = tmp_path / "w.safetensors"
+    weights.save(network(toy.small_config()), path, {"of": "a card"})
+    header, tensors = weights._read(path)
+    assert said in header[entry]
+    save_file(tensors, str(path), metadata=header | {entry: header[entry].replace(said, other, 1)})
+    with pytest.raises(WeightsError, match="checksum"):
+        weights.load(path)
+
+
+def test_a_checkpoint_with_a_flipped_bit_is_refused(toy, tmp_path):
+    net, path = network(toy.small_config()), tmp_path / "checkpoint.safetensors"
+    optimizer = torch.optim.AdamW(net.parameters())
+    save_checkpoint(path, net, net, optimizer, {"step": 3})
+    assert load_checkpoint(path, net, net, optimizer) == {"step": 3}
+    whole = path.read_bytes()
+    for at in (whole.index(b"step") + 8, len(whole) - 5):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(WeightsError, match="a checkpoint"):
+            load_checkpoint(path, net, net, optimizer)
+
+
 @pytest.mark.parametrize("entry", ["config", "card"])
 def test_weights_with_a_damaged_header_are_refused_as_weights(toy, tmp_path, entry):
     path = tmp_path / "w.safetensors"
     weights.save(network(toy.small_config()), path)
     header, tensors = weights._read(path)
+    del header["signature"]  # as of an older file
     save_file(tensors, str(path), metadata=header | {entry: "{no json"})
     with pytest.raises(WeightsError, match="fit their configuration"):
         weights.load(path)

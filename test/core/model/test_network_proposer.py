@@ -12,7 +12,7 @@ from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
-from gapr_core.registration.confidence.classifier import Calibration
+from gapr_core.registration.confidence.classifier import Classifier
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem import target as targets
 from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
@@ -83,7 +83,7 @@ def test_of_other_weights_than_the_shipped_ones_it_is_said_that_no_confidence_wa
     own = NetworkProposer.from_weights(tmp_path / "w.safetensors")
     for path in (SHIPPED, os.path.relpath(SHIPPED)):
         Registrar(proposers=[NetworkProposer.from_weights(path)])
-    Registrar(proposers=[own], calibrations=[Calibration.shipped("network")])
+    Registrar(proposers=[own], classifier=Classifier.load())
     assert not caplog.messages
     Registrar(proposers=[own])
     assert "fitted to the shipped weights, and this network has others" in caplog.text

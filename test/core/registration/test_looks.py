@@ -71,7 +71,7 @@ def test_the_order_of_the_points_says_nothing(registrar, pair, target, result):
 
 def test_looks_between_which_the_bone_moved_are_refused_by_this_rule_alone(registrar, moved, target, monkeypatch):
     result = registrar.register(moved[0], target, viewpoint=moved[1])
-    assert result.status is RegistrationStatus.AMBIGUOUS and "shows the bone elsewhere" in result.reason
+    assert result.status is RegistrationStatus.AMBIGUOUS and "show the bone elsewhere" in result.reason
     fits = [look.fit for look in result.looks]
     assert 1 <= fits.count(LookFit.APART) <= 3
     assert np.array_equal([look.viewpoint for look in result.looks], np.unique(moved[1], axis=0))

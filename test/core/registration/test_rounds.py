@@ -51,7 +51,7 @@ def test_the_next_proposer_is_asked_for_what_is_not_sure(pair, believing, probab
     registrar = Registrar(replace(SURE_BONE, **settings), [first, second], believing(probability))
     result = registrar.register(pair.source, registrar.prepare(pair.target))
     assert (result.rounds, result.proposer) == (rounds, ("network", "search")[rounds - 1])
-    assert (first.prepared, second.prepared, first.asked, second.asked) == (1, 1, 1, rounds - 1)
+    assert (first.prepared, second.prepared, second.asked) == (1, 1, rounds - 1)
 
 
 def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair, believing):
@@ -59,7 +59,7 @@ def test_a_doubtful_answer_is_kept_among_those_of_the_next_proposer(pair, believ
     first, second = Fixed("network", near[None]), Fixed("search", np.eye(4)[None])
     registrar = Registrar(ONE_THREAD, [first, second], believing(0.7))
     result = registrar.register(pair.source, registrar.prepare(pair.target))
-    assert (first.asked, second.asked, result.rounds) == (1, 1, 2)
+    assert (second.asked, result.rounds) == (1, 2)
     assert se3.pose_error(result.best, pair.T_target_source, pair.source)[0] < 1.0
 
 

@@ -1,7 +1,7 @@
-"""Does the mirror image of a source fit the bone better: the other side of the body, or a flipped scan?
+"""Mirror images: the other side of the body, or a flipped scan, fits the bone better mirrored.
 
-Near the pose the question is cheap. A nonsensical pose on the bone of the other side has a nonsensical image, so an
-answer that is not sure, or of few points, takes the best pose that the first proposer finds for the mirror image.
+Near the pose the test is cheap. A nonsensical pose on the bone of the other side has a nonsensical image. So an answer
+that is not sure, or of few points, takes the best pose that the first proposer finds for the mirror image.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ def parts(stages: dict[str, list[dict[str, float]]]) -> str:
 
 def ratios(wall: dict[str, np.ndarray]) -> str:
     """Our times over those of others, repetition by repetition."""
-    pairs = ((TRACK, GICP), (FOLLOW, GICP), *((FULL[name], KISS[name]) for name in FULL), (TARGET, OPEN3D))
+    pairs = ((TRACK, GICP), *((FULL[name], KISS[name]) for name in FULL), (TARGET, OPEN3D))
     rows = [markdown.row((ours, other, f"{np.median(wall[ours] / wall[other]):.2f}")) for ours, other in pairs]
     return "\n".join([markdown.head(("ours", "over", "median ratio of wall times")), *rows])
 

@@ -1,4 +1,4 @@
-"""Fit what says how sure and how precise an answer is; one command makes the data, the models and their card.
+"""Fit the confidence and the error bound; one command makes the data, the models and their card.
 
     python -m gapr_core.calibration --anatomy DIR --out runs/calibration --jobs 2 --count 3000
 
@@ -47,7 +47,7 @@ from gapr_core.runtime.files import write_json, write_text
 
 Array = NDArray[np.float64]
 
-SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features that every kind has
+SHARED = tuple(name for name in PRECISION_FEATURES if name != "log_tre")  # features of every kind
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,7 +92,7 @@ def _parser() -> ArgumentParser:
 
 
 def _tasks(args: Namespace) -> list[Task]:
-    """The pairs that the options ask for, in the order in which they are registered."""
+    """List the pairs that the options ask for, in the order of their registration."""
     which = (str(args.anatomy), args.split, args.seed)
     tasks = [Task(*which, number) for number in range(args.count)]
     tasks += scenes(*which, args.scenes)
@@ -129,7 +129,7 @@ def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str
 
 
 def fit_precision(kinds: Sequence[tuple[Answers, Array]]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Fit the scale and the factors of the bound to the accepted right answers of each kind; returns its card, too.
+    """Fit scale and bound factors to the accepted right answers of each kind; returns model and card.
 
     Raises:
         ConfigError: nothing is accepted.

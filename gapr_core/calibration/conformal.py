@@ -1,8 +1,8 @@
-"""Fit the precision: how predicted errors at the whole bone compare with true ones, and a bound that holds.
+"""Fit of the precision: the scale of predicted errors at the whole bone, and a bound that holds.
 
-The scale of a predicted standard deviation is an additive model of a few features, of the logarithm of the scale that
-true errors and NEES ask for. The factor of the bound is the conformal quantile of true errors over bounds in bins of
-the confidence (Vovk et al. 2005), of models that had not seen the subject.
+An additive model of a few features predicts the logarithm of the scale of a standard deviation, as true errors and NEES
+require it. The factor of the bound is the conformal quantile of true errors over bounds in bins of the confidence (Vovk
+et al. 2005), by models without the subject.
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from gapr_core.registration.uncertainty.error_calibration import PRECISION_FEATU
 
 Array = NDArray[np.float64]
 MEDIAN_NEES = 5.348  # of chi square with six degrees of freedom
-MEDIAN_RATIO = 0.8  # of a true error to its expected root mean square: of two to three directions that matter
-COVERED = 0.955  # of the errors in a bin: a little above the 95 % that are asked for
+MEDIAN_RATIO = 0.8  # of a true error to its expected root mean square, for two to three effective directions
+COVERED = 0.955  # of the errors in a bin: a little above the required 95 %
 IN_EACH = 0.935  # of the errors of each sensor family in a bin
 BINS = (0.5, 0.8, 0.9, 0.97, 1.0)  # edges of the confidence
-FEWEST = 30  # answers of a bin, or of a family in it, that have a say
+FEWEST = 30  # least answers of a bin, or of a family in it
 
 
 def fit_scale(answers: Answers) -> Additive:
-    """Fit the logarithm of the scale that a predicted standard deviation needs."""
+    """Fit the logarithm of the scale of a predicted standard deviation."""
     by_error = np.log(answers.true_mm / (MEDIAN_RATIO * answers.tre_mm))
     by_nees = 0.5 * np.log(answers.nees / MEDIAN_NEES)  # a variance over a variance
     return fit_centre(precision_table(answers), 0.5 * (by_error + by_nees), PRECISION_FEATURES)
 
 
 def scales(model: Additive, answers: Answers) -> Array:
-    """(N,) as `Precision.scale` gives them."""
+    """Compute (N,) scales, as `Precision.scale`."""
     return np.clip(np.exp(model.values(precision_table(answers))), *SCALE_LIMITS)
 
 
 def precision_table(answers: Answers) -> Array:
-    """(N, P) in the order of `PRECISION_FEATURES`."""
+    """Collect (N, P) features in the order of `PRECISION_FEATURES`."""
     columns = {"log_tre": np.log(np.maximum(answers.tre_mm, 1e-6))}
     columns |= {name: answers.features[:, number] for number, name in enumerate(answers.feature_names)}
     return np.column_stack([columns[name] for name in PRECISION_FEATURES])
 
 
 def scales_of_unseen_families(answers: Answers, known: NDArray[np.bool_]) -> Array:
-    """(N,) scales by models of the known families that have seen neither the subject nor the sensor family."""
+    """Predict (N,) scales by models of the known families without the subject and its sensor family."""
     return of_models_that_saw_neither(answers, known, fit_scale, scales)
 
 
 def scales_of_unseen_people(answers: Answers, known: NDArray[np.bool_]) -> Array:
-    """(N,) scales by models of the known families that have not seen the subject."""
+    """Predict (N,) scales by models of the known families without the subject."""
     return of_models_that_saw_no_subject(answers, known, fit_scale, scales)
 
 
@@ -60,8 +60,8 @@ def factors(scores: Array, confidence: Array, family: NDArray[np.str_]) -> tuple
 
     Args:
         scores: (N,) true errors over their bounds.
-        confidence: (N,) of the answers.
-        family: (N,) sensor families, each of which is covered in each bin.
+        confidence: (N,) confidences of the answers.
+        family: (N,) sensor families, each of which the bound covers in each bin.
 
     Returns:
         Middle confidence and factor of each bin that has enough answers.
@@ -82,7 +82,7 @@ def conformal_quantile(scores: Array, share: float) -> float:
     """Find a number that the next score of the same kind stays below with at least this probability.
 
     The k-th smallest of n scores, k = ceil((n + 1) share): one more than the plain quantile has (Vovk et al. 2005).
-    Where k > n, as of 5 scores for .95, it is the largest one, which the next score stays below with n / (n + 1) only.
+    Where k > n, as of 5 scores for .95, it is the largest one, which the next score stays below only with n / (n + 1).
     """
     k = int(np.ceil((len(scores) + 1) * share))
     return float(np.sort(scores)[min(k, len(scores)) - 1])
@@ -92,9 +92,9 @@ def coverage(answers: Answers, scale: Array, factor: Array) -> dict[str, dict[st
     """Measure how often the bound holds, its width, and the NEES: all, by family, by round.
 
     Args:
-        answers: N accepted ones with a truth.
-        scale: (N,) of the standard deviations.
-        factor: (N,) of the bound.
+        answers: N accepted answers with a truth.
+        scale: (N,) scales of the standard deviations.
+        factor: (N,) factors of the bound.
     """
     groups = {"all": np.full(len(answers), True)}
     groups |= {str(name): answers.family == name for name in np.unique(answers.family)}

@@ -135,8 +135,8 @@ def _check_new(points: Array, result: RegistrationResult) -> None:
 def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
     """Measure signed distances (N,), mm, of points (N, 3) to the surface under a pose, and its normals.
 
-    They are exact where the target is a mesh. Off the edge of a model that was cut off, what a point lies beyond it
-    counts as well.
+    They are exact where the target is a mesh, and NaN where no surface is near. Past the edge of a cut model the
+    distance to it counts as well.
     """
     if exact := target.mesh_distances(se3.apply(T, points)):
         return exact

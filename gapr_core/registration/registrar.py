@@ -5,7 +5,7 @@
 | clean and thin the source | `problem.source` |
 | propose poses, keep the best distinct ones, refine the best, compute its two numbers | `_in_rounds` |
 | the same for a camera's cloud, most of which may not be bone | `scenes.rounds` |
-| ask the costly checks, correct pose and covariance | `_checked` |
+| apply the costly checks, correct pose and covariance | `_checked` |
 | weigh the sources before it | `streams.evidence`, of a stream only |
 | fold numbers and findings into the answer | `checks.conclude` |
 """
@@ -55,26 +55,26 @@ log = logging.getLogger(__name__)
 Own = TypeVar("Own", bound="Registrar")
 Array = NDArray[np.float64]
 
-Enough = Callable[[Assessment], bool]  # whether an answer that is not sure by itself needs no other proposer
+Enough = Callable[[Assessment], bool]  # True for an unsure answer that needs no other proposer
 
 NO_POSES = np.empty((0, 4, 4))
 NO_POSE = Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
-WITHIN_MM = 15.0  # root mean square over the source: refinement comes from there to the same pose
+WITHIN_MM = 15.0  # root mean square over the source from which refinement reaches the same pose
 
 
 def never(assessment: Assessment) -> bool:
-    """Only a sure answer is enough."""
+    """Stop only with a sure answer."""
     return False
 
 
 class Registrar:
     """Registers partial sources to one or many prepared targets.
 
-    Proposers are asked in turn, each round with the poses of all so far, until an answer is sure
-    (`RegistrarConfig.sure`): with the shipped weights the network first, then the exhaustive search.
+    Proposers run in turn, each round with the poses of all so far, until an answer is sure (`RegistrarConfig.sure`).
+    With the shipped weights the network is first, then the exhaustive search.
 
     Args:
-        config: every setting.
+        config: settings of the registration.
         proposers: sources of hypotheses; the weight-free search when not given.
         classifier: model of the two numbers; the shipped one when not given, with a warning for a network of other
             weights than those it was fitted to.
@@ -110,8 +110,8 @@ class Registrar:
         """Load the best registrar that ships: GAPR-Net, then the search; nothing is downloaded.
 
         Args:
-            config: every setting.
-            device: where the network runs: "cpu", "cuda", or "auto" for the GPU where there is one.
+            config: settings of the registration.
+            device: device of the network: "cpu", "cuda", or "auto" for the GPU where there is one.
 
         Raises:
             MethodUnavailableError: torch is not installed; `Registrar()` works without.
@@ -121,7 +121,7 @@ class Registrar:
         return cls(config, (shipped_network(device), _search(config)))
 
     def of_bone_alone(self: Own) -> Own:
-        """Copy the registrar for sources that are all bone: those that were seen from several places."""
+        """Copy the registrar for sources that are all bone: those seen from several places."""
         twin = copy(self)
         twin.config = replace(self.config, clutter=replace(self.config.clutter, infer_viewpoint=False))
         return twin
@@ -147,21 +147,21 @@ class Registrar:
             source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
-            viewpoint: (3,) mm, source frame: place of the camera, if there was one; (N, 3) its place for each point, of
-                a camera that moved around a bone at rest. Without it the cloud is registered as bone. Where that pose
-                is refused, it is registered as a camera's cloud (`ClutterConfig.infer_viewpoint`).
+            viewpoint: (3,) mm, source frame: place of the camera, if there was one; (N, 3) its place for each
+                point, of a camera that moved in a frame in which the bone rests. Without it the cloud is registered as
+                bone, and where that pose is refused, as a camera's cloud (`ClutterConfig.infer_viewpoint`).
 
         Raises:
-            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm. Also a
-                target that is not prepared, an `initial` that is no rigid pose, and a `viewpoint` that sees nothing of
-                the cloud or names more than 16 places.
+            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm. A target
+                that is not prepared, or an `initial` that is no rigid pose. A `viewpoint` that is neither, or that sees
+                nothing of the cloud; more than 16 places.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
 
     @single_threaded_libraries
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
-        """Fold an assessment into the answer; all of it is the caller's own and shares no array with a stream."""
+        """Fold an assessment into the answer; the answer shares no array with a stream."""
         if isinstance(assessment, Refusal):
             reason = assessment.reason
             return RegistrationResult(assessment.status, reason=reason, method=self.name, stage_ms=clock.stages)
@@ -199,7 +199,7 @@ class Registrar:
         clock: Clock,
         enough: Enough = never,
     ) -> Assessment | Refusal:
-        """Assess with any number of poses to try as well: (K, 4, 4) T_target_source, mm, each rigid."""
+        """Assess with any number of start poses: (K, 4, 4) T_target_source, mm, each rigid."""
         target = offset_surface(target, self.config.sensor)
         if viewpoint is not None:
             return self._as_scene(scenes.split(source, viewpoint), target, start, clock, enough)
@@ -217,7 +217,7 @@ class Registrar:
     def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """Register a source of which all points may be bone; to both cortices where the residuals ask for it."""
+        """Register a source of which all points may be bone; to both cortices where it follows both."""
         assessment = self._in_rounds(source, target, poses, clock, enough)
         if assessment is None or not cortices.follows_both(assessment, self.config):
             return assessment
@@ -228,14 +228,14 @@ class Registrar:
     def _in_rounds(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough = never
     ) -> Assessment | None:
-        """Ask one proposer after the other, each with the poses of all so far, until an answer is good enough."""
+        """Run one proposer after the other, each with the poses of all so far, until an answer is good enough."""
         config, assessment, given = self.config, None, len(poses)
         for number, proposer in enumerate(self.proposers, 1):
             rng = np.random.default_rng(config.seed)
             proposed = proposer.propose(source, target, rng).poses
             clock.lap("propose")
             if not len(proposed):
-                continue  # a pose that was given is not weighed against nothing
+                continue  # a given pose needs a rival
             poses = np.concatenate([poses, proposed])
             candidates = verify(poses, source, target, config.verification, config.num_threads)
             clock.lap("verify")
@@ -254,9 +254,9 @@ class Registrar:
         return assessment.reaches(self.config.sure_from)
 
     def _is_near(self, assessment: Assessment, proposed: Array) -> bool:
-        """True where a proposer would have come to the best pose without one that was given.
+        """Return True where a proposer would have reached the best pose without a given one.
 
-        Where none would, its poses are no rivals to the given one: the pose that it missed may be the right one, too.
+        Else its poses are no rivals to the given one: the pose that it missed may be the right one, too.
         """
         count, T = self.config.verification.markers, assessment.fit.T[None]
         return bool(support(T, proposed, assessment.source, count, WITHIN_MM)[0] > 0.0)
@@ -264,7 +264,7 @@ class Registrar:
     def _checked(
         self, assessment: Assessment, clock: Clock, enough: Enough, mirrored_scene: image.RegisterScene | None = None
     ) -> Assessment:
-        """Ask the costly checks of a pose that may yet be accepted, then correct pose and covariance."""
+        """Apply the costly checks to a pose that may be accepted, then correct pose and covariance."""
         config = self.config
         if assessment.reaches(config.worth_checking):
             believed = assessment.reaches(config.sure_from) or enough(assessment)
@@ -318,7 +318,7 @@ class Registrar:
     def _all_of_scene(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """Register all looks of a scene; `memory.TrackingRegistrar` asks remembered poses first."""
+        """Register all looks of a scene; `memory.TrackingRegistrar` tries the previous poses first."""
         return self._in_scene(scene, target, start, clock)
 
     def _in_scene(
@@ -352,12 +352,12 @@ class Registrar:
         return clutter.inferred_places(source, self.config)
 
     def _of_unsure_views(self, unsure: list[Assessment], clock: Clock) -> Assessment | None:
-        """Give no answer: a source by itself is rather refused as bone; in a stream it may be a view."""
+        """Return no answer: a single source is rather refused as bone; in a stream it may be a view."""
         return None
 
 
 def as_config(config: object) -> RegistrarConfig:
-    """Return the settings, if they are some."""
+    """Return the settings if they are a `RegistrarConfig`, else raise."""
     if not isinstance(config, RegistrarConfig):
         how = "pass RegistrarConfig(...); weights of your own go into NetworkProposer.from_weights"
         raise ConfigError("a RegistrarConfig", repr(config), how)
@@ -380,7 +380,7 @@ def shipped_network(device: str = "cpu") -> Proposer:
 
 
 def check_call(target: object, initial: ArrayLike | None) -> None:
-    """Refuse a target that is not prepared, and an `initial` that is no rigid pose, before anything is forgotten.
+    """Refuse a target that is not prepared, or an `initial` that is no rigid pose, before any change of state.
 
     Raises:
         InvalidPointCloudError: as `Registrar.register`.

@@ -14,7 +14,6 @@ NO_VERB = re.compile(
 )
 TO_DO = (  # packages whose docstrings are still to be shortened: this list only shrinks
     "gapr_core/__init__.py",
-    "gapr_core/calibration",
     "gapr_core/cli.py",
     "gapr_core/clouds.py",
     "gapr_core/commands",

@@ -1,7 +1,7 @@
-"""The one fold: numbers and findings become an answer.
+"""The fold of numbers and findings into an answer.
 
 Order: a finding that refuses, the user's `min_confidence`, the user's `max_tre_mm`, the name of a refusal of a cloud
-that is mostly not bone, and the questions that a refusal asks.
+that is mostly not bone, and the questions of a refusal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
-OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # taken for mm by mistake
+OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # units that may be mistaken for mm
 STANDOFF_BETTER = 0.15  # log of mean squares: refused sources without a stand-off hardly fit better by more
 
 
@@ -33,7 +33,7 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
     Args:
         assessment: the best pose with its numbers and findings.
         config: thresholds of the user.
-        clutter: name of the refusal where most of the cloud is not this bone, should it be refused.
+        clutter: name of the refusal where most of the cloud is not this bone.
     """
     a, tre95_mm = assessment, assessment.tre95_mm
     refusal = a.refusal or below_thresholds(a, tre95_mm, config)
@@ -99,7 +99,7 @@ def by_threshold(
 
 
 def questions(a: Assessment, refusal: Finding, config: RegistrarConfig) -> Sequence[Finding]:
-    """Ask of a refused source whether its unit, or its stand-off, is right."""
+    """Ask whether the unit, or the stand-off, of a refused source is right."""
     if refusal.status is RegistrationStatus.DEGENERATE:
         asked = unit_question(a.source.points, a.target.points)
     elif refusal.status is RegistrationStatus.LOW_CONFIDENCE and a.seen is None:
@@ -112,10 +112,10 @@ def questions(a: Assessment, refusal: Finding, config: RegistrarConfig) -> Seque
 def unit_question(source: Array, target: Array) -> Finding | None:
     """Ask for the unit where the cloud would have the bone's size in another one.
 
-    A short scan of a long bone is as small as a whole one in cm that is taken for mm: no check can distinguish them.
+    A short scan of a long bone is as small as a whole one in cm taken for mm: no check can distinguish them.
 
     Args:
-        source, target: (N, 3) and (M, 3), mm, as they are read now.
+        source, target: (N, 3) and (M, 3), read as mm.
     """
     low, high = PLAUSIBLE
     extent_mm, target_mm = Surface(source).extent_mm, Surface(target).extent_mm

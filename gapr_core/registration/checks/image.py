@@ -1,9 +1,7 @@
-"""Does the mirror image of a source fit the bone better?
+"""Mirror images: the other side of the body, or a flipped scan, fits the bone better mirrored.
 
-Then it is of the other side of the body, or a scan was flipped.
-
-Near the pose the question is cheap. A nonsensical pose on the bone of the other side has a nonsensical image. So an
-answer that is not sure, or of few points, asks the first proposer for the best pose of the mirror image.
+Near the pose the test is cheap. A nonsensical pose on the bone of the other side has a nonsensical image. So an answer
+that is not sure, or of few points, takes the best pose that the first proposer finds for the mirror image.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ from gapr_core.runtime.clock import Clock
 Propose = Callable[[PreparedSource, PreparedTarget, Clock], Candidates | None]
 RegisterScene = Callable[[], Assessment | None]
 
-FEW_POINTS = 400  # chance lets the image of so few fit anywhere on the bone
+FEW_POINTS = 400  # points up to which the image may fit somewhere on the bone by chance
 
 
 def log_ratio(
@@ -44,11 +42,11 @@ def log_ratio(
 
     Args:
         assessment: the answer.
-        config: every setting.
+        config: settings of the registration.
         believed: the answer is sure.
         propose: finds poses of the mirror image.
-        scene: registers the mirror image of all that a camera saw; None where no place of a camera was given.
-        clock: of the call.
+        scene: registers the mirror image of a camera's whole view; None without a given place of a camera.
+        clock: stage times of the call.
     """
     trial, count = trial_of(assessment, config), len(assessment.source.points)
     if alternatives.is_symmetric(trial):
@@ -72,7 +70,7 @@ def flipped_looks(seen: Sequence[Look]) -> list[Look]:
 
 
 def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config: RegistrarConfig) -> float:
-    """Take the larger log ratio, of mean squares or robust variances: chance lays a few gross points on an image."""
+    """Take the larger log ratio, of mean squares or robust variances: gross points may lie on an image by chance."""
     own = float(a.candidates.scores[0])
     if a.seen is not None:  # a scene's own scores are no mean squares
         own = mean_square_mm2(a.fit.T, a.source, a.target, config.verification, config.num_threads)
@@ -84,9 +82,9 @@ def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config:
 
 
 def _of_scene(assessment: Assessment, image: Assessment | None) -> float:
-    """Log ratio of the scores of lines of sight, 1 / score each; infinite where the image is no surer.
+    """Compute the log ratio of scores of lines of sight, 1 / score each; infinite where the image is no surer.
 
-    A poor image may give its mirror image a slightly better score. On the bone of the other side that is sure (.999).
+    A poor image may score slightly better mirrored. On the bone of the other side the mirrored one is sure (.999).
     """
     if image is None or not image.confidence > assessment.confidence:
         return np.inf

@@ -1,7 +1,7 @@
-"""Every check of a pose, as one table: each measures, compares with its threshold, and may find.
+"""Table of the checks of a pose: each compares a statistic with its threshold, and may give a finding.
 
-A check refuses only what no probability can weigh: a motion that is not observed, a rival that is as good, a mirror
-image. What can be learned is a feature of the classifier. `docs/checks.md` has a row for each check, with its gain.
+A check refuses only where no probability can decide: a motion that is not observed, a rival that is as good, a mirror
+image. Anything learnable is a feature of the classifier. `docs/concepts/checks.md` has a row for each check.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Check = Callable[[Assessment, RegistrarConfig], Assessment]
 Register = Callable[[PreparedSource], Assessment | None]
 
 LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations of a motion that is not observed
-EQUAL_SHARE, EQUAL_MM = 0.015, 0.25  # a rival whose mean square is larger by less is as good; the same as a length
+EQUAL_SHARE, EQUAL_MM = 0.015, 0.25  # mean square of a rival as good over the best's, less 1; the same as a length
 MIRRORED_BETTER = 0.01  # log of mean squares by which the mirror image may fit better
 MORE_BONE = "measure another side or an end of the bone"
 
@@ -65,10 +65,10 @@ def flat_valley(a: Assessment, config: RegistrarConfig) -> Assessment:
 
 
 def as_good_as(mean_square_mm2: float) -> float:
-    """Mean square, mm^2, below which another pose explains the source as well as one of this mean square.
+    """Compute the mean square, mm^2, below which another pose explains the source as well as one of this mean square.
 
     Above 2 mm of noise a small share is chance. Below it the target's own roughness decides between such poses:
-    terraces of voxels, or what a smooth element leaves of an edge.
+    terraces of voxels, or the misfit of a smooth element at an edge.
     """
     return max((1.0 + EQUAL_SHARE) * mean_square_mm2, mean_square_mm2 + EQUAL_MM**2)
 
@@ -90,7 +90,7 @@ def one_rigid_piece(a: Assessment, config: RegistrarConfig) -> Assessment:
 
 
 def turn_text(a: Assessment) -> str:
-    """Say how far the bone could still be turned, about an axis of its own."""
+    """Describe the largest turn that the points leave open, about an axis of the bone."""
     turn_deg = a.uncertainty.largest_turn_deg
     axis = axis_name(a.uncertainty.weakest_turn, a)
     how = f"by {turn_deg:.0f} degrees" if turn_deg <= 180.0 else "freely"
@@ -98,7 +98,7 @@ def turn_text(a: Assessment) -> str:
 
 
 def shift_text(a: Assessment) -> str:
-    """Say how far the bone could still be shifted, along an axis of its own."""
+    """Describe the largest shift that the points leave open, along an axis of the bone."""
     shift_mm = a.uncertainty.largest_shift_mm
     axis = axis_name(a.uncertainty.weakest_shift, a)
     how = f"by {shift_mm:.0f} mm" if shift_mm <= 1000.0 else "freely"
@@ -112,9 +112,9 @@ def axis_name(direction: np.ndarray, a: Assessment) -> str:
 
 
 DEGENERATE, AMBIGUOUS = RegistrationStatus.DEGENERATE, RegistrationStatus.AMBIGUOUS
-GEOMETRY: tuple[Check, ...] = (unobserved_motion, equal_rival)  # of every pose
-COSTLY: tuple[Check, ...] = (flat_valley,)  # of one that may be accepted
-WIDENING: tuple[Check, ...] = (one_rigid_piece,)  # of one that is accepted
+GEOMETRY: tuple[Check, ...] = (unobserved_motion, equal_rival)  # checks of every pose
+COSTLY: tuple[Check, ...] = (flat_valley,)  # checks of a pose that may be accepted
+WIDENING: tuple[Check, ...] = (one_rigid_piece,)  # checks of an accepted pose
 
 
 def _refuse(

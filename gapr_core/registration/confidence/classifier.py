@@ -1,8 +1,8 @@
-"""Two questions, two numbers: is this the right pose, and is this the right bone?
+"""The two numbers of an answer: the probability of the right pose, and the evidence for the right bone.
 
 P(right) = P(pose | this bone) x P(this bone). The first factor is the expit of an additive model of the features. The
 second follows from a likelihood ratio of this bone to another subject's, also an additive model, and from a prior that
-the ward knows and the data do not. Both models are fitted by `python -m gapr_core.calibration`; each feature adds its
+the ward knows and the data do not. Both models are fitted by `python -m gapr_core.calibration`. Each feature adds its
 share to the log odds, so an answer can be read.
 """
 
@@ -20,8 +20,8 @@ from gapr_core.registration.confidence.additive import FIT_AGAIN, Additive, from
 from gapr_core.registration.confidence.features import FEATURES_OF
 
 SHIPPED = Path(__file__).parents[2] / "weights" / "confidence.json"
-LARGEST_LOG_ODDS = 9.0  # a few thousand records say nothing of rarer errors than one in eight thousand
-LARGEST_EVIDENCE = 3.0  # log10: as few pairs of subjects say nothing of rarer look-alikes than one in a thousand
+LARGEST_LOG_ODDS = 9.0  # a few thousand records cannot show errors rarer than one in eight thousand
+LARGEST_EVIDENCE = 3.0  # log10: the pairs of subjects cannot show look-alikes rarer than one in a thousand
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Judgement:
 
 
 def joint(judgement: Judgement, other_bone_prior: float) -> float:
-    """P(pose | this bone) x P(this bone).
+    """Compute P(pose | this bone) x P(this bone).
 
     Args:
         judgement: the two numbers.
@@ -55,7 +55,7 @@ def joint(judgement: Judgement, other_bone_prior: float) -> float:
 
 
 def bone_probability(evidence: float, other_bone_prior: float) -> float:
-    """Posterior probability of this bone: 1 / (1 + pi / (1 - pi) 10^-evidence)."""
+    """Compute the posterior probability of this bone: 1 / (1 + pi / (1 - pi) 10^-evidence)."""
     if not 0.0 < other_bone_prior < 1.0:
         return 1.0 - other_bone_prior
     return float(expit(np.log(10.0) * evidence - np.log(other_bone_prior / (1.0 - other_bone_prior))))
@@ -63,7 +63,7 @@ def bone_probability(evidence: float, other_bone_prior: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Classifier:
-    """The models of both numbers, for sources that are bone alone and for a camera's clouds.
+    """Models of both numbers, for sources that are bone alone and for a camera's clouds.
 
     Attributes:
         pose: model of the pose's log odds, by kind (`features.FEATURES_OF`).

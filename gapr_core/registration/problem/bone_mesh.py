@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-NEIGHBOURS = 12  # surface elements that are compared with a face
+NEIGHBOURS = 12  # surface elements compared with a face
 ALIKE = 0.5  # cosine of normals, whatever their signs: a flatter angle is another side of an edge
 ONE_WAY = 0.5  # mean of the sides, 1 or -1, above which the faces are wound one way, as those of most meshes
 ON_BORDER = 1e-6  # barycentric coordinate: the nearest point lies on an edge or a corner
@@ -28,7 +28,7 @@ class BoneMesh:
         faces: (F, 3) indices into the vertices.
         normals: (F, 3) unit, outward.
         at_vertices: (N, 3) sums of the normals around, by area.
-        tree: libigl's, over the faces.
+        tree: libigl's tree over the faces.
     """
 
     vertices: Array
@@ -38,7 +38,7 @@ class BoneMesh:
     tree: Any
 
     def distances(self, points: Array) -> tuple[Array, Array]:
-        """Signed distances (K,) of points (K, 3), mm, positive outside, and their gradients (K, 3)."""
+        """Measure signed distances (K,) of points (K, 3), mm, positive outside, and their gradients (K, 3)."""
         import igl
 
         squared, face, nearest = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points))
@@ -55,12 +55,12 @@ class BoneMesh:
 
 
 def build(vertices: Array, faces: Faces, kept: tuple[Array, Array], dropped: Array) -> BoneMesh:
-    """The faces on which the surface elements lie.
+    """Build the mesh of the faces on which the surface elements lie.
 
     Args:
-        vertices, faces: of the whole mesh.
+        vertices, faces: vertices and faces of the whole mesh.
         kept: (M, 3) points of the surface elements, and their outward normals (M, 3).
-        dropped: (D, 6) points and normals of what was left out: inner surfaces and flat ends.
+        dropped: (D, 6) points and normals of omitted surfaces: inner ones and flat ends.
     """
     import igl
 
@@ -89,5 +89,5 @@ def build(vertices: Array, faces: Faces, kept: tuple[Array, Array], dropped: Arr
     tree = igl.AABB()
     tree.init(vertices, used)
     mesh = BoneMesh(vertices, used, outward, at_vertices, tree)
-    weakref.finalize(mesh, mesh.__dict__.clear)  # a tree that is left when Python ends is complained of on the terminal
+    weakref.finalize(mesh, mesh.__dict__.clear)  # a tree that is left when Python ends prints a complaint
     return mesh

@@ -48,9 +48,9 @@ class PreparedTarget:
         both_cortices: the same with the inner cortex of a hollow bone, for a source that follows both; else None.
         elements: (M, 13) points, normals, shapes (xx xy xz yy yz zz) and variances (mm^2: how badly an element fits its
             surroundings, at an edge or a thin blade) side by side, for the compiled loops.
-        cache: what proposers keep per target (a network's features).
+        cache: results that proposers keep per target (a network's features).
         drawn: (S, 6) points and normals, `points` among them and those of flat ends and of an inner cortex.
-        offset_mm: how far outside of `points` a sensor sees the surface (`sensor.offset_surface`); in `elements`.
+        offset_mm: distance of the surface that a sensor sees from `points`, outwards; in `elements`.
     """
 
     points: Array

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from gapr_core.config import SENSOR_KINDS
 from gapr_core.runtime.settings import Settings, range_text, setting, why_not
-from msg_adapters import INPUTS
 
 if TYPE_CHECKING:
     from rcl_interfaces.msg import ParameterDescriptor
@@ -35,7 +34,7 @@ READ_BY_LAUNCH = (  # needs no declaration
     "sigkill_timeout",
     "ros_namespace",
 )
-TRE_M, BONE_M, ROOM_M = 0.1, 1.0, 100.0  # longer lengths are odd for a bound, for a limit at a bone, for one in a room
+LONGEST_M = {"max_tre": 0.1, "max_jump_translation": 1.0, "crop_min": 100.0, "crop_max": 100.0}  # more may be mm
 MOST_LOOKS = 16  # of a camera that are registered as one, however many are asked for
 TOGETHER = {"pointer": 500, "ultrasound": 50}  # clouds that are registered as one: each says little by itself
 Triple = tuple[float, float, float]
@@ -47,90 +46,56 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class NodeParameters(Settings):
-    """All parameters of register_node. Lengths in metres, times in seconds, angles in radians.
+    """All parameters of register_node. Lengths in metres, times in seconds, angles in radians; 0 switches a limit off.
 
-    `live=False`: read when configuring.
+    `live=False`: read when configuring. `group`: heading in the parameter file, at its first parameter.
     """
 
-    model_path: str = setting(
-        "",
-        "file of the pre-operative bone: a mesh, a cloud or a label map (docs/reference/formats.md); "
-        "model_... are read when configuring and by ~/reload_model",
-    )
+    model_path: str = setting("", "file of the bone: a mesh, a cloud or a label map (docs/reference/formats.md)",
+                              group="model: which bone")  # fmt: skip
     model_label: str = setting("", "name or number of the bone in a label map; several, with commas, are one bone")
-    model_unit: str = setting("auto", "unit of that file; auto guesses mm or m from the extent and warns",
+    model_unit: str = setting("auto", "unit of the file; auto guesses mm or m from the extent and warns",
                               choices=("auto", "mm", "cm", "m"))  # fmt: skip
-    model_scale: float = setting(1.0, "the bone is multiplied by this", low=1e-6)
-    model_axes: str = setting("as_is", "axes of a mesh file: auto is what it says of itself; ras is turned to LPS, "
+    model_axes: str = setting("as_is", "axes of a mesh file; auto: as the file states; ras is turned to LPS, "
                               "lps_to_ras to RAS", choices=("as_is", "auto", "lps", "ras", "lps_to_ras"))  # fmt: skip
-    model_frame: str = setting("bone_preop", "frame of the pre-operative bone, child of every pose", live=False)
+    model_frame: str = setting("bone_preop", "frame of the bone, child of every pose", live=False)
+
+    cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "cm", "mm"),
+                              group="input: what measures, and where")  # fmt: skip
+    sensor: str = setting("unknown", "kind of sensor; sets the errors to expect", choices=SENSOR_KINDS, live=False)
     output_frame: str = setting("", "frame of the poses; empty: the frame of the cloud", live=False)
-    tf_timeout: float = setting(
-        0.1, "longest wait for a transform: of output_frame, crop_frame, viewpoint, initialpose",
-        unit="s", low=0.0, high=60.0,
-    )  # fmt: skip
-    max_tf_gap: float = setting(
-        0.25, "where a frame was not heard for longer than this, nothing is interpolated; 0: off", unit="s", low=0.0
-    )
-    cloud_type: str = setting("PointCloud2", "message type of the clouds", choices=tuple(INPUTS), live=False)
-    cloud_unit: str = setting("m", "unit of the clouds; never guessed", choices=("m", "cm", "mm"))
-    cloud_reliability: str = setting("auto", "auto: reliable, and best effort once a publisher offers only that",
-                                     choices=("auto", "reliable", "best_effort"), live=False)  # fmt: skip
-    min_points: int = setting(
-        200, "fewer usable points are refused; counted over all clouds that are registered as one", low=3
-    )
-    max_points: int = setting(200_000, "larger clouds are thinned to this; 0: never", low=0)
-    range_min: float = setting(0.0, "nearer points are left out; 0: off", unit="m", low=0.0)
-    range_max: float = setting(0.0, "farther points are left out; 0: off", unit="m", low=0.0)
-    max_cloud_age: float = setting(0.0, "older clouds are refused; 0: off", unit="s", low=0.0)
-    max_future: float = setting(0.5, "clouds stamped farther ahead of the clock are refused; 0: off", unit="s", low=0.0)
-    crop_frame: str = setting("", "frame of the box that clouds are cropped to; empty: that of the cloud", live=False)
-    crop_min: Triple = setting((0.0, 0.0, 0.0), "its lowest corner; the same as crop_max: no box", unit="m")
-    crop_max: Triple = setting((0.0, 0.0, 0.0), "its highest corner", unit="m")
-    crop_to_track: float = setting(0.0, "after a good pose, points farther from the bone there are left out; 0: off",
-                                   unit="m", low=0.0)  # fmt: skip
-    viewpoint: str = setting("auto", "where the camera is: auto (its pixels or its surface may show it), none (all is "
+    tf_timeout: float = setting(0.1, "longest wait for a transform", unit="s", low=0.0, high=60.0)
+    crop_frame: str = setting("", "frame of the crop box; empty: the frame of the cloud", live=False)
+    crop_min: Triple = setting((0.0, 0.0, 0.0), "lowest corner of the crop box; equal to crop_max: no box", unit="m")
+    crop_max: Triple = setting((0.0, 0.0, 0.0), "highest corner of the crop box", unit="m")
+    viewpoint: str = setting("auto", "place of the camera: auto (from its pixels or surface), none (all points are "
                              "bone), origin (of the cloud's frame), or a frame", live=False)  # fmt: skip
-    sensor: str = setting("unknown", "what measures the clouds; says what errors to expect",
-                          choices=SENSOR_KINDS, live=False)  # fmt: skip
-    standoff: float = setting(0.0, "how far outside of the bone the points lie; 0: what is usual for the sensor",
-                              unit="m", low=-0.01, high=0.01, live=False)  # fmt: skip
-    model_error: float = setting(-1.0, "standard deviation of how much too thick or too thin the bone's model is; 0: "
-                                 "it is exact; below 0: 0.0003, or what the file of settings says",
-                                 unit="m", low=-1.0, high=0.01, live=False)  # fmt: skip
-    min_confidence: float = setting(0.5, "poses below are refused", low=0.0, high=1.0)
-    max_tre: float = setting(0.0, "poses whose 95 % bound of the error over the bone is larger are refused; 0: off",
-                             unit="m", low=0.0)  # fmt: skip
-    require_consecutive: int = setting(1, "a pose goes out after this many good ones in a row", low=1, high=1000)
-    max_jump_translation: float = setting(0.0, "poses farther from the last one are refused; 0: off", unit="m", low=0.0)
-    max_jump_rotation: float = setting(
-        0.0, "poses turned farther from the last one are refused; 0: off", unit="rad", low=0.0, high=3.15
-    )
-    continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register")
-    track: bool = setting(True, "start where the last pose was; false: every cloud by itself", live=False)
-    assess_every: int = setting(1, "of so many clouds one is assessed; the others may go to ~/followed_pose alone",
-                                low=1, high=1000)  # fmt: skip
+    max_cloud_age: float = setting(0.0, "clouds older than this are refused, also once registered; 0: off", unit="s",
+                                   low=0.0)  # fmt: skip
     accumulate: int = setting(0, "clouds registered as one; the bone must rest in output_frame; 0: as the sensor needs",
                               low=0, high=10_000, live=False)  # fmt: skip
-    max_rate: float = setting(0.0, "most registrations a second; 0: as many as possible", low=0.0, high=1000.0)
-    timeout: float = setting(5.0, "a registration that took longer is refused", unit="s", low=1e-3)
-    publish_tf: bool = setting(True, "send accepted poses to /tf", live=False)
-    publish_hypotheses: bool = setting(False, "send poses that are not believed to ~/hypotheses, to look at")
-    guide: bool = setting(False, "work out where to look next, for ~/guidance and ~/next_view; takes time", live=False)
-    settings_file: str = setting("", "YAML file as for `gapr register --config`; it must not contradict a parameter",
+
+    min_confidence: float = setting(0.5, "poses below are refused", low=0.0, high=1.0,
+                                    group="gates: which poses go out")  # fmt: skip
+    max_tre: float = setting(0.0, "poses with a larger 95 % bound of the error over the bone are refused; 0: off",
+                             unit="m", low=0.0)  # fmt: skip
+    pose_lifetime: float = setting(2.0, "a pose that no newer one follows is withdrawn after this; 0: never", unit="s",
+                                   low=0.0)  # fmt: skip
+    error_after: int = setting(5, "so many refusals in a row are an ERROR in the diagnostics; 0: never", low=0)
+    max_jump_translation: float = setting(0.0, "poses farther from the last one are refused; 0: off", unit="m", low=0.0)
+    max_jump_rotation: float = setting(0.0, "poses turned farther from the last one are refused; 0: off", unit="rad",
+                                       low=0.0, high=3.15)  # fmt: skip
+
+    continuous: bool = setting(True, "register every cloud that time allows; false: only on ~/register",
+                               group="behaviour: how clouds are registered")  # fmt: skip
+    track: bool = setting(True, "start at the last pose; false: every cloud by itself", live=False)
+    guide: bool = setting(False, "compute where to look next, for ~/debug/next_view; takes time", live=False)
+    device: str = setting("auto", "where the network runs", choices=("auto", "cpu", "cuda"), live=False)
+    settings_file: str = setting("", "YAML file as for `gapr register --config`; must not contradict a parameter",
                                  live=False)  # fmt: skip
-    device: str = setting("auto", "where a network runs", choices=("auto", "cpu", "cuda"), live=False)
-    num_threads: int = setting(0, "threads of a registration; 0: all cores", low=0, high=1024, live=False)
-    seed: int = setting(
-        0, "seed of the thinning to max_points, and of a proposer that draws", low=0, high=2**31 - 1, live=False
-    )
-    autostart: bool = setting(True, "configure and activate without a lifecycle manager; read when the node starts",
-                              live=False)  # fmt: skip
-    diagnostics_period: float = setting(1.0, "time between two diagnostics", unit="s", low=0.01, high=3600.0)
-    covariance_floor_translation: float = setting(
-        1e-4, "smallest standard deviation of a translation", unit="m", low=1e-9
-    )
-    covariance_floor_rotation: float = setting(1e-3, "smallest standard deviation of a rotation", unit="rad", low=1e-9)
+    autostart: bool = setting(True, "configure and activate at the start; false: a lifecycle manager does", live=False)
+
+    publish_tf: bool = setting(True, "send accepted poses to /tf", live=False, group="output")
 
     @property
     def collects(self) -> bool:
@@ -139,13 +104,18 @@ class NodeParameters(Settings):
 
     @property
     def names_a_place(self) -> bool:
-        """Whether every cloud is registered as what a camera saw from a place that is known."""
+        """Whether every cloud is registered as what a camera saw from a known place."""
         return self.viewpoint not in NO_FRAME and not (self.collects and self.sensor in TOGETHER)
 
     @property
     def collects_looks(self) -> bool:
-        """Whether clouds that are registered as one are looks of a camera, each from a place of its own."""
+        """Whether clouds that are registered as one are looks of a camera, each from its own place."""
         return self.collects and self.names_a_place
+
+    @property
+    def has_box(self) -> bool:
+        """Whether clouds are cropped to a box."""
+        return self.crop_min != self.crop_max
 
 
 FIELDS: Mapping[str, Field] = {f.name: f for f in fields(NodeParameters)}
@@ -181,69 +151,34 @@ def remarks(parameters: NodeParameters) -> list[str]:
     sensor, sentences = parameters.sensor, []
     if sensor == "unknown":
         sentences.append("sensor is not set, and tre95 allows for any: set it to what measures the clouds")
-    if sensor != "structured_light":
-        stated = "where settings_file states it (sensor: tracking_mm, tracking_deg)"
-        sentences.append(f"an error of the whole cloud's place, such as a tracker's, is in tre95 only {stated}")
     if parameters.max_tre == 0.0:
-        sentences.append("max_tre is 0: a pose goes out however large its tre95 over the bone is")
-    if sensor in TOGETHER and parameters.collects:
-        sentences.append(f"sensor {sensor}: the last {parameters.accumulate} clouds are registered as one")
-    elif sensor in TOGETHER and not parameters.output_frame:
+        sentences.append("max_tre is 0: a pose goes out however large its tre95 is")
+    if sensor in TOGETHER and not parameters.collects and not parameters.output_frame:
         why = "output_frame is empty: name the frame of the reference that is fixed to the bone"
         sentences.append(f"sensor {sensor}: every cloud is registered by itself, because {why}")
-    if parameters.collects and not parameters.output_frame:
-        sentences.append("output_frame is empty: clouds are collected in their own frames, in which the bone must rest")
-    if parameters.collects_looks:
-        count = min(parameters.accumulate, MOST_LOOKS)
-        most = f", {MOST_LOOKS} at most" if parameters.accumulate > MOST_LOOKS else ""
-        sentences.append(f"the last {count} looks are registered as one, each from another direction{most}")
-    elif parameters.viewpoint not in NO_FRAME and parameters.collects:
-        sentences.append(f"viewpoint is not used: sensor {sensor} sees nothing from afar")
-    if parameters.assess_every > 1 and (why := why_all_assessed(parameters)):
-        sentences.append(f"assess_every is not used: {why}")
-    if 0 < parameters.max_points < parameters.min_points:
-        limits = f"max_points {parameters.max_points} is below min_points {parameters.min_points}"
-        sentences.append(f"{limits}: points are counted before a cloud is thinned, so fewer than min_points may decide")
+    if parameters.collects:
+        kind = "looks of a camera" if parameters.collects_looks else "clouds"
+        sentences.append(f"the last {parameters.accumulate} {kind} are registered as one")
+        if not parameters.output_frame:
+            sentences.append("output_frame is empty: the bone must rest in the frame of the clouds")
     return sentences
 
 
-def empty_limits(parameters: NodeParameters) -> list[str]:
-    """One sentence for each pair of limits that no point can lie between."""
-    least, most, pairs = parameters.range_min, parameters.range_max, []
-    if 0.0 < most <= least:
-        pairs.append(f"range_min {least} is not below range_max {most}")
-    low, high = parameters.crop_min, parameters.crop_max
-    if low != high and any(start >= end for start, end in zip(low, high, strict=True)):
-        pairs.append(f"crop_min {low} is not below crop_max {high}")
-    return [f"{pair}: every cloud is refused until it is" for pair in pairs]
-
-
-def odd_lengths(parameters: NodeParameters) -> list[str]:
-    """One sentence for each length with which a limit never holds, as of a bone or of a room: perhaps it is in mm."""
-    of_bound = ("max_tre",), TRE_M
-    at_bone = ("max_jump_translation", "crop_to_track"), BONE_M
-    in_room = ("range_min", "range_max", "crop_min", "crop_max"), ROOM_M
-    return [
+def doubts(parameters: NodeParameters) -> list[str]:
+    """One sentence for each length that is probably in millimetres, and for a box without room."""
+    found = [
         f"{name} is {getattr(parameters, name)}: lengths are in metres; is it in mm?"
-        for names, longest_m in (of_bound, at_bone, in_room)
-        for name in names
+        for name, longest_m in LONGEST_M.items()
         if any(longest_m < abs(length_m) < math.inf for length_m in _each(getattr(parameters, name)))
     ]
+    low, high = parameters.crop_min, parameters.crop_max
+    if parameters.has_box and any(start >= end for start, end in zip(low, high, strict=True)):
+        found.append(f"crop_min {low} is not below crop_max {high}: every cloud is refused until it is")
+    return found
 
 
 def _each(value: float | Triple) -> Triple:
     return value if isinstance(value, tuple) else (value,) * 3
-
-
-def why_all_assessed(parameters: NodeParameters) -> str:
-    """Why no cloud can be followed with these parameters, whatever `assess_every` is; empty where some can."""
-    if not parameters.track:
-        return "track is off, so there is no pose to follow"
-    if parameters.collects:
-        return "a cloud that is registered with others says little alone"
-    if parameters.viewpoint not in NO_FRAME:
-        return "with a viewpoint nobody knows which part of a cloud is bone before it is assessed"
-    return ""
 
 
 def _together(parameters: NodeParameters) -> int:
@@ -251,23 +186,14 @@ def _together(parameters: NodeParameters) -> int:
 
 
 def unknown_names(node: Node) -> list[str]:
-    """One sentence for each name that was given, has no effect, and resembles none that has one."""
-    of_qos = [name for name in node._parameter_overrides if name.startswith("qos_overrides")]
-    others = [f"unknown parameter '{name}' is ignored" for name, near in _not_ours(node).items() if not near]
-    return [f"'{name}' is ignored: set cloud_reliability" for name in of_qos] + others
-
-
-def misspelt_names(node: Node) -> list[str]:
-    """One sentence for each name that was given, has no effect, and resembles one that has."""
-    named = {name: near[0] for name, near in _not_ours(node).items() if near}
-    return [f"unknown parameter '{name}' is ignored; did you mean '{near}'?" for name, near in named.items()]
-
-
-def _not_ours(node: Node) -> dict[str, list[str]]:
-    """The names that were given and are none of the node's, each with the nearest one that is, where one is near."""
-    known = (*FIELDS, *NOT_OURS)
-    given = [name for name in node._parameter_overrides if name not in known and not name.startswith("qos_overrides")]
-    return {name: difflib.get_close_matches(name, FIELDS, n=1) for name in given}
+    """One sentence for each name that was given and is no parameter, with the nearest one where one is near."""
+    known, sentences = (*FIELDS, *NOT_OURS), []
+    for name in node._parameter_overrides:
+        if name not in known:
+            near = difflib.get_close_matches(name, FIELDS, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else ": see docs/reference/parameters.md, or settings_file"
+            sentences.append(f"unknown parameter '{name}' is ignored{hint}")
+    return sentences
 
 
 def check_launch_names(
@@ -361,6 +287,8 @@ def as_yaml() -> str:
              "# Lengths in metres, times in seconds, angles in radians. Doubles need a decimal point.",
              "/**:", "  ros__parameters:"]  # fmt: skip
     for name, setting_field in FIELDS.items():
+        if group := setting_field.metadata.get("group"):
+            lines.append(f"    # --- {group} ---")
         lines.append(f"    {f'{name}: {_yaml(setting_field.default)}':<42} # {_help(setting_field)}")
     return "\n".join(lines) + "\n"
 

@@ -30,6 +30,7 @@ ARGUMENTS = {
     "use_sim_time": ("", "true: node and RViz take time from /clock; RViz does not read params_file"),
     "params_file": ("", "parameter file; what is given here as an argument, and not empty, wins"),
     "rviz": ("false", "show clouds and bone"),
+    "manager": ("false", "true: nav2's lifecycle manager configures and activates the node, with autostart:=false"),
 }
 # in every namespace, and in no other file: rcl joins entries of one name where the first one is, and the last one wins
 ENTRY = "/**/register_node/**"
@@ -77,15 +78,15 @@ def _files(path: str, parameters: dict[str, Any]) -> list[str]:
 
 def _shown(chosen: dict[str, str]) -> dict[str, str]:
     """Where the topics of register.rviz are, by their names there."""
-    own = {f"register_node/{name}": f"register_node/{name}" for name in ("aligned", "model", "pose")}
+    own = {f"register_node/{name}": f"register_node/{name}" for name in ("debug/aligned", "model", "pose")}
     return {"points": chosen["points"], "initialpose": chosen["initialpose"]} | own
 
 
 def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
     """The node and RViz, once the arguments are known."""
     check_launch_names(context, FILE, (*ARGUMENTS, *FIELDS), NOT_NEAR, get_logger(FILE.name).warning)
-    parameters = given(context)
     chosen = context.launch_configurations
+    parameters = given(context) | ({"autostart": False} if chosen["manager"] == "true" else {})
     path = os.path.expanduser(chosen["params_file"])
     if not Path(path).is_file():  # launch only warns, and the node would run with other limits
         raise ValueError(f"params_file: expected a parameter file, got {chosen['params_file']!r}")
@@ -109,7 +110,15 @@ def nodes(context: LaunchContext, share: FindPackageShare) -> list[Node]:
         parameters=[{"use_sim_time": parameters.get("use_sim_time", False)}],
         condition=IfCondition(chosen["rviz"]),
     )
-    return [rviz, register]  # RViz first: where it is not installed, launch stops before it has started a node
+    manager = Node(
+        package="nav2_lifecycle_manager",
+        executable="lifecycle_manager",
+        name="lifecycle_manager_gapr",
+        namespace=chosen["namespace"],
+        parameters=[{"node_names": ["register_node"], "autostart": True, "bond_timeout": 0.0}],  # it has no bond
+        condition=IfCondition(chosen["manager"]),
+    )
+    return [rviz, manager, register]  # RViz first: where it is not installed, launch stops before it has started a node
 
 
 def generate_launch_description() -> LaunchDescription:

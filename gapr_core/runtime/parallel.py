@@ -7,13 +7,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from functools import cache, wraps
 from multiprocessing import parent_process
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -68,13 +68,18 @@ def single_threaded_libraries(call: Callable[Given, Result]) -> Callable[Given, 
 
     @wraps(call)
     def limited(*args: Given.args, **kwargs: Given.kwargs) -> Result:
-        with _controller("torch" in sys.modules).limit(limits=1):
+        controller = _controller("torch" in sys.modules)
+        with nullcontext() if controller is None else controller.limit(limits=1):
             return call(*args, **kwargs)
 
     return limited
 
 
 @cache
-def _controller(with_torch: bool) -> ThreadpoolController:
-    """Control the threads of the loaded libraries; torch brings its own OpenMP."""
-    return ThreadpoolController()
+def _controller(with_torch: bool) -> Any | None:
+    """Control the threads of the loaded libraries; torch brings its own OpenMP. None without threadpoolctl."""
+    with suppress(ImportError):  # rosdep has no key for it; without it calls are slower on a busy machine
+        from threadpoolctl import ThreadpoolController
+
+        return ThreadpoolController()
+    return None

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 FIRST_STAMP_S = 1_700_000_000.0
 OWN_BAG = ".written_by_gapr_demo"  # in the folder of a bag that a later demo may replace
-CROP_TO_TRACK_M = 0.04  # what the bone moves in the camera's frame between two frames, and more
 
 
 class DemoError(RuntimeError):
@@ -101,7 +100,7 @@ def act_of_pairs(specimen: Specimen, path: Path, pairs: Sequence[Pair], period_s
         specimen.bone, specimen.surface, path, tuple(pair.source for pair in pairs),
         tuple(shift @ pair.T_target_source for shift, pair in zip(shifts, pairs, strict=True)),
         period_s, "A camera looks into a wound", lead, "camera",
-        {"viewpoint": "origin", "crop_to_track": CROP_TO_TRACK_M},
+        {"viewpoint": "origin"},
         tuple(pair.metadata["is_bone"] for pair in pairs),
     )  # fmt: skip
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 GOAL_MM = 2.0  # bound of the error over the bone (95 %) with which the probe has seen enough
-PARAMETERS = {"guide": True, "track": False, "min_points": 30}
+PARAMETERS = {"guide": True, "track": False}
 TITLE = "A probe that follows the guidance"
 LEAD = (
     "The probe sees 30 mm of a {bone} at a time. After every look register_node says what it knows by now and where "

@@ -14,7 +14,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from gapr_ros.node import timeline, units
+from gapr_ros.node import units
+from gapr_ros.node.outcome import stamp_ns
 from msg_adapters import cloud_to_field, cloud_to_xyz, pose_to_matrix
 
 Array = NDArray[np.float64]
@@ -96,11 +97,11 @@ class Observer(Node):
         self._centre: Array | None = None
         listen = self.create_subscription
         self._heard = [
-            listen(DiagnosticStatus, f"{node_name}/status", self._on_status, 50),
+            listen(DiagnosticArray, f"{node_name}/status", self._on_status, 50),
             listen(PoseWithCovarianceStamped, f"{node_name}/pose", self._on_pose, 50),
-            listen(PointCloud2, f"{node_name}/residuals", self._on_residuals, 50),
-            listen(PointCloud2, f"{node_name}/guidance", self._on_guidance, 10),
-            listen(PoseStamped, f"{node_name}/next_view", self._on_next_view, 10),
+            listen(PointCloud2, f"{node_name}/debug/residuals", self._on_residuals, 50),
+            listen(PointCloud2, f"{node_name}/debug/guidance", self._on_guidance, 10),
+            listen(PoseStamped, f"{node_name}/debug/next_view", self._on_next_view, 10),
         ]
         listen(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
@@ -138,12 +139,12 @@ class Observer(Node):
             answer.T_target_source, answer.used = self._poses.get(stamp), self._used.get(stamp)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._poses[_ms(timeline.stamp_ns(message.header))] = units.core_pose(pose_to_matrix(message))
+        self._poses[_ms(stamp_ns(message.header))] = units.core_pose(pose_to_matrix(message))
 
     def _on_residuals(self, message: PointCloud2) -> None:
         points_mm = units.to_mm(cloud_to_xyz(message, keep_nan=True), "m")
         used = Used(points_mm, cloud_to_field(message, "inlier").astype(bool))
-        self._used[_ms(timeline.stamp_ns(message.header))] = used
+        self._used[_ms(stamp_ns(message.header))] = used
 
     def _on_guidance(self, message: PointCloud2) -> None:
         gain_mm = units.to_mm(cloud_to_field(message, "intensity").astype(np.float64), "m")
@@ -152,15 +153,18 @@ class Observer(Node):
     def _on_next_view(self, message: PoseStamped) -> None:
         self._centre = units.to_mm(pose_to_matrix(message)[:3, 3], "m")
 
-    def _on_status(self, message: DiagnosticStatus) -> None:
-        values = {pair.key: pair.value for pair in message.values}
-        stamp, refused = round(float(values["stamp"]) * 1e3), bool(values["reason"])
+    def _on_status(self, message: DiagnosticArray) -> None:
+        (status,) = message.status
+        values = {pair.key: pair.value for pair in status.values}
+        if values["reason"] == "withdrawn":  # of no cloud
+            return
+        stamp, refused = _ms(stamp_ns(message.header)), bool(values["reason"])
         self.answers[stamp] = Answer(
-            refusal=message.message.removeprefix("refused: ") if refused else "",
+            refusal=f"{values['reason']}: {values['detail']}" if refused else "",
             confidence=float(values["confidence"] or 0.0),
             tre_mm=_millimetres(values["tre"]),
             tre95_mm=_millimetres(values["tre95"]),
-            exec_ms=float(values["exec_ms"] or 0.0),
+            exec_ms=1000.0 * float(values["seconds"] or 0.0),
             heard_s=time.monotonic(),
             sent_s=self._sent.get(stamp, float("nan")),
         )

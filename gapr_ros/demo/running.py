@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from gapr_ros.demo.observer import Answer, Observer
 
 START_LIMIT_S, SILENCE_LIMIT_S = 180.0, 60.0  # the first start on a machine compiles
-USUAL: dict[str, Any] = {"timeout": 30.0, "diagnostics_period": 0.2}
 STARTING = "waiting for the node to read the bone (the first time it compiles, up to a minute)"
 
 
@@ -139,7 +138,7 @@ class Sender:
 def running(observer: Observer, folder: Path, parameters: Mapping[str, Any]) -> Iterator[RunningNode]:
     """Starts the node with these parameters; it ends with the block."""
     log = folder / "register_node.log"
-    with child("gapr_ros.register_node", ["--ros-args", *as_arguments({**USUAL, **parameters})], log) as process:
+    with child("gapr_ros.register_node", ["--ros-args", *as_arguments(parameters)], log) as process:
         yield RunningNode(process, log, observer)
 
 

@@ -1,18 +1,15 @@
-"""What register_node is made of, a file for each task.
+"""The rooms of register_node.
 
 The way of one cloud, from bytes to messages:
 
     subscription   takes the bytes; a cloud is not deserialised before it is its turn
     session        owns all that lives from configure to cleanup, and hands the cloud on
-    admission      judges its frame and its stamp (timeline), which its header says
+    gate           judges its frame and its stamp, and later its answer: resets, limits, order of time, jumps
     worker         holds the newest cloud until the thread that registers is free
-    registration   reads it (intake), looks frames up (frames), crops (region), follows or registers, converts (units)
-    outcome        what became of it: a pose, or a reason (refusal)
-    course         decides whether the pose goes out: resets, limits, order of time, jumps (track)
-    publishers     sends what became of it (messages), and to /tf (frames)
+    register       reads it (cloud), looks frames up (frames, tf_guard), registers, converts (units)
+    outcome        a pose, or a reason
+    publish        sends the outcome, and the pose to /tf (frames)
 
-`check_points` are the other way in: points that a pointer touched, which check the pose that stands.
-`lifecycle` is the node itself: states, parameters, clock. `loader` reads bones in another thread (model, method).
-`reporter` sends /diagnostics (diagnostics). Files do not call the node, but the six members of `host`.
-`parameter_files` finds those of the command line that are for other nodes.
+`lifecycle` is the node itself: states, parameters, clock. `model` reads the bone and makes the method, in a
+thread. `report` sends /diagnostics, `services` answers calls. Rooms do not call the node, but the members of `host`.
 """

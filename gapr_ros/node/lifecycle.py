@@ -27,13 +27,10 @@ from rclpy.task import Future
 
 from gapr_ros import parameters
 from gapr_ros.node import frames
-from gapr_ros.node.diagnostics import Counters
-from gapr_ros.node.guard import RosLogHandler, guarded, transition
-from gapr_ros.node.host import steady_timer
-from gapr_ros.node.loader import Loader
-from gapr_ros.node.method import ShippedMethod
-from gapr_ros.node.model import make_ready
-from gapr_ros.node.reporter import Reporter
+from gapr_ros.node.host import RosLogHandler, guarded, steady_timer, transition
+from gapr_ros.node.model import Loader, ShippedMethod, make_ready
+from gapr_ros.node.outcome import Counters
+from gapr_ros.node.report import PERIOD_S, Reporter
 from gapr_ros.node.services import Services
 from gapr_ros.node.session import Session
 from gapr_ros.node.subscription import CLOUDS, Subscriptions
@@ -72,7 +69,7 @@ class RegisterNode(LifecycleNode):
         self._reporter = Reporter(self, self._loader)
         self._services_offered = Services(self, self._loader, lambda: self.state, lambda: self.session)
         self._load_before_configuring()
-        self._diagnosing = steady_timer(self, self.parameters.diagnostics_period, self.report)
+        self._diagnosing = steady_timer(self, PERIOD_S, self.report)
         if self.parameters.autostart:
             self.call_soon(self._autostart)
         else:
@@ -191,11 +188,10 @@ class RegisterNode(LifecycleNode):
         model = str(ready.model)
         for sentence in parameters.remarks(self.parameters):
             self.get_logger().info(sentence)
-        for sentence in parameters.empty_limits(self.parameters) + parameters.odd_lengths(self.parameters):
+        for sentence in parameters.doubts(self.parameters):
             self.get_logger().warning(sentence)
         self.get_logger().info(model)
         self.session = Session(self, ready, self._method_factory)
-        self.session.conflicts.note("parameters", "; ".join(parameters.misspelt_names(self)), log=False)
         return super().on_configure(state)
 
     @transition
@@ -204,9 +200,9 @@ class RegisterNode(LifecycleNode):
         result = super().on_activate(state)
         self._configured.send_model()
         self.subscriptions_in = Subscriptions(self, self._configured)
-        kind, unit = self.parameters.cloud_type, self.parameters.cloud_unit
+        unit = self.parameters.cloud_unit
         does = "waits for clouds" if self._configured.enabled else "but disabled (~/set_enabled): drops clouds"
-        self.get_logger().info(f"active, {does} on {self.resolve_topic_name(CLOUDS)} ({kind}, in {unit})")
+        self.get_logger().info(f"active, {does} on {self.resolve_topic_name(CLOUDS)} (in {unit})")
         return result
 
     @transition
@@ -259,7 +255,7 @@ class RegisterNode(LifecycleNode):
     # --- what the node watches ---
 
     def _watch_parameters(self) -> None:
-        for sentence in parameters.unknown_names(self) + parameters.misspelt_names(self):
+        for sentence in parameters.unknown_names(self):
             self.get_logger().warning(sentence)
         self.add_on_set_parameters_callback(self._on_change)
         self.add_post_set_parameters_callback(self._on_changed)
@@ -280,9 +276,6 @@ class RegisterNode(LifecycleNode):
     @guarded
     def _on_changed(self, changes: list[Parameter]) -> None:
         self.parameters = parameters.read(self)
-        if any(change.name == "diagnostics_period" for change in changes):
-            self._diagnosing.timer_period_ns = int(self.parameters.diagnostics_period * 1e9)
-            self._diagnosing.reset()
         if self.session is not None:
             self.session.parameters_changed()
 

@@ -13,9 +13,8 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
-from gapr_ros.node.guard import describe
-from gapr_ros.node.host import Host, steady_timer
-from gapr_ros.node.loader import Loader
+from gapr_ros.node.host import Host, describe, steady_timer
+from gapr_ros.node.model import Loader
 from gapr_ros.node.session import Session
 
 # calls that come while the executor is busy wait in the middleware, whose default drops the oldest of more than 10
@@ -112,7 +111,7 @@ class Services:
             raise NotNowError("no cloud has come yet, or none since the last reset, reload or pause")
         await self._answers.in_turn(waiter)
         outcome = waiter.result()
-        return outcome.ok, str(outcome)
+        return outcome.ok, outcome.line
 
     @answering
     async def reset(self, _: Trigger.Request) -> tuple[bool, str]:

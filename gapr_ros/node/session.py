@@ -1,54 +1,54 @@
-"""Everything that lives from configure to cleanup: one bone, one method, one worker, one track.
+"""Everything that lives from configure to cleanup: one bone, one method, one worker, one gate.
 
 What an interruption forgets; all but the last two refuse the clouds that are on their way:
 
-| event | collection | row of good poses | limits on jumps | initial pose | last cloud (`~/register`) | latched pose |
-|---|---|---|---|---|---|---|
-| reset, another clock, bone, place on /tf_static | forgotten | ends | off until a pose | none | outdated | withdrawn |
-| `initialpose` | forgotten | ends | stay until a good pose | the new one | stays | stays |
-| pause | stays | ends | stay | stays | outdated | stays |
-| clouds are read in another way | forgotten | stays | stay | stays | stays | stays |
-| other limits | forgotten: another method | stays | stay | stays | stays | stays |
+| event | collection | limits on jumps | initial pose | last cloud (`~/register`) | latched pose |
+|---|---|---|---|---|---|
+| reset, another clock, bone, place on /tf_static | forgotten | off until a pose | none | outdated | withdrawn |
+| `initialpose` | forgotten | stay until a good pose | the new one | stays | stays |
+| pause | stays | stay | stays | outdated | stays |
+| clouds are read in another way | forgotten | stay | stays | stays | stays |
+| other limits | forgotten: another method | stay | stays | stays | stays |
 """
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
-from numpy.typing import NDArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from std_msgs.msg import Header
 
-from gapr_core.results import PointCheck
-from gapr_ros.node import check_points, intake, timeline
-from gapr_ros.node.admission import CLOCK_CHANGED, CLOCK_WENT_BACK, STAMPS_WENT_BACK, Admission
-from gapr_ros.node.changes import Changes
-from gapr_ros.node.collection import forget
-from gapr_ros.node.conflicts import Conflicts
-from gapr_ros.node.course import Course
-from gapr_ros.node.diagnostics import RefusalLog
-from gapr_ros.node.frames import Frames
-from gapr_ros.node.guard import THROTTLE_S
-from gapr_ros.node.host import Host
+from gapr_ros.node import cloud, units
+from gapr_ros.node.frames import Frames, needs_frames
+from gapr_ros.node.gate import Gate, is_far_ahead
+from gapr_ros.node.host import THROTTLE_S, Host, guarded, steady_timer
 from gapr_ros.node.model import Model, Ready
-from gapr_ros.node.outcome import Outcome
-from gapr_ros.node.publishers import Publishers
-from gapr_ros.node.refusal import Reason, RefusedError
-from gapr_ros.node.registration import Registration, needs_frames
-from gapr_ros.node.shared_frame import SharedFrame
-from gapr_ros.node.shared_name import SharedName
-from gapr_ros.node.situation import InitialPose, Situation
-from gapr_ros.node.worker import Job, Worker
+from gapr_ros.node.outcome import NO_CLOCK_S, Job, Outcome, Place, Reason, RefusedError, normal
+from gapr_ros.node.publish import Publishers
+from gapr_ros.node.register import JobContext, Registration, forget
+from gapr_ros.node.report import Conflicts, RefusalLog, names_of
+from gapr_ros.node.worker import Worker
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, pose_to_matrix
 
-Array = NDArray[np.float64]
-STREAM_AFTER = 5  # guesses without an answer between them
-OUTLIVED_AFTER = 10  # refusals in a row: where the bone was before them is nothing for late listeners
+WATCH_S = 0.1  # between two looks at the age of the pose
+OF_BONE = "model_path", "model_label", "model_unit", "model_axes"  # read with the bone
+SHOWN_S = 10.0
+NO_CLOCK = "use_sim_time is true and no /clock has come: no stamp is checked"
+OTHER_CLOCK = "the clouds are {:.0f} days older than the clock, as of a bag without /clock: play it with --clock"
+STAMPS_WENT_BACK = "the stamps of the clouds went back"
+CLOCK_WENT_BACK, CLOCK_CHANGED = "the clock jumped back", "the node's clock is another one now"
+OVER = "time starts over and the track is cleared"
+TWO_CLOCKS = "the clock jumped back, and /clock has {} publishers ({}): each step back drops clouds; leave one"
+BEHIND = (
+    "/tf waits for stamps 10 s newer than those it had before, or tf2 would mix the poses of both rounds: "
+    "play bags with --clock, for nodes with use_sim_time:=true, or start the listeners again and call ~/reset"
+)
 
 
 class Session:
@@ -60,29 +60,29 @@ class Session:
         host: the node.
         ready: the method and the bone.
         method_factory: makes another method when its own settings change.
+
+    Attributes:
+        withdrawn: why the last pose was withdrawn by its age; empty while one stands, and before the first.
     """
 
     def __init__(self, host: Host, ready: Ready, method_factory: Callable[[NodeParameters], Any]) -> None:
         self._host, self._ready, self._method_factory = host, ready, method_factory
         self._swapping = threading.Lock()  # both threads put another `_ready`; neither may lose what the other put
-        self._changes = Changes(ready.parameters, host.parameters)
-        self.enabled, self._closed = True, False
+        self._reading, self._limits = _reading(host.parameters), _limits(ready.parameters)
+        self.enabled, self._closed, self.withdrawn = True, False, ""
         self.last_outcome: Outcome | None = None
-        self._guesses = 0  # since the last cloud that none of them superseded
-        self._standing: Outcome | None = None  # of the last accepted pose, until it is withdrawn
-        self.conflicts = Conflicts(host.ros.get_logger().warning)
-        self.course = Course()
-        self._log_refusal = RefusalLog(host.ros.get_logger().warning)
-        publish, listen = host.parameters.publish_tf, needs_frames(host.parameters)
-        self._shared = SharedFrame(host, self.conflicts) if publish else None
-        self._named = SharedName(host, self.conflicts)
-        note_sent = self._shared.note_own if self._shared else None
+        self._posed_at: float | None = None  # when the pose that stands was sent, `time.monotonic`
+        self._log = host.ros.get_logger()
+        self.conflicts = Conflicts(self._log.warning)
+        self.gate = Gate()
+        self._log_refusal = RefusalLog(self._log.warning)
         host.counters.forget_refusals()
-        self._frames = Frames(host.ros, publish, listen, note_sent, self._is_future, self._moved)
-        self._admission = Admission(host, self.course.timeline, self._frames, self.conflicts)
+        parameters = host.parameters
+        self._frames = Frames(host.ros, parameters.publish_tf, needs_frames(parameters), self._is_future, self._moved)
         self._publishers = Publishers(host, self._frames)
-        self._registration = Registration(self._frames, self._situation, self._report_collected)
-        self.worker = Worker(self._work, self._held, self._period_s)
+        self._registration = Registration(self._frames, self._context, self._report_collected)
+        self.worker = Worker(self._work, lambda: not host.parameters.continuous)
+        self._watching = steady_timer(host.ros, WATCH_S, self._watch_pose)
         self.parameters_changed()  # a limit may have been set while the bone was read
 
     @property
@@ -93,14 +93,15 @@ class Session:
     def close(self) -> None:
         """End the worker, after the cloud that it has in hand, and give the topics back; waits for nothing."""
         self.stop_waiting("the node stopped")
-        self.worker.run(partial(self._registration.end, "the node stopped"))
         self._closed = True
         self.worker.stop()
+        self._host.ros.destroy_timer(self._watching)
         self._publishers.close()
         self._frames.close()
-        self._named.close()
-        if self._shared is not None:
-            self._shared.close()
+
+    def get_logger(self) -> Any:
+        """The node's logger (for `guarded`)."""
+        return self._log
 
     # --- in: the executor's thread ---
 
@@ -111,21 +112,24 @@ class Session:
         if not self.enabled:
             counters.dropped += 1
             return
-        self._admission.note_clock(now_ns)
-        header = intake.read_header(data)  # None: the worker says what is wrong with the bytes
+        self.conflicts.note("clock", "" if now_ns else NO_CLOCK)
+        header = cloud.read_header(data)  # None: the worker says what is wrong with the bytes
         try:
-            if header is not None and self._admission.admit(header, now_ns, alone):
+            if header is not None and self.gate.admit(header, now_ns, self._host.parameters, alone):
+                self.conflicts.note("time", f"{STAMPS_WENT_BACK}: {OVER}", SHOWN_S)
+                self._frames.hold()
                 self._clear(STAMPS_WENT_BACK)
         except RefusedError as refusal:
-            job = Job(b"", self.course.epoch, now_ns)
-            self._answer(Outcome.refused(job, timeline.normal(header), refusal.reason, refusal.text))
+            named = Header() if header is None else normal(header)
+            outcome = Outcome(Job(b"", self.gate.epoch, now_ns), named.frame_id, named)
+            outcome.refuse(refusal.reason, refusal.text)
+            self._answer(outcome)
             return
-        self._put(Job(data, self.course.epoch, now_ns))
-
-    def _put(self, job: Job) -> None:
         collects = self._host.parameters.collects
-        pushed_out = self.worker.put(job, leave=self._registration.collect if collects else None)
-        self._host.counters.dropped += pushed_out and not collects
+        pushed_out = self.worker.put(
+            Job(data, self.gate.epoch, now_ns), leave=self._registration.collect if collects else None
+        )
+        counters.dropped += pushed_out and not collects
 
     def take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         """A pose from outside, where the next registrations start until one is accepted."""
@@ -134,58 +138,44 @@ class Session:
         except InvalidMessageError as error:
             self._warn(f"initialpose is ignored: {error}")
             return
-        frame = intake.plain_frame(message.header.frame_id)
+        frame = cloud.plain_frame(message.header.frame_id)
         if frame == self._host.parameters.model_frame:
             self._warn(f"initialpose is ignored: it is in '{frame}', the bone's own frame")
             return
-        self._guesses += 1
-        often = f", {self._guesses} came since the last answer: send one guess, not a stream of them"
-        why = "an initialpose" + (often if self._guesses >= STREAM_AFTER else "")
-        self._begin_again(why, InitialPose(T_frame_model, frame))
+        self.gate.begin_again("an initialpose", Place(T_frame_model, frame))
+        self._forget_clouds("an initialpose")
         where = f"in '{frame}'" if frame else "in the frame of the clouds"
-        text = f"initialpose {where} is taken: the track is forgotten"
-        self._host.ros.get_logger().info(text, throttle_duration_sec=THROTTLE_S)
+        self._log.info(f"initialpose {where} is taken: the track is forgotten", throttle_duration_sec=THROTTLE_S)
         if frame:
             self._frames.listen()
-
-    def take_check_points(self, message: PoseArray) -> None:
-        """Touched points, which check the last accepted pose: what they say goes out, and the pose stays."""
-        found: PointCheck | str
-        try:
-            found = check_points.check(message, self._standing, self._ready, self._host.parameters)
-        except check_points.NothingToCheckError as error:
-            found = str(error)
-            self._warn(f"nothing was checked: {found}")
-        name, now_ns = self._host.ros.get_fully_qualified_name(), self._host.now_ns()
-        self._publishers.send_check(check_points.status(message, found, self._standing, now_ns, name, self.model.file))
 
     def _warn(self, text: str) -> None:
         self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
 
     def _is_future(self, stamp_ns: int) -> bool:
         """Of a transform."""
-        return timeline.is_far_ahead(stamp_ns, self._host.now_ns(), self._host.parameters.max_future)
+        return is_far_ahead(stamp_ns, self._host.now_ns())
 
     def register_newest(self, waiter: Any) -> bool:
         """Register the newest cloud now; its outcome becomes the waiter's result.
 
         False when none has come, or none since the last reset or reload.
         """
-        return self.worker.ask(waiter, self.course.epoch)
+        return self.worker.ask(waiter, self.gate.epoch)
 
     # --- the worker's thread ---
 
     def _work(self, job: Job) -> None:
         self._host.call_soon(partial(self._conclude, self._registration.process(job)))
 
-    def _report_collected(self, collected: bool, why: str) -> None:
+    def _report_collected(self, why: str) -> None:
         """A cloud that a newer one pushed out of the mailbox is registered with it, or could not be."""
-        self._host.call_soon(partial(self._count_collected, collected, why))
+        self._host.call_soon(partial(self._count_collected, why))
 
-    def _situation(self) -> Situation:
-        host, ready, course = self._host, self._ready, self.course
-        since = course.epoch, course.oldest, course.why, course.initial_pose, course.place
-        return Situation(ready.method, ready.model, host.parameters, *since, host.now_ns())
+    def _context(self) -> JobContext:
+        host, ready, gate = self._host, self._ready, self.gate
+        since = gate.epoch, gate.oldest, gate.why, gate.initial_pose
+        return JobContext(ready.method, ready.model, host.parameters, *since, host.now_ns())
 
     def _renew_method(self) -> None:
         """Before the next cloud, which may wait already: it is not registered by the limits of before."""
@@ -193,77 +183,92 @@ class Session:
         with self._swapping:
             self._ready = replace(self._ready, method=method)
 
-    def _held(self) -> bool:
-        return not self._host.parameters.continuous
-
-    def _period_s(self) -> float:
-        max_rate = self._host.parameters.max_rate
-        return 1.0 / max_rate if max_rate > 0.0 else 0.0
-
     # --- out: the executor's thread again ---
 
-    def _count_collected(self, collected: bool, why: str) -> None:
-        self._host.counters.count_pushed_out(collected)
-        if not collected:
+    def _count_collected(self, why: str) -> None:
+        self._host.counters.merged += not why
+        self._host.counters.dropped += bool(why)
+        if why:
             self._warn(f"a cloud is not registered with the newer ones: {why}")
 
     def _conclude(self, outcome: Outcome) -> None:
         """Decide on an outcome of the worker and answer."""
-        if outcome.followed is not None:
-            self._show(outcome.followed, outcome)
-            return
-        self.course.decide(outcome, self.model, self._host.parameters)
+        points_m = units.to_metres(self.model.points_mm)
+        self.gate.decide(outcome, points_m, self._host.now_ns(), self._host.parameters)
+        is_of_another_clock = (outcome.age_s or 0.0) > NO_CLOCK_S
+        text = OTHER_CLOCK.format((outcome.age_s or 0.0) / 86_400.0) if is_of_another_clock else ""
+        self.conflicts.note("other clock", text)
         self._answer(outcome)
-
-    def _show(self, T_frame_model: Array, outcome: Outcome) -> None:
-        """Send a pose that was followed where what it rests on still stands. It is no answer and changes nothing."""
-        stands = self.course.may_show(T_frame_model, outcome, self.model, self._host.parameters)
-        shown = stands and not self._closed
-        self._host.counters.count_followed(shown)
-        if shown:
-            self._publishers.send_followed(T_frame_model, outcome.header)
-        self._host.report()
 
     def _answer(self, outcome: Outcome) -> None:
         """Count an outcome, send it, and tell who waits for it."""
         self.last_outcome = outcome
-        self._guesses = self._guesses if outcome.reason is Reason.SUPERSEDED_BY_RESET else 0
-        self._standing = outcome if outcome.ok else self._standing
         self._host.counters.count_answer(outcome)
         if not outcome.ok:
             self._log_refusal(outcome)
         try:
             if not self._closed:
                 self._publishers.send(outcome, self.model)
-                if self._host.counters.consecutive_refusals == OUTLIVED_AFTER:
-                    self._withdraw_pose()
-                self._admission.note_tf()
+                if outcome.ok:
+                    self._note_pose(outcome)
+                self.conflicts.note("/tf", BEHIND if self._frames.behind else "")
         finally:
             outcome.answer_waiters()
             self._host.report()
+
+    def _note_pose(self, outcome: Outcome) -> None:
+        """A pose stands from now on."""
+        if self._posed_at is None:
+            self._log.info(f"{'poses are back' if self.withdrawn else 'first pose'}: {outcome.line}")
+        self._posed_at, self.withdrawn = time.monotonic(), ""
+
+    @guarded
+    def _watch_pose(self) -> None:
+        """Withdraw a pose that no newer one has followed for `pose_lifetime`."""
+        lifetime_s = self._host.parameters.pose_lifetime
+        if self._posed_at is None or not 0.0 < lifetime_s < time.monotonic() - self._posed_at:
+            return
+        last = self._host.counters.last_refusal if self._host.counters.consecutive_refusals else "no cloud was answered"
+        self._withdraw_pose(f"no newer one for {lifetime_s:g} s (pose_lifetime); {last}"[:180])
+        self._log.warning(f"poses stopped: {self.withdrawn}")
+        self._host.report()
 
     # --- state ---
 
     def reset(self) -> None:
         """Forget track, initial pose, all clouds so far, their stamps on /tf, and the pose that late listeners get."""
-        self._admission.forget()
+        self._forget_time()
         self._clear("a reset")
+
+    def _forget_time(self) -> None:
+        """Whatever comes next is the newest, on /tf too: its listeners are started again."""
+        self.gate.forget_time()
+        self._frames.forget()
+        for kind in ("time", "/tf"):
+            self.conflicts.note(kind, "")
 
     def _clear(self, why: str) -> None:
         self._begin_again(why)
-        self._outdate()
+        self._outdate(why)
 
-    def _outdate(self) -> None:
+    def _outdate(self, why: str) -> None:
         """Nothing that was found or refused so far says anything of now."""
-        self.worker.outdate(self.course.epoch)
+        self.worker.outdate(self.gate.epoch)
         self.last_outcome = None
         self._host.counters.forget_refusals()
-        self._withdraw_pose()
+        if self._posed_at is not None:
+            self._withdraw_pose(why)
+        self.withdrawn = ""  # whoever did this knows
 
     def clock_jumped(self, is_another: bool) -> None:
-        """The node's clock went back, or is another one: `use_sim_time` was set."""
+        """The node's clock went back, or is another one: `use_sim_time` was set. Everybody who uses it knows."""
         why = CLOCK_CHANGED if is_another else CLOCK_WENT_BACK
-        self._admission.start_over(why)
+        self._forget_time()
+        clocks = [] if is_another else self._host.ros.get_publishers_info_by_topic("/clock")
+        if len(clocks) > 1:
+            self.conflicts.note("clocks", TWO_CLOCKS.format(len(clocks), names_of(clocks)), SHOWN_S)
+        else:
+            self._log.warning(f"{why}: {OVER}")
         self._clear(why)
 
     def _moved(self, frame: str) -> None:
@@ -281,27 +286,27 @@ class Session:
 
     def parameters_changed(self) -> None:
         """Take up what may change while running; the method's own limit means a new method for the same bone."""
-        now = self._host.parameters
-        waits = self._changes.of_bone(now)
+        now, before = self._host.parameters, self._ready.parameters
+        waits = [name for name in OF_BONE if getattr(now, name) != getattr(before, name)]
         self.conflicts.note("bone", f"the bone is not that of {', '.join(waits)}: call ~/reload_model" if waits else "")
-        if self._changes.in_reading(now):
+        if _reading(now) != self._reading:
             self._forget_clouds("clouds are read in another way")
-        if self._changes.in_limits(now):
-            self.course.forget_place()
-            if self._host.parameters.collects:
-                self._host.ros.get_logger().warning("the limits changed: the clouds collected so far are forgotten")
+        if _limits(now) != self._limits:
+            if now.collects:
+                self._log.warning("the limits changed: the clouds collected so far are forgotten")
             self.worker.run(self._renew_method)
+        self._reading, self._limits = _reading(now), _limits(now)
         self.worker.wake()
 
     def replace(self, ready: Ready) -> None:
         """Swap the bone, between two clouds; the pose of the old one is withdrawn."""
         self.conflicts.note("reload", "")
-        self._host.ros.get_logger().info(str(ready.model))
+        self._log.info(str(ready.model))
         self._begin_again("another bone")
         with self._swapping:
             self._ready = ready
-        self._changes = Changes(ready.parameters, self._host.parameters)
-        self._outdate()
+        self._limits = _limits(ready.parameters)
+        self._outdate("another bone")
         self.look_at_file()
         self.parameters_changed()
         self.send_model()
@@ -312,20 +317,24 @@ class Session:
 
     def withdraw(self) -> None:
         """Late listeners get nothing from a node that is not active: it does not know where the bone is."""
-        self._withdraw_pose()
-        self._publishers.withdraw("model")
+        if self._posed_at is not None:
+            self._withdraw_pose("the node was deactivated")
+        self.withdrawn = ""
+        self._publishers.withdraw_all()
 
-    def _withdraw_pose(self) -> None:
-        """Nobody gets it any more, and nothing checks it."""
-        self._standing = None
-        self._publishers.withdraw("pose")
+    def _withdraw_pose(self, why: str) -> None:
+        """The last pose holds no more."""
+        self._posed_at, self.withdrawn = None, why
+        frame = self.last_outcome.header.frame_id if self.last_outcome else ""
+        header = Header(frame_id=frame, stamp=self._host.ros.get_clock().now().to_msg())
+        self._publishers.withdraw(why, header, self.model)
 
     def stop_waiting(self, why: str) -> None:
         """A pause: drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way.
 
         What was collected stays, with that cloud, and so do the poses against which jumps are measured.
         """
-        self.course.refuse_all(why)
+        self.gate.refuse_all(why)
         waiting = self.worker.clear()
         if waiting is not None:
             outcome = Outcome(waiting)
@@ -338,9 +347,19 @@ class Session:
         self._host.counters.dropped += waiting is not None
         self._forget_clouds(why)
 
-    def _begin_again(self, why: str, initial_pose: InitialPose | None = None) -> None:
-        self.course.begin_again(why, initial_pose)
+    def _begin_again(self, why: str) -> None:
+        self.gate.begin_again(why)
         self._forget_clouds(why)
 
     def _forget_clouds(self, why: str) -> None:
         self.worker.run(partial(forget, self._ready.method, why))
+
+
+def _reading(parameters: NodeParameters) -> tuple[Any, ...]:
+    """What decides how a cloud is read: collected with other values, clouds do not go together."""
+    return parameters.cloud_unit, parameters.crop_min, parameters.crop_max
+
+
+def _limits(parameters: NodeParameters) -> tuple[float, ...]:
+    """What the method itself refuses by: with other values a new method is needed, for the same bone."""
+    return parameters.min_confidence, parameters.max_tre

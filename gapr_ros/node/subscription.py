@@ -6,28 +6,24 @@ import time
 from collections import deque
 from typing import Any
 
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from sensor_msgs.msg import PointCloud2
 
-from gapr_ros.node.conflicts import names_of
-from gapr_ros.node.diagnostics import CloudTopic
-from gapr_ros.node.gaps import Gaps
-from gapr_ros.node.guard import guarded
-from gapr_ros.node.host import Host, steady_timer
+from gapr_ros.node.host import Host, guarded, steady_timer
+from gapr_ros.node.report import SILENCE_S, CloudTopic, names_of
 from gapr_ros.node.session import Session
-from msg_adapters import INPUTS
 
-CLOUDS, INITIAL_POSES, CHECK_POINTS = "points", "initialpose", "check_points"
+CLOUDS, INITIAL_POSES, CLOUD_TYPE = "points", "initialpose", "sensor_msgs/msg/PointCloud2"
 LOOK_S = 1.0  # between two looks at who publishes
-ALONE_S = 5.0  # without a publisher: not all start at once
 GRACE_S = 3.0  # the graph may know of a publisher later than the event of its QoS
 MOST_QUEUED = 100  # clouds in the middleware's queue
 REMEMBERED = 256  # clouds, to know the same one from the other subscription
 
 
 class Subscriptions:
-    """Listens to `points`, `initialpose` and `check_points` while the node is active.
+    """Listens to `points` and `initialpose` while the node is active.
 
     Clouds stay serialised until the worker takes one: a dropped cloud costs nothing, and damaged bytes cannot end the
     executor. Reliable publishers are heard by a reliable subscription, always. While there are publishers that offer
@@ -36,33 +32,29 @@ class Subscriptions:
 
     def __init__(self, host: Host, session: Session) -> None:
         self._host, self._session = host, session
-        self._asked = host.parameters.cloud_reliability
-        self._mismatch, self._closed, self._gaps = "", False, Gaps()
+        self._mismatch, self._closed = "", False
+        self._last_number: int | None = None
         self._taken: deque[tuple[int, int | None]] = deque(maxlen=REMEMBERED)
-        self._needed_at, self._published_at = 0.0, time.monotonic()
-        self._waiting_since: float | None = time.monotonic()  # for the first cloud; None once it came
-        first = ReliabilityPolicy.BEST_EFFORT if self._asked == "best_effort" else ReliabilityPolicy.RELIABLE
-        self._clouds, self._second = self._subscribe(first), None
+        self._needed_at, self._cloud_at = 0.0, time.monotonic()
+        self._clouds, self._second = self._subscribe(ReliabilityPolicy.RELIABLE), None
         self._initial_poses = host.ros.create_subscription(
             PoseWithCovarianceStamped, INITIAL_POSES, self._on_initial_pose, 1
         )
-        self._check_points = host.ros.create_subscription(PoseArray, CHECK_POINTS, self._on_check_points, 10)
         self._looking = steady_timer(host.ros, LOOK_S, self.look)
 
     def describe(self) -> CloudTopic:
         """For /diagnostics."""
         publishers = self._host.ros.count_publishers(self._clouds.topic_name)
         mismatch = self._mismatch if publishers else ""
-        qos = "best_effort" if self._asked == "best_effort" else "reliable"
-        return CloudTopic(qos if self._second is None else "reliable and best_effort", publishers, mismatch)
+        return CloudTopic("reliable" if self._second is None else "reliable and best_effort", publishers, mismatch)
 
     def close(self) -> None:
         """Listen no more; who publishes is no conflict then."""
         self._closed = True
-        for about in ("type", "publishers", "nobody", "latched"):
+        for about in ("type", "publishers", "silence"):
             self._session.conflicts.note(about, "")
         self._host.ros.destroy_timer(self._looking)
-        for subscription in (self._clouds, self._second, self._initial_poses, self._check_points):
+        for subscription in (self._clouds, self._second, self._initial_poses):
             if subscription is not None:
                 self._host.ros.destroy_subscription(subscription)
 
@@ -74,54 +66,50 @@ class Subscriptions:
     def look(self) -> None:
         """See who publishes: how many, what, and whether somebody still needs best effort."""
         self._session.look_at_file()
-        topic, kind = self._clouds.topic_name, self._host.parameters.cloud_type
+        topic = self._clouds.topic_name
         publishers = self._host.ros.get_publishers_info_by_topic(topic)
-        self._note_nobody(topic, any_publisher=bool(publishers))
-        others = {p.topic_type for p in publishers} - {_type_name(kind)}
-        text = f"a publisher of {topic} sends {', '.join(sorted(others))}, cloud_type is {kind}: nothing of it comes"
+        others = {p.topic_type for p in publishers} - {CLOUD_TYPE}
+        text = f"a publisher of {topic} sends {', '.join(sorted(others))} and no PointCloud2: nothing of it comes"
         self._session.conflicts.note("type", text if others else "")
-        publishers = [each for each in publishers if each.topic_type == _type_name(kind)]
+        publishers = [each for each in publishers if each.topic_type == CLOUD_TYPE]
         text = f"{len(publishers)} publishers on {topic} ({names_of(publishers)}): a node follows one source of clouds"
         self._session.conflicts.note("publishers", text if len(publishers) > 1 else "")
-        self._note_latched(topic, publishers)
+        self._note_silence(topic, publishers)
         if any(p.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for p in publishers):
             self._needed_at = time.monotonic()
         elif time.monotonic() - self._needed_at > GRACE_S:
             self._mismatch = ""
             self._hear_reliable_only()
 
-    def _note_nobody(self, topic: str, any_publisher: bool) -> None:
-        """Say so where nobody publishes for a while, as where the topic is misspelt."""
-        now = time.monotonic()
-        self._published_at = now if any_publisher else self._published_at
-        text = f"nobody publishes on {topic}: start the driver, or remap points (-r points:=TOPIC)"
-        self._session.conflicts.note("nobody", text if now - self._published_at > ALONE_S else "")
-
-    def _note_latched(self, topic: str, publishers: list[Any]) -> None:
-        """Say so where no cloud has come yet and a publisher keeps one: no volatile listener gets that."""
-        is_long = self._waiting_since is not None and time.monotonic() - self._waiting_since > ALONE_S
-        latched = [p for p in publishers if p.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL]
-        how = "the one that it keeps for late listeners (transient local) does not: let it publish once more"
-        text = f"no cloud has come from the publisher of {topic} ({names_of(latched)}), and {how}"
-        self._session.conflicts.note("latched", text if is_long and latched else "")
+    def _note_silence(self, topic: str, publishers: list[Any]) -> None:
+        """Say so where no cloud came for a while, and the most likely reason."""
+        text = f"no cloud on {topic} for {SILENCE_S:.0f} s from {names_of(publishers)}: does the sensor run?"
+        if not publishers:
+            text = f"nobody publishes on {topic}: start the driver, or remap points (-r points:=TOPIC)"
+        elif any(p.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for p in publishers):
+            text += " The cloud that it keeps for late listeners does not come here: publish it once more"
+        is_long = time.monotonic() - self._cloud_at > SILENCE_S
+        self._session.conflicts.note("silence", text if is_long else "")
 
     def _subscribe(self, reliability: ReliabilityPolicy) -> Any:
         depth = min(self._host.parameters.accumulate, MOST_QUEUED)  # every cloud counts where clouds are collected
         return self._host.ros.create_subscription(
-            INPUTS[self._host.parameters.cloud_type].message, CLOUDS, self._on_cloud,
+            PointCloud2, CLOUDS, self._on_cloud,
             QoSProfile(depth=depth, reliability=reliability), raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch),
         )  # fmt: skip
 
     @guarded
     def _on_cloud(self, data: bytes, info: dict[str, Any]) -> None:
-        self._waiting_since = None
+        self._cloud_at = time.monotonic()
+        self._session.conflicts.note("silence", "")
         number = info["publication_sequence_number"]  # None where the middleware has none
         if self._is_taken((info["source_timestamp"], number)):
             return
         publishers = self._host.ros.count_publishers(self._clouds.topic_name)
-        if number is not None:
-            self._host.counters.count_lost(self._gaps.note(number, publishers))
+        if number is not None and self._last_number is not None and publishers == 1:  # of several, no gap is a loss
+            self._host.counters.count_lost(max(number - self._last_number - 1, 0))
+        self._last_number = number
         self._session.take_cloud(data, alone=publishers == 1)
 
     def _is_taken(self, key: tuple[int, int | None]) -> bool:
@@ -138,19 +126,14 @@ class Subscriptions:
         self._session.take_initial_pose(message)
 
     @guarded
-    def _on_check_points(self, message: PoseArray) -> None:
-        self._session.take_check_points(message)
-
-    @guarded
     def _on_mismatch(self, event: Any) -> None:
         self._needed_at = time.monotonic()
-        if self._asked == "auto" and event.last_policy_kind == QoSPolicyKind.RELIABILITY:
+        if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
             self._host.call_soon(self._hear_best_effort)
             return
         kind = qos_policy_name_from_kind(event.last_policy_kind)
         topic = self._clouds.topic_name
-        how = f"; cloud_reliability is {self._asked}: set it to auto" if self._asked != "auto" else ""
-        self._mismatch = f"a publisher of {topic} offers an incompatible {kind}: none of its clouds come{how}"
+        self._mismatch = f"a publisher of {topic} offers an incompatible {kind}: none of its clouds come"
         self.get_logger().error(self._mismatch)
 
     def _hear_best_effort(self) -> None:
@@ -166,9 +149,3 @@ class Subscriptions:
         if second is not None:
             self.get_logger().info(f"every publisher of {self._clouds.topic_name} is reliable again")
             self._host.ros.destroy_subscription(second)
-
-
-def _type_name(cloud_type: str) -> str:
-    """As the graph has it: sensor_msgs/msg/PointCloud2."""
-    message = INPUTS[cloud_type].message
-    return f"{message.__module__.split('.')[0]}/msg/{message.__name__}"

@@ -7,32 +7,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from gapr_ros.node.outcome import Job
+
 log = logging.getLogger(__name__)
-
-
-@dataclass(eq=False)
-class Job:
-    """One cloud on its way through the worker.
-
-    Attributes:
-        cloud: serialised message, as it came from the middleware.
-        epoch: the reset count when it arrived; a later reset makes its result worthless.
-        received_ns: the node's clock when it arrived, ns.
-        waiters: futures of service calls that want its outcome.
-        urgent: asked for by a service: neither `continuous` nor `max_rate` holds it back.
-        arrived_s: by the wall clock (`time.monotonic`).
-    """
-
-    cloud: bytes
-    epoch: int
-    received_ns: int
-    waiters: list[Any] = field(default_factory=list)
-    urgent: bool = False
-    arrived_s: float = field(default_factory=time.monotonic)
 
 
 class Worker:
@@ -41,17 +21,15 @@ class Worker:
     Args:
         process: what to do with a job, in the worker's thread; must not raise.
         held: asked before a job that is not urgent; true leaves it in the mailbox (`continuous: false`).
-        period_s: asked for the least time between the starts of two jobs that are not urgent.
     """
 
-    def __init__(self, process: Callable[[Job], None], held: Callable[[], bool], period_s: Callable[[], float]) -> None:
-        self._process, self._held, self._period_s = process, held, period_s
+    def __init__(self, process: Callable[[Job], None], held: Callable[[], bool]) -> None:
+        self._process, self._held = process, held
         self._wake = threading.Condition()
         self._slot: Job | None = None
         self._tasks: deque[Callable[[], None]] = deque()
         self._last: Job | None = None
         self._oldest = 0
-        self._last_start = float("-inf")
         self._since: float | None = None  # the job that is processed was taken, `time.monotonic`
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="registration", daemon=True)
@@ -102,7 +80,7 @@ class Worker:
             self._wake.notify()
 
     def wake(self) -> None:
-        """Look again: `held` or `period_s` may have changed."""
+        """Look again: `held` may have changed."""
         with self._wake:
             self._wake.notify()
 
@@ -138,26 +116,14 @@ class Worker:
             while self._tasks or not self._stopping:
                 if self._tasks:
                     return self._tasks.popleft()
-                wait_s = self._wait_s()
-                if wait_s is not None and wait_s <= 0.0:
-                    return self._take()
-                self._wake.wait(wait_s)
+                if self._slot is not None and (self._slot.urgent or not self._held()):
+                    self._last, self._slot = self._slot, None
+                    return partial(self._run, self._last)
+                self._wake.wait()
         return None
 
-    def _wait_s(self) -> float | None:
-        """Seconds until the cloud in the mailbox is due; None while there is none to wait for."""
-        if self._slot is None or (self._held() and not self._slot.urgent):
-            return None
-        return 0.0 if self._slot.urgent else self._last_start + self._period_s() - time.monotonic()
-
-    def _take(self) -> Callable[[], None]:
-        job, self._slot = self._slot, None
-        assert job is not None
-        self._last, self._last_start = job, time.monotonic()
-        return partial(self._run, job)
-
     def _run(self, job: Job) -> None:
-        self._since = self._last_start
+        self._since = time.monotonic()
         try:
             self._process(job)
         finally:

@@ -31,7 +31,7 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.registration.problem import sensor
 from gapr_core.results import RegistrationStatus
 from gapr_ros.demo.act import write_stl
-from gapr_ros.node.refusal import Reason
+from gapr_ros.node.outcome import Reason
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"

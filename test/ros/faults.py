@@ -73,7 +73,7 @@ class Bench:
         """A new node, active."""
         self.end()
         self.client.be_quiet()
-        options = {"model_path": self.model, "model_unit": "mm", "timeout": ANSWER_S, "diagnostics_period": 0.2}
+        options = {"model_path": self.model, "model_unit": "mm"}
         self.node = NodeProcess(self.folder, keeps=True, **(options | parameters))
         self.client.wait_for_state("active", ANSWER_S)
 
@@ -258,7 +258,7 @@ def the_clock_goes_back(bench: Bench) -> None:
 
 
 def parameters_are_nonsense(bench: Bench) -> None:
-    names = ("min_confidence", "timeout", "max_rate", "crop_min", "cloud_unit", "model_path", "accumulate", "seed")
+    names = ("min_confidence", "pose_lifetime", "error_after", "crop_min", "cloud_unit", "model_path", "accumulate")
     nonsense = (float("nan"), -1.0, 7, "x", True, [0.0], 10**12, "")
     for name in names:
         for value in nonsense:

@@ -26,9 +26,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from gapr_ros.node import intake, timeline
-from gapr_ros.node.refusal import RefusedError
-from gapr_ros.node.timeline import Timeline
+from gapr_ros.node import cloud as cloud_room
+from gapr_ros.node.gate import Gate
+from gapr_ros.node.outcome import RefusedError
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import InvalidMessageError, cloud_to_xyz
 
@@ -38,7 +38,7 @@ HANG_S = 5.0
 START_S = 30.0  # imports
 CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 EXTREME = (0, 1, 2, 3, 4, 7, 8, 12, 15, 16, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1)
-PARAMETERS = NodeParameters(max_points=500, min_points=3)
+PARAMETERS = NodeParameters()
 MODEL_EXTENT_MM = 240.0
 
 
@@ -98,13 +98,11 @@ def case(seed: int, number: int) -> bytes:
 
 def check(data: bytes) -> str:
     """What becomes of the bytes on the node's way; raises for whatever must not happen."""
-    header = intake.read_header(data)
+    header = cloud_room.read_header(data)
     try:
         if header is not None:
-            intake.check_frame(intake.plain_frame(header.frame_id), PARAMETERS.model_frame)
-            Timeline().admit(timeline.stamp_ns(header), 0, PARAMETERS)
-        cloud = intake.read_message(data, "PointCloud2")
-        points = intake.take_in(cloud, MODEL_EXTENT_MM, PARAMETERS)
+            Gate().admit(header, 0, PARAMETERS)
+        points = cloud_room.take_in(cloud_room.read_message(data), MODEL_EXTENT_MM, PARAMETERS).points_mm
     except RefusedError as refusal:
         _compare(data)
         return str(refusal.reason)

@@ -34,16 +34,18 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Float64, Header
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_ros.node import lifecycle
 from gapr_ros.node.lifecycle import RegisterNode
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import xyz_to_cloud
 
+lifecycle.PERIOD_S = 0.1  # between two diagnostics of nodes in this process
 DOMAIN = domain.claim()
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NODE = "/register_node"
@@ -123,14 +125,19 @@ class Client:
         self.node = Node("client", context=self._spinner.context)
         self.poses: list[PoseWithCovarianceStamped] = []
         self.transforms: list[TransformStamped] = []
-        self.confidences: list[float] = []
+        self.statuses: list[DiagnosticArray] = []
         self.models: list[PointCloud2] = []
         self.diagnostics: list[DiagnosticArray] = []
         self._services: dict[str, Any] = {}
         listen = self.node.create_subscription
         listen(PoseWithCovarianceStamped, f"{NODE}/pose", self.poses.append, LATCHED)
-        listen(TransformStamped, f"{NODE}/transform", self.transforms.append, 10)
-        listen(Float64, f"{NODE}/confidence", lambda m: self.confidences.append(m.data), 1000)
+        listen(TransformStamped, f"{NODE}/debug/transform", self.transforms.append, 10)
+        listen(
+            DiagnosticArray,
+            f"{NODE}/status",
+            self.statuses.append,
+            QoSProfile(depth=1000, durability=LATCHED.durability),
+        )
         listen(PointCloud2, f"{NODE}/model", self.models.append, LATCHED)
         listen(DiagnosticArray, "/diagnostics", self.diagnostics.append, 100)
         self.points = self.node.create_publisher(PointCloud2, "points", QoSProfile(depth=10, reliability=reliability))
@@ -147,20 +154,33 @@ class Client:
         """Give a publisher back."""
         self.do(lambda: self.node.destroy_publisher(publisher))
 
-    def values(self, status: str = "registration") -> dict[str, str]:
-        """Key and value of the newest diagnostics, with `level` and `message`; empty before the first."""
+    def values(self, status: str = "registration") -> dict[str, Any]:
+        """Key and value of the newest diagnostics, with `level` and `message`; empty before the first.
+
+        Those of the registration with what the newest ~/status says, its `cloud_stamp` and `frame`.
+        """
         for array in reversed(self.diagnostics):
             for entry in array.status:
                 if entry.name.endswith(f": {status}"):
                     own = {"level": ord(entry.level), "message": entry.message}
-                    return {pair.key: pair.value for pair in entry.values} | own
+                    said = self.said() if status == "registration" else {}
+                    return said | {pair.key: pair.value for pair in entry.values} | own
         return {}
+
+    def said(self) -> dict[str, Any]:
+        """Key and value of the newest ~/status of a cloud, with its `cloud_stamp`, `frame` and `line`."""
+        for array in reversed(self.statuses):
+            values: dict[str, Any] = {pair.key: pair.value for pair in array.status[0].values}
+            if values["reason"] != "withdrawn":
+                stamp = f"{array.header.stamp.sec}.{array.header.stamp.nanosec:09d}"
+                return values | {"cloud_stamp": stamp, "frame": array.header.frame_id, "line": array.status[0].message}
+        return {"cloud_stamp": "", "frame": "", "line": ""}
 
     def wait_for_state(self, state: str, timeout_s: float = PATIENCE_S) -> None:
         wait_until(lambda: self.values().get("state") == state, timeout_s, f"state {state}")
         if state == "active":
             wait_until(lambda: self.points.get_subscription_count(), 60.0, "the subscription")
-            wait_until(lambda: self.node.count_publishers(f"{NODE}/confidence"), 60.0, "the publishers")
+            wait_until(lambda: self.node.count_publishers(f"{NODE}/status"), 60.0, "the publishers")
 
     def send(self, cloud: PointCloud2 | np.ndarray | bytes, frame: str = "probe", stamp_s: float | None = None) -> str:
         """Publish a cloud, (N, 3) points in metres, or the bytes of a message.
@@ -175,30 +195,29 @@ class Client:
         self.points.publish(xyz_to_cloud(np.asarray(cloud, dtype=np.float32), Header(frame_id=frame, stamp=stamp)))
         return f"{stamp.sec}.{stamp.nanosec:09d}"
 
-    def ask(self, cloud: PointCloud2 | np.ndarray, timeout_s: float = PATIENCE_S, **kwargs: Any) -> dict[str, str]:
+    def ask(self, cloud: PointCloud2 | np.ndarray, timeout_s: float = PATIENCE_S, **kwargs: Any) -> dict[str, Any]:
         """Publish one cloud and wait for its answer: the diagnostics after it was counted.
 
-        Answers to earlier clouds may still be on their way: the stamp tells them apart. The confidence, and the pose of
-        an accepted cloud, are waited for too, or they would pass for those of the next cloud.
+        Answers to earlier clouds may still be on their way: the stamp tells them apart. The pose of an accepted cloud
+        is waited for too, or it would pass for that of the next cloud.
         """
-        before, heard, posed = _answered(self.values()), len(self.confidences), len(self.poses)
+        before, heard, posed = _answered(self.values()), len(self.statuses), len(self.poses)
         stamp = self.send(cloud, **kwargs)
 
-        def answer() -> dict[str, str]:
+        def answer() -> dict[str, Any]:
             values = self.values()
-            return values if _answered(values) > before and stamp in ("", values["cloud_stamp"]) else {}
+            is_new = _answered(values) > before and len(self.statuses) > heard
+            return values if is_new and stamp in ("", values["cloud_stamp"]) else {}
 
         try:
-            values: dict[str, str] = wait_until(answer, timeout_s, "an answer")
+            values: dict[str, Any] = wait_until(answer, timeout_s, "an answer")
         except AssertionError as error:
             sent = self.diagnostics[-1].header.stamp if self.diagnostics else "none"
             text = f"{error} after {before} others; newest diagnostics of {sent}: {self.values()}"
             raise AssertionError(text) from error
         deadline = time.monotonic() + SIBLINGS_S
-        while len(self.confidences) <= heard or (values["level"] == 0 and len(self.poses) <= posed):
-            if time.monotonic() > deadline:  # what the test waits for says more
-                break
-            time.sleep(0.002)
+        while values["level"] == 0 and len(self.poses) <= posed and time.monotonic() < deadline:
+            time.sleep(0.002)  # what the test waits for says more
         return values
 
     def be_quiet(self) -> None:
@@ -237,7 +256,7 @@ class Client:
         return bool(future.result().success)
 
 
-def _answered(values: dict[str, str]) -> int:
+def _answered(values: dict[str, Any]) -> int:
     return int(values.get("frames_accepted", 0)) + int(values.get("frames_refused", 0))
 
 
@@ -255,8 +274,7 @@ def node_in_thread(
         "model_path": str(model_path),
         "model_unit": "mm",
         "publish_tf": False,
-        "diagnostics_period": 0.1,
-        "timeout": 60.0,
+        "pose_lifetime": 0.0,
     }
     overrides = [Parameter(name, value=value) for name, value in (values | parameters).items()]
     options = {"context": spinner.context, "parameter_overrides": overrides, "namespace": namespace}

@@ -35,7 +35,7 @@ from gapr_core.data.scenes import stream as scenes
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
 from gapr_ros.node import units
-from gapr_ros.node.timeline import stamp_ns
+from gapr_ros.node.outcome import stamp_ns
 from msg_adapters import pose_to_matrix, xyz_to_cloud
 
 SEED, SUBJECT = 3, 900_001  # a subject that no training draws
@@ -57,7 +57,7 @@ def a_scene(bone: Specimen, frames: int) -> list[Pair]:
 
 KINDS: dict[str, tuple[Callable[[Specimen, int], list[Pair]], dict[str, Any]]] = {
     "sweeps": (sweeps, {}),
-    "scenes": (a_scene, {"viewpoint": "origin", "crop_to_track": 0.03}),
+    "scenes": (a_scene, {"viewpoint": "origin"}),
 }
 
 
@@ -69,7 +69,7 @@ class Soak:
         sent: clouds that were published.
         received, accepted, refused, dropped, lost: as the node counts them.
         reasons: of the refusals.
-        confidences, transforms: how many messages arrived.
+        statuses, transforms: how many messages arrived.
         answered_s, latency_s: when each answer came, and how long after its cloud was sent; in order.
         errors_mm: of the poses that were heard, at the cloud's centroid.
         rss_mb: of the node, once a second.
@@ -84,7 +84,7 @@ class Soak:
     dropped: int = 0
     lost: int = 0
     reasons: dict[str, int] = field(default_factory=dict)
-    confidences: int = 0
+    statuses: int = 0
     transforms: int = 0
     answered_s: list[float] = field(default_factory=list, repr=False)
     latency_s: list[float] = field(default_factory=list, repr=False)
@@ -119,7 +119,7 @@ class Soak:
         """Raise AssertionError for whatever must not happen."""
         assert self.received + self.lost == self.sent, self
         assert self.accepted + self.refused + self.dropped == self.received, self
-        assert self.confidences == self.accepted + self.refused == len(self.latency_s), "every processed cloud answers"
+        assert self.statuses == self.accepted + self.refused == len(self.latency_s), "every processed cloud answers"
         assert self.transforms == self.accepted > 0, self
         assert self.growth < MOST_GROWTH, (self.growth, self.rss_mb)
         assert self.exit_code == 0, self
@@ -133,7 +133,7 @@ def soak(folder: Path, kind: str, seconds: float, hz: float = 10.0, distinct: in
     clouds = [(units.to_metres(pair.source).astype(np.float32), _truth(pair, bone)) for pair in pairs]
     model = bones.save(bone.surface, folder / f"{kind}.npz")
     client, result = Client(), Soak(kind)
-    node = NodeProcess(folder, model_path=model, model_unit="mm", timeout=60.0, **parameters)
+    node = NodeProcess(folder, model_path=model, model_unit="mm", **parameters)
     try:
         wait_until(
             lambda: node.process.poll() is not None or client.values().get("state") == "active", START_S, "a node"
@@ -191,7 +191,7 @@ def _count(client: Client, node: NodeProcess, result: Soak) -> None:
     for kind in ("received", *NOT_NOW):
         setattr(result, kind, count(kind))
     time.sleep(1.0)
-    result.confidences, result.transforms = len(client.confidences), len(client.transforms)
+    result.statuses, result.transforms = len(client.statuses), len(client.transforms)
 
 
 def _truth(pair: Pair, bone: Specimen) -> np.ndarray:

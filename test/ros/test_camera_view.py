@@ -26,7 +26,7 @@ def test_a_wound_is_registered_by_its_pixels_or_its_surface_whatever_frame_it_is
     image[row, column] = se3.apply(T_ROOM_CAMERA, pair.source)
     client, model = Client(), tmp_path / "femur.npy"
     np.save(model, pair.target)
-    node = NodeProcess(tmp_path, model_path=model, model_unit="mm", timeout=60.0)
+    node = NodeProcess(tmp_path, model_path=model, model_unit="mm")
     try:
         client.wait_for_state("active")
         values = client.ask(image / 1000.0)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from harness import context
 from rclpy.time import Time
@@ -245,7 +245,7 @@ def test_the_acts_exclude_each_other(capsys):
 
 
 def test_parameters_are_written_as_ros_reads_them():
-    assert as_arguments({"guide": True, "timeout": 30.0}) == ["-p", "guide:=true", "-p", "timeout:=30.0"]
+    assert as_arguments({"guide": True}) == ["-p", "guide:=true"]
 
 
 def test_the_truth_of_a_scene_lays_its_bone_on_the_file_of_the_bone():
@@ -319,11 +319,15 @@ def header(stamp_s):
     return Header(frame_id="camera", stamp=Time(nanoseconds=int(stamp_s * 1e9)).to_msg())
 
 
+def status_of(values, stamp_s):
+    pairs = [KeyValue(key=k, value=v) for k, v in values.items()]
+    return DiagnosticArray(header=header(stamp_s), status=[DiagnosticStatus(values=pairs)])
+
+
 def test_an_answer_is_put_together_from_what_the_node_publishes(observer):
     observer.note_sent("points", 1_700_000_002_000_000_000)
-    values = {"stamp": "1700000002.000000000", "reason": "", "confidence": "0.93", "tre": "0.0012", "tre95": "0.0021",
-              "exec_ms": "812"}  # fmt: skip
-    observer._on_status(DiagnosticStatus(values=[KeyValue(key=k, value=v) for k, v in values.items()]))
+    values = {"reason": "", "detail": "", "confidence": "0.93", "tre": "0.0012", "tre95": "0.0021", "seconds": "0.812"}
+    observer._on_status(status_of(values, 1_700_000_002))
     pose = PoseWithCovarianceStamped(header=header(1_700_000_002))
     pose.pose.pose = matrix_to_pose(units.ros_pose(TRUTH))
     observer._on_pose(pose)
@@ -342,9 +346,17 @@ def test_an_answer_is_put_together_from_what_the_node_publishes(observer):
 
 
 def test_a_refusal_keeps_its_reason_and_has_no_pose(observer):
-    values = {"stamp": "5.0", "reason": "clutter", "confidence": "0.2", "tre": "", "tre95": "", "exec_ms": "9"}
-    pairs = [KeyValue(key=k, value=v) for k, v in values.items()]
-    observer._on_status(DiagnosticStatus(values=pairs, message="refused: clutter: hardly any bone"))
+    values = {
+        "reason": "clutter",
+        "detail": "hardly any bone",
+        "confidence": "0.2",
+        "tre": "",
+        "tre95": "",
+        "seconds": "",
+    }
+    observer._on_status(status_of(values, 5))
+    observer._on_status(status_of({"reason": "withdrawn"}, 6))
+    assert len(observer.answers) == 1
     observer.complete()
     answer = observer.answers[5000]
     assert answer.refusal == "clutter: hardly any bone" and answer.T_target_source is None and answer.tre95_mm is None

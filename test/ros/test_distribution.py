@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 
 from gapr_ros import register_node
-from gapr_ros.node import distribution
 
 
 @pytest.mark.parametrize("name", ["", "jazzy", "kilted", "rolling"])
 def test_a_distribution_that_works_and_none_at_all_are_no_problem(name):
-    assert distribution.problem({"ROS_DISTRO": name} if name else {}) == ""
+    assert register_node.distribution_problem({"ROS_DISTRO": name} if name else {}) == ""
 
 
 @pytest.mark.parametrize("name", ["humble", "iron", "noetic"])

@@ -21,8 +21,7 @@ from gapr_core import Accumulator, LookAccumulator
 from gapr_core.config import ClutterConfig, CovarianceConfig, RegistrarConfig, SensorConfig
 from gapr_core.errors import ConfigError
 from gapr_core.runtime.settings import changes
-from gapr_ros.node.method import ShippedMethod, check_file, configured
-from gapr_ros.node.model import load_model
+from gapr_ros.node.model import ShippedMethod, check_file, configured, load_model
 from gapr_ros.parameters import NodeParameters
 
 LIMIT_S = 2.0  # of CPU time
@@ -53,8 +52,8 @@ def slow():
 
 @pytest.mark.parametrize(("scale", "is_odd"), [(1.0, False), (0.1, True)])
 def test_a_bone_of_an_uncommon_size_is_warned_of(tmp_path, caplog, scale, is_odd):
-    path = bones.save(bones.bone(), tmp_path / "bone.npz")
-    parameters = replace(NodeParameters(), model_path=str(path), model_scale=scale)
+    path = bones.save(bones.bone(), tmp_path / "bone.npz", 1.0 / scale)
+    parameters = replace(NodeParameters(), model_path=str(path), model_unit="mm")
     load_model(StandIn(), parameters)
     assert ("as small as a patella" in caplog.text) is is_odd
 
@@ -73,27 +72,13 @@ def test_where_a_camera_was_is_inferred_unless_all_is_bone(file, given, is_infer
     assert configured(settings, replace(NodeParameters(), **given)).clutter.infer_viewpoint is is_inferred
 
 
-def test_what_is_said_of_sensor_and_model_is_in_metres_and_wins_over_the_file():
-    file = RegistrarConfig(sensor=SensorConfig("laser", 0.5), covariance=CovarianceConfig(model_mm=0.2))
-    said = configured(file, replace(NodeParameters(), sensor="pointer", standoff=0.001, model_error=0.0003))
-    assert (said.sensor.kind, said.sensor.standoff_mm) == ("pointer", pytest.approx(1.0))
-    assert said.covariance.model_mm == pytest.approx(0.3)
-    assert configured(file, replace(NodeParameters(), model_error=0.0)).covariance.model_mm == 0.0
-    kept = configured(file, replace(NodeParameters(), sensor="laser"))
-    assert (kept.sensor, kept.covariance) == (file.sensor, file.covariance)
-
-
 @pytest.mark.parametrize(
     ("file", "given", "parameter"),
     [
         (RegistrarConfig(min_confidence=0.99), {}, "min_confidence"),
         (RegistrarConfig(max_tre_mm=2.0), {"max_tre": 0.003}, "max_tre"),
         (RegistrarConfig(guide=True), {}, "guide"),
-        (RegistrarConfig(seed=3), {}, "seed"),
-        (RegistrarConfig(num_threads=1), {}, "num_threads"),
         (RegistrarConfig(sensor=SensorConfig("pointer", 0.0)), {}, "sensor"),
-        (RegistrarConfig(sensor=SensorConfig(standoff_mm=1.0)), {"standoff": 0.002}, "standoff"),
-        (RegistrarConfig(covariance=CovarianceConfig(model_mm=0.1)), {"model_error": 0.0005}, "model_error"),
     ],
 )
 def test_a_file_must_not_say_otherwise_than_a_parameter_that_decides(file, given, parameter):
@@ -129,6 +114,8 @@ def test_a_file_may_say_the_same_as_the_parameters_and_what_they_leave_open():
         max_tre_mm=2.0,
         sensor=SensorConfig("pointer", 0.0),
         covariance=CovarianceConfig(model_mm=0.1),
+        num_threads=1,
+        seed=3,
     )
     same = replace(NodeParameters(), min_confidence=0.9, max_tre=0.002, sensor="pointer")
     check_file(file, same, named_in(file))
@@ -304,12 +291,12 @@ def test_a_parameter_that_is_set_just_as_the_bone_is_ready_does_not_miss_the_met
 
         def finish_and_set(*args):
             finish(*args)
-            answers.append(node.set_parameters([Parameter("seed", value=7)])[0])
+            answers.append(node.set_parameters([Parameter("accumulate", value=7)])[0])
 
         node._loader._finish = finish_and_set
         assert client.change_state(Transition.TRANSITION_CONFIGURE)
         assert not answers[0].successful and "read when configuring" in answers[0].reason
-        assert node.session._ready.parameters.seed == node.parameters.seed == 0
+        assert node.session._ready.parameters.accumulate == node.parameters.accumulate == 1
 
 
 def test_a_bone_that_is_ready_after_the_node_was_destroyed_raises_nothing(blob_path, client, slow):
@@ -349,7 +336,7 @@ def huge_model(tmp_path_factory):
 
 def started(client, folder, model_path, **parameters):
     """A node process, as soon as it is heard."""
-    node = NodeProcess(folder, model_path=model_path, model_unit="mm", diagnostics_period=0.1, **parameters)
+    node = NodeProcess(folder, model_path=model_path, model_unit="mm", **parameters)
     wait_until(lambda: client.values() or node.process.poll() is not None, PATIENCE_S, "the node's first word")
     return node
 
@@ -386,7 +373,7 @@ def test_a_signal_ends_the_node_within_two_seconds_while_it_registers(client, tm
     """400 000 points, none of them left out, take most of a second of CPU time and more."""
     bone = bones.bone()
     model = bones.save(bone, tmp_path / "bone.npz")
-    node = started(client, tmp_path, model, max_points=0, track=False, timeout=600.0)
+    node = started(client, tmp_path, model, max_points=0, track=False)
     client.wait_for_state("active")
     before = client.values()
     begun_s = cpu_s(node)

@@ -49,7 +49,3 @@ def test_everything_that_the_ros_side_imports_is_asked_for_by_its_rosdep_key():
 def test_a_key_that_was_wrong_or_missing_before_is_there(key):
     assert key in DEPENDENCIES
     assert "tf2_ros" not in DEPENDENCIES, "that is the C++ package: Python's is tf2_ros_py"
-
-
-def test_the_package_says_where_it_lives():
-    assert {url.get("type") for url in MANIFEST.findall("url")} >= {"website", "repository"}

@@ -7,7 +7,7 @@ from harness import DOMAIN, NodeProcess, wait_until
 from rclpy.context import Context
 from rclpy.node import Node
 
-from gapr_ros.node.parameter_files import files_in, without_entry
+from gapr_ros.register_node import files_in, without_entry
 
 NODE = "/femur/register_node"
 ENTRY = "{ros__parameters: {autostart: false}}"

@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 from harness import node_in_thread, wait_until
 
-from gapr_ros.node.publishers import TOPICS
+from gapr_ros.node.publish import TOPICS
 
 ROOT = Path(__file__).parents[2]
 

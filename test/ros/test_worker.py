@@ -7,15 +7,16 @@ import time
 
 from harness import wait_until
 
-from gapr_ros.node.worker import Job, Worker
+from gapr_ros.node.outcome import Job
+from gapr_ros.node.worker import Worker
 
 
 class Bench:
     """A worker whose process waits for a gate."""
 
-    def __init__(self, held=False, period_s=0.0):
-        self.done, self.gate, self.held, self.period_s = [], threading.Event(), held, period_s
-        self.worker = Worker(self._process, lambda: self.held, lambda: self.period_s)
+    def __init__(self, held=False):
+        self.done, self.gate, self.held = [], threading.Event(), held
+        self.worker = Worker(self._process, lambda: self.held)
 
     def _process(self, job):
         self.gate.wait(10.0)
@@ -118,20 +119,6 @@ def test_without_a_cloud_there_is_nothing_to_ask_for():
     assert not bench.worker.ask("waiter", epoch=0)
     assert bench.worker.clear() is None
     bench.worker.stop(5.0)
-
-
-def test_the_rate_is_limited_and_the_newest_cloud_is_taken_when_the_time_has_come():
-    bench = Bench(period_s=0.2)
-    bench.gate.set()
-    start = time.monotonic()
-    for i in range(12):
-        bench.worker.put(job(b"%d" % i))
-        time.sleep(0.05)
-    bench.worker.stop(5.0)
-    starts = [moment - start for _, moment in bench.done]
-    assert len(starts) >= 3
-    assert all(moment >= 0.2 * i for i, moment in enumerate(starts)), "they may come later, never sooner"
-    assert bench.names() == sorted(bench.names(), key=int)
 
 
 def test_tasks_go_before_clouds_and_an_exception_ends_nothing(caplog):

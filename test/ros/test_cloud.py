@@ -1,21 +1,17 @@
-"""The region of interest: a box in a frame, the neighbourhood of the tracked bone; and where the camera was."""
+"""Which points of a cloud are registered: a box in a frame, no table; and where the camera was."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
-from harness import Collecting, StandIn, accepted, node_in_thread, pose_mm
+from harness import Collecting, StandIn, node_in_thread, pose_mm
 from rclpy.parameter import Parameter
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
 
 from gapr_core.geometry import se3
-from gapr_core.results import RegistrationResult, RegistrationStatus
-from gapr_ros.node import frames, intake, region, units
-from gapr_ros.node.model import load_model
-from gapr_ros.node.refusal import Reason, RefusedError
+from gapr_ros.node import cloud, frames, units
+from gapr_ros.node.outcome import Reason, RefusedError
 from gapr_ros.parameters import NodeParameters
 from msg_adapters import matrix_to_transform, xyz_to_cloud
 
@@ -58,7 +54,7 @@ def test_the_box_keeps_what_is_inside_it_in_its_own_frame():
     parameters = NodeParameters(crop_min=(0.0, 0.1, 0.2), crop_max=(0.1, 0.3, 0.4))
     there_m = np.array([[0.05, 0.2, 0.3], [0.11, 0.2, 0.3], [0.05, 0.09, 0.3], [0.05, 0.2, 0.41], [0.01, 0.11, 0.21]])
     points_mm = se3.apply(se3.inverse(T_BOX_PROBE), there_m) * 1000.0
-    kept = region.box(parameters, T_BOX_PROBE)(points_mm)
+    kept = cloud.take_in(xyz_to_cloud(points_mm / 1000.0), 250.0, parameters, T_BOX_PROBE).points_mm
     np.testing.assert_allclose(kept, points_mm[[0, 4]], atol=1e-9)
 
 
@@ -66,42 +62,9 @@ def test_the_box_keeps_what_is_inside_it_in_its_own_frame():
 def test_a_box_that_no_point_fits_in_names_its_corners_in_metres(highest):
     parameters = NodeParameters(crop_min=(0.0, 0.1, 0.2), crop_max=highest)
     with pytest.raises(RefusedError) as refused:
-        region.box(parameters, np.eye(4))
+        cloud.take_in(xyz_to_cloud(GOOD), 250.0, parameters, np.eye(4))
     assert refused.value.reason is Reason.TOO_FEW_POINTS
     assert f"crop_min [0.0, 0.1, 0.2] is not below crop_max {list(highest)}" in refused.value.text
-
-
-@pytest.mark.parametrize(("given", "crop", "said"), [
-    ({"range_min": 5.0}, False, "0 usable points, min_points is 200; of 1000 points are left out: 1000 by range_min"),
-    ({}, True, "0 usable points, min_points is 200; of 1000 points are left out: 1000 by the crop (crop_min, crop_max"),
-    ({"accumulate": 5}, True, "0 usable points; of 1000 points are left out: 1000 by the crop"),
-    ({"min_points": 1001}, False, "1000 usable points, min_points is 1001"),
-])  # fmt: skip
-def test_a_refusal_for_too_few_points_says_which_limits_left_them_out(given, crop, said):
-    """A box in the wrong place looks like a sensor that sees nothing."""
-    crops = [lambda points: points[:0]] if crop else []
-    with pytest.raises(RefusedError) as refused:
-        intake.take_in(xyz_to_cloud(GOOD), 250.0, NodeParameters(**given), crops)
-    assert refused.value.reason is Reason.TOO_FEW_POINTS
-    assert refused.value.text.startswith(said) and ("left out" in said or "left out" not in refused.value.text)
-
-
-def test_the_neighbourhood_of_the_bone_is_where_its_last_pose_puts_it():
-    model_mm = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
-    T_cloud_model = pose_mm([0.0, 0.0, np.pi / 2], [0.5, 0.0, 0.0])  # metres: the second point is at (0.5, 0.1, 0)
-    points_mm = np.array([[500.0, 100.0, 9.0], [500.0, 100.0, 11.0], [600.0, 0.0, 0.0], [495.0, 0.0, 0.0]])
-    kept = region.around(SimpleNamespace(tree=cKDTree(model_mm)), T_cloud_model, 0.01)(points_mm)
-    np.testing.assert_array_equal(kept, points_mm[[0, 3]])
-
-
-def test_points_on_the_bone_stay_however_far_apart_the_corners_of_its_mesh_are(tmp_path):
-    corners = np.array([[x, y, z] for x in (0.0, 40.0) for y in (0.0, 40.0) for z in (0.0, 300.0)])
-    np.savez(tmp_path / "shaft.npz", points=corners, faces=ConvexHull(corners).simplices)
-    parameters = NodeParameters(model_path=str(tmp_path / "shaft.npz"), model_unit="mm")
-    model = load_model(StandIn(), parameters)
-    middle = np.array([[0.0, 20.0, 150.0], [40.0, 10.0, 120.0], [20.0, 0.0, 200.0], [60.0, 20.0, 150.0]])
-    kept = region.around(model, np.eye(4), 0.01)(middle)
-    np.testing.assert_array_equal(kept, middle[:3])
 
 
 def test_a_cloud_with_points_metres_away_is_registered_when_it_is_cropped(blob_path, client, method):
@@ -112,7 +75,7 @@ def test_a_cloud_with_points_metres_away_is_registered_when_it_is_cropped(blob_p
         assert node.set_parameters_atomically(box).successful
         values = client.ask(np.vstack([GOOD, FAR]))
         assert values["level"] == 0 and values["points_used"] == "1000"
-        assert "too_few_points: 0 usable points" in client.ask(FAR)["last_refusal"]
+        assert "too_few_points: none of" in client.ask(FAR)["last_refusal"], "as where the box is in the wrong place"
 
 
 def test_the_box_is_looked_up_in_its_frame_and_a_missing_frame_is_a_refusal(blob_path, client, method, monkeypatch):
@@ -124,23 +87,7 @@ def test_the_box_is_looked_up_in_its_frame_and_a_missing_frame_is_a_refusal(blob
         values = client.ask(np.vstack([GOOD, FAR]), frame="probe")
         assert values["level"] == 0 and values["points_used"] == "1000"
         refused = client.ask(GOOD, frame="elsewhere")
-        assert refused["last_refusal"] == "tf_missing: crop_frame: table <- elsewhere: table does not exist"
-
-
-def test_after_a_good_pose_only_the_neighbourhood_counts_and_after_a_refusal_everything(blob_path, client, method):
-    aside = GOOD + [0.0, 0.4, 0.0]
-    with node_in_thread(method, blob_path, crop_to_track=0.15):
-        client.wait_for_state("active")
-        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "2000"
-        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "1000"
-        method.answer = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE)
-        client.ask(np.vstack([GOOD, aside]))
-        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "2000", "the bone may be elsewhere"
-        method.answer = accepted()
-        client.ask(GOOD)
-        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "1000"
-        client.call("reset")
-        assert client.ask(np.vstack([GOOD, aside]))["points_used"] == "2000"
+        assert refused["last_refusal"].startswith("tf_missing: crop_frame: table <- elsewhere: nobody sends 'table'")
 
 
 @pytest.mark.parametrize(
@@ -171,15 +118,6 @@ def test_the_origin_of_the_cloud_is_given_in_the_frame_of_the_answer(blob_path, 
     np.testing.assert_allclose(method.calls[-1]["viewpoint"], T_BOX_PROBE[:3, 3] * 1000.0, atol=1e-9)
 
 
-def test_a_first_cloud_that_no_collection_keeps_is_refused_for_its_number_of_points(blob_path, client, monkeypatch):
-    """As one of five points by a `LookAccumulator`."""
-    method = Collecting()
-    monkeypatch.setattr(method, "together_with", lambda source, viewpoint=None: np.empty((0, 3)))
-    with node_in_thread(method, blob_path, accumulate=4):
-        client.wait_for_state("active")
-        assert client.ask(GOOD[:5], frame="probe")["last_refusal"].startswith("too_few_points")
-
-
 @pytest.mark.parametrize(
     ("given", "is_given"),
     [
@@ -191,12 +129,11 @@ def test_a_first_cloud_that_no_collection_keeps_is_refused_for_its_number_of_poi
     ],
 )
 def test_looks_that_are_registered_as_one_each_keep_their_place(blob_path, client, monkeypatch, given, is_given):
-    """The first has too few points to be registered alone: it is collected, with its place too."""
     monkeypatch.setattr(frames, "_import_tf2", Tf2)
     method = Collecting()
     with node_in_thread(method, blob_path, output_frame="table", accumulate=4, **given):
         client.wait_for_state("active")
-        assert client.ask(GOOD[:150], frame="probe")["last_refusal"].startswith("too_few_points")
+        assert client.ask(GOOD[:150], frame="probe")["level"] == 0
         assert client.ask(GOOD, frame="probe")["level"] == 0
     of_model, *places = method.places
     assert len(places) == 2 and (of_model is None) is not is_given
@@ -262,3 +199,42 @@ def test_a_method_that_knows_no_viewpoint_is_not_given_one(blob_path, client, im
         assert client.ask(GOOD)["level"] == 0
         answer = client.ask(image / 1000.0)
         assert answer["level"] == 0 and answer["seen_from"] == "", answer
+
+
+def table_scene(rng, size_mm=1200.0, bone_mm=100.0, share=0.06):
+    """(N, 3) mm: a noisy table of 20 000 points, and a bone and a cup on it."""
+    count = int(share * 20_000)
+    table = np.column_stack([rng.uniform(-0.5, 0.5, (20_000, 2)) * size_mm, np.zeros(20_000)])
+    bone = rng.normal(size=(count, 3))
+    bone = bone / np.linalg.norm(bone, axis=1, keepdims=True) * [bone_mm / 2, 15.0, 15.0] + [0.0, 0.0, 20.0]
+    cup = rng.normal(size=(50, 3)) * 5.0 + [200.0, 100.0, 30.0]
+    turned = pose_mm([0.4, 0.2, 0.1], [0.0, 0.0, 800.0])
+    noisy = np.vstack([table, bone, cup]) + rng.normal(0.0, 1.0, (20_050 + count, 3))
+    return se3.apply(turned, noisy), se3.apply(turned, bone)
+
+
+def test_a_table_is_left_out_and_the_bone_on_it_stays():
+    scene, bone = table_scene(np.random.default_rng(0))
+    kept = cloud.without_table(scene, 110.0)
+    distance_mm = cKDTree(bone).query(kept)[0]
+    assert 0.6 * len(bone) < len(kept) < 1.1 * len(bone) and np.quantile(distance_mm, 0.99) < 10.0
+
+
+@pytest.mark.parametrize("scene", ["no table", "a table smaller than the bone", "nothing on it"])
+def test_where_no_plane_is_larger_than_the_bone_all_points_stay(scene):
+    rng = np.random.default_rng(0)
+    points = {
+        "no table": GOOD * 1000.0,
+        "a table smaller than the bone": table_scene(rng, size_mm=200.0)[0],
+        "nothing on it": np.column_stack([rng.uniform(-600.0, 600.0, (5000, 2)), np.zeros(5000)]),
+    }[scene]
+    np.testing.assert_array_equal(cloud.without_table(points, 300.0), points)
+
+
+def test_the_status_of_a_cloud_of_a_table_counts_what_was_left_out(blob_path, client, method):
+    scene, _ = table_scene(np.random.default_rng(0), bone_mm=300.0)
+    with node_in_thread(method, blob_path, viewpoint="none"):
+        client.wait_for_state("active")
+        values = client.ask(scene / 1000.0)
+        assert values["level"] == 0 and 15_000 < int(values["points_on_table"])
+        assert int(values["points_in"]) == int(values["points_on_table"]) + int(values["points_used"])

@@ -64,7 +64,7 @@ def factors(scores: Array, confidence: Array, family: NDArray[np.str_]) -> tuple
         family: (N,) sensor families, each of which the bound covers in each bin.
 
     Returns:
-        Middle confidence and factor of each bin that has enough answers.
+        Upper end and factor of each bin that has enough answers: between two ends the factor is the lower bin's or less.
     """
     at, found = [], []
     for low, high in zip(BINS[:-1], BINS[1:], strict=True):
@@ -73,7 +73,7 @@ def factors(scores: Array, confidence: Array, family: NDArray[np.str_]) -> tuple
             continue
         families = [in_bin & (family == name) for name in np.unique(family[in_bin])]
         of_each = [conformal_quantile(scores[of_it], IN_EACH) for of_it in families if of_it.sum() >= FEWEST]
-        at.append(float(np.median(confidence[in_bin])))
+        at.append(high)
         found.append(max([conformal_quantile(scores[in_bin], COVERED), *of_each]))
     return tuple(at), tuple(np.maximum.accumulate(found[::-1])[::-1])
 

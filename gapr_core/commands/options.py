@@ -16,7 +16,7 @@ from gapr_core.runtime.console import say
 if TYPE_CHECKING:
     from gapr_core.surface import Surface
 
-UNITS = ("mm", "cm", "m")
+UNITS = ("mm", "cm", "m", "in")
 
 
 def add_method(parser: ArgumentParser) -> None:

@@ -140,7 +140,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     from gapr_core import clouds
 
     target = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
-    clouds.warn_of_size(args.target, target.extent_mm)
+    clouds.warn_of_size(args.target, target.extent_mm, args.units or "mm")
     how = {"axes": args.source_axes, "tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
     how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
     source = options.load(args.source, args.source_units or args.units, **how)

@@ -29,7 +29,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
-OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # that are taken for mm by mistake
+OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit in ("m", "cm")}  # that are taken for mm by mistake
 HALF_TURN_DEG = 180.0
 
 

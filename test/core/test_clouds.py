@@ -119,11 +119,13 @@ def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
 
 def test_centimetres_become_millimetres_and_are_asked_for(tmp_path):
     assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
-    with pytest.raises(InvalidPointCloudError, match="it looks like cm .* or in .*: pass units='cm', or convert it to mm$"):
+    with pytest.raises(
+        InvalidPointCloudError, match="looks like cm .* or in .*: pass units='cm', or convert it to mm$"
+    ):
         clouds.load(VERTICES / 10.0, units="mm")
     np.save(tmp_path / "a.npy", VERTICES / 10.0)
     options = r"\(--units cm; --source-units cm, of the source alone; model_unit of the node\)"
-    with pytest.raises(InvalidPointCloudError, match=rf"it looks like cm: pass units='cm' {options}, or convert it"):
+    with pytest.raises(InvalidPointCloudError, match=rf"cm .* or in .*: pass units='cm' {options}, or convert it"):
         clouds.load(tmp_path / "a.npy", units="mm")
 
 

@@ -24,7 +24,7 @@ CORE = [
 ]  # what a registration by the search needs
 NETWORK = ["safetensors", "torch>=2.4,<2.14"]
 DATA = ["open3d>=0.18"]  # rays and distances of simulated bones
-REPORTS = ["matplotlib", "pillow", "plotly>=5.20", "rich"]
+REPORTS = ["jinja2>=3.1", "matplotlib>=3.7", "pillow", "rich"]
 BASELINES = [*DATA, "kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
 MEDICAL = ["SimpleITK>=2.3", "highdicom>=0.24", "scikit-image>=0.22"]
 RERUN = ["rerun-sdk>=0.23"]

@@ -12,7 +12,7 @@ from gapr_core.runtime import compiled_code
 
 if TYPE_CHECKING:
     from gapr_core.clouds import load
-    from gapr_core.config import RegistrarConfig
+    from gapr_core.config import RegistrarConfig, SensorConfig
     from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
     from gapr_core.formats.options import ReadOptions
     from gapr_core.registration.check_points import check_points
@@ -35,6 +35,7 @@ _HOMES = {
     "LookAccumulator": "registration.streams.look_accumulator",
     "FollowedPose": "registration.streams.following",
     "RegistrarConfig": "config",
+    "SensorConfig": "config",
     "PreparedTarget": "registration.problem.target",
     "RegistrationResult": "results",
     "RegistrationStatus": "results",

@@ -12,5 +12,6 @@
 | `scenes` | a camera's cloud, most of which may not be bone |
 | `streams` | `Tracker`, `Accumulator`, `LookAccumulator` |
 
-`guidance` says where to measure next; `check_points` tests a pose where the source was not.
+`guidance` says where to measure next; `check_points` tests a pose where the source was not; `caveats` completes a
+result with its warnings.
 """

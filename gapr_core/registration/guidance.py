@@ -66,7 +66,8 @@ def guide(assessment: Assessment, config: GuidanceConfig) -> Guidance | None:
     ranked = tuple(
         Patch(points[k], normals[k], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k])) for k in order
     )
-    return Guidance(target.points.copy(), _spread(target, patches, now_mm - after_mm), now_mm, ranked)
+    gain_mm = _spread(target, patches, now_mm - after_mm)
+    return Guidance(target.points.copy(), gain_mm, now_mm, ranked, config.patch_mm)
 
 
 def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array:

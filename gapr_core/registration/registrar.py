@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
+from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks import cortices, limits, rules
 from gapr_core.registration.checks import costly as checks
 from gapr_core.registration.checks import second_copy as doubles
@@ -131,6 +132,9 @@ class Registrar:
             scene_calibration.check_is_for(clutter.NAME)
         self.precision = precision or Precision.load()
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {', '.join(proposer.name for proposer in self.proposers)}; {self.config}>"
+
     @classmethod
     def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu") -> Registrar:
         """The best registrar that ships: GAPR-Net, then the search; nothing is downloaded.
@@ -165,6 +169,7 @@ class Registrar:
             proposer.prepare(prepared)  # `both_cortices` gets its share when a source first follows both
         return prepared
 
+    @answering
     def register(
         self,
         source: ArrayLike,
@@ -175,7 +180,7 @@ class Registrar:
         """The pose of a source on the target, or a refusal.
 
         Args:
-            source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
+            source: (N, 3), mm, in its own frame; rows that are not finite are dropped. Also a path or a `Surface`.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
             viewpoint: (3,) mm, source frame: where the camera was, if there was one; (N, 3) where it was for each

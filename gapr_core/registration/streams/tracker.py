@@ -14,6 +14,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks import limits
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.confidence.classifier import Calibration
@@ -157,6 +158,7 @@ class Tracker:
         """Everything static about a target; see `Registrar.prepare`."""
         return self.registrar.prepare(target, units)
 
+    @answering
     @single_threaded_libraries
     def register(
         self,

@@ -15,7 +15,6 @@ from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import markups
 from gapr_core.formats.markups import Markups
 from gapr_core.geometry.landmarks import LandmarkPose, paired_pose
-from gapr_core.geometry.mesh_distance import signed_distance_mm
 from gapr_core.geometry.twists import motion_jacobians
 from gapr_core.results import RegistrationResult, ResultWarning, TargetError
 from gapr_core.surface import Surface, as_points
@@ -81,10 +80,17 @@ def with_targets(result: RegistrationResult, points: ArrayLike, labels: Sequence
 
 
 def distances_mm(points: Array, bone: Surface) -> Array:
-    """(N,) distance of points (N, 3) to a bone, mm: negative inside a mesh; to the nearest point of a cloud."""
+    """Distance of points (N, 3) to a bone, mm: negative inside a mesh; to the nearest point of a cloud.
+
+    Inside, the winding number is above a half: the mesh need not be closed, and may be turned inside out.
+    """
     if bone.faces is None or not len(bone.faces):
         return np.asarray(cKDTree(bone.points).query(points)[0])
-    return signed_distance_mm(points, bone.points, bone.triangles)
+    import igl
+
+    distance_mm = np.sqrt(igl.point_mesh_squared_distance(points, bone.points, bone.triangles)[0])
+    inside = np.abs(igl.winding_number(bone.points, bone.triangles, points)) > 0.5
+    return np.where(inside, -distance_mm, distance_mm)
 
 
 def _far_targets(points: Array, apart_mm: Array, result: RegistrationResult) -> tuple[ResultWarning, ...]:

@@ -14,6 +14,7 @@ from gapr_core.formats import planning, signatures, transforms
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, Residuals, TargetError
 from gapr_core.runtime import files
+from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 

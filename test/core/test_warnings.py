@@ -9,9 +9,8 @@ import pytest
 from gapr_core import Registrar, RegistrarConfig, SensorConfig, cli
 from gapr_core.benchmark import methods
 from gapr_core.config import ClutterConfig
-from gapr_core.formats import markups
+from gapr_core.formats import markups, planning
 from gapr_core.geometry import se3
-from gapr_core.geometry.mesh_distance import signed_distance_mm
 from gapr_core.registration import caveats
 from gapr_core.results import Effect, Finding, RegistrationResult, RegistrationStatus, ResultWarning
 from gapr_core.surface import Surface
@@ -174,7 +173,7 @@ def test_the_distance_to_a_mesh_is_exact_and_negative_inside_even_if_its_faces_a
     expected = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
     bone = box(size)
     for faces in (bone.faces, bone.faces[:, ::-1]):
-        np.testing.assert_allclose(signed_distance_mm(points, bone.points, faces), expected, atol=1e-9)
+        np.testing.assert_allclose(planning.distances_mm(points, replace(bone, faces=faces)), expected, atol=1e-9)
 
 
 def test_a_refusal_keeps_no_caveat_of_a_pose_and_no_error_at_a_target():

@@ -13,7 +13,7 @@ import numpy as np
 FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 CHUNK = 16
 ZERO, ONE, TWO, HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
-TINY, TINY_PLANE, TINY_SINE = np.float32(1e-12), np.float32(1e-10), np.float32(1e-18)
+TINY, FADE, FADE_SINE, POINT = np.float32(1e-12), np.float32(1e-10), np.float32(1e-8), np.float32(2e-4)
 X, Y, Z = 11 * CHUNK, 12 * CHUNK, 13 * CHUNK  # where the neighbours lie in the scratch array, behind the features
 
 
@@ -51,7 +51,8 @@ def chunk(s, h, k):
     hx, hy, hz = h
     kx, ky, kz = k
     ax, ay, az = ky * hz - kz * hy, kz * hx - kx * hz, kx * hy - ky * hx  # k x h
-    aa, length = ax * ax + ay * ay + az * az, np.sqrt(kx * kx + ky * ky + kz * kz + TINY)
+    aa, axis = ax * ax + ay * ay + az * az, kx * kx + ky * ky + kz * kz
+    length, side = np.sqrt(axis + TINY), axis + hx * hx + hy * hy + hz * hz + POINT
     for j in range(CHUNK):
         x, y, z = s[X + j], s[Y + j], s[Z + j]
         ux, uy, uz = hx - x, hy - y, hz - z
@@ -59,19 +60,26 @@ def chunk(s, h, k):
         ii, hh, kk = x * x + y * y + z * z, ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
         s[j], s[CHUNK + j], s[2 * CHUNK + j] = np.sqrt(ii + TINY), np.sqrt(hh + TINY), np.sqrt(kk + TINY)
         nx, ny, nz = y * vz - z * vy, z * vx - x * vz, x * vy - y * vx
-        scale = ONE / np.sqrt(ii * kk + TINY_PLANE)
-        s[3 * CHUNK + j] = np.sqrt(nx * nx + ny * ny + nz * nz + TINY_SINE) * scale
+        sides = ii + kk + POINT
+        faded = FADE * sides * sides
+        scale = ONE / np.sqrt(ii * kk + faded)
+        s[3 * CHUNK + j] = np.sqrt(nx * nx + ny * ny + nz * nz + FADE_SINE * faded) * scale
         s[4 * CHUNK + j] = -(x * vx + y * vy + z * vz) * scale
         nx, ny, nz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
-        scale = ONE / np.sqrt(ii * hh + TINY_PLANE)
-        s[5 * CHUNK + j] = np.sqrt(nx * nx + ny * ny + nz * nz + TINY_SINE) * scale
+        sides = ii + hh + POINT
+        faded = FADE * sides * sides
+        scale = ONE / np.sqrt(ii * hh + faded)
+        s[5 * CHUNK + j] = np.sqrt(nx * nx + ny * ny + nz * nz + FADE_SINE * faded) * scale
         s[6 * CHUNK + j] = -(x * ux + y * uy + z * uz) * scale
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        scale = ONE / np.sqrt(hh * kk + TINY_PLANE)
-        s[7 * CHUNK + j] = np.sqrt(nx * nx + ny * ny + nz * nz + TINY_SINE) * scale
+        sides = hh + kk + POINT
+        faded = FADE * sides * sides
+        scale = ONE / np.sqrt(hh * kk + faded)
+        s[7 * CHUNK + j] = np.sqrt(nx * nx + ny * ny + nz * nz + FADE_SINE * faded) * scale
         s[8 * CHUNK + j] = (ux * vx + uy * vy + uz * vz) * scale
         nx, ny, nz = ky * z - kz * y, kz * x - kx * z, kx * y - ky * x  # k x j
-        scale = ONE / np.sqrt(aa * (nx * nx + ny * ny + nz * nz) + TINY_PLANE)
+        sides = side * (axis + ii + POINT)
+        scale = ONE / np.sqrt(aa * (nx * nx + ny * ny + nz * nz) + FADE * sides * sides)
         s[9 * CHUNK + j] = length * (ax * x + ay * y + az * z) * scale
         s[10 * CHUNK + j] = (ax * nx + ay * ny + az * nz) * scale
 

@@ -29,6 +29,11 @@ def half_extent_mm(points: Array) -> float:
     return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
 
 
+def half_edge_mm(points: Array) -> float:
+    """Half of the longest edge of the axis-aligned box around (N, 3) points."""
+    return 0.5 * float(np.ptp(points, axis=0).max())
+
+
 def radius_mm(points: Array) -> float:
     """Root mean square distance of (N, 3) points to their mean; 1 at least, as it divides."""
     return max(float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)

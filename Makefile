@@ -31,6 +31,7 @@ faults: $(READY)  ## a table of faults on real processes of the node
 fuzz: $(READY)  ## 100 000 mutated PointCloud2 through the node's reader, 20 000 files of all formats; ARGS="--seed 2" for others
 	$(BIN)/python test/ros/fuzz.py $(ARGS)
 	$(BIN)/python test/fuzz/files.py $(ARGS)
+	$(BIN)/python test/fuzz/packed.py $(ARGS)
 
 soak: $(READY)  ## sweeps and scenes at 10 Hz: every cloud is answered or counted; ARGS="--minutes 60 --out soak" is an hour
 	$(BIN)/python test/ros/soak.py $(ARGS)

@@ -24,7 +24,7 @@ CORE = [
 ]  # what a registration by the search needs
 NETWORK = ["safetensors", "torch>=2.4,<2.14"]
 DATA = ["open3d>=0.18"]  # rays and distances of simulated bones
-REPORTS = ["matplotlib", "pillow", "plotly>=5.20", "rich"]
+REPORTS = ["jinja2>=3.1", "matplotlib>=3.7", "pillow", "rich"]
 BASELINES = [*DATA, "kiss-matcher; python_version < '3.13'", "pycpd", "small_gicp"]
 MEDICAL = ["SimpleITK>=2.3", "highdicom>=0.24", "scikit-image>=0.22"]
 RERUN = ["rerun-sdk>=0.23"]
@@ -90,10 +90,27 @@ setup(
     license="Apache-2.0",
     maintainer="GAPR maintainers",
     maintainer_email="maintainers@gapr.invalid",
+    url="https://gapr.invalid/gapr",
+    project_urls={
+        "Source": "https://gapr.invalid/gapr.git",
+        "Issues": "https://gapr.invalid/gapr/issues",
+    },
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Healthcare Industry",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in range(10, 14)),
+        "Topic :: Scientific/Engineering :: Medical Science Apps.",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=["gapr_core*", "msg_adapters*", "gapr_ros*"]),
     cmdclass={"build_py": BuildCompiled},
-    package_data={"gapr_core": ["weights/*.safetensors", "weights/*.json", "weights/*.md", "pages/templates/*"]},
+    package_data={
+        "gapr_core": ["weights/*.safetensors", "weights/*.json", "weights/*.md", "pages/templates/*", "py.typed"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -10,20 +10,28 @@ from typing import TYPE_CHECKING, Any
 
 from gapr_core.runtime import compiled_code
 
-if TYPE_CHECKING:
-    from gapr_core.clouds import load
-    from gapr_core.config import RegistrarConfig
-    from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError, MethodUnavailableError, WeightsError
-    from gapr_core.formats.options import ReadOptions
-    from gapr_core.registration.check_points import check_points
-    from gapr_core.registration.problem.crop import crop_box, crop_to_pose
-    from gapr_core.registration.problem.target import PreparedTarget
-    from gapr_core.registration.registrar import Registrar
-    from gapr_core.registration.streams.accumulator import Accumulator
-    from gapr_core.registration.streams.look_accumulator import LookAccumulator
-    from gapr_core.registration.streams.tracker import Tracker
-    from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
-    from gapr_core.surface import Surface
+if TYPE_CHECKING:  # `X as X`: what mypy --strict takes for exported
+    from gapr_core.clouds import load as load
+    from gapr_core.config import RegistrarConfig as RegistrarConfig
+    from gapr_core.config import SensorConfig as SensorConfig
+    from gapr_core.errors import ConfigError as ConfigError
+    from gapr_core.errors import GaprError as GaprError
+    from gapr_core.errors import InvalidPointCloudError as InvalidPointCloudError
+    from gapr_core.errors import MethodUnavailableError as MethodUnavailableError
+    from gapr_core.errors import WeightsError as WeightsError
+    from gapr_core.formats.options import ReadOptions as ReadOptions
+    from gapr_core.registration.check_points import check_points as check_points
+    from gapr_core.registration.problem.crop import crop_box as crop_box
+    from gapr_core.registration.problem.crop import crop_to_pose as crop_to_pose
+    from gapr_core.registration.problem.target import PreparedTarget as PreparedTarget
+    from gapr_core.registration.registrar import Registrar as Registrar
+    from gapr_core.registration.streams.accumulator import Accumulator as Accumulator
+    from gapr_core.registration.streams.look_accumulator import LookAccumulator as LookAccumulator
+    from gapr_core.registration.streams.tracker import Tracker as Tracker
+    from gapr_core.results import LookFit as LookFit
+    from gapr_core.results import RegistrationResult as RegistrationResult
+    from gapr_core.results import RegistrationStatus as RegistrationStatus
+    from gapr_core.surface import Surface as Surface
 
 __version__ = "0.2.0"
 
@@ -33,6 +41,7 @@ _HOMES = {
     "Accumulator": "registration.streams.accumulator",
     "LookAccumulator": "registration.streams.look_accumulator",
     "RegistrarConfig": "config",
+    "SensorConfig": "config",
     "PreparedTarget": "registration.problem.target",
     "RegistrationResult": "results",
     "RegistrationStatus": "results",

@@ -37,7 +37,7 @@ COMMANDS = {
     "paper": "gapr_core.commands.paper",
 }
 EXTRAS = {  # top-level module -> the extra of setup.py that installs it
-    "torch": "network", "safetensors": "network", "open3d": "data", "matplotlib": "reports", "plotly": "reports",
+    "torch": "network", "safetensors": "network", "open3d": "data", "matplotlib": "reports", "jinja2": "reports",
     "PIL": "reports", "rich": "reports", "rclpy": "ros", "rosbags": "bags",
     "sensor_msgs": "ros", "std_msgs": "ros", "geometry_msgs": "ros", "diagnostic_msgs": "ros", "std_srvs": "ros",
     "builtin_interfaces": "ros", "lifecycle_msgs": "ros", "rcl_interfaces": "ros", "rosgraph_msgs": "ros",
@@ -98,7 +98,7 @@ def _parser(arguments: list[str]) -> argparse.Namespace:
     for name, module in modules().items():
         command = commands.add_parser(name, help=_first_line(module))
         if arguments[:1] == [name]:
-            _load(command, module)
+            _load(command, module, {"-h", "--help"}.isdisjoint(arguments))
     return parser.parse_args(_joined(arguments))
 
 
@@ -119,22 +119,37 @@ def modules() -> Mapping[str, str]:
     return COMMANDS | {name: others[name] for name in sorted(others.keys() - COMMANDS.keys())}
 
 
-def _load(command: argparse.ArgumentParser, name: str) -> None:
-    """The options of the one command that is called; no other module is imported."""
-    module: Any = import_module(name)
-    command.description, command.formatter_class = module.__doc__, argparse.RawDescriptionHelpFormatter
+def _load(command: argparse.ArgumentParser, name: str, runs: bool) -> None:
+    """The options of the one command that is called; no other module is imported.
+
+    Help for a command whose libraries are not installed says what it does, and how to install them.
+    """
+    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    try:
+        module: Any = import_module(name)
+    except ModuleNotFoundError as error:
+        if runs:
+            raise
+        command.description = f"{_docstring(name)}\n\n{_which_extra(error, command.prog.rpartition(' ')[2])}"
+        return
+    command.description = module.__doc__
     module.add_arguments(command)
     command.set_defaults(run=module.run)
 
 
 def _first_line(module: str) -> str:
+    """What a command does, in a line."""
+    return _docstring(module).splitlines()[0].partition(": ")[2] or "not installed"
+
+
+def _docstring(module: str) -> str:
     """What a module says of itself, read without running it."""
     try:
         spec = find_spec(module)
     except ModuleNotFoundError:
         spec = None
     text = ast.get_docstring(ast.parse(Path(spec.origin).read_text())) if spec and spec.origin else None
-    return (text or "not installed").splitlines()[0].partition(": ")[2] or "not installed"
+    return text or "not installed"
 
 
 def _which_extra(error: ModuleNotFoundError, command: str) -> str:

@@ -17,7 +17,7 @@ from gapr_core.surface import Array, Surface, as_array, as_points, check_faces
 
 log = logging.getLogger(__name__)
 
-MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0}
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "in": 25.4}
 PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
 CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header, or convert it to mm"
@@ -40,8 +40,8 @@ def load(
         source: path to a mesh or cloud (PLY, PCD, STL, OBJ, VTK, VTP, XYZ, CSV, NPY, or NPZ with `points` and `faces`),
             a label map (NIfTI, NRRD, MHA, DICOM SEG), markups or tracked slices; an (N, 3) array of floats (rows that
             are not finite are dropped); or a `Surface`.
-        units: what the numbers are, "mm", "cm" or "m"; "auto" takes what the names of the columns say, or guesses mm
-            or m from the extent and logs a warning.
+        units: what the numbers are, "mm", "cm", "m" or "in"; "auto" takes what the names of the columns say, or
+            guesses mm or m from the extent and logs a warning.
             Files in patient coordinates (label maps, markups) and a tracker's recordings are in mm, whatever is named
             here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
@@ -122,10 +122,12 @@ def check_extent(extent_mm: float, unit: str, name: str, how: str = CONVERT) -> 
     low, high = EXTENT_LIMITS_MM
     if low <= extent_mm <= high:
         return
-    other = next((u for u, mm in MM_PER_UNIT.items() if low <= extent_mm / MM_PER_UNIT[unit] * mm <= high), None)
+    others = _across_mm(extent_mm / MM_PER_UNIT[unit], (low, high))
+    others = {"m": others["m"]} if "m" in others else others  # what scanners and ROS write
     hint = "check the file and its unit"
-    if other:
-        hint = f"it looks like {other}: {how.format(unit=other, read_as=unit)}"
+    if others:
+        looks = " or ".join(others if len(others) == 1 else [f"{u} ({mm:.0f} mm across)" for u, mm in others.items()])
+        hint = f"it looks like {looks}: {how.format(unit=next(iter(others)), read_as=unit)}"
     raise InvalidPointCloudError(
         f"a bone or a piece of one, {low:g} to {high:g} mm across",
         f"{name} of {extent_mm:.3g} mm read as {unit}",
@@ -133,20 +135,32 @@ def check_extent(extent_mm: float, unit: str, name: str, how: str = CONVERT) -> 
     )
 
 
-def warn_of_size(path: Path, extent_mm: float) -> None:
+def _across_mm(extent: float, limits_mm: tuple[float, float]) -> dict[str, float]:
+    """Size in mm by each unit of a number that makes one within the limits."""
+    sizes = {unit: extent * mm for unit, mm in MM_PER_UNIT.items()}
+    return {unit: size for unit, size in sizes.items() if limits_mm[0] <= size <= limits_mm[1]}
+
+
+def warn_of_size(path: Path, extent_mm: float, unit: str = "mm") -> None:
     """Warn of a whole bone of an uncommon size: it and a source in the same wrong unit fit each other.
 
     Args:
         path: the file that was read.
         extent_mm: the diagonal of what is in it.
+        unit: that it was read as; cm are easily named for inches.
     """
     low, high = WHOLE_BONE_MM
+    others = _across_mm(extent_mm / MM_PER_UNIT.get(unit, 1.0), WHOLE_BONE_MM)
+    sizes = ", ".join(f"{size:.0f} mm in {other}" for other, size in others.items() if other != unit)
+    if low <= extent_mm <= high and unit == "cm" and "in" in others:
+        log.warning("%s is %.3g mm across in cm, and %s (inches): a femur has 350 to 550 mm, a pelvis 250 to 350 mm. "
+                    "Name the unit that is right", path.name, extent_mm, sizes)  # fmt: skip
     if low <= extent_mm <= high:
         return
     how = (
         OF_HEADER
         if reading.format_of(path).in_mm
-        else "name the unit, such as units='cm' (--units cm, of both files; model_unit)"
+        else "name the unit with units, --units (of both files) or model_unit" + (f": it has {sizes}" if sizes else "")
     )
     if extent_mm < low:
         said = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"
@@ -183,7 +197,7 @@ def _known(surface: Surface, units: str, name: str) -> str:
         units = "m" if surface.extent_mm < EXTENT_LIMITS_MM[0] else "mm"
         log.warning("%s is %.3g across: taken to be in %s; name the unit to be sure", name, surface.extent_mm, units)
     if units not in MM_PER_UNIT:
-        raise InvalidPointCloudError("units 'mm', 'cm', 'm' or 'auto'", repr(units), "name one of them")
+        raise InvalidPointCloudError("units 'mm', 'cm', 'm', 'in' or 'auto'", repr(units), "name one of them")
     return units
 
 

@@ -53,6 +53,10 @@ class Surface:
         points, faces = o3d.utility.Vector3dVector(self.points), o3d.utility.Vector3iVector(self.triangles)
         return o3d.geometry.TriangleMesh(points, faces)
 
+    def __repr__(self) -> str:
+        faces = "" if self.faces is None else f"{len(self.faces)} faces, "
+        return f"<Surface: {len(self.points)} points, {faces}{self.extent_mm:.0f} mm across>"
+
     @property
     def triangles(self) -> NDArray[np.int64]:
         """(F, 3) the faces of a mesh.
@@ -150,6 +154,10 @@ def as_points(array: ArrayLike) -> Array:
         how = next((how for name, how in OF_OBJECTS.items() if hasattr(array, name)), "pass x y z in columns")
         raise InvalidPointCloudError("an array of shape (N, 3)", f"a {type(array).__name__}", how)
     if points.dtype.kind not in "fiu":
+        if hasattr(array, "files"):
+            raise InvalidPointCloudError(
+                "an array of shape (N, 3)", "an NPZ archive", "pass its path, or one of its arrays"
+            )
         raise InvalidPointCloudError("(N, 3) real numbers", f"dtype {points.dtype}", "convert them to float")
     if points.ndim == 3 and points.shape[2] == 3:
         points = points.reshape(-1, 3).astype(np.float64)

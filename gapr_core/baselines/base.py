@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from inspect import signature
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,10 +18,11 @@ from scipy.spatial import cKDTree
 from gapr_core.clouds import finite_points, load
 from gapr_core.errors import MethodUnavailableError
 from gapr_core.geometry import extent, se3
-from gapr_core.results import RegistrationResult, RegistrationStatus
+from gapr_core.results import RegistrationResult, RegistrationStatus, ResultWarning
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
+Source = str | Path | ArrayLike | Surface
 
 TARGET_POINTS = 8192  # drawn from a mesh, as the protocols do
 MIN_SOURCE_POINTS = 10
@@ -41,6 +43,12 @@ class RegistrationMethod(Protocol):
     def register(self, source: ArrayLike, target: Any) -> RegistrationResult:
         """Pose of `source` (N, 3), mm, in the frame of the prepared target, or a refusal."""
         ...
+
+
+def uncalibrated(name: str) -> ResultWarning:
+    """Warn of the confidence of a baseline."""
+    text = f"{name} is a baseline: its confidence is its share of inliers, not calibrated, and a wrong pose may be OK."
+    return ResultWarning("uncalibrated", text, "Use --method gapr for a confidence to rely on.")
 
 
 def takes(method: RegistrationMethod, hint: str) -> bool:
@@ -104,11 +112,11 @@ class Baseline(ABC):
         static = self._prepare(points - origin, normals)
         return BaselineTarget(points, normals, origin, cKDTree(points), self, static)
 
-    def register(self, source: ArrayLike, target: Any, initial: ArrayLike | None = None) -> RegistrationResult:
+    def register(self, source: Source, target: Any, initial: ArrayLike | None = None) -> RegistrationResult:
         """Pose of the source in the target's frame.
 
         Args:
-            source: (N, 3) points, mm; rows that are not finite are dropped.
+            source: (N, 3) points, mm, or a path or a `Surface`; rows that are not finite are dropped.
             target: from `prepare`; a target that another method prepared is prepared again, outside the times.
             initial: optional (4, 4) seed T_target_source; local methods start there instead of from the centroids,
                 global ones ignore it.
@@ -116,7 +124,7 @@ class Baseline(ABC):
         Raises:
             InvalidPointCloudError: source of a wrong shape or type.
         """
-        points = finite_points(source)
+        points = finite_points(load(source).points if isinstance(source, str | Path | Surface) else source)
         if len(points) < MIN_SOURCE_POINTS:
             return self.refusal(f"{len(points)} usable points", RegistrationStatus.TOO_FEW_POINTS)
         own = self._own(target)
@@ -134,7 +142,7 @@ class Baseline(ABC):
         features = {"residual_mm": truncated_residual(distance)}
         return RegistrationResult(
             RegistrationStatus.OK, T, confidence=inliers, inlier_ratio=inliers, stage_ms=stage_ms, method=self.name,
-            features=features,
+            features=features, warnings=(uncalibrated(self.name),),
         )  # fmt: skip
 
     def refusal(

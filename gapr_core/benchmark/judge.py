@@ -113,7 +113,8 @@ def pose_errors(pair: Pair, T: Array, accepted: bool) -> dict[str, Any]:
         "rmse_mm": rmse, "whole_bone_mm": metrics.whole_bone_rmse_mm(T, true, pair.target),
         "tre_mm": metrics.tre_mm(T, true, named_targets(pair)),
         "chamfer_mm": metrics.chamfer_mm(se3.apply(T, pair.source), pair.target),
-        "within_paper": accepted and metrics.within_paper_limit(rmse, pair.target), **limits,
+        "within_paper": accepted and metrics.within_paper_limit(rmse, pair.target),
+        "within_extent": accepted and metrics.within_extent_limit(rmse, pair.target), **limits,
     }  # fmt: skip
 
 

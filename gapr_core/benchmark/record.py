@@ -78,7 +78,7 @@ class Verdict:
         judged, true: (4, 4) the pose that is judged, and the truth.
         rte_mm, rre_deg, rmse_mm, whole_bone_mm, chamfer_mm: errors of it.
         tre_mm: errors at named targets.
-        within_paper, within_1_1, within_2_2, within_4_5: accepted and within these limits.
+        within_paper, within_extent, within_1_1, within_2_2, within_4_5: accepted and within these limits.
         twist: (6,) error as x y z (mm) rx ry rz (rad), target frame.
         axes: (3, 3) rows: principal axes of the bone, longest first.
         nees, covariance: normalised error squared under the (6, 6) covariance of the answer.
@@ -98,6 +98,7 @@ class Verdict:
     chamfer_mm: float | None = None
     tre_mm: dict[str, float] | None = None
     within_paper: bool = False
+    within_extent: bool = False
     within_1_1: bool = False
     within_2_2: bool = False
     within_4_5: bool = False

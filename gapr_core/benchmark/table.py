@@ -15,7 +15,10 @@ from gapr_core.metrics.confidence import SURE
 Row = dict[str, Any]
 ALL = "all"
 TIMES = ("seconds", "seconds_p90", "prepare_seconds")  # what may differ between two runs of one command
-RECALLS = {"rr_paper": "within_paper", "rr_1_1": "within_1_1", "rr_2_2": "within_2_2", "rr_4_5": "within_4_5"}
+RECALLS = {
+    "rr_paper": "within_paper", "rr_extent": "within_extent", "rr_1_1": "within_1_1", "rr_2_2": "within_2_2",
+    "rr_4_5": "within_4_5",
+}  # fmt: skip
 
 
 def rows(records: Sequence[Record], methods: Sequence[str]) -> list[Row]:

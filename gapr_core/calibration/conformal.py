@@ -64,7 +64,7 @@ def factors(scores: Array, confidence: Array, family: NDArray[np.str_]) -> tuple
         family: (N,) sensor families, each of which the bound covers in each bin.
 
     Returns:
-        Upper end and factor of each bin that has enough answers: between two ends the factor is the lower bin's or less.
+        Upper end and factor of each bin that has enough answers; interpolation never falls below a bin's own factor.
     """
     at, found = [], []
     for low, high in zip(BINS[:-1], BINS[1:], strict=True):

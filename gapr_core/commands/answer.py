@@ -1,8 +1,7 @@
-"""The answer as JSON, there and back: the keys of docs/reference/json.md."""
+"""An answer read back from JSON, and what made one: the keys of docs/reference/json.md."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,34 +11,12 @@ from numpy.typing import NDArray
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
-from gapr_core.results import Patch, RegistrationResult, RegistrationStatus
+from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime import files, origin
 
 
-def as_json(result: RegistrationResult) -> dict[str, Any]:
-    """The contract of the JSON output: transform is 4x4 row-major, source -> target, mm; null on a refusal."""
-    pose, covariance, seen_from = result.T_target_source, result.covariance, result.inferred_viewpoint
-    return {
-        "transform": None if pose is None else pose.tolist(),
-        "confidence": result.confidence,
-        "pose_probability": result.pose_probability,
-        "bone_evidence": result.bone_evidence,
-        "status": str(result.status),
-        "covariance": None if covariance is None else covariance.tolist(),
-        "centre_mm": None if result.centre_mm is None else np.asarray(result.centre_mm).tolist(),
-        "seconds": result.seconds,
-        "tre_mm": result.tre_mm,
-        "tre95_mm": result.tre95_mm,
-        "factor95": result.factor95,
-        "inlier_ratio": result.inlier_ratio,
-        "inferred_viewpoint": None if seen_from is None else np.asarray(seen_from).tolist(),
-        "contributions": {name: round(log_odds, 3) for name, log_odds in result.contributions.items()},
-        "reason": result.reason,
-    }
-
-
 def read_json(path: Path) -> RegistrationResult:
-    """The accepted pose that `as_json` wrote, with its covariance.
+    """The accepted pose that `RegistrationResult.to_json` gave, with its covariance.
 
     Raises:
         ConfigError: no such file, another one, or an answer without a pose.
@@ -80,15 +57,3 @@ def made_by(method: str, config: RegistrarConfig) -> dict[str, Any]:
 
     by = {"method": method, "calibrated": method in methods.OWN, "weights": methods.made_of(method)}
     return origin.of_answers(config) | by
-
-
-def guidance_json(result: RegistrationResult, spots: Sequence[Patch]) -> dict[str, Any] | None:
-    """The bound over the bone now, and patches in order of what a look there would gain; None where none is known."""
-    if result.guidance is None:
-        return None
-    patches = [
-        {"centre_mm": spot.centre.tolist(), "normal": spot.normal.tolist(), "tre95_mm": spot.tre95_mm,
-         "rivals_excluded": spot.rivals_excluded, "gain_mm": spot.gain_mm}
-        for spot in spots
-    ]  # fmt: skip
-    return {"now_mm": result.guidance.now_mm, "patches": patches}

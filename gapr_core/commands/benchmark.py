@@ -27,7 +27,7 @@ from gapr_core.config import RegistrarConfig
 from gapr_core.data.make_pairs import MANIFEST, read_manifest
 from gapr_core.data.pair_files import load_pair, pair_hash, pair_paths
 from gapr_core.errors import ConfigError
-from gapr_core.pages import benchmark_report, writers
+from gapr_core.pages import writers
 from gapr_core.runtime import cluster, files, origin
 from gapr_core.runtime.arguments import a_path, at_least_one, names
 from gapr_core.runtime.console import say
@@ -58,6 +58,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run or merge as the arguments say, and say where the report is."""
+    import gapr_core.pages.benchmark_report  # noqa: F401  a missing library is said before the work
+
     if args.merge:
         folders = [Path(name) for name in args.merge[1:]]
         if args.merge[0] != "merge" or not folders:
@@ -182,6 +184,8 @@ def _join(folders: Sequence[Path], out: Path, ours: str | None) -> None:
 
 def write(out: Path, plan: Plan) -> list[Row]:
     """Table, plots and report of the records in `out`."""
+    from gapr_core.pages import benchmark_report
+
     found = records.sort(records.read(out / records.FILE), plan.methods)
     if not found:
         raise ConfigError("results", f"none in {out}", "this shard has no pairs: use fewer shards")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapr_core.clouds import MM_PER_UNIT
 from gapr_core.errors import ConfigError, GaprError, MethodUnavailableError
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult
@@ -26,7 +25,6 @@ Named = tuple[str, Path]  # an option, and what it names
 OF_EARLIER = ", and what is there is of an earlier run"
 FAR_LANDMARKS_MM = 50.0  # median to a cloud, farther than landmarks lie from the part of a bone that was seen
 FAR_PAIRS_MM = 20.0  # of landmarks under the pose that fits them best, more than anybody errs by as he touches them
-FAR_TARGETS = 0.5  # of the diagonal of the bone's box: a planned target is nearer to that box
 MUCH_NEARER = 0.3  # share of that distance that is left with the axes turned, or to the other cloud, and it was wrong
 
 
@@ -166,18 +164,22 @@ def warn_of_axes(args: Namespace) -> None:
     """Warn where files are LPS by definition and the cloud in their frame may be anything; both can be read."""
     from gapr_core.formats import axes, reading
 
-    names = ", ".join(path.name for path in files_in_lps(args).values())
+    in_lps = list(files_in_lps(args).values())
     is_known = args.target.is_dir() or reading.says_axes(args.target)
-    if names and (args.axes == "as_is" or (args.axes == "auto" and not is_known)):
-        log.warning("in LPS: %s. If %s is RAS, give --axes ras", names, args.target.name)
+    if in_lps and (args.axes == "as_is" or (args.axes == "auto" and not is_known)):
+        log.warning("%s that %s is in LPS. If it is RAS, give --axes ras", _assume(in_lps), args.target.name)
     of_source = args.landmarks[:1] if args.landmarks else []
     of_source += [] if _is_tracked(args) else _files_of_itk(args)  # of a tracker's `warn_of_tracker` says more
     if of_source and args.source_axes == "auto" and not reading.says_axes(args.source):
-        names = ", ".join(path.name for path in of_source)
-        log.warning("in LPS: %s. If %s is RAS, give --source-axes ras", names, args.source.name)
+        how = "If it came from Slicer's Python (RAS), add --source-axes ras"
+        log.warning("%s that %s is in LPS. %s", _assume(of_source), args.source.name, how)
     said = axes.stated(args.source) if args.source_axes == "auto" and args.source.is_file() else args.source_axes
     if not isinstance(args.viewpoint, str) and said == "ras":
         log.warning("%s is turned from RAS to LPS: --viewpoint is taken to be in LPS", args.source.name)
+
+
+def _assume(paths: Sequence[Path]) -> str:
+    return " and ".join(path.name for path in paths) + (" assume" if len(paths) > 1 else " assumes")
 
 
 def warn_of_tracker(args: Namespace) -> None:
@@ -253,41 +255,12 @@ def warn_of_pairs(rms_mm: float) -> None:
 
 
 def warn_of_frames(args: Namespace, source: Array, target: Array) -> None:
-    """Warn of landmarks that were exchanged, and of a plan in the frame of the source (N, 3), not of the target, mm."""
+    """Warn of landmarks that were exchanged: each file is near the cloud of the other, (N, 3) and (M, 3), mm."""
     clouds = (source, target)
     if args.landmarks and all(map(_is_elsewhere, args.landmarks, clouds, clouds[::-1])):
         first, second = (path.name for path in args.landmarks)
         near = f"{first} is near {args.target.name}, and {second} near {args.source.name}"
         log.warning("%s: are the files of --landmarks exchanged? That of the source comes first", near)
-    if args.targets:
-        _warn_of_targets(args, source, target)
-
-
-def _warn_of_targets(args: Namespace, source: Array, target: Array) -> None:
-    """Warn of planned targets that are far from the box of the bone (N, 3), mm, or near the source, with the cause."""
-    from gapr_core.formats import axes, markups
-
-    points = markups.load(args.targets).points
-    is_far = _is_far(points, target)
-    cause = ""
-    if is_far.any() and not _is_far(points * axes.LPS_RAS, target).any():
-        cause = "with x and y negated they are near: is one of the files RAS, and read as LPS?"
-    elif is_far.any() and not _is_far(points * MM_PER_UNIT["m"], target).any():
-        cause = "times 1000 they are near: are they in m, and said to be in mm?"
-    if not cause and _is_elsewhere(args.targets, target, source):
-        near = f"{args.targets.name} is near {args.source.name}, and far from {args.target.name}"
-        log.warning("%s: --targets are in the frame of the target", near)
-    elif is_far.any():
-        log.warning("%d of %d points of %s are far from %s (half its size and more), and their errors mean little: %s",
-                    is_far.sum(), len(points), args.targets.name, args.target.name,
-                    cause or "check coordinateSystem and coordinateUnits")  # fmt: skip
-
-
-def _is_far(points: Array, target: Array) -> NDArray[np.bool_]:
-    """(K,) whether points (K, 3) are farther from the box of a bone (N, 3) than a share of its diagonal."""
-    low, high = target.min(axis=0), target.max(axis=0)
-    apart_mm = np.linalg.norm(points - np.clip(points, low, high), axis=1)
-    return np.asarray(apart_mm > FAR_TARGETS * np.linalg.norm(high - low))
 
 
 def warn_of_start(args: Namespace, start: Array | None, source: Array, target: Array) -> None:

@@ -14,10 +14,11 @@ from typing import Any
 from tqdm import tqdm
 
 from gapr_core.baselines import RegistrationMethod
+from gapr_core.baselines.base import uncalibrated
 from gapr_core.benchmark import methods
 from gapr_core.benchmark.record import ERROR
 from gapr_core.commands import options
-from gapr_core.commands.answer import as_json, made_by
+from gapr_core.commands.answer import made_by
 from gapr_core.data.pair_files import load_clouds, pair_paths
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError, WeightsError
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -67,7 +68,8 @@ def run(args: Namespace) -> int:
                 pause_s = max(WRITE_SECONDS, WRITE_TIMES * (written - start))
     finally:  # of an interrupted run, too
         answers |= _written(args.out, new) if new else {}
-    options.say_uncalibrated(args.method)
+    if args.method not in methods.OWN and ":" not in args.method:
+        say(f"warning: {uncalibrated(args.method)}")
     return _say_counts(args.out, {path.name: answers[path.stem] for path in paths})
 
 
@@ -122,11 +124,11 @@ def _answer(path: Path, method: RegistrationMethod) -> Answer:
     except InvalidPointCloudError as error:
         reason = OF_PYTHON.sub("", str(error))
         refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=reason)
-        return as_json(refusal) | {"status": INVALID_INPUT, "prepare_seconds": None}
+        return refusal.to_json() | {"status": INVALID_INPUT, "prepare_seconds": None}
     except (ConfigError, MethodUnavailableError, WeightsError):
         raise
     except Exception as error:
         log.warning("%s failed", path.name, exc_info=True)
         refusal = RegistrationResult(RegistrationStatus.LOW_CONFIDENCE, reason=f"{type(error).__name__}: {error}")
-        return as_json(refusal) | {"status": ERROR, "prepare_seconds": None}
-    return as_json(result) | {"seconds": seconds, "prepare_seconds": prepare_seconds}
+        return refusal.to_json() | {"status": ERROR, "prepare_seconds": None}
+    return result.to_json() | {"seconds": seconds, "prepare_seconds": prepare_seconds}

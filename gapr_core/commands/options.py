@@ -11,12 +11,11 @@ import numpy as np
 from gapr_core.config import RegistrarConfig
 from gapr_core.runtime import settings
 from gapr_core.runtime.arguments import a_path
-from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
     from gapr_core.surface import Surface
 
-UNITS = ("mm", "cm", "m")
+UNITS = ("mm", "cm", "m", "in")
 
 
 def add_method(parser: ArgumentParser) -> None:
@@ -28,14 +27,6 @@ def add_method(parser: ArgumentParser) -> None:
         "which refuses almost nothing: its confidence is its share of inliers, not calibrated",
     )
     add_settings(parser)
-
-
-def say_uncalibrated(method: str) -> None:
-    """Say of a baseline that what it calls a confidence is no probability."""
-    from gapr_core.benchmark import methods
-
-    if method not in methods.OWN and ":" not in method:
-        say(f"{method} is a baseline: its confidence is its share of inliers, not calibrated; a wrong pose may be OK")
 
 
 def add_settings(parser: ArgumentParser) -> None:

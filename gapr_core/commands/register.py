@@ -4,34 +4,26 @@ from __future__ import annotations
 
 import logging
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gapr_core.commands import checks, options
-from gapr_core.commands.answer import as_json, guidance_json, made_by
+from gapr_core.commands.answer import made_by
 from gapr_core.errors import ConfigError
-from gapr_core.pages.registration import Registration
-from gapr_core.results import Patch, RegistrationResult
+from gapr_core.results import RegistrationResult
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import a_path
 from gapr_core.runtime.console import say
 
 if TYPE_CHECKING:
-    from gapr_core.config import RegistrarConfig, SensorConfig
-    from gapr_core.formats.planning import TargetError
+    from gapr_core.config import RegistrarConfig
     from gapr_core.surface import Surface
 
 log = logging.getLogger(__name__)
 
 OK, REFUSED = 0, 2
-NOT_NAMED = "the sensor is not named, and tre95 allows for any (--set sensor.kind=...; docs/how-to/sensors.md)"
-PLACE_IS_EXACT = (
-    "an error of the whole cloud's place, such as a tracker's, is not in tre95 "
-    "(--set sensor.tracking_mm=... --set sensor.tracking_deg=...)"
-)
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -100,7 +92,8 @@ def run(args: Namespace) -> int:
     checks.check_method(args)
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
-    method = methods.make(args.method, config)
+    is_guided = config.guide or (bool(args.report) and args.method in methods.OWN)  # for the page of a refusal
+    method = methods.make(args.method, replace(config, guide=is_guided))
     with checks.naming_old_files(args.out, args.residuals, args.slicer, args.json, args.report, args.rerun):
         plan, hints = _plan(args), _hints(args, method)
         target, source = _read(args)
@@ -109,27 +102,16 @@ def run(args: Namespace) -> int:
         checks.warn_of_start(args, hints.get("initial"), source.points, target.points)
         hints |= _seen(args, method, source)
         result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
-    errors = _errors(plan, result)
-    spots = result.guidance.spots() if result.guidance else ()
-    code = _show(args, result, errors)
-    options.say_uncalibrated(args.method)
-    if result.tre95_mm is not None:
-        _say_what_the_bound_leaves_out(config.sensor)
-    if config.guide:
-        _say_where_next(result, spots)
-    _write(args, Registration(target, source.points, result, errors, spots), config)
+    if result.bone is None:
+        result = replace(result, bone=target, source=source.points)
+    if plan is not None and not (result.ok and result.covariance is None):
+        result = result.with_targets(plan.points, plan.labels)
+    code = _show(args, result)
+    if config.guide or (result.guidance is not None and not result.ok):
+        _say_where_next(result)
+    _write(args, result, config)
     checks.check_answer(args, result)
     return code
-
-
-def _say_what_the_bound_leaves_out(sensor: SensorConfig) -> None:
-    from gapr_core.registration.problem.sensor import errors
-
-    known = errors(sensor, 0)
-    if sensor.kind == "unknown":
-        say(NOT_NAMED)
-    if known.tracking_mm == 0.0 and known.tracking_deg == 0.0:
-        say(PLACE_IS_EXACT)
 
 
 def _read(args: Namespace) -> tuple[Surface, Surface]:
@@ -137,7 +119,7 @@ def _read(args: Namespace) -> tuple[Surface, Surface]:
     from gapr_core import clouds
 
     target = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
-    clouds.warn_of_size(args.target, target.extent_mm)
+    clouds.warn_of_size(args.target, target.extent_mm, args.units or "mm")
     how = {"axes": args.source_axes, "tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
     how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
     source = options.load(args.source, args.source_units or args.units, **how)
@@ -198,75 +180,62 @@ def _seen(args: Namespace, method: Any, source: Surface) -> dict[str, Any]:
     return {"viewpoint": camera}
 
 
-def _errors(plan: Any, result: RegistrationResult) -> list[TargetError]:
-    from gapr_core.formats import planning
-
-    return planning.errors_at(plan, result) if plan is not None and result.covariance is not None else []
-
-
-def _show(args: Namespace, result: RegistrationResult, errors: list[TargetError]) -> int:
+def _show(args: Namespace, result: RegistrationResult) -> int:
     """The result in words, before a file can fail."""
     say(str(result))
+    for line in (*result.targets, *(f"warning: {warning}" for warning in result.warnings)):
+        say(str(line))
+    for finding in result.findings:
+        say(f"{finding.text} {finding.advice}")
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
             say(f"no pose: {path} is not written{checks.OF_EARLIER if path.exists() else ''}")
         return REFUSED
-    if result.inferred_viewpoint is not None:
-        x, y, z = result.inferred_viewpoint
-        say(f"taken for what a camera at {x:.0f},{y:.0f},{z:.0f} mm saw: as bone alone it gave no pose (--viewpoint)")
     say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
-    for number, error in enumerate(errors, 1):
-        name = " ".join(error.label.split()) or f"target {number}"
-        say(f"{name}: expected error {error.expected_mm:.2f} mm (95 %: {error.bound95_mm:.2f} mm)")
     return OK
 
 
-def _say_where_next(result: RegistrationResult, spots: Sequence[Patch]) -> None:
+def _say_where_next(result: RegistrationResult) -> None:
     """The best patches in order, or why there are none."""
     if result.guidance is None:
         seen = "the source shows the whole bone" if result.best is not None else "no hypothesis was found"
         say(f"where to look next: not known, {seen}")
         return
     say(f"where to look next (the error bound over the bone is {result.guidance.now_mm:.2f} mm, rivals included):")
-    for rank, spot in enumerate(spots, 1):
+    for rank, spot in enumerate(result.guidance.spots(), 1):
         centre = "({:.1f}, {:.1f}, {:.1f})".format(*spot.centre)
         normal = "({:.2f}, {:.2f}, {:.2f})".format(*spot.normal)
         say(f"{rank}. {centre} mm, normal {normal}: expected tre95 {spot.tre95_mm:.2f} mm, "
             f"gain {spot.gain_mm:.2f} mm, {100 * spot.rivals_excluded:.0f} % of the rivals excluded")  # fmt: skip
 
 
-def _write(args: Namespace, done: Registration, config: RegistrarConfig) -> None:
+def _write(args: Namespace, result: RegistrationResult, config: RegistrarConfig) -> None:
     """The files that were asked for; those of a pose only where there is one."""
     with files.together():
-        _write_all(args, done, config)
+        _write_all(args, result, config)
 
 
-def _write_all(args: Namespace, done: Registration, config: RegistrarConfig) -> None:
+def _write_all(args: Namespace, result: RegistrationResult, config: RegistrarConfig) -> None:
     if args.json:
-        errors = [asdict(error) for error in done.errors]
-        more = {"targets": errors, "guidance": guidance_json(done.result, done.spots)}
-        files.write_json(args.json, as_json(done.result) | made_by(args.method, config) | more)
+        files.write_json(args.json, result.to_json() | made_by(args.method, config))
     if args.report:
-        from gapr_core.pages import registration_report
-
-        registration_report.write(args.report, done)
+        result.report(args.report, " and ".join(args.label))
     if args.rerun:
         from gapr_core.formats import recording
 
-        recording.write(args.rerun, done.target, done.source, done.result, done.errors)
-    if done.result.ok:
-        _write_pose(args, done)
+        recording.write(args.rerun, result)
+    if result.ok:
+        _write_pose(args, result)
 
 
-def _write_pose(args: Namespace, done: Registration) -> None:
-    from gapr_core.formats import scene, transforms
+def _write_pose(args: Namespace, result: RegistrationResult) -> None:
+    from gapr_core.formats import scene
 
-    result = done.result
     if args.out:
-        transforms.write(args.out, result.T_target_source)  # type: ignore[arg-type]
-    if result.residuals is None:
+        result.save(args.out)
+    if result.residuals is None or result.source is None:
         return
-    used, given = len(result.residuals.points), len(done.source)
+    used, given = len(result.residuals.points), len(result.source)
     if used < given and (args.residuals or args.slicer):
         say(f"distances are of {used} of {given} points, those that were used: docs/reference/formats.md")
     if args.residuals and args.residuals.suffix.lower() == ".json":
@@ -274,4 +243,4 @@ def _write_pose(args: Namespace, done: Registration) -> None:
     elif args.residuals:
         scene.write_coloured(args.residuals, result.apply(result.residuals.points), result.residuals)
     if args.slicer:
-        scene.write_slicer(args.slicer, done.target, result, done.errors)
+        scene.write_slicer(args.slicer, result)

@@ -65,6 +65,11 @@ class Specimen:
         queries = (points - self._centre).astype(np.float32)
         return self._scene.compute_distance(queries).numpy().astype(np.float64)
 
+    def signed_distance(self, points: Array) -> Array:
+        """Distance (N,) mm from points (N, 3) to the surface, negative inside."""
+        queries = (points - self._centre).astype(np.float32)
+        return self._scene.compute_signed_distance(queries).numpy().astype(np.float64)
+
     def end(self, share: float, upper: bool) -> Specimen:
         """Keep a share of the length at one end, closed where it is cut, as a shorter scan does.
 

@@ -18,6 +18,7 @@ UNITS = {
     "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
     "cm": "cm", "centimeter": "cm", "centimeters": "cm", "centimetre": "cm", "centimetres": "cm",
     "m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
+    "in": "in", "inch": "in", "inches": "in",
 }  # fmt: skip
 OTHER_UNITS = (
     "um",
@@ -27,9 +28,6 @@ OTHER_UNITS = (
     "microns",
     "nm",
     "dm",
-    "inch",
-    "inches",
-    "in",
     "ft",
     "feet",
     "yd",
@@ -160,7 +158,7 @@ def unit(path: Path) -> str | None:
     said = {UNITS[word] for word in words if word in UNITS}
     if others := sorted(words.intersection(OTHER_UNITS)):
         given = f"{path.name} with columns in {' and '.join(others)}"
-        raise InvalidPointCloudError("coordinates in mm, cm or m", given, "convert them, and name the columns so")
+        raise InvalidPointCloudError("coordinates in mm, cm, m or in", given, "convert them, and name the columns so")
     if not said:
         return None
     if len(said) > 1:

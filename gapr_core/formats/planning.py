@@ -1,43 +1,35 @@
-"""Landmarks as a start, and the error to expect at planned targets."""
+"""Landmarks as a start, and planned targets: the error to expect there, and how far they are from the bone."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import markups
 from gapr_core.formats.markups import Markups
 from gapr_core.geometry.landmarks import LandmarkPose, paired_pose
 from gapr_core.geometry.twists import motion_jacobians
-from gapr_core.results import RegistrationResult
+from gapr_core.results import RegistrationResult, ResultWarning, TargetError
+from gapr_core.surface import Surface, as_points
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 DRAWS = 4096
-
-
-@dataclass(frozen=True)
-class TargetError:
-    """The error to expect at one planned target.
-
-    Attributes:
-        label: its name in the plan.
-        position_mm: x y z, target frame.
-        expected_mm: root-mean-square error of the pose there.
-        bound95_mm: the error is below it in 95 of 100 cases.
-    """
-
-    label: str
-    position_mm: tuple[float, float, float]
-    expected_mm: float
-    bound95_mm: float
+FAR_MM = 30.0  # planned targets are in a bone, on it, or in the tissue around it
+MUCH_NEARER = 0.3  # share of the distance that is left once a mistake is undone
+FLIPPED = np.array([-1.0, -1.0, 1.0])
+MISTAKES = {  # of a plan: what undoes it, and what to do
+    "With x and y negated it is near: correct which of plan and bone is RAS and which LPS.": FLIPPED,
+    "Times 1000 it is near: correct the unit of the plan, which is in m.": np.full(3, 1000.0),
+}
 
 
 def start_of(source: Path, target: Path) -> LandmarkPose:
@@ -65,21 +57,62 @@ def start_of(source: Path, target: Path) -> LandmarkPose:
     return paired_pose(moving.points, fixed.points)
 
 
-def errors_at(plan: Markups, result: RegistrationResult) -> list[TargetError]:
-    """What the covariance of an accepted pose means at each target: J Sigma J^T of the point (Fitzpatrick 1998).
+def with_targets(result: RegistrationResult, points: ArrayLike, labels: Sequence[str] = ()) -> RegistrationResult:
+    """See `RegistrationResult.with_targets`; the error is J Sigma J^T of the point (Fitzpatrick 1998).
 
     The bound is taken times `RegistrationResult.factor95`, as `tre95_mm` is.
-
-    Raises:
-        InvalidPointCloudError: a result without a covariance.
     """
+    points = as_points(np.atleast_2d(np.asarray(points)))
+    apart_mm = np.full(len(points), np.nan) if result.bone is None else distances_mm(points, result.bone)
+    warnings = result.warnings + _far_targets(points, apart_mm, result)
+    if not result.ok:
+        return replace(result, warnings=warnings)
     if result.covariance is None or result.centre_mm is None:
         given = f"a result of {result.method} with status {result.status}"
         raise InvalidPointCloudError("a pose with a covariance", given, "use --method gapr")
-    covariances = covariances_at(plan.points, result.covariance, result.centre_mm)
+    covariances = covariances_at(points, result.covariance, result.centre_mm)
     draws = np.random.default_rng(0).standard_normal((DRAWS, 3))
-    targets = zip(plan.labels, plan.points, covariances, strict=True)
-    return [_error(*target, draws, result.factor95) for target in targets]
+    names = [" ".join(label.split()) or f"target {number}" for number, label in enumerate(labels, 1)]
+    names += [f"target {number}" for number in range(len(names) + 1, len(points) + 1)]
+    targets = zip(names, points, covariances, apart_mm, strict=True)
+    found = tuple(_error(*target, draws, result.factor95) for target in targets)
+    return replace(result, targets=found, warnings=warnings)
+
+
+def distances_mm(points: Array, bone: Surface) -> Array:
+    """Distance of points (N, 3) to a bone, mm: negative inside a mesh; to the nearest point of a cloud.
+
+    Inside, the winding number is above a half: the mesh need not be closed, and may be turned inside out.
+    """
+    if bone.faces is None or not len(bone.faces):
+        return np.asarray(cKDTree(bone.points).query(points)[0])
+    import igl
+
+    distance_mm = np.sqrt(igl.point_mesh_squared_distance(points, bone.points, bone.triangles)[0])
+    inside = np.abs(igl.winding_number(bone.points, bone.triangles, points)) > 0.5
+    return np.where(inside, -distance_mm, distance_mm)
+
+
+def _far_targets(points: Array, apart_mm: Array, result: RegistrationResult) -> tuple[ResultWarning, ...]:
+    """The warning of planned targets (N, 3) that are far from the bone, with the mistake that is likely."""
+    far = apart_mm > FAR_MM
+    if result.bone is None or not far.any():
+        return ()
+    text = f"{far.sum()} of {len(points)} planned targets {'is' if far.sum() == 1 else 'are'} far from the bone"
+    return (ResultWarning("target_far", f"{text}, up to {apart_mm.max():.0f} mm.", _mistake(points[far], result)),)
+
+
+def _mistake(points: Array, result: RegistrationResult) -> str:
+    """What to do about targets (N, 3) far from the bone."""
+    assert result.bone is not None
+    median_mm = np.median(distances_mm(points, result.bone))
+    for advice, factors in MISTAKES.items():
+        if np.median(distances_mm(points * factors, result.bone)) < MUCH_NEARER * median_mm:
+            return advice
+    if result.source is not None and len(result.source):
+        if np.median(cKDTree(result.source).query(points)[0]) < MUCH_NEARER * median_mm:
+            return "The source is near: give the plan in the frame of the bone, not of the source."
+    return "Check that the plan is of this bone; its errors hold for a tool that is rigid and exact."
 
 
 def covariances_at(points: Array, covariance: Array, centre_mm: Array) -> Array:
@@ -88,12 +121,13 @@ def covariances_at(points: Array, covariance: Array, centre_mm: Array) -> Array:
     return np.asarray(jacobians @ covariance @ jacobians.transpose(0, 2, 1))
 
 
-def _error(label: str, point: Array, covariance: Array, draws: Array, factor95: float) -> TargetError:
+def _error(label: str, point: Array, covariance: Array, apart_mm: float, draws: Array, factor95: float) -> TargetError:
     variances = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     lengths = np.sqrt(draws**2 @ variances)
     x, y, z = (float(v) for v in point)
     bound95_mm = factor95 * float(np.percentile(lengths, 95.0))
-    return TargetError(label, (x, y, z), float(np.sqrt(variances.sum())), bound95_mm)
+    distance_mm = float(apart_mm) if np.isfinite(apart_mm) else None
+    return TargetError(label, (x, y, z), float(np.sqrt(variances.sum())), bound95_mm, distance_mm)
 
 
 def save_targets(path: Path, errors: Sequence[TargetError]) -> None:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError, MethodUnavailableError
-from gapr_core.formats.planning import TargetError
 from gapr_core.formats.scene import GREY, colours_of
-from gapr_core.results import RegistrationResult
+from gapr_core.results import RegistrationResult, TargetError
 from gapr_core.runtime import files
 from gapr_core.surface import Surface
 
@@ -38,34 +37,31 @@ def check(path: Path) -> None:
     _rerun()
 
 
-def write(
-    path: Path, target: Surface, source: Array, result: RegistrationResult, errors: Sequence[TargetError] = ()
-) -> None:
+def write(path: Path, result: RegistrationResult) -> None:
     """One .rrd file, for an accepted pose and for a refusal. Its timeline goes through the hypotheses.
 
     Args:
         path: ends with .rrd; open it with `rerun PATH`.
-        target: the bone, mm, LPS where its file says so.
-        source: (N, 3) the source as read, its own frame, mm.
-        result: of registering them.
-        errors: of the planned targets; none without a plan or a pose.
+        result: of registering a source to a bone, which it knows.
 
     Raises:
         ConfigError: another ending, or a path that cannot be written.
         MethodUnavailableError: rerun is not installed.
     """
     check(path)
+    if result.bone is None or result.source is None:
+        raise ValueError("a recording needs a result that knows its bone and its source")
     rr = _rerun()
     stream = rr.RecordingStream(APPLICATION)
     stream.log("/", rr.ViewCoordinates.LBU, static=True)  # left, back, up: LPS
-    stream.log("target", _bone(rr, target), static=True)
+    stream.log("target", _bone(rr, result.bone), static=True)
     stream.log("answer", rr.TextDocument(_words(result)), static=True)
-    if errors:
-        stream.log("planned", _planned(rr, errors), static=True)
+    if result.targets:
+        stream.log("planned", _planned(rr, result.targets), static=True)
     for number, (T, probability) in enumerate(_poses(result), 1):
         stream.set_time(TIMELINE, sequence=number)
         stream.log("source", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        stream.log("source", _points(rr, source, result, number))
+        stream.log("source", _points(rr, result.source, result, number))
         stream.log("probability", rr.Scalars(probability))
     with files.replacing(path) as scratch:
         stream.save(scratch)

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from gapr_core.errors import ConfigError
 from gapr_core.formats import planning, signatures, transforms
-from gapr_core.formats.planning import TargetError
 from gapr_core.geometry import se3
-from gapr_core.results import RegistrationResult, Residuals
+from gapr_core.results import RegistrationResult, Residuals, TargetError
 from gapr_core.runtime import files
 from gapr_core.surface import Surface
 
@@ -82,21 +81,19 @@ def _is_own(path: Path) -> bool:
     return path.is_file() and f"<!-- {WRITTEN_BY} -->".encode() in path.read_bytes()
 
 
-def write_slicer(folder: Path, target: Surface, result: RegistrationResult, errors: Sequence[TargetError]) -> None:
+def write_slicer(folder: Path, result: RegistrationResult) -> None:
     """A folder with target, source, transform and planned targets, and the scene.mrml that loads them together.
 
     Points of the source near which no surface is have no distance: they are a grey model of their own, `off_bone`.
 
     Args:
         folder: made if it is not there; files of other names in it stay.
-        target: the bone, LPS mm.
-        result: an accepted pose with residuals.
-        errors: of the planned targets; none without a plan.
+        result: an accepted pose with residuals, and the bone, LPS mm.
     """
-    if result.T_target_source is None or result.residuals is None:
-        raise ValueError("a scene needs a pose and its residuals")
+    if result.T_target_source is None or result.residuals is None or result.bone is None:
+        raise ValueError("a scene needs a bone, a pose and its residuals")
     with files.together():
-        _write_scene(folder, target, result.T_target_source, result.residuals, errors)
+        _write_scene(folder, result.bone, result.T_target_source, result.residuals, result.targets)
 
 
 def _write_scene(

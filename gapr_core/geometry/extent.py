@@ -29,6 +29,11 @@ def half_extent_mm(points: Array) -> float:
     return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
 
 
+def half_edge_mm(points: Array) -> float:
+    """Half of the longest edge of the axis-aligned box around (N, 3) points."""
+    return 0.5 * float(np.ptp(points, axis=0).max())
+
+
 def radius_mm(points: Array) -> float:
     """Root mean square distance of (N, 3) points to their mean; 1 at least, as it divides."""
     return max(float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
@@ -39,3 +44,17 @@ def principal(points: Array) -> Principal:
     centred = points - points.mean(axis=0)
     scatter, columns = np.linalg.eigh(centred.T @ centred)
     return Principal(columns[:, ::-1].T, scatter[::-1] / len(points))
+
+
+LONG = 4.0  # variance along the longest axis over the next, above which a cloud has a long axis
+NEAR_COS = 0.9  # of the angle to an axis that gives its name
+OF_THE_BODY = ("the left-right axis", "the front-back axis", "the head-foot axis")  # x, y, z of LPS
+
+
+def axis_in_words(axis: Array, points: Array) -> str:
+    """Name a unit axis (3,): the long axis of points (N, 3), or one of the body (LPS)."""
+    axes, variances = principal(points)
+    if variances[0] > LONG * variances[1] and abs(axis @ axes[0]) > NEAR_COS:
+        return "its long axis"
+    nearest = int(np.abs(axis).argmax())
+    return OF_THE_BODY[nearest] if abs(axis[nearest]) > NEAR_COS else "an axis ({:.1f}, {:.1f}, {:.1f})".format(*axis)

@@ -21,6 +21,7 @@ from gapr_core.metrics.pose import (
     rmse_mm,
     tre_mm,
     whole_bone_rmse_mm,
+    within_extent_limit,
     within_paper_limit,
 )
 from gapr_core.metrics.surfaces import chamfer_mm, coarse_inlier_ratio, fine_inlier_ratio
@@ -29,5 +30,6 @@ __all__ = [
     "PoseError", "auroc", "centroid_alignment", "chamfer_mm", "coarse_inlier_ratio", "error_twist",
     "expected_calibration_error", "extreme_points", "false_accept_rate", "false_accepts", "fine_inlier_ratio",
     "interval", "nees", "pose_bound", "pose_error", "predicted_rmse_mm", "r2_rotation", "r2_translation", "recall",
-    "reliability", "risk_coverage", "rmse_mm", "tre_mm", "whole_bone_rmse_mm", "within_paper_limit",
+    "reliability", "risk_coverage", "rmse_mm", "tre_mm", "whole_bone_rmse_mm", "within_extent_limit",
+    "within_paper_limit",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ from gapr_core.geometry.se3 import RIGHT_DEG, RIGHT_MM
 
 Array = NDArray[np.float64]
 
-PAPER_RMSE_LIMIT = 0.02  # of the target's half extent: "after normalisation" in the paper
+PAPER_RMSE_LIMIT = 0.02  # of the unit in which the longest edge of the target's box is 2: the paper's section III
 STRICT_LIMITS = ((1.0, 1.0), (2.0, 2.0), (RIGHT_MM, RIGHT_DEG))  # mm at the source's centroid, deg
 
 
@@ -49,7 +49,12 @@ def error_motion(T_estimate: ArrayLike, T_true: ArrayLike) -> Array:
 
 
 def within_paper_limit(rmse: float, target: ArrayLike) -> bool:
-    """RMSE, mm, below 0.02 of the half extent of the target (M, 3), mm."""
+    """RMSE, mm, below 0.02 of half the longest edge of the box of the target (M, 3), mm."""
+    return rmse < PAPER_RMSE_LIMIT * extent.half_edge_mm(np.asarray(target, dtype=np.float64))
+
+
+def within_extent_limit(rmse: float, target: ArrayLike) -> bool:
+    """RMSE, mm, below 0.02 of the half extent of the target (M, 3), mm: 6 to 43 % wider than the paper's limit."""
     return rmse < PAPER_RMSE_LIMIT * extent.half_extent_mm(np.asarray(target, dtype=np.float64))
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from gapr_core.model import steps
-from gapr_core.model.pairs import DensePairs, Pairs
+from gapr_core.model.pairs import Pairs
 
 
 class PairEncoding:
@@ -75,8 +74,6 @@ class Attention(nn.Module):
         """Queries of x_q look at keys and values of x_s; both in the layout of `pairs`."""
         if isinstance(self.encoder, FusedEncoder) and self.encoder.fits(pairs, x_q):
             return self.encoder.attend(self.query(x_q), self.key(x_s), self.value(x_s), pairs, self.heads)
-        if isinstance(self.encoder, VanillaEncoder) and isinstance(pairs, DensePairs) and steps.can_take(x_q, x_s):
-            return self._plain(self.query(x_q), self.key(x_s), self.value(x_s), pairs.valid)
         encoding = self.encoder(pairs)
         q = encoding.query(pairs.queries(self.query(x_q)))
         k, v = pairs.keys(torch.cat([self.key(x_s), self.value(x_s)], dim=-1)).split(self.dim, dim=-1)
@@ -88,12 +85,6 @@ class Attention(nn.Module):
         out = (weights.flatten(1, 2) @ v).view(batch, n, self.heads, self.dim)  # eq. (1), (3)
         out = encoding.values(out, weights).view(batch, n, self.heads, self.heads, -1)
         return pairs.restore(out.diagonal(dim1=2, dim2=3).transpose(2, 3).reshape(batch, n, self.dim))
-
-    def _plain(self, q: Tensor, k: Tensor, v: Tensor, valid: Tensor) -> Tensor:
-        """Dense attention without geometry, head by head: a quarter of the products, for training."""
-        q, k, v = (x.unflatten(-1, (self.heads, -1)).transpose(1, 2) for x in (q, k, v))  # (B, H, n, D)
-        logits = (q @ k.transpose(2, 3) * self.scale).masked_fill(~valid[:, None], float("-inf"))
-        return (torch.softmax(logits, dim=-1) @ v).transpose(1, 2).flatten(2)
 
 
 class TransformerLayer(nn.Module):

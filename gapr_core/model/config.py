@@ -26,7 +26,6 @@ class ModelConfig(Settings):
     repositioning: str = setting("svd", "svd (paper) or none, before the last cross-attention")
     fine_scores: str = setting("cosine", "dot (eq. 8), or cosine with a learnable temperature")
     norm: str = setting("group", "group (statistics over each cloud) or layer (each point by itself)")
-    centred_features: bool = setting(False, "take off what all superpoints of the target share before comparing")
     mlp_projections: bool = setting(False, "a hidden layer before W^Q, W^K, W^V: the paper's separate MLP projections")
     pair_width: int = setting(32, "channels between a pair's geometry and r_ij; 0: as many as the features", low=0)
     stages: int = setting(4, "encoder stages, the bottleneck included", low=2, high=10)
@@ -42,8 +41,6 @@ class ModelConfig(Settings):
     radius_voxels: float = setting(2.5, "radius of a neighbourhood in voxels of its stage", low=0.1)
     sigma_voxels: float = setting(2.0, "reach of a kernel point in voxels of its stage", low=0.1)
     small_ball: float = setting(0.5, "k_r: radius of the PGF's second ball over the first", low=0.01, high=1)
-    bone_head: str = setting("none", "which source points are bone: none (all are), or mlp", choices=("none", "mlp"))
-    bone_scores: bool = setting(True, "the head's probabilities multiply the scores of matches")
     global_small_ball: str = setting(
         "part", "second ball of global self-attention: the bottleneck's whole ball (paper), or small_ball of it",
         choices=("part", "whole"),

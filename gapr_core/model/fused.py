@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gapr_core.model import attention_kernels, steps
+from gapr_core.model import attention_kernels
 from gapr_core.model.pairs import Pairs
 
 Arrays = list[NDArray[Any]]
 
 
 def fits(pairs: Pairs, *tensors: Tensor) -> bool:
-    """Whether the loops can take these tensors and the geometry of these pairs."""
-    return steps.can_take(*tensors, pairs.p_i)
+    """Whether the loops can take these tensors and the geometry of these pairs: float32 on a CPU, not autocast."""
+    plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, pairs.p_i))
+    return plain and not torch.is_autocast_enabled("cpu")
 
 
 def attend(

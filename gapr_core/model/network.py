@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from gapr_core.model.backbone import Backbone
-from gapr_core.model.bone_head import BONE_HEADS
-from gapr_core.model.config import ModelConfig, choose
+from gapr_core.model.config import ModelConfig
 from gapr_core.model.layers import pad
 from gapr_core.model.point_matching import FineAssignment, FineMatching
 from gapr_core.model.superpoint_matching import coarse_scores, patch_pairs
@@ -18,17 +17,13 @@ from gapr_core.model.types import Cloud, Features, Matches, PatchPairs
 
 @dataclass(frozen=True)
 class Output:
-    """Everything one forward pass found.
-
-    `coarse` is the log of eq. (7), (B, n, m); `bone` (N,) are logits of the source's fine points to be bone.
-    """
+    """Everything one forward pass found; `coarse` is the log of eq. (7), (B, n, m)."""
 
     aggregated: Aggregated
     coarse: Tensor
     chosen: PatchPairs
     fine: FineAssignment
     matches: Matches
-    bone: Tensor
 
 
 class GAPRNet(nn.Module):
@@ -48,7 +43,6 @@ class GAPRNet(nn.Module):
         self.backbone = Backbone(self.config)
         self.aggregation = GlobalAggregation(self.config)
         self.fine_matching = FineMatching(self.config)
-        self.bone_head = choose("bone_head", BONE_HEADS, self.config.bone_head)(self.config)
 
     def forward(self, source: Cloud, target: Cloud, target_features: Features | None = None) -> Output:
         """Correspondences of a batch of pairs; the truth is not needed, the target's features may be given."""
@@ -58,14 +52,8 @@ class GAPRNet(nn.Module):
         coarse = self.coarse_scores(source, target, aggregated)  # eq. (6), (7)
         chosen = patch_pairs(coarse, self.config.test_pairs, source.coarse.lengths, target.coarse.lengths)  # C'
         fine = self.fine_matching(source, target, f_p.fine, f_q.fine, chosen)  # eq. (8)
-        bone = self.bone(source, f_p, aggregated)
-        weight = bone.sigmoid() if self.config.bone_scores else None
-        matches = self.fine_matching.correspondences(source, target, fine, chosen, weight)  # eq. (9)
-        return Output(aggregated, coarse, chosen, fine, matches, bone)
-
-    def bone(self, source: Cloud, features: Features, aggregated: Aggregated) -> Tensor:
-        """(N,) logits of the source's fine points to be bone; infinite without a head."""
-        return self.bone_head(source, features.fine, aggregated.source[aggregated.source_valid])
+        matches = self.fine_matching.correspondences(source, target, fine, chosen)  # eq. (9)
+        return Output(aggregated, coarse, chosen, fine, matches)
 
     def coarse_scores(self, source: Cloud, target: Cloud, aggregated: Aggregated) -> Tensor:
         """Log of eq. (7); superpoints without any fine point are out."""

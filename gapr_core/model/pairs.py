@@ -11,7 +11,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gapr_core.model import pgf, steps
+from gapr_core.model import pgf
 from gapr_core.model.types import Level, Neighborhood
 
 
@@ -42,8 +42,6 @@ class Pairs:
     @cached_property
     def pgf(self) -> Tensor:
         """(B, n, m, 11) embedded PGF; shared by all layers that look at these pairs."""
-        if steps.can_take(self.p_i, self.p_j, self.c_h, self.c_k, self.radius):
-            return steps.embed(self.p_i, self.p_j, self.c_h, self.c_k, self.radius)
         with torch.no_grad():
             return pgf.embed(self.p_i, self.p_j, self.c_h, self.c_k, self.radius[..., None])
 

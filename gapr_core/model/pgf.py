@@ -9,7 +9,8 @@ from gapr_core.model.vectors import Parts, cross, dot, minus, parts
 
 EMBEDDED = 11  # 3 distances, sine and cosine of 4 angles
 _TINY = 1e-12
-_TINY_PLANE = 1e-10
+_FADE = 1e-10  # of the fourth powers of the sides: an angle fades once a side is below 0.3 % of the other
+_POINT = 2e-4  # squared length in radii below which three points are one, so that float32 can go back
 
 
 def pgf(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | float) -> Tensor:
@@ -45,15 +46,16 @@ def embed(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | f
     ji, jh, jk = [-x for x in j], minus(h, j), minus(k, j)  # seen from p_j
     ii, hh, kk = dot(ji, ji), dot(jh, jh), dot(jk, jk)
     distances = [torch.sqrt(squared + _TINY) for squared in (ii, hh, kk)]  # (i) to (iii)
-    angles = [*_angle(ji, jk, ii * kk), *_angle(ji, jh, ii * hh), *_angle(jh, jk, hh * kk)]  # (iv) to (vi)
+    angles = [*_angle(ji, jk, ii, kk), *_angle(ji, jh, ii, hh), *_angle(jh, jk, hh, kk)]  # (iv) to (vi)
     features = torch.broadcast_tensors(*distances, *angles, *_dihedral(k, h, j))  # the dihedral is (vii)
     return torch.stack(features).movedim(0, -1).contiguous()  # five times faster than to stack along the last axis
 
 
-def _angle(a: Parts, b: Parts, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """Sine and cosine of the unsigned angle between vectors whose squared lengths multiply to `squared`."""
-    normal, scale = cross(a, b), torch.rsqrt(squared + _TINY_PLANE)
-    return torch.sqrt(dot(normal, normal) + _TINY_PLANE * 1e-8) * scale, dot(a, b) * scale
+def _angle(a: Parts, b: Parts, aa: Tensor, bb: Tensor) -> tuple[Tensor, Tensor]:
+    """Sine and cosine of the unsigned angle between vectors with the squared lengths `aa` and `bb`."""
+    normal, faded = cross(a, b), _FADE * (aa + bb + _POINT) ** 2
+    scale = torch.rsqrt(aa * bb + faded)
+    return torch.sqrt(dot(normal, normal) + 1e-8 * faded) * scale, dot(a, b) * scale
 
 
 def _dihedral(axis: Parts, first: Parts, second: Parts) -> tuple[Tensor, Tensor]:
@@ -61,9 +63,10 @@ def _dihedral(axis: Parts, first: Parts, second: Parts) -> tuple[Tensor, Tensor]
 
     With n_1 = axis x first and n_2 = axis x second, n_1 x n_2 = axis (n_1 . second).
     """
-    n_1, n_2 = cross(axis, first), cross(axis, second)
-    scale = torch.rsqrt(dot(n_1, n_1) * dot(n_2, n_2) + _TINY_PLANE)
-    return torch.sqrt(dot(axis, axis) + _TINY) * dot(n_1, second) * scale, dot(n_1, n_2) * scale
+    n_1, n_2, length = cross(axis, first), cross(axis, second), dot(axis, axis)
+    sides = (length + dot(first, first) + _POINT) * (length + dot(second, second) + _POINT)
+    scale = torch.rsqrt(dot(n_1, n_1) * dot(n_2, n_2) + _FADE * sides**2)
+    return torch.sqrt(length + _TINY) * dot(n_1, second) * scale, dot(n_1, n_2) * scale
 
 
 def ball_centroids(centres: Tensor, support: Tensor, valid: Tensor, radius: Tensor | float) -> Tensor:

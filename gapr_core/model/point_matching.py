@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from gapr_core.model import steps
 from gapr_core.model.config import ModelConfig, choose
 from gapr_core.model.pairs import gather
 from gapr_core.model.types import Cloud, Matches, PatchPairs
@@ -87,13 +86,8 @@ class FineMatching(nn.Module):
         log_z = log_optimal_transport(scores, self.dustbin.float(), valid_p, valid_q, self.iterations)
         return FineAssignment(log_z, index_p, index_q, valid_p, valid_q)
 
-    def correspondences(
-        self, source: Cloud, target: Cloud, fine: FineAssignment, chosen: PatchPairs, bone: Tensor | None = None
-    ) -> Matches:
-        """Eq. (9): the union of the mutual top-k matches of all patch pairs.
-
-        `bone` (N,) is the probability of the source's fine points to be bone; it multiplies the scores.
-        """
+    def correspondences(self, source: Cloud, target: Cloud, fine: FineAssignment, chosen: PatchPairs) -> Matches:
+        """Eq. (9): the union of the mutual top-k matches of all patch pairs."""
         z = fine.log_z[:, :-1, :-1].clamp(min=_LOWEST).exp()
         z = z * (fine.source_valid[:, :, None] & fine.target_valid[:, None])
         kept = mutual_top_k(z, self.mutual_k) & (z > self.confidence)
@@ -101,8 +95,6 @@ class FineMatching(nn.Module):
         p = source.fine.points[fine.source_index[patch, a]]
         q = target.fine.points[fine.target_index[patch, b]]
         score = z[patch, a, b] * chosen.score[patch].sqrt()
-        if bone is not None:
-            score = score * bone[fine.source_index[patch, a]]
         return Matches(p, q, score, patch, chosen.pair[patch])
 
 
@@ -116,8 +108,6 @@ def log_optimal_transport(scores: Tensor, dustbin: Tensor, valid_p: Tensor, vali
         (P, a + 1, b + 1) log assignment: every existing point's row (column) sums to one.
     """
     mask_p, mask_q = (torch.nn.functional.pad(v, (0, 1), value=True) for v in (valid_p, valid_q))
-    if steps.can_take(scores, dustbin):
-        return steps.transport(scores, dustbin, mask_p, mask_q, rounds - 1)
     padded = torch.nn.functional.pad(scores, (0, 1, 0, 1))
     bins = torch.zeros_like(padded)
     bins[:, -1], bins[:, :, -1] = 1.0, 1.0

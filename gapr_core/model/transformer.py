@@ -75,7 +75,7 @@ class GlobalAggregation(nn.Module):
         crosses = ["vanilla"] * (layers - 1) + [config.final_cross]
         self.self_layers = nn.ModuleList(make_transformer(config.encoding, dim, config) for _ in range(layers))
         self.cross_layers = nn.ModuleList(make_transformer(name, dim, config) for name in crosses)
-        self.centred, self.small_ball = config.centred_features, config.global_small_ball
+        self.small_ball = config.global_small_ball
         self.reposition = choose("repositioning", REPOSITIONING, config.repositioning)(config)
 
     def forward(self, source: Cloud, target: Cloud, x_p: Tensor, x_q: Tensor) -> Aggregated:
@@ -87,18 +87,10 @@ class GlobalAggregation(nn.Module):
             x_p, x_q = self_layer(x_p, x_p, self_p), self_layer(x_q, x_q, self_q)  # eq. (1), (2)
             x_p, x_q = cross_layer(x_p, x_q, cross_p), cross_layer(x_q, x_p, cross_q)  # eq. (3), (4)
         x_p, x_q = self.self_layers[-1](x_p, x_p, self_p), self.self_layers[-1](x_q, x_q, self_q)
-        early_p, early_q = self.compared(self.early(x_p), self.early(x_q), q.valid)
+        early_p, early_q = normalize(self.early(x_p), dim=-1), normalize(self.early(x_q), dim=-1)
         T = self.reposition(early_p, early_q, p.points, q.points, p.valid, q.valid)  # T_r
         p = p.moved(T)
         final = self.cross_layers[-1]
         x_p, x_q = final(x_p, x_q, p.look_at(q)), final(x_q, x_p, q.look_at(p))  # eq. (3), (5)
-        f_p, f_q = self.compared(self.leave(x_p), self.leave(x_q), q.valid)
+        f_p, f_q = normalize(self.leave(x_p), dim=-1), normalize(self.leave(x_q), dim=-1)
         return Aggregated(f_p, f_q, p.valid, q.valid, early_p, early_q, T)
-
-    def compared(self, x_p: Tensor, x_q: Tensor, valid_q: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit features; as an option without the mean of the target's, which tells nothing apart."""
-        if self.centred:
-            weight = valid_q[..., None].to(x_q.dtype)
-            common = (x_q * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
-            x_p, x_q = x_p - common, x_q - common
-        return normalize(x_p, dim=-1), normalize(x_q, dim=-1)

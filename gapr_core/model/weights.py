@@ -18,6 +18,7 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.runtime import files
 
 FORMAT = "gapr-net/1"
+DROPPED = {"bone_head": ("none", "mlp"), "bone_scores": (False,), "centred_features": (False,)}  # changed no match
 
 
 def save(
@@ -73,12 +74,20 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet,
     if checksum(tensors) != header.get("sha256") or header.get("signature", signed) != signed:
         raise WeightsError("tensors with the checksum of the header", f"others in {path}", "fetch the file again")
     try:
-        network = GAPRNet(ModelConfig.from_dict(json.loads(header["config"])))
-        network.load_state_dict({name: t.float() for name, t in tensors.items()}, strict=True)
+        network = GAPRNet(_config(json.loads(header["config"])))
+        own = {name: t.float() for name, t in tensors.items() if not name.startswith("bone_head.")}
+        network.load_state_dict(own, strict=True)
         card = json.loads(header.get("card", "{}"))
     except (ConfigError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise WeightsError("weights that fit their configuration", f"{path}: {error}", "export them again") from error
     return network.to(device).eval(), card
+
+
+def _config(settings: dict[str, Any]) -> ModelConfig:
+    """The configuration in a header, without settings of earlier files at values that change no match."""
+    return ModelConfig.from_dict(
+        {name: value for name, value in settings.items() if value not in DROPPED.get(name, ())}
+    )
 
 
 def checksum(tensors: dict[str, Tensor], *texts: str) -> str:

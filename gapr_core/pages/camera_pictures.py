@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,13 @@ from numpy.typing import NDArray
 
 from gapr_core.data.scenes.figure import BONE, OTHER, paint
 from gapr_core.pages.poster import draw_bone, draw_chart
+from gapr_core.pages.views import as_png
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 NOT_LOOKED_AT = np.array([0.72, 0.75, 0.78])
 KEY = "light: taken for bone, red: looked at and not taken, grey: not looked at"
-POSTER_VIEWS, COLOURS = 5, 256
+POSTER_VIEWS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,7 @@ def views_as_png(views: Sequence[CameraView], columns: int = 4) -> bytes:
     rows = -(-len(views) // columns)
     figure = _figure(2.6 * columns, 2.75 * rows)
     _draw_views(figure, views, rows, columns)
-    out = BytesIO()
-    figure.savefig(out, format="png")
-    return _smaller(out)
+    return as_png(figure)
 
 
 def save_scene_poster(
@@ -65,7 +63,7 @@ def save_scene_poster(
         target: the bone, mm.
         views: every image, in the order of time.
         points: (N, 3) mm in the target's frame, laid on it.
-        distances_mm: (N,) their distances from the surface.
+        distances_mm: (N,) their signed distances from the surface.
         title: the line above.
         charts: name to (values, limit); not finite where there is no value.
         facing: (3,) direction in the target's frame to the camera; from the front where it is None.
@@ -101,12 +99,3 @@ def _draw_views(figure: Any, views: Sequence[CameraView], rows: int, columns: in
         axes.set_title(view.title, fontsize=8)
     for axes in all_axes[len(views) :]:
         axes.axis("off")
-
-
-def _smaller(png: BytesIO) -> bytes:
-    """The same picture with few colours: about half of the bytes."""
-    from PIL import Image
-
-    out = BytesIO()
-    Image.open(png).convert("RGB").quantize(COLOURS).save(out, format="png", optimize=True)
-    return out.getvalue()

@@ -9,6 +9,9 @@ TARGET = "#9aa2ab"  # points of a target in a flat picture
 BONE = "#eadfc8"
 OTHERS = "#9aa5b1"  # measured points that are not of the bone
 GUIDE = "#bbbbbb"  # limits and diagonals
+INK, SOFT = "#1d2733", "#5d6b7a"  # text and marks, and what is less important
+SIGNED = ("#123c9c", "#6f9be8", "#f7f7f7", "#f08a80", "#b71c1c")  # inside the bone, on it, outside
+GAIN = (BONE, "#f2a541", "#7a1fa2")  # of a further look: none, ever more
 
 
 def dash(number: int) -> str:

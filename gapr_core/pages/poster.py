@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gapr_core.data.picture import shade
-from gapr_core.pages.report import level
+from gapr_core.pages import palette, views
+from gapr_core.pages.views import OnBone
 from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
-
-LYING = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # a long bone from above: z runs to the left
-MM_PER_PIXEL = 0.35
+NOWHERE = np.zeros((0, 3))
 
 
 def save_poster(
@@ -35,14 +34,11 @@ def save_poster(
         path: where to.
         target: the bone, mm.
         points: (N, 3) mm in the target's frame, laid on it.
-        distances_mm: (N,) their distances from the surface.
+        distances_mm: (N,) their signed distances from the surface.
         title: the line above.
         charts: name to (values, limit): small charts under the bone; not finite where there is no value.
         x_title: what the charts run over, counted from 1.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(11.0, 6.2), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13)
@@ -56,25 +52,25 @@ def save_poster(
 
 
 def draw_bone(figure: Any, target: Surface, points: Array, distances_mm: Array, facing: Array | None = None) -> None:
-    """The bone, a long one lying, with points on it that are coloured by their distance, seen as `level` says."""
-    size, (x, y) = np.ptp(target.points, axis=0), level(facing)
-    to_front = np.array([[-y, x, 0.0], [-x, -y, 0.0], [0.0, 0.0, 1.0]])
-    turn = (LYING if size[2] > 1.5 * size[0] else np.eye(3)) @ to_front
-    turned = replace(target, points=target.points @ turn.T, normals=None)
-    low, high = turned.points.min(axis=0) - 8.0, turned.points.max(axis=0) + 8.0
+    """The bone with points on it by signed distance, from `facing` (3,), or from where most points are seen."""
+    on = OnBone(target, points, distances_mm, NOWHERE)
     axes = figure.subplots()
-    extent = (low[0], high[0], low[2], high[2])
-    axes.imshow(shade(turned, "anterior", MM_PER_PIXEL), extent=extent, interpolation="bilinear")
-    across, _, up = (points @ turn.T).T
-    dots = axes.scatter(across, up, c=distances_mm, s=2.5, cmap="turbo", vmin=0.0, vmax=5.0, linewidths=0)
+    dots = views.paint(axes, on, views.picture_of(on, on.side_facing(facing)))
     figure.colorbar(dots, ax=axes, label="distance to the bone, mm", shrink=0.8)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]), aspect="equal")
-    axes.axis("off")
+
+
+def charts_as_png(charts: Mapping[str, tuple[Sequence[float], float | None]], x_title: str) -> bytes:
+    """Small charts beside each other as a PNG: name to (values, limit); not finite where there is no value."""
+    figure = Figure((2.6 * len(charts), 2.4), views.DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, (values, limit)) in zip(np.ravel(figure.subplots(1, len(charts))), charts.items(), strict=True):
+        draw_chart(axes, name, values, limit, x_title)
+    return views.as_png(figure)
 
 
 def draw_chart(axes: Any, name: str, values: Sequence[float], limit: float | None, x_title: str) -> None:
     """One curve over the frames, counted from 1, with a dashed line at the limit."""
-    axes.plot(np.arange(1, len(values) + 1), values, "o-", color="#1f5fa8", markersize=4, linewidth=1.2)
+    axes.plot(np.arange(1, len(values) + 1), values, "o-", color=palette.FIRST, markersize=4, linewidth=1.2)
     if limit is not None:
         axes.axhline(limit, color="0.5", linestyle="--", linewidth=1.0)
     axes.set(title=name, xlabel=x_title, xlim=(0.5, len(values) + 0.5))

@@ -12,5 +12,6 @@
 | `scenes` | a camera's cloud, most of which may not be bone |
 | `streams` | `Tracker`, `Accumulator`, `LookAccumulator` |
 
-`guidance` ranks where to measure next; `check_points` tests a pose with points outside the source.
+`guidance` ranks where to measure next; `check_points` tests a pose with points outside the source; `caveats` adds
+warnings to a result.
 """

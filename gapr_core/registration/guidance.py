@@ -68,7 +68,8 @@ def guide(assessment: Assessment) -> Guidance | None:
     ranked = tuple(
         Patch(points[k], normals[k], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k])) for k in order
     )
-    return Guidance(target.points.copy(), _spread(target, patches, now_mm - after_mm), now_mm, ranked)
+    gain_mm = _spread(target, patches, now_mm - after_mm)
+    return Guidance(target.points.copy(), gain_mm, now_mm, ranked, PATCH_MM)
 
 
 def information(J: Array, points: int, noise_mm: float, bias_mm: float) -> Array:

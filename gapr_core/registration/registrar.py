@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
+from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks import cortices, image, table
 from gapr_core.registration.checks.assess import assess_fit, bias_corrected
 from gapr_core.registration.checks.assessment import Assessment
@@ -105,6 +106,9 @@ class Registrar:
         self.classifier = classifier or Classifier.load()
         self.precision = precision or Precision.load()
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {', '.join(proposer.name for proposer in self.proposers)}; {self.config}>"
+
     @classmethod
     def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu") -> Registrar:
         """Load the best registrar that ships: GAPR-Net, then the search; nothing is downloaded.
@@ -134,6 +138,7 @@ class Registrar:
             proposer.prepare(prepared)  # `both_cortices` gets its share when a source first follows both
         return prepared
 
+    @answering
     def register(
         self,
         source: ArrayLike,
@@ -144,7 +149,7 @@ class Registrar:
         """Find the pose of a source on the target, or refuse.
 
         Args:
-            source: (N, 3), mm, in its own frame; rows that are not finite are dropped.
+            source: (N, 3), mm, in its own frame; rows that are not finite are dropped. Also a path or a `Surface`.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
             viewpoint: (3,) mm, source frame: place of the camera, if there was one; (N, 3) its place for each

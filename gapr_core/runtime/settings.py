@@ -12,6 +12,7 @@ from __future__ import annotations
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -71,6 +72,12 @@ class Settings:
         """Put a file's entries over the defaults; see `load`."""
         return load(cls, path)
 
+    def __init_subclass__(cls) -> None:
+        cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]  # else `dataclass` writes one of all settings
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(changes(self))})"
+
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries, as `from_dict` takes them."""
         return asdict(self)
@@ -124,12 +131,22 @@ def from_dict(cls: type[T], values: Any, path: str = "") -> T:
     known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
     unknown = [str(name) for name in values if name not in known]
     if unknown:
-        raise ConfigError(f"one of {', '.join(known)}", f"{path}{unknown[0]}", f"correct the name in {cls.__name__}")
+        how = _did_you_mean(cls, unknown[0], path)
+        raise ConfigError(f"one of {', '.join(known)}", f"{path}{unknown[0]}", how or f"correct it in {cls.__name__}")
     missing = [f"{path}{name}" for name, f in known.items() if name not in values and not _has_default(f)]
     if missing:
         raise ConfigError(f"{', '.join(missing)} for {cls.__name__}", "none", "add it")
     hints = _hints(cls)  # type: ignore[arg-type]
     return cls(**{name: _converted(hints[name], value, f"{path}{name}") for name, value in values.items()})
+
+
+def _did_you_mean(cls: type, name: str, path: str) -> str:
+    """Ask for a setting of the same or nearly the same name; empty where there is none."""
+    names = [row.name for row in table(cls, path)]
+    near = [each for each in names if each.endswith(f".{name}")]
+    by_end = {each.rpartition(".")[2]: each for each in reversed(names)}
+    near = near or [by_end[end] for end in get_close_matches(name, by_end, n=1)]
+    return f"did you mean {' or '.join(near)}?" if near else ""
 
 
 def load(cls: type[T], file: str | Path | None = None, assignments: Sequence[str] = ()) -> T:

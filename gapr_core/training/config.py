@@ -24,10 +24,6 @@ class TrainConfig(Settings):
     model: str = setting("", "path of a yaml in config/model; empty: the defaults (best)")
     initial: str = setting("", "weights (safetensors) of the same network to begin with; empty: random ones")
     model_settings: dict[str, Any] = setting({}, "settings of the network over those of its yaml")
-    trained: str = setting(
-        "all", "what learns: all, or bone_head, a head on the network of `initial`, which stays as it is",
-        choices=("all", "bone_head"),
-    )  # fmt: skip
     bones: tuple[str, ...] = setting(("femur", "tibia", "pelvis", "thoracic"), "bone types")
     mix: dict[str, float] = setting(MIX, "protocols and how often each is drawn", low=0)
     target_frame: str = setting(
@@ -38,7 +34,6 @@ class TrainConfig(Settings):
         choices=("new", "target"),
     )  # fmt: skip
     early_loss: float = setting(0.5, "weight of the coarse loss before repositioning; the paper has none: 0", low=0)
-    bone_loss: float = setting(0.5, "weight of the loss of the bone head, where the network has one", low=0)
     pairs: int = setting(24_000, "length of the schedule, in pairs", low=1)
     batch: int = setting(8, "pairs per optimiser step, over all processes", low=1)
     micro_batch: int = setting(4, "pairs per forward pass; gradients add up to a batch", low=1)
@@ -48,6 +43,9 @@ class TrainConfig(Settings):
     warmup: float = setting(0.02, "share of the schedule with a rising learning rate", low=0, high=1)
     final_rate: float = setting(0.01, "learning rate at the end of the cosine over that at its start", low=0, high=1)
     ema: float = setting(0.995, "decay of the averaged weights, which are validated and exported", low=0, high=1)
+    coarse_first: float = setting(
+        0.0, "share of the schedule, its first part, with 0.6 of the superpoints, at half the cost", low=0, high=1
+    )
     pool: int = setting(128, "bones in use at once", low=1)
     reuse: int = setting(16, "pairs that a bone serves before the next subject comes in", low=1)
     share: int = setting(2, "neighbouring pairs with one target, whose features are computed once", low=1)

@@ -31,6 +31,7 @@ from gapr_core.training.targets import TrainingPair, join, training_pair
 Array = NDArray[np.float64]
 CROPPED = ("paper", "overlap", "incomplete")  # protocols (beginnings) that crop a cloud
 OWN_TARGET = ("incomplete",)  # protocols whose target is not the whole bone
+COARSE = 0.6  # of the superpoints, in the first part of a schedule with `coarse_first`
 LANES = 4  # the bone of a pair and its micro-batch have numbers that are the same modulo this
 
 
@@ -115,13 +116,14 @@ class TrainingPairs(Dataset[TrainingPair]):
     def pair(self, number: int) -> TrainingPair:
         """Pair `number`; the rare one with too few points or overlap gives way to a later draw of the same number."""
         rng = np.random.default_rng([self.train.seed, 1, number])
+        which = self._bone_number(number)
         for _ in range(20):
-            bone = self._bone(self._bone_number(number))
+            bone = self._bone(which)
             protocol = str(rng.choice(self.protocols, p=self.weights))
             seed = int(rng.integers(2**31))
             try:
                 made = make_pair(protocol, self._seen_by(protocol, bone), seed)
-                found = self._prepare(made, bone) if len(made.source) >= FEWEST_POINTS else None
+                found = self._prepare(made, bone, self._sizes(which)) if len(made.source) >= FEWEST_POINTS else None
             except (ConfigError, InvalidPointCloudError):  # no wound shows enough bone; a scene larger than its bone
                 continue
             if found is not None and bool((found.overlaps > 0.1).any()):
@@ -147,14 +149,21 @@ class TrainingPairs(Dataset[TrainingPair]):
             return whose
         return SampledOnce(whose.surface, whose.bone, whose.person, whose.cohort, bone.points)
 
-    def _prepare(self, made: Pair, bone: PooledBone) -> TrainingPair:
+    def _sizes(self, bone: int) -> ModelConfig:
+        """The network's settings for pairs of this bone: fewer superpoints for the bones that come in first."""
+        if bone // LANES * LANES * self.train.reuse >= self.train.coarse_first * self.train.pairs:
+            return self.model
+        few, many = (max(4, round(COARSE * count)) for count in self.model.superpoints)
+        return replace(self.model, superpoints=(few, many))
+
+    def _prepare(self, made: Pair, bone: PooledBone, model: ModelConfig) -> TrainingPair:
         frame, target, T = bone.frame, bone.target, made.T_target_source.copy()
         T[:3, 3] += made.metadata["origin_mm"]
         if made.protocol in OWN_TARGET:
             own = made.target + made.metadata["origin_mm"]
-            frame = target_frame(own, self.model)
-            target = build_cloud(own, frame, self.model).turned(bone.turn)
-        return training_pair(build_cloud(made.source, frame, self.model), target, bone.turn @ T, frame)
+            frame = target_frame(own, model)
+            target = build_cloud(own, frame, model).turned(bone.turn)
+        return training_pair(build_cloud(made.source, frame, model), target, bone.turn @ T, frame)
 
     def _bone(self, number: int) -> PooledBone:
         if number not in self._pool:
@@ -180,10 +189,11 @@ class TrainingPairs(Dataset[TrainingPair]):
         specimen, subjects = people.draw_of(number, self.train.synthetic, self.train.seed)
         rng = np.random.default_rng([self.train.seed, 2, number])
         points, _ = specimen.sample(TARGET_POINTS, rng)
-        frame, turn = target_frame(points, self.model), np.eye(4)
+        model, turn = self._sizes(number), np.eye(4)
+        frame = target_frame(points, model)
         if self.train.target_frame == "random":
             turn = se3.from_rotation_translation(se3.random_rotation(rng), np.zeros(3))
-        target = build_cloud(points, frame, self.model).turned(turn)
+        target = build_cloud(points, frame, model).turned(turn)
         return PooledBone(specimen, points, frame, target, turn, subjects)
 
 

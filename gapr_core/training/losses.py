@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits, softplus
+from torch.nn.functional import softplus
 
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.transformer import Aggregated
@@ -20,26 +20,23 @@ LOG_SCALE = 24.0
 
 @dataclass(frozen=True)
 class Losses:
-    """Losses of a batch, and the weights of those that the paper does not have.
+    """Losses of a batch, and the weight of the one that the paper does not have.
 
     Attributes:
         coarse, fine: of the superpoints and of the points in patches: the paper's.
         early: the coarse loss where repositioning takes its features.
-        bone: of the head that says which points are bone.
-        early_weight, bone_weight: what the two count.
+        early_weight: what it counts.
     """
 
     coarse: Tensor
     fine: Tensor
     early: Tensor
-    bone: Tensor | float = 0.0
     early_weight: float = 0.5
-    bone_weight: float = 0.5
 
     @property
     def total(self) -> Tensor:
-        """Eq. (10), with the auxiliary losses at their weights; the paper has none."""
-        return self.coarse + self.fine + self.early_weight * self.early + self.bone_weight * self.bone
+        """Eq. (10), with the auxiliary loss at its weight; the paper has none."""
+        return self.coarse + self.fine + self.early_weight * self.early
 
 
 def circle_loss(f_p: Tensor, f_q: Tensor, overlaps: Tensor, valid_p: Tensor, valid_q: Tensor) -> Tensor:
@@ -78,14 +75,6 @@ def assignment_loss(log_z: Tensor, labels: Tensor) -> Tensor:
     return -log_z[labels].mean() if bool(labels.any()) else 0.0 * log_z.sum()
 
 
-def bone_loss(logits: Tensor, is_bone: Tensor) -> Tensor | float:
-    """Mean cross-entropy of logits (N,) against bool (N,); zero without a head, whose logits are infinite."""
-    said = ~logits.isposinf()
-    if not bool(said.any()):
-        return 0.0
-    return binary_cross_entropy_with_logits(logits[said], is_bone[said].float())
-
-
 def features(network: GAPRNet, pair: TrainingPair) -> tuple[Features, Features]:
     """What the backbone makes of sources and targets: all clouds in one pass, each different target once."""
     targets = pair.target if pair.distinct is None else pair.distinct
@@ -96,19 +85,14 @@ def features(network: GAPRNet, pair: TrainingPair) -> tuple[Features, Features]:
 
 
 def compute_losses(
-    network: GAPRNet,
-    pair: TrainingPair,
-    generator: torch.Generator,
-    early_weight: float = 0.5,
-    bone_weight: float = 0.5,
+    network: GAPRNet, pair: TrainingPair, generator: torch.Generator, early_weight: float = 0.5
 ) -> tuple[Losses, Aggregated]:
     """One pass of a batch with the truth: the fine loss looks at true patch pairs and need not wait for good ones."""
     f_p, f_q = features(network, pair)
     a = network.aggregation(pair.source, pair.target, f_p.coarse, f_q.coarse)
     coarse = circle_loss(a.source, a.target, pair.overlaps, a.source_valid, a.target_valid)
     early = circle_loss(a.early_source, a.early_target, pair.overlaps, a.source_valid, a.target_valid)
-    bone = bone_loss(network.bone(pair.source, f_p, a), pair.is_bone) if pair.is_bone is not None else 0.0
     chosen = true_patch_pairs(pair, network.config.train_pairs, generator)
     fine = network.fine_matching(pair.source, pair.target, f_p.fine, f_q.fine, chosen)
     labels = fine_labels(pair, fine.source_index, fine.target_index, fine.source_valid, fine.target_valid, chosen.pair)
-    return Losses(coarse, assignment_loss(fine.log_z, labels), early, bone, early_weight, bone_weight), a
+    return Losses(coarse, assignment_loss(fine.log_z, labels), early, early_weight), a

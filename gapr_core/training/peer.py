@@ -68,9 +68,9 @@ class WithVoxel(TrainingPairs):
 
     voxel = 0.0
 
-    def _prepare(self, made: Pair, bone: PooledBone) -> TrainingPair:
+    def _prepare(self, made: Pair, bone: PooledBone, model: ModelConfig) -> TrainingPair:
         self.voxel = bone.frame.voxel
-        return super()._prepare(made, bone)
+        return super()._prepare(made, bone, model)
 
 
 def main(description: str, checkout: type[Checkout], teacher: Teacher) -> int:

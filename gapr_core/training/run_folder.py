@@ -102,7 +102,7 @@ def log_row(state: dict[str, Any], config: TrainConfig, values: dict[str, float]
 
 def mean_losses(parts: list[Losses]) -> dict[str, float]:
     """The total and each loss, averaged over the micro-batches that one process had in a step."""
-    names = ["total", "coarse", "fine", "early", *(["bone"] if isinstance(parts[0].bone, torch.Tensor) else [])]
+    names = ["total", "coarse", "fine", "early"]
     means = {name: sum(float(getattr(part, name).detach()) for part in parts) / len(parts) for name in names}
     return {"loss": means.pop("total"), **means}
 

@@ -61,3 +61,11 @@ class Drawn:
 
 
 HELD_OUT = ("val", "test")
+
+
+def check_validate(names: Iterable[str], folder: Path | None) -> None:
+    """Raise `ConfigError` where somebody to validate on is not in the split val: a choice by test subjects leaks."""
+    val = anatomy.splits(folder)["val"] if folder else []
+    others = sorted({name for name in names if name not in val and parametric_split(name) != "val"})
+    if others:
+        raise ConfigError("subjects of the split val only", ", ".join(others), "the validation draws others: fix that")

@@ -32,7 +32,6 @@ class TrainingPair:
         radius: (B,) matching radius in units.
         distinct: the different targets, each once; None for a single pair.
         which: row of `distinct` for each pair.
-        is_bone: (N,) bool, fine points of the source that lie on the target under the truth.
         subjects: whose bones the pairs were made of, a name for each contribution.
     """
 
@@ -43,7 +42,6 @@ class TrainingPair:
     radius: Tensor
     distinct: Cloud | None = None
     which: tuple[int, ...] = ()
-    is_bone: Tensor | None = None
     subjects: tuple[str, ...] = ()
 
     def to(self, device: torch.device | str) -> TrainingPair:
@@ -61,12 +59,8 @@ def training_pair(source: Cloud, target: Cloud, T_target_source: Array, frame: F
     radius = matching_radius(frame)
     matches = _matches(source, target, T, radius)
     overlaps = _overlaps(source, target, matches)
-    near = np.zeros(len(source.fine.points), dtype=bool)
-    near[matches["i"][matches["v"] < radius]] = True
-    return TrainingPair(
-        source, target, torch.from_numpy(T[None, :3]).float(), torch.from_numpy(overlaps[None]), torch.tensor([radius]),
-        is_bone=torch.from_numpy(near),
-    )  # fmt: skip
+    truth = torch.from_numpy(T[None, :3]).float()
+    return TrainingPair(source, target, truth, torch.from_numpy(overlaps[None]), torch.tensor([radius]))
 
 
 def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:
@@ -128,7 +122,6 @@ def join(pairs: list[TrainingPair]) -> TrainingPair:
         torch.cat([p.radius for p in pairs]),
         collate(distinct),
         which,
-        torch.cat([p.is_bone for p in pairs if p.is_bone is not None]),
         tuple(name for p in pairs for name in p.subjects),
     )
 

@@ -27,7 +27,7 @@ from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import prune
 from gapr_core.training.distributed import Group
 from gapr_core.training.losses import Losses, compute_losses
-from gapr_core.training.start import begin, learning, optimizer_of
+from gapr_core.training.start import begin, optimizer_of
 from gapr_core.training.subjects import Drawn
 from gapr_core.training.targets import TrainingPair
 from gapr_core.training.validation import validation_set
@@ -83,8 +83,7 @@ class Run:
         self.network = (GAPRNet(model) if begun else begin(config, model)).to(group.device)
         self.ema = GAPRNet(model).to(group.device)
         self.ema.load_state_dict(self.network.state_dict())
-        self.learns = learning(self.network, config.trained)
-        self.optimizer = optimizer_of(self.learns, config)
+        self.optimizer = optimizer_of(self.network, config)
         self.state: dict[str, Any] = {"step": 0, "seconds": 0.0}
         if begun:
             self.state = load_checkpoint(self.checkpoint, self.network, self.ema, self.optimizer)
@@ -167,7 +166,7 @@ class Run:
         Raises:
             FloatingPointError: that happens again and again.
         """
-        norm = torch.nn.utils.clip_grad_norm_(self.learns, self.config.clip, foreach=True)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip, foreach=True)
         self.lost = 0 if torch.isfinite(norm) else self.lost + 1
         if self.lost == MOST_LOST:
             raise FloatingPointError(f"{self.lost} steps in a row, up to {step + 1}, had gradients that are not finite")
@@ -209,8 +208,7 @@ class Learner(nn.Module):
     def forward(self, pair: TrainingPair, generator: torch.Generator) -> Losses:
         """The losses of one micro-batch."""
         with torch.autocast(pair.T.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
-            weights = self.config.early_loss, self.config.bone_loss
-            return compute_losses(self.network, pair, generator, *weights)[0]
+            return compute_losses(self.network, pair, generator, self.config.early_loss)[0]
 
 
 class Interval:

@@ -24,6 +24,7 @@ from gapr_core.model.types import Cloud
 from gapr_core.registration.proposals.consensus import local_to_global
 from gapr_core.registration.proposals.network import correspondences_mm
 from gapr_core.training.config import TrainConfig
+from gapr_core.training.subjects import check_validate
 from gapr_core.training.targets import TrainingPair, training_pair
 
 Array = NDArray[np.float64]
@@ -75,6 +76,8 @@ def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) 
     if train.validation_pairs and not people:
         how = "move some subjects to val in splits.json, or set validation_pairs to 0"
         raise ConfigError(f"subjects of split val with {' or '.join(train.bones)}", f"none in {folder}", how)
+    if train.validation_pairs:
+        check_validate((subject.person for of_bone in people for subject in of_bone), folder)
     found = []
     for p, protocol in enumerate(train.mix):
         for number in range(train.validation_pairs):

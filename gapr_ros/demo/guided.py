@@ -15,11 +15,13 @@ from gapr_core import metrics
 from gapr_core.data.looking_probe import LookingProbe
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.geometry import se3
-from gapr_core.pages.guidance import GuidedStep, guidance_figure
-from gapr_core.pages.report import Report, timeline_figure
-from gapr_core.results import confidence_text
+from gapr_core.pages import views
+from gapr_core.pages.poster import charts_as_png
+from gapr_core.pages.report import Image, Report
+from gapr_core.pages.views import OnBone
+from gapr_core.results import Guidance, confidence_text
 from gapr_ros.demo.act import Act, write_bone
-from gapr_ros.demo.report import Row, add_frames, facts, judge
+from gapr_ros.demo.report import Row, add_frames, add_verdict, facts, judge
 from gapr_ros.demo.running import STARTING, Sender, running
 
 if TYPE_CHECKING:
@@ -112,18 +114,22 @@ def judged(probe: LookingProbe, looks: Sequence[Look]) -> list[Row]:
 def write(probe: LookingProbe, looks: Sequence[Look], rows: Sequence[Row], folder: Path) -> None:
     """report.html."""
     report = Report(TITLE, LEAD.format(bone=probe.specimen.bone))
+    add_verdict(report, rows)
     report.facts(_facts(looks, rows))
     report.heading("Where to look next")
     report.paragraph(
-        "The bone is coloured by how much a look there would lower the bound of the error over the bone, rival poses "
-        "included. Black: the points so far, where they really are. Red: the newest look. Green: where the node sends "
-        "the probe. Below: that bound, and the true error, root mean square over the bone."
+        "Look after look, to be scrolled. The bone is coloured by how much a look there would lower the bound of the "
+        "error over the bone, rival poses included. Dark: the points so far, where they really are. Red: the newest "
+        "look. 1: where the node sends the probe. Below: that bound, and the true error over the bone."
     )
-    report.figure(guidance_figure(probe.specimen.surface, _steps(probe, looks)))
+    steps = [_on_bone(probe, look) for look in looks]
+    side = max(steps, key=lambda step: len(step.points)).sides(1)[0]
+    captions = [_line(number, look) for number, look in enumerate(looks, 1)]
+    report.film([Image(views.png(on, side), "bone by gain", line) for on, line in zip(steps, captions, strict=True)])
     bounds = [_bound_mm(look) for look in looks]
     errors = [_error_over_bone_mm(probe, look) for look in looks]
-    curves = {"95 % bound, mm": bounds, "true error, mm": errors}
-    report.figure(timeline_figure(range(1, len(looks) + 1), curves, "look", dict.fromkeys(curves, GOAL_MM)))
+    curves = {"95 % bound, mm": (bounds, GOAL_MM), "true error, mm": (errors, GOAL_MM)}
+    report.images([Image(charts_as_png(curves, "look"), "bound and error over the looks")])
     add_frames(report, rows)
     report.write(folder / "report.html")
 
@@ -139,17 +145,15 @@ def _facts(looks: Sequence[Look], rows: Sequence[Row]) -> dict[str, str]:
     return own | facts(rows)
 
 
-def _steps(probe: LookingProbe, looks: Sequence[Look]) -> list[GuidedStep]:
-    return [
-        GuidedStep(
-            str(number),
-            _line(number, look),
-            se3.apply(probe.T_target_source, look.cloud),
-            look.newest,
-            (look.advice.points, look.advice.gain_mm, look.advice.centre) if look.advice else None,
-        )
-        for number, look in enumerate(looks, 1)
-    ]
+def _on_bone(probe: LookingProbe, look: Look) -> OnBone:
+    """What is known after a look, and where the next one would help."""
+    bone, points = probe.specimen.surface, se3.apply(probe.T_target_source, look.cloud)
+    old, new = np.split(points, [len(points) - look.newest])
+    advice, place = look.advice, np.zeros((0, 3))
+    gain = Guidance(bone.points, np.zeros(len(bone.points)), 0.0, ())
+    if advice is not None:
+        gain, place = Guidance(advice.points, advice.gain_mm, 0.0, ()), advice.centre[None]
+    return OnBone(bone, old, np.zeros(len(old)), place, gain, new)
 
 
 def _bound_mm(look: Look) -> float:

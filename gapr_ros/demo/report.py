@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,11 @@ from scipy.spatial import cKDTree
 
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import se3
+from gapr_core.pages import views
 from gapr_core.pages.camera_pictures import KEY, CameraView, save_scene_poster, views_as_png
-from gapr_core.pages.poster import save_poster
-from gapr_core.pages.report import Image, Report, Step, alignment_figure, timeline_figure
+from gapr_core.pages.poster import charts_as_png, save_poster
+from gapr_core.pages.report import Image, Report
+from gapr_core.pages.views import OnBone
 from gapr_core.results import confidence_text
 from gapr_ros.demo.act import Act
 from gapr_ros.demo.observer import Answer
@@ -154,30 +155,48 @@ def _first_words(text: str) -> str:
 
 def write(act: Act, rows: Sequence[Row], folder: Path) -> None:
     """report.html and report.png."""
-    steps = _steps(act, rows)
     shown = max((k for k, row in enumerate(rows) if row.mark in ("ok", "bad")), default=len(rows) - 1)
-    charts, views, facing = _charts(rows), _views(act, rows), _facing(act, shown)
-    _page(act, rows, alignment_figure(act.bone, steps, shown, facing), views).write(folder / "report.html")
-    title = f"{act.name}: {steps[shown].caption}"
-    panels = {name: (values, LIMITS.get(name)) for name, values in charts.items() if name != "latency, ms"}
-    on_bone = steps[shown].points, steps[shown].distances_mm
-    if views:
-        save_scene_poster(folder / "report.png", act.bone, views, *on_bone, title, panels, facing)
+    frames = [_on_bone(row, cloud, act) for row, cloud in zip(rows, act.clouds, strict=True)]
+    images, facing = _views(act, rows), _facing(act, shown)
+    _page(act, rows, frames, images, facing).write(folder / "report.html")
+    title = f"{act.name}: {_caption(rows[shown])}"
+    panels = {name: panel for name, panel in _charts(rows).items() if name != "latency, ms"}
+    on_bone = frames[shown].points, frames[shown].distance_mm
+    if images:
+        save_scene_poster(folder / "report.png", act.bone, images, *on_bone, title, panels, facing)
     else:
         save_poster(folder / "report.png", act.bone, *on_bone, title, panels)
 
 
-def _page(act: Act, rows: Sequence[Row], on_bone: Any, views: Sequence[CameraView]) -> Report:
+def _page(
+    act: Act, rows: Sequence[Row], frames: Sequence[OnBone], images: Sequence[CameraView], facing: np.ndarray | None
+) -> Report:
     report = Report(act.title, act.lead)
+    add_verdict(report, rows)
     report.facts(facts(rows))
-    if views:
+    if images:
         report.heading("What the camera sees")
         report.paragraph("Every image, and what the node took for bone in it.")
-        report.images([Image(views_as_png(views), "the images, with the points taken for bone", KEY)])
+        report.images([Image(views_as_png(images), "the images, with the points taken for bone", KEY)])
     report.heading("The points laid on the bone")
-    report.figure(on_bone)
+    report.paragraph("Frame after frame, to be scrolled. Red points are outside of the bone, blue ones inside.")
+    side = max(frames, key=lambda frame: len(frame.points)).side_facing(facing)
+    report.film(
+        [
+            Image(views.png(frame, side), "points on the bone", _caption(row), row.mark == "bad")
+            for frame, row in zip(frames, rows, strict=True)
+        ]
+    )
     add_frames(report, rows)
     return report
+
+
+def add_verdict(report: Report, rows: Sequence[Row]) -> None:
+    """How many poses are right, and whether one is wrong."""
+    right, wrong, refused = ([row.mark for row in rows].count(mark) for mark in ("ok", "bad", "hold"))
+    tone = "refused" if wrong or not right else "accepted"
+    headline = f"{wrong} wrong poses" if wrong else f"{right} right poses, none wrong"
+    report.verdict(tone, headline, [f"{refused} of {len(rows)} clouds were refused, each with a reason."])
 
 
 def add_frames(report: Report, rows: Sequence[Row]) -> None:
@@ -188,28 +207,28 @@ def add_frames(report: Report, rows: Sequence[Row]) -> None:
         "as an angle; TRE is what the node expects of its own pose, over the whole bone, with its 95 % bound. More "
         f"than {se3.RIGHT_MM:g} mm or {se3.RIGHT_DEG:g} degrees is a wrong pose. Dashed: the limits."
     )
-    report.figure(timeline_figure([row.frame for row in rows], _charts(rows), "frame", LIMITS))
+    report.images([Image(charts_as_png(_charts(rows), "frame"), "charts over the frames")])
     report.table(columns(rows), [row.cells() for row in rows], [row.mark for row in rows], text=("answer",))
 
 
-def _steps(act: Act, rows: Sequence[Row]) -> list[Step]:
-    bone = Specimen(act.bone, act.name, "")
-    return [_step(row, cloud, bone) for row, cloud in zip(rows, act.clouds, strict=True)]
-
-
-def _step(row: Row, cloud: np.ndarray, bone: Specimen) -> Step:
+def _on_bone(row: Row, cloud: np.ndarray, act: Act) -> OnBone:
+    """One frame; what the node did not take for bone is grey, and without a pose there is nothing on the bone."""
     if row.answer is None or row.answer.T_target_source is None:
-        words = row.cells()[columns([row]).index("answer")]
-        return Step(str(row.frame), f"frame {row.frame}: {words}", np.zeros((0, 3)), np.zeros(0))
+        return OnBone(act.bone, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))
     aligned = se3.apply(row.answer.T_target_source, cloud)
-    on, aside = (aligned, aligned[:0]) if row.taken is None else (
-        aligned[row.taken.is_taken], aligned[~row.taken.is_taken]
-    )  # fmt: skip
-    caption = (
+    distance_mm = Specimen(act.bone, act.name, "").signed_distance(aligned)
+    if row.taken is not None:
+        distance_mm = np.where(row.taken.is_taken, distance_mm, np.nan)
+    return OnBone(act.bone, aligned, distance_mm, np.zeros((0, 3)))
+
+
+def _caption(row: Row) -> str:
+    if row.answer is None or row.answer.T_target_source is None:
+        return f"frame {row.frame}: {row.cells()[columns([row]).index('answer')]}"
+    return (
         f"frame {row.frame}, {row.points} points: confidence {confidence_text(row.answer.confidence)}, "
         f"error {row.error_mm:.2f} mm, {row.error_deg:.2f} deg"
     )
-    return Step(str(row.frame), caption, on, bone.distance(on), aside)
 
 
 def _facing(act: Act, frame: int) -> np.ndarray | None:
@@ -230,16 +249,18 @@ def _views(act: Act, rows: Sequence[Row]) -> list[CameraView]:
     ]
 
 
-def _charts(rows: Sequence[Row]) -> dict[str, list[float]]:
+def _charts(rows: Sequence[Row]) -> dict[str, tuple[list[float], float | None]]:
+    """Name to values, and the limit where there is one."""
     nan = float("nan")
     charts = {"confidence": [row.answer.confidence if row.answer else nan for row in rows]}
     if any(row.taken for row in rows):
         charts["taken points that are bone, %"] = [100.0 * row.taken.right_share if row.taken else nan for row in rows]
-    return charts | {
+    charts |= {
         "error at the centroid, mm": [row.error_mm for row in rows],
         "error, deg": [row.error_deg for row in rows],
         "latency, ms": [row.answer.latency_ms if row.answer else nan for row in rows],
     }
+    return {name: (values, LIMITS.get(name)) for name, values in charts.items()}
 
 
 def facts(rows: Sequence[Row]) -> dict[str, str]:

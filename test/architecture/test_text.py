@@ -21,7 +21,7 @@ TO_DO = (  # packages whose docstrings are still to be shortened: this list only
     "gapr_core/formats",
     "gapr_core/model",
     "gapr_core/pages",
-    "gapr_core/results.py",
+    "gapr_core/results",
     "gapr_core/surface.py",
     "gapr_core/training",
     "gapr_ros/demo",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gapr_core import Registrar, check_points, cli
-from gapr_core.commands.answer import as_json, read_json
+from gapr_core.commands.answer import read_json
 from gapr_core.formats import markups
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
@@ -25,7 +25,7 @@ def folder(tmp_path, monkeypatch, femur_cloud):
     np.save("bone.npy", femur_cloud)
     touched = femur_cloud[np.random.default_rng(0).choice(len(femur_cloud), 30, replace=False)]
     np.savetxt("touched.txt", se3.apply(np.linalg.inv(T), touched))
-    (tmp_path / "pose.json").write_text(json.dumps(as_json(OK)))
+    (tmp_path / "pose.json").write_text(json.dumps(OK.to_json()))
     return tmp_path
 
 
@@ -50,7 +50,7 @@ def test_a_right_pose_holds_with_exit_code_0(folder, capsys):
 
 def test_a_vague_pose_that_is_shown_to_be_off_does_not_hold(folder, capsys):
     vague = replace(OK, covariance=np.diag([25.0] * 3 + [1e-3] * 3))
-    (folder / "vague.json").write_text(json.dumps(as_json(vague)))
+    (folder / "vague.json").write_text(json.dumps(vague.to_json()))
     np.savetxt("moved.txt", np.loadtxt("touched.txt") + T[:3, :3].T @ [6.0, 0.0, 0.0])
     assert run("--json", "found.json", points="moved.txt", pose="vague.json") == 2
     shown, found = capsys.readouterr().out, json.loads((folder / "found.json").read_text())
@@ -141,15 +141,18 @@ def test_most_points_far_from_the_bone_are_asked_for_their_frame_and_not_for_ano
         ("{", "expected the answer of a registration; got pose.json"),
         ("[1]", "the answer of a registration in pose.json"),
         ('{"status": "OK"}', "no 'transform' in it"),
-        (json.dumps(as_json(RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two fit"))), "AMBIGUOUS: two fit"),
-        (json.dumps(as_json(OK) | {"transform": np.diag([2.0, 2, 2, 1]).tolist()}), "a rigid transform in pose.json"),
-        (json.dumps(as_json(OK) | {"covariance": [[1.0]]}), "finite numbers (6, 6) in pose.json; got (1, 1)"),
-        (json.dumps(as_json(OK) | {"centre_mm": ["a", 0, 0]}), "numbers (3,) in pose.json"),
-        (json.dumps(as_json(OK) | {"confidence": None}), "the answer of a registration in pose.json"),
-        (json.dumps(as_json(OK) | {"confidence": [0.9]}), "the answer of a registration in pose.json"),
-        (json.dumps(as_json(OK) | {"confidence": np.nan}), "got factor95 1.3 and confidence nan"),
-        (json.dumps(as_json(OK) | {"factor95": np.nan}), "got factor95 nan and confidence 0.93"),  # any point held
-        (json.dumps(as_json(OK) | {"factor95": 0.0}), "got factor95 0 and confidence 0.93"),
+        (
+            json.dumps(RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two fit").to_json()),
+            "AMBIGUOUS: two fit",
+        ),
+        (json.dumps(OK.to_json() | {"transform": np.diag([2.0, 2, 2, 1]).tolist()}), "a rigid transform in pose.json"),
+        (json.dumps(OK.to_json() | {"covariance": [[1.0]]}), "finite numbers (6, 6) in pose.json; got (1, 1)"),
+        (json.dumps(OK.to_json() | {"centre_mm": ["a", 0, 0]}), "numbers (3,) in pose.json"),
+        (json.dumps(OK.to_json() | {"confidence": None}), "the answer of a registration in pose.json"),
+        (json.dumps(OK.to_json() | {"confidence": [0.9]}), "the answer of a registration in pose.json"),
+        (json.dumps(OK.to_json() | {"confidence": np.nan}), "got factor95 1.3 and confidence nan"),
+        (json.dumps(OK.to_json() | {"factor95": np.nan}), "got factor95 nan and confidence 0.93"),  # any point held
+        (json.dumps(OK.to_json() | {"factor95": 0.0}), "got factor95 0 and confidence 0.93"),
     ],
 )
 def test_another_file_than_an_accepted_answer_is_one_line(folder, capsys, content, said):
@@ -165,7 +168,7 @@ def test_an_answer_that_bad_input_leaves_is_named(folder, capsys):
     assert run("--json", "found.json", points="none.txt") == 1
     said = "found.json is not written, and what is there is of an earlier run\n"
     assert capsys.readouterr().out == said
-    (folder / "pose.json").write_text(json.dumps(as_json(RegistrationResult(RegistrationStatus.AMBIGUOUS))))
+    (folder / "pose.json").write_text(json.dumps(RegistrationResult(RegistrationStatus.AMBIGUOUS).to_json()))
     assert run("--json", "found.json") == 1 and capsys.readouterr().out == said
 
 

@@ -46,32 +46,6 @@ def test_register_prints_a_pose_and_writes_it_as_json(tmp_path, files, pair, cap
     assert rte_mm < 0.5 and rre_deg < 0.5
 
 
-@pytest.mark.parametrize(
-    ("settings", "unnamed", "placed"),
-    [
-        ([], True, True),
-        (["sensor.kind=laser"], False, True),
-        (["sensor.kind=structured_light"], False, False),
-        (["sensor.tracking_mm=0.2"], True, False),
-        (["sensor.tracking_deg=0.2"], True, False),
-    ],
-)
-def test_register_says_what_the_bound_leaves_out(files, capsys, settings, unnamed, placed):
-    more = [word for setting in settings for word in ("--set", setting)]
-    assert cli.main(["register", *map(str, files), *more]) == 0
-    said = capsys.readouterr().out
-    assert ("the sensor is not named" in said) is unnamed and (
-        "place, such as a tracker's, is not in" in said
-    ) is placed
-
-
-@pytest.mark.parametrize("count", [150, 3000])
-def test_register_says_what_kept_an_accepted_pose_from_being_sure(tmp_path, files, pair, capsys, count):
-    np.save(tmp_path / "partial.npy", pair.source[:count])
-    assert cli.main(["register", *files]) == 0
-    assert ("no surer than that: so few points" in capsys.readouterr().out) is (count == 150)
-
-
 def test_a_refusal_exits_with_2_and_has_no_transform(tmp_path, files, capsys):
     np.save(tmp_path / "partial.npy", np.random.default_rng(0).uniform(0, 40, (500, 3)))
     assert cli.main(["register", *files, "--json", str(tmp_path / "out.json")]) == 2

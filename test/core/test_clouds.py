@@ -119,11 +119,13 @@ def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
 
 def test_centimetres_become_millimetres_and_are_asked_for(tmp_path):
     assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
-    with pytest.raises(InvalidPointCloudError, match="it looks like cm: pass units='cm', or convert it to mm$"):
+    with pytest.raises(
+        InvalidPointCloudError, match="looks like cm .* or in .*: pass units='cm', or convert it to mm$"
+    ):
         clouds.load(VERTICES / 10.0, units="mm")
     np.save(tmp_path / "a.npy", VERTICES / 10.0)
     options = r"\(--units cm; --source-units cm, of the source alone; model_unit of the node\)"
-    with pytest.raises(InvalidPointCloudError, match=rf"it looks like cm: pass units='cm' {options}, or convert it"):
+    with pytest.raises(InvalidPointCloudError, match=rf"cm .* or in .*: pass units='cm' {options}, or convert it"):
         clouds.load(tmp_path / "a.npy", units="mm")
 
 
@@ -173,7 +175,7 @@ def test_a_vertex_of_no_face_that_is_metres_away_is_named_and_not_the_unit():
 def test_points_that_need_not_be_a_bone_may_have_any_size(points, unit):
     found = clouds.load(points, unit, of_bone=False).points
     np.testing.assert_allclose(found, np.array(points) * clouds.MM_PER_UNIT[unit])
-    with pytest.raises(InvalidPointCloudError, match="units 'mm', 'cm', 'm' or 'auto'"):
+    with pytest.raises(InvalidPointCloudError, match="units 'mm', 'cm', 'm', 'in' or 'auto'"):
         clouds.load(points, "inch", of_bone=False)
 
 
@@ -210,6 +212,23 @@ def test_a_target_of_an_uncommon_size_is_warned_of(tmp_path, caplog, extent_mm, 
     caplog.clear()
     target.prepare(np.load(tmp_path / "bone.npy"))
     assert not caplog.text, "arrays come from programs, which may register small things"
+
+
+@pytest.mark.parametrize(("extent", "unit", "said"), [
+    (18.7, "mm", "it has 187 mm in cm, 475 mm in in"), (18.7, "cm", "475 mm in in (inches): a femur has 350 to 550 mm"),
+    (45.0, "cm", ""), (18.7, "in", ""),
+])  # fmt: skip
+def test_a_bone_in_inches_is_not_taken_for_one_in_centimetres_without_a_word(tmp_path, caplog, extent, unit, said):
+    """Both fit a cloud in the same unit: only the size can show it."""
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    np.save(tmp_path / "bone.npy", points * extent / Surface(points).extent_mm)
+    clouds.warn_of_size(tmp_path / "bone.npy", clouds.load(tmp_path / "bone.npy", unit).extent_mm, unit)
+    assert said in caplog.text and bool(caplog.text) == bool(said)
+
+
+def test_a_cloud_in_inches_is_not_called_one_in_centimetres_alone():
+    with pytest.raises(InvalidPointCloudError, match=r"looks like cm \(31 mm across\) or in \(79 mm across\): pass"):
+        clouds.load(VERTICES / Surface(VERTICES).extent_mm * 3.1, units="mm")
 
 
 def test_auto_guesses_the_unit_and_warns(caplog):

@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from gapr_core import __version__, cli
+from gapr_core import __version__, cli, config
 from gapr_core.benchmark import methods
 from gapr_core.commands import options
+from gapr_core.commands.settings import USERS
+from gapr_core.runtime import settings
 
 CLOUD = np.random.default_rng(0).normal(size=(400, 3)) * [60.0, 20.0, 12.0]
 
@@ -181,9 +183,15 @@ def test_a_full_disk_is_one_line(folder, capsys, monkeypatch):
     assert "No space left" in capsys.readouterr().err
 
 
-def test_settings_lists_every_setting(capsys):
+def test_settings_lists_what_a_user_touches_and_with_all_the_rest(capsys):
     assert run("settings") == 0
-    assert "| min_confidence | 0.5 | 0 to 1 |" in capsys.readouterr().out
+    few = capsys.readouterr().out
+    assert "| min_confidence | 0.5 | 0 to 1 |" in few and "| sensor.kind |" in few
+    assert few.count("\n| ") < 25 and "refinement" not in few
+    assert run("settings --all") == 0
+    assert "| refinement." in capsys.readouterr().out
+    names = [row.name for row in settings.table(config.RegistrarConfig)]
+    assert all(any(name.startswith(user) for name in names) for user in USERS if user != "other_bone_prior")
 
 
 def test_a_setting_from_a_file_and_one_from_the_command_line_reach_the_method(folder):
@@ -199,7 +207,7 @@ def test_a_setting_from_a_file_and_one_from_the_command_line_reach_the_method(fo
 
 def test_a_missing_library_names_the_extra_that_installs_it(capsys, monkeypatch):
     def absent(args):
-        raise ModuleNotFoundError("No module named 'plotly'", name="plotly.graph_objects")
+        raise ModuleNotFoundError("No module named 'jinja2'", name="jinja2.graph_objects")
 
     monkeypatch.setattr("gapr_core.commands.settings.run", absent)
     assert run("settings") == 1

@@ -1,5 +1,6 @@
 """Settings: one place for default, range and help; the same from a file, the command line and Python."""
 
+import re
 from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from gapr_core.config import (
     ClutterConfig,
     RefinementConfig,
     RegistrarConfig,
+    SensorConfig,
     VerificationConfig,
 )
 from gapr_core.errors import ConfigError
@@ -35,6 +37,20 @@ def test_what_is_not_named_keeps_its_default_and_lists_become_tuples():
 def test_a_name_that_does_not_exist_is_refused_with_those_that_do(values):
     with pytest.raises(ConfigError, match="keep|seed"):
         from_dict(RegistrarConfig, values)
+
+
+@pytest.mark.parametrize(("assignment", "said"), [
+    ("noise_mm=0.3", "did you mean sensor.noise_mm"), ("sensor.nois_mm=0.3", "did you mean sensor.noise_mm?"),
+    ("min_confidense=0.3", "did you mean min_confidence?"), ("qqqqq=1", "correct it in RegistrarConfig"),
+])  # fmt: skip
+def test_a_mistyped_or_ungrouped_name_is_answered_with_the_nearest(assignment, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        settings.load(RegistrarConfig, None, [assignment])
+
+
+def test_settings_show_themselves_by_what_is_not_their_default():
+    assert repr(RegistrarConfig(min_confidence=0.9)) == "RegistrarConfig(min_confidence=0.9)"
+    assert repr(SensorConfig(kind="laser")) == "SensorConfig(kind=laser)"
 
 
 WRONG_TYPES = [

@@ -14,7 +14,7 @@ ABSENT = (
     "safetensors",
     "open3d",
     "matplotlib",
-    "plotly",
+    "jinja2",
     "rich",
     "vtkmodules",
     "small_gicp",
@@ -70,6 +70,12 @@ def test_a_report_without_its_libraries_names_the_extra(files, tmp_path):
     done = run("benchmark", "--pairs", tmp_path, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "gapr: " in done.stderr and "pip install 'gapr_ros[reports]'" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["register", "benchmark", "train", "paper", "settings", "check-points"])
+def test_help_is_given_without_any_optional_library(command):
+    done = run(command, "--help")
+    assert done.returncode == 0 and f"usage: gapr {command}" in done.stdout and done.stderr == ""
 
 
 def test_a_notebook_offers_the_public_names_before_they_are_used():

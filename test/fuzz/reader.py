@@ -74,7 +74,7 @@ def in_this_process(path, options, out):
     """What `label_map._in_a_child` gives, or raises; also when the reader raises anything at all."""
     request = {"path": str(path), "labels": list(options.labels), "limits": vars(options.limits), "seconds": 0}
     said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
         code = child.main(json.dumps(request), str(out))
     if code:
         raise InvalidPointCloudError(*json.loads(said.getvalue()))

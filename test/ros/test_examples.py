@@ -92,9 +92,9 @@ def test_the_consumer_acts_on_a_pose_while_it_may(consumer, age_s, score, max_ag
     assert found == done if isinstance(done, tuple) else found.startswith(done)
 
 
+@pytest.mark.skipif(find_spec("vision_msgs") is None, reason="the messages come with a ROS installation")
 def test_the_consumer_follows_the_node_through_five_clouds(blob_path, client, method, consumer):
     """Accepted, accepted below the consumer's gate, refused, stopped, late joined."""
-    pytest.importorskip("vision_msgs", reason="the messages come with a ROS installation")
     made, done = consumer
     spinner = Spinner(context())
     with node_in_thread(method, blob_path, pose_lifetime=0.5):

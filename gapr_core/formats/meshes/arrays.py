@@ -51,7 +51,9 @@ def read_npz(path: Path, options: ReadOptions) -> Surface:
             given = f"only {', '.join(names) or 'nothing'}"
             raise InvalidPointCloudError("an array named points", given, "save it as np.savez(file, points=P)")
         wanted = [names[name] for name in ("points", "faces") if name in names]
-        limits.check_unpacked(sum(archive.getinfo(name).file_size for name in wanted))
+        limits.check_unpacked(sum(entry.file_size for entry in archive.infolist()))
+        if damaged := archive.testzip():  # of all: faces whose name is damaged are no faces
+            raise ValueError(f"the array {damaged} in it is damaged")
         arrays = [array_of(archive.read(name), limits) for name in wanted]
     if len(arrays) == 1:
         return Surface(as_points(arrays[0]))

@@ -13,7 +13,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from gapr_core.model import steps
 from gapr_core.model.config import ModelConfig, choose
 from gapr_core.model.layers import SLOPE, Unary, activated, make_norm
 from gapr_core.model.pairs import LocalPairs
@@ -75,11 +74,8 @@ class KPConv(nn.Module):
         self.register_buffer("kernel", kernel_layout(), persistent=False)
 
     def forward(self, x: Tensor, pairs: LocalPairs) -> Tensor:
-        if self.places is surface_places and steps.can_take(x, self.kernel):
-            influence = steps.surface_influences(pairs.centres, pairs.support, pairs.hood, self.kernel, self.sigma)
-        else:
-            with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
-                influence = influences(self.places(pairs), pairs.hood.valid, self.kernel, self.sigma)
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+            influence = influences(self.places(pairs), pairs.hood.valid, self.kernel, self.sigma)
         weighed = influence.to(x.dtype) @ pairs.keys(x)  # (M, 15, C_in)
         return weighed.flatten(1) @ self.weight / pairs.hood.valid.sum(1, keepdim=True)
 

@@ -23,7 +23,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
-OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit != "mm"}  # units that may be mistaken for mm
+OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit in ("m", "cm")}  # units that may be mistaken for mm
 STANDOFF_BETTER = 0.15  # log of mean squares: refused sources without a stand-off hardly fit better by more
 
 

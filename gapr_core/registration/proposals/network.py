@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model.network import GAPRNet
@@ -96,23 +95,6 @@ class NetworkProposer:
         with torch.inference_mode():
             output = self.network(source.to(self._device), target.to(self._device), features)
         return correspondences_mm(output.matches, source, target)
-
-    def bone(self, source: PreparedSource, target: PreparedTarget) -> Array:
-        """Predict (N,) the probability of every fitted source point to be bone; 1 without a head.
-
-        Raises:
-            InvalidPointCloudError: the source is too small or too large for the network.
-        """
-        import torch
-
-        frame, cloud, features = self.prepare(target)
-        moving, net = build_cloud(source.whole, frame, self.network.config), self.network
-        there, still = moving.to(self._device), cloud.to(self._device)
-        with torch.inference_mode():
-            own = net.backbone(there)
-            logits = net.bone(there, own, net.aggregation(there, still, own.coarse, features.coarse))
-        fine_mm = moving.fine.points.double().numpy() * frame.scale_mm + moving.centre_mm.numpy()
-        return logits.sigmoid().double().cpu().numpy()[cKDTree(fine_mm).query(source.points)[1]]
 
     @property
     def _device(self) -> Any:

@@ -12,6 +12,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import sampling, se3
 from gapr_core.geometry.twists import covariance_about, predicted_rmse_mm
+from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks.conclude import by_threshold
 from gapr_core.registration.checks.deformation import covariance_of_half
 from gapr_core.registration.fit.refinement import distances_mm, refine_fully
@@ -112,6 +113,7 @@ class Accumulator:
         """Compute everything static about a target; see `Registrar.prepare`."""
         return self.method.prepare(target, units)
 
+    @answering
     @single_threaded_libraries
     def register(
         self,

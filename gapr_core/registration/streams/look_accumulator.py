@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.registration.caveats import answering
 from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
@@ -161,6 +162,7 @@ class LookAccumulator:
         """Compute everything static about a target; see `Registrar.prepare`."""
         return self.method.prepare(target, units)
 
+    @answering
     @single_threaded_libraries
     def register(
         self,

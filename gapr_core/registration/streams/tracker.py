@@ -13,6 +13,7 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
+from gapr_core.registration.caveats import answering
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
@@ -116,6 +117,7 @@ class Tracker:
         """Compute everything static about a target; see `Registrar.prepare`."""
         return self.registrar.prepare(target, units)
 
+    @answering
     @single_threaded_libraries
     def register(
         self,

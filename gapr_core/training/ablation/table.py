@@ -21,8 +21,8 @@ from gapr_core.training.config import TrainConfig, Variant, trained_as
 
 Record = dict[str, Any]
 FIGURES = {  # of a record -> what the column is called
-    "coarse": "coarse inliers", "fine": "fine inliers", "rr_paper": "recall RMSE < 0.02", "rr_4_5": "recall 4 mm / 5°",
-    "refined_rr_paper": "refined: RMSE < 0.02", "refined_rr_4_5": "refined: 4 mm / 5°",
+    "coarse": "coarse inliers", "fine": "fine inliers", "rr_paper": "recall (paper)", "rr_4_5": "recall 4 mm / 5°",
+    "refined_rr_paper": "refined: recall (paper)", "refined_rr_4_5": "refined: 4 mm / 5°",
 }  # fmt: skip
 ALL = "all"
 
@@ -130,9 +130,10 @@ def _preamble(settings: Record) -> str:
         f"{run['pairs']} training pairs a network, {settings['seeds']} seed(s), the same pairs in the same order for "
         f"all; examined on subjects of split {exam['split']}, {exam['count']} pairs a protocol and bone "
         f"({', '.join(exam['bones'])}).\n\nIn %, with 95 % intervals from a bootstrap over subjects. Recall is of the "
-        "best raw pose (consensus of the matches, no search): RMSE < 0.02 x the target's half extent, or 4 mm and 5° "
-        "at the source's centroid; refined: after the point-to-surface refinement. The paper's numbers are on its own "
-        "data at its own budget: compare the order of the rows, not the values. A dash: not finished, or no value."
+        "best raw pose (consensus of the matches, no search): RMSE < 0.01 x the longest edge of the target's box, "
+        "or 4 mm and 5° at the source's centroid; refined: after the point-to-surface refinement. The paper's "
+        "numbers are on its own data at its own budget: compare the order of the rows, not the values. A dash: not "
+        "finished, or no value."
     )
 
 

@@ -1,6 +1,7 @@
 """The recording for rerun: what is logged, with a stand-in for the library; and a file, where it is installed."""
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from gapr_core.errors import ConfigError, MethodUnavailableError
 from gapr_core.formats import recording
-from gapr_core.formats.planning import TargetError
 from gapr_core.geometry import se3
-from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus, Residuals
+from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus, Residuals, TargetError
 from gapr_core.surface import Surface
 
 T = se3.from_rotation_translation(Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix(), [10.0, -70.0, 200.0])
@@ -55,8 +55,8 @@ def stand_in(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(RecordingStream=Stream, ViewCoordinates=views, **made))
 
 
-def written(path, result, errors=()):
-    recording.write(path, BONE, POINTS, result, errors)
+def written(path, result, targets=()):
+    recording.write(path, replace(result, bone=BONE, source=POINTS, targets=targets))
     return Stream.last
 
 
@@ -78,7 +78,7 @@ def test_points_are_blue_inside_and_red_outside_and_grey_under_a_rival(tmp_path,
 
 
 def test_planned_targets_are_named_with_their_errors(tmp_path, stand_in):
-    (planned, _), = written(tmp_path / "a.rrd", ACCEPTED, [TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)]).of(
+    (planned, _), = written(tmp_path / "a.rrd", ACCEPTED, (TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9),)).of(
         "planned", "Points3D"
     )  # fmt: skip
     assert planned["labels"] == ["hip: 0.50 mm (95 %: 0.90 mm)"] and planned["given"] == ([(1.0, 2.0, 3.0)],)
@@ -102,5 +102,6 @@ def test_an_ending_and_a_missing_library_are_said_before_the_work(tmp_path, monk
 
 def test_a_recording_is_a_file_of_rerun(tmp_path):
     pytest.importorskip("rerun", reason="the viewer whose files are written: pip install rerun-sdk")
-    recording.write(tmp_path / "a.rrd", BONE, POINTS, ACCEPTED, [TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)])
+    hip = TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)
+    recording.write(tmp_path / "a.rrd", replace(ACCEPTED, bone=BONE, source=POINTS, targets=(hip,)))
     assert (tmp_path / "a.rrd").read_bytes()[:3] == b"RRF" and (tmp_path / "a.rrd").stat().st_size > 2000

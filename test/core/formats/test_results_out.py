@@ -20,7 +20,7 @@ from gapr_core.data.masks import mask_of
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import markups, planning, scene, transforms
 from gapr_core.geometry import se3
-from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals
+from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals, TargetError
 from gapr_core.runtime import child
 
 sitk = pytest.importorskip("SimpleITK", reason="reference: pip install SimpleITK")
@@ -192,6 +192,9 @@ def test_a_source_in_a_label_map_has_a_label_of_its_own(tmp_path, femur, capsys)
     np.testing.assert_allclose(np.loadtxt(tmp_path / "pose.txt"), np.eye(4), atol=0.5)
 
 
+HIP = TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)
+
+
 def result_with(covariance=None, residuals=None):
     centre, status = np.array([5.0, 0.0, 0.0]), RegistrationStatus.OK
     return RegistrationResult(status, T, covariance, 0.99, 0.5, 1.0, 0.9, centre_mm=centre, residuals=residuals)
@@ -199,8 +202,8 @@ def result_with(covariance=None, residuals=None):
 
 def test_the_error_at_a_target_grows_with_its_distance_from_the_pose_centre():
     covariance = np.diag([0.04, 0.01, 0.01, 1e-4, 4e-4, 9e-4])
-    plan = markups.Markups(np.array([[5.0, 0.0, 0.0], [105.0, 0.0, 0.0], [5.0, 100.0, 0.0]]), ("c", "x", "y"))
-    at = {error.label: error for error in planning.errors_at(plan, result_with(covariance))}
+    plan = np.array([[5.0, 0.0, 0.0], [105.0, 0.0, 0.0], [5.0, 100.0, 0.0]])
+    at = {error.label: error for error in result_with(covariance).errors_at(plan, ("c", "x", "y"))}
     assert at["c"].expected_mm == pytest.approx(np.sqrt(0.06))
     assert at["x"].expected_mm == pytest.approx(np.sqrt(0.06 + 1e4 * (4e-4 + 9e-4)))
     assert at["y"].expected_mm == pytest.approx(np.sqrt(0.06 + 1e4 * (1e-4 + 9e-4)))
@@ -210,7 +213,7 @@ def test_95_of_100_poses_stay_below_the_bound_at_a_target():
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6)) * np.array([0.3, 0.3, 0.3, 0.003, 0.003, 0.003])[:, None]
     covariance, target = root @ root.T, np.array([[80.0, -30.0, 40.0]])
-    bound = planning.errors_at(markups.Markups(target, ("a",)), result_with(covariance))[0].bound95_mm
+    bound = result_with(covariance).errors_at(target)[0].bound95_mm
     twists = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
     off = [np.linalg.norm(se3.apply(se3.exp(twist, [5.0, 0.0, 0.0]), target) - target) for twist in twists]
     assert np.mean(np.array(off) < bound) == pytest.approx(0.95, abs=0.015)
@@ -221,7 +224,7 @@ def test_the_bound_at_a_target_is_the_assessment_s_own(registrar, target, femur)
     source = femur.sample(3000, np.random.default_rng(5))[0]
     assessment, result = registrar.assess(source, target), registrar.register(source, target)
     for point in target.points[::4000]:
-        bound_mm = planning.errors_at(markups.Markups(point[None], ("a",)), result)[0].bound95_mm
+        bound_mm = result.errors_at(point)[0].bound95_mm
         assert bound_mm == pytest.approx(assessment.bound_mm(point[None]), rel=0.05)
     assert result.factor95 > 1.1
 
@@ -278,9 +281,9 @@ def test_residuals_are_written_as_json_and_as_colours(tmp_path):
 
 
 def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_other(tmp_path, femur):
-    errors = [planning.TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)]
+    result = replace(result_with(np.eye(6), residuals()), bone=femur, targets=(HIP,))
     (tmp_path / "mine.txt").write_text("stays")
-    scene.write_slicer(tmp_path, femur, result_with(np.eye(6), residuals()), errors)
+    scene.write_slicer(tmp_path, result)
     nodes = list(ElementTree.parse(tmp_path / "scene.mrml").getroot())
     names = {node.get("id") for node in nodes}
     for node in nodes:
@@ -303,7 +306,7 @@ def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_
 
 def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(tmp_path, femur):
     """They had a distance of 0, which is white: exactly on the bone."""
-    scene.write_slicer(tmp_path, femur, result_with(np.eye(6), residuals()), [])
+    scene.write_slicer(tmp_path, replace(result_with(np.eye(6), residuals()), bone=femur))
     shown = (tmp_path / "source.vtk").read_text().split("LOOKUP_TABLE default\n")[1].split()
     assert [float(distance) for distance in shown] == [-3.0, 0.0, 3.0] + [0.0] * 16
     off = clouds.load(tmp_path / "off_bone.vtk", of_bone=False)
@@ -312,15 +315,15 @@ def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(t
     display = ElementTree.parse(tmp_path / "scene.mrml").find(".//ModelDisplay[@name='off_bone display']")
     assert len(set(display.get("color").split())) == 1 and display.get("scalarVisibility") is None
     near = Residuals(POINTS, np.zeros(20), np.ones(20, dtype=bool))
-    scene.write_slicer(tmp_path, femur, result_with(np.eye(6), near), [])
+    scene.write_slicer(tmp_path, replace(result_with(np.eye(6), near), bone=femur))
     assert "off_bone" not in (tmp_path / "scene.mrml").read_text()
     assert not (tmp_path / "off_bone.vtk").exists()
 
 
 def test_targets_of_an_earlier_run_do_not_stay_in_the_folder_of_a_scene(tmp_path, femur):
-    result = result_with(np.eye(6), residuals())
-    scene.write_slicer(tmp_path, femur, result, [planning.TargetError("hip", (1.0, 2.0, 3.0), 0.5, 0.9)])
-    scene.write_slicer(tmp_path, femur, result, [])
+    result = replace(result_with(np.eye(6), residuals()), bone=femur)
+    scene.write_slicer(tmp_path, replace(result, targets=(HIP,)))
+    scene.write_slicer(tmp_path, result)
     assert not (tmp_path / "targets.mrk.json").exists()
     assert "targets" not in (tmp_path / "scene.mrml").read_text()
 

@@ -1,5 +1,7 @@
 """Pose errors against scipy, closed forms and hand-made cases."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -97,6 +99,13 @@ def test_the_paper_limit_scales_with_the_bone():
     small, large = ([[-half, 0.0, 0.0], [half, 0.0, 0.0]] for half in (100.0, 200.0))
     assert pose.within_paper_limit(1.9, small) and not pose.within_paper_limit(2.0, small)
     assert pose.within_paper_limit(3.9, large) and not pose.within_paper_limit(4.1, large)
+
+
+def test_the_paper_measures_a_bone_by_the_longest_edge_of_its_box():
+    """The largest distance to the mean is longer for every bone that is not a line."""
+    box = np.array(list(product((-50.0, 50.0), (-30.0, 30.0), (-100.0, 100.0))))
+    assert pose.within_paper_limit(1.99, box) and not pose.within_paper_limit(2.01, box)
+    assert pose.within_extent_limit(2.3, box) and not pose.within_extent_limit(2.33, box)
 
 
 def test_recall_counts_failures_and_is_nan_of_nothing():

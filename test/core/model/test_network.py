@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,13 +47,10 @@ def tiny(path: Path, toy) -> ModelConfig:
                 "norm",
                 "mlp_projections",
                 "pair_width",
-                "centred_features",
                 "coarse_temperature",
                 "fine_stage",
                 "global_small_ball",
                 "early_features",
-                "bone_head",
-                "bone_scores",
             )
         },
     )
@@ -68,6 +66,25 @@ def pair(config, toy, seed=3, share=0.5):
 def network(config, seed=0):
     torch.manual_seed(seed)
     return GAPRNet(config)
+
+
+def test_weights_of_earlier_settings_load_where_these_changed_no_match(toy, tmp_path):
+    """The shipped file has a head whose scores are not used. Where they were, the network is another one."""
+    config = toy.small_config()
+    net = network(config)
+    tensors = {**net.state_dict(), "bone_head.layers.0.bias": torch.zeros(3)}
+
+    def written(**earlier):
+        settings = json.dumps(config.to_dict() | earlier)
+        header = {"format": weights.FORMAT, "config": settings, "sha256": weights.checksum(tensors)}
+        save_file(tensors, tmp_path / "w.safetensors", metadata=header)
+        return tmp_path / "w.safetensors"
+
+    again, _ = weights.load(written(bone_head="mlp", bone_scores=False, centred_features=False))
+    assert again.config == config and all(torch.equal(t, tensors[name]) for name, t in again.state_dict().items())
+    for changed in ({"bone_scores": True}, {"centred_features": True}):
+        with pytest.raises(WeightsError, match="fit their configuration"):
+            weights.load(written(bone_head="mlp", **changed))
 
 
 def test_there_is_a_yaml_for_every_variant_of_the_ablations_and_each_is_named_after_its_file():

@@ -80,6 +80,12 @@ def test_an_undefined_angle_is_zero_and_its_embedding_fades():
     assert embedded[3:7].abs().max() < 1e-3
 
 
+def test_angles_of_a_small_cloud_are_those_of_a_large_one():
+    points = torch.from_numpy(RNG.normal(size=(4, 200, 3))).float()
+    large = pgf.embed(*points, 1.0)[..., 3:]
+    torch.testing.assert_close(pgf.embed(*(0.05 * points), 1.0)[..., 3:], large, atol=1e-4, rtol=0.0)
+
+
 def test_ball_centroids_equal_a_loop_and_fall_back_to_the_nearest_point():
     centres, support = torch.rand(2, 7, 3), torch.rand(2, 9, 3)
     centres[0, 0] = 40.0

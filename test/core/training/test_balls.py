@@ -43,7 +43,7 @@ def test_the_caps_for_a_share_are_the_smallest_that_keep_to_it():
     assert balls.share_cut(sizes, [95]) == [0.05] and balls.share_cut(sizes, [94]) == [0.06]
 
 
-@pytest.mark.parametrize("name", ["faithful", "faithful_small", "best_balls"])
+@pytest.mark.parametrize("name", ["faithful", "faithful_small"])
 def test_the_caps_of_the_paper_cut_at_most_one_ball_in_twenty_of_every_bone_and_stage(name, anatomy_folder):
     config = ModelConfig.from_yaml(MODELS / f"{name}.yaml")
     for bone in bones.BONES:

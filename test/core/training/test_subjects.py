@@ -12,7 +12,7 @@ import yaml
 from gapr_core.data.pool import parametric_people, parametric_split
 from gapr_core.errors import ConfigError
 from gapr_core.model import weights
-from gapr_core.training import dataset, trainer
+from gapr_core.training import dataset, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.subjects import Drawn
 
@@ -41,6 +41,16 @@ def test_a_training_that_draws_from_everybody_ends_with_an_error(settings, anato
     monkeypatch.setattr(dataset.anatomy, "surfaces", lambda folder, bone, split="all": everybody(folder, bone))
     with pytest.raises(ConfigError, match="train split only.*p[5678]"):
         trainer.train(replace(settings, pairs=64), tmp_path, anatomy)
+
+
+@pytest.mark.parametrize("real", [True, False])
+def test_a_validation_on_test_subjects_ends_with_an_error_that_names_them(settings, anatomy, monkeypatch, real):
+    """The leak mutant: `test` where `val` is meant."""
+    folder, drawn, train = anatomy if real else None, validation.specimens, replace(settings, validation_pairs=1)
+    validation.validation_set(train, train.network(), folder)
+    monkeypatch.setattr(validation, "specimens", lambda bone, split, *more: drawn(bone, "test", *more))
+    with pytest.raises(ConfigError, match="split val only; got p[78]" if real else "split val only; got parametric_"):
+        validation.validation_set(train, train.network(), folder)
 
 
 def test_meshes_of_nobody_in_the_split_train_are_no_reason_to_train_on_parametric_bones(anatomy, tmp_path):

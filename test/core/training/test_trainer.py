@@ -21,11 +21,11 @@ from gapr_core.data import protocols
 from gapr_core.errors import ConfigError, WeightsError
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
-from gapr_core.model.export import leaves
+from gapr_core.model.types import mapped
 from gapr_core.runtime import files
 from gapr_core.runtime.settings import load
 from gapr_core.surface import Surface
-from gapr_core.training import batches, curves, distributed, export, provenance, start, trainer, validation
+from gapr_core.training import batches, curves, distributed, provenance, start, trainer, validation
 from gapr_core.training.config import TrainConfig
 from gapr_core.training.dataset import TrainingPairs, prune
 from gapr_core.training.shapes import ShapeModel, vary
@@ -72,6 +72,15 @@ def test_training_pairs_are_registered_by_their_truth(settings, anatomy):
         moved = move(pair.T, pair.source.fine.points[None])[0]
         gap = torch.cdist(moved, pair.target.fine.points).amin(1)
         assert gap.median() < 0.1 and pair.overlaps.max() > 0.3
+
+
+def test_the_first_part_of_a_schedule_can_see_coarse_clouds(settings, anatomy):
+    """The bones that come in first have fewer superpoints, those after them as many as ever."""
+    train = replace(settings, mix={"incomplete": 1.0}, pairs=1000, coarse_first=0.5)
+    pairs = TrainingPairs(train, settings.network(), anatomy)
+    plain = TrainingPairs(replace(train, coarse_first=0.0), settings.network(), anatomy)
+    early, late = ([len(of.pair(n).target.coarse.points) for of in (pairs, plain)] for n in (0, 990))
+    assert early[0] < 0.8 * early[1] and late[0] == late[1]
 
 
 @pytest.mark.parametrize("pool", [3, 8, 128])
@@ -244,78 +253,11 @@ def test_a_run_can_begin_with_the_weights_of_another_one(settings, anatomy, tmp_
         trainer.train(replace(going_on, model=str(tmp_path / "wider.yaml")), tmp_path / "third", anatomy)
 
 
-def test_a_head_trained_alone_leaves_the_network_under_it_as_it_is_bit_by_bit(settings, anatomy, tmp_path):
-    under = trainer.train(replace(settings, pairs=4), tmp_path / "under", anatomy)
-    head = {"model_settings": {"bone_head": "mlp"}, "mix": {"scene-C2": 1.0}, "trained": "bone_head"}
-    alone = replace(settings, initial=str(under), pairs=8, validation_pairs=0, learning_rate=0.01, **head)
-    trainer.train(alone, tmp_path / "alone", anatomy, minutes=0.0)
-    begun = weights.load(tmp_path / "alone" / "weights.safetensors")[0].state_dict()
-    ended = weights.load(trainer.train(alone, tmp_path / "alone", anatomy))[0].state_dict()
-    before = weights.load(under)[0].state_dict()
-    assert all(torch.equal(tensor, ended[name]) for name, tensor in before.items())
-    learned = ended.keys() - before.keys()
-    assert learned and all(name.startswith("bone_head.") for name in learned)
-    assert all(not torch.equal(begun[name], ended[name]) for name in learned)
-
-    shipped = tmp_path / "shipped.safetensors"
-    export.main([str(tmp_path / "alone"), "--under", str(under), "--out", str(shipped)])
-    card = weights.load(shipped)[1]
-    assert card["run"]["trained"] == "bone_head" and card["network"]["run"]["trained"] == "all"
-    other = trainer.train(replace(settings, pairs=4, seed=9), tmp_path / "other", anatomy)
-    with pytest.raises(WeightsError, match="and a head"):
-        export.main([str(tmp_path / "alone"), "--under", str(other), "--out", str(shipped)])
-
-
-def test_the_mean_of_two_stages_is_that_of_each_tensor_and_names_both(settings, anatomy, tmp_path):
-    """In float32 before the rounding to half precision; the order does not matter."""
-    first = trainer.train(replace(settings, pairs=4), tmp_path / "first", anatomy)
-    trainer.train(replace(settings, initial=str(first), pairs=4), tmp_path / "second", anatomy)
-    mean = tmp_path / "mean.safetensors"
-    export.main([str(tmp_path / "second"), "--mean-with", str(first), "--out", str(mean)])
-    averaged, card = weights.load(mean)
-    a, b = (weights.load(path)[0].state_dict() for path in (first, tmp_path / "second" / "weights.safetensors"))
-    assert any(not torch.equal(a[name], b[name]) for name in a)
-    for name, tensor in averaged.state_dict().items():
-        assert torch.equal(tensor, ((a[name] + b[name]) / 2.0).half().float()), name
-    assert card["run"]["initial"] == str(first) and [of["run"]["initial"] for of in card["mean_with"]] == [""]
-
-    other = ModelConfig.from_yaml(settings.model)
-    with pytest.raises(WeightsError, match="networks of one configuration"):
-        export.mean_of([trainer.GAPRNet(other), trainer.GAPRNet(replace(other, name="other"))])
-
-
-def test_a_network_without_a_head_begins_with_weights_that_have_one(settings, anatomy, tmp_path):
-    """Those that ship have one since it was trained, and training.md says to begin with them."""
-    with_head = replace(settings, model_settings={"bone_head": "mlp"}, mix={"scene-C2": 1.0}, validation_pairs=0)
-    first = trainer.train(replace(with_head, pairs=4), tmp_path / "first", anatomy)
-    begun = start.begin(replace(settings, initial=str(first)), ModelConfig.from_yaml(settings.model))
-    before, own = weights.load(first)[0].state_dict(), begun.state_dict()
-    assert own and all(torch.equal(tensor, before[name]) for name, tensor in own.items())
-    assert all(name.startswith("bone_head.") for name in before.keys() - own.keys())
-
-    headless = trainer.train(replace(settings, pairs=4), tmp_path / "headless", anatomy)
-    with pytest.raises(ConfigError, match="initial weights"):
-        trainer.train(replace(with_head, initial=str(headless)), tmp_path / "second", anatomy)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["train", "train_longer", "train_uncentred", "train_bone_head", "train_sensors", "train_sweeps", "train_probes"],
-)
-def test_what_the_documentation_begins_with_the_shipped_weights_can_begin_with_them(name):
+def test_a_training_can_begin_with_the_shipped_weights():
     shipped = REPOSITORY / "gapr_core/weights/gapr_net.safetensors"
-    config = load(TrainConfig, REPOSITORY / f"config/{name}.yaml", [])
-    config = replace(config, initial=str(shipped), model=config.model and str(REPOSITORY / config.model))
+    config = load(TrainConfig, REPOSITORY / "config/train.yaml", [f"initial={shipped}"])
     begun, before = start.begin(config, config.network()).state_dict(), weights.load(shipped)[0].state_dict()
     assert all(torch.equal(tensor, before[tensor_name]) for tensor_name, tensor in begun.items())
-
-
-def test_a_head_alone_needs_a_head_and_a_network_under_it(settings, anatomy, tmp_path):
-    alone = replace(settings, trained="bone_head")
-    with pytest.raises(ConfigError, match="a network with a bone head"):
-        trainer.train(alone, tmp_path / "headless", anatomy)
-    with pytest.raises(ConfigError, match="weights of the network under the bone head"):
-        trainer.train(replace(alone, model_settings={"bone_head": "mlp"}), tmp_path / "nothing", anatomy)
 
 
 def test_a_run_whose_gradients_are_never_finite_ends_with_an_error(settings, anatomy, tmp_path, monkeypatch):
@@ -429,6 +371,13 @@ def test_a_batch_that_the_processes_cannot_share_is_refused():
     assert distributed.Group(0, 2, torch.device("cpu")).share(8, 2) == 2
     with pytest.raises(ConfigError, match="2 x 3"):
         group.share(8, 2)
+
+
+def leaves(value):
+    """The tensors inside nested dataclasses and tuples."""
+    found = []
+    mapped(value, lambda tensor: found.append(tensor) or tensor)
+    return found
 
 
 def test_a_bone_from_the_shared_folder_gives_the_same_pairs_bit_by_bit(settings, anatomy, tmp_path):

@@ -102,9 +102,15 @@ class Tracker:
         self.reset()
 
     @classmethod
-    def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu", recheck: int = 10) -> Tracker:
+    def from_pretrained(
+        cls,
+        config: RegistrarConfig | None = None,
+        device: str = "cpu",
+        recheck: int = 10,
+        weights: str | Path | None = None,
+    ) -> Tracker:
         """A tracker over `Registrar.from_pretrained`, which see."""
-        return cls(Registrar.from_pretrained(config, device), recheck)
+        return cls(Registrar.from_pretrained(config, device, weights), recheck)
 
     @property
     def config(self) -> RegistrarConfig:

@@ -25,25 +25,27 @@ if TYPE_CHECKING:
 OURS = "gapr"
 
 
-Maker = Callable[[RegistrarConfig], RegistrationMethod]
+Maker = Callable[[RegistrarConfig, str | None], RegistrationMethod]
 
 
-def _from_pretrained(config: RegistrarConfig) -> RegistrationMethod:
+def _from_pretrained(config: RegistrarConfig, weights: str | None) -> RegistrationMethod:
     from gapr_core import Registrar
 
-    return Registrar.from_pretrained(config)
+    return Registrar.from_pretrained(config, weights=weights)
 
 
-def _search_alone(config: RegistrarConfig) -> RegistrationMethod:
+def _search_alone(config: RegistrarConfig, weights: str | None) -> RegistrationMethod:
     from gapr_core import Registrar
 
+    if weights is not None:
+        raise ConfigError("weights for a method with a network", "gapr_search", "leave --weights out")
     return _named(Registrar(config), "gapr_search")
 
 
-def _network_alone(config: RegistrarConfig) -> RegistrationMethod:
-    from gapr_core.registration.registrar import Registrar, shipped_network
+def _network_alone(config: RegistrarConfig, weights: str | None) -> RegistrationMethod:
+    from gapr_core.registration.registrar import Registrar, pretrained_network
 
-    return _named(Registrar(config, [shipped_network()]), "gapr_network")
+    return _named(Registrar(config, [pretrained_network(weights=weights)]), "gapr_network")
 
 
 def _named(registrar: Registrar, name: str) -> Registrar:
@@ -51,10 +53,10 @@ def _named(registrar: Registrar, name: str) -> Registrar:
     return registrar
 
 
-def _tracker(config: RegistrarConfig) -> RegistrationMethod:
+def _tracker(config: RegistrarConfig, weights: str | None) -> RegistrationMethod:
     from gapr_core import Tracker
 
-    return Tracker.from_pretrained(config)
+    return Tracker.from_pretrained(config, weights=weights)
 
 
 OWN: dict[str, Maker] = {
@@ -106,9 +108,14 @@ def _with_weights(name: str) -> tuple[str, str | None]:
     method, has_weights, rest = name.partition("@")
     ending = REFINED if has_weights and rest.endswith(REFINED) else ""
     weights = rest.removesuffix(REFINED) or None
-    if has_weights and weights is None and method in RAW:
+    if has_weights and weights is None and method in (*OWN, *RAW):
         raise ConfigError(f"{method}@WEIGHTS", f"no weights in {name!r}", "name their file, or leave @ out")
     return method + ending, weights
+
+
+def is_own(name: str) -> bool:
+    """Whether a name is that of one of our methods, with weights of one's own ("gapr@FILE") or without."""
+    return _with_weights(name)[0] in OWN
 
 
 def names() -> tuple[str, ...]:
@@ -119,7 +126,7 @@ def names() -> tuple[str, ...]:
 def check(wanted: Sequence[str]) -> None:
     """Raise `ConfigError` where a name is none of `names()` and no module:factory; nothing is loaded."""
     for name in wanted:
-        is_known = name in names() or (_with_weights(name)[0] in TRAINED and "@" in name) or ":" in name
+        is_known = name in names() or (_with_weights(name)[0] in (*OWN, *TRAINED) and "@" in name) or ":" in name
         if not is_known:
             raise ConfigError(f"one of {', '.join(names())}, or module:factory", repr(name), "name one of them")
 
@@ -128,25 +135,25 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
     """Make a new instance of a method.
 
     Args:
-        name: "gapr" is the `Registrar` with the shipped weights. "gapr_search" and "gapr_network" have one proposer.
-            "gapr_tracker" is a `Tracker`, "gapr_paper" or "gapr_paper@WEIGHTS" the paper's pipeline.
-            "geotransformer@WEIGHTS" and "predator@WEIGHTS" are their authors' code (see `peer`). Others are baselines
-            of `gapr_core.baselines.REGISTRY`, or "package.module:factory", a callable that returns a
-            `RegistrationMethod`.
+        name: "gapr" is the `Registrar` with the shipped weights, "gapr@WEIGHTS" with others. "gapr_search" and
+            "gapr_network" have one proposer. "gapr_tracker" is a `Tracker`, "gapr_paper" or "gapr_paper@WEIGHTS" the
+            paper's pipeline. "geotransformer@WEIGHTS" and "predator@WEIGHTS" are their authors' code (see `peer`).
+            Others are baselines of `gapr_core.baselines.REGISTRY`, or "package.module:factory", a callable that returns
+            a `RegistrationMethod`.
         config: settings of our own methods.
 
     Raises:
         ConfigError: for a name that leads nowhere, and for settings where the method has none.
         MethodUnavailableError: a library is missing.
     """
-    if name in OWN:
-        return OWN[name](config or RegistrarConfig())
+    method, weights = _with_weights(name)
+    if method in OWN:
+        return OWN[method](config or RegistrarConfig(), weights)
     if config not in (None, RegistrarConfig()):
         raise ConfigError(
             f"settings for one of {', '.join(OWN)}", f"settings for {name}", "leave --config and --set out"
         )
-    if _with_weights(name)[0] in TRAINED:
-        method, weights = _with_weights(name)
+    if method in TRAINED:
         return TRAINED[method](weights)
     if ":" in name:
         return _from_module(*name.split(":", 1))
@@ -156,12 +163,12 @@ def make(name: str, config: RegistrarConfig | None = None) -> RegistrationMethod
 
 def config_of(name: str, config: RegistrarConfig) -> RegistrarConfig | None:
     """Choose the settings for a method: those given for our own, none for the others."""
-    return config if name in OWN else None
+    return config if is_own(name) else None
 
 
 def settings_of(name: str, config: RegistrarConfig) -> str:
     """List the settings that are not the default, as `name=value` with commas."""
-    return ", ".join(settings.changes(config)) if name in OWN else ""
+    return ", ".join(settings.changes(config)) if is_own(name) else ""
 
 
 def made_of(name: str) -> str:
@@ -170,9 +177,9 @@ def made_of(name: str) -> str:
     Of a module only its own file counts, not what it imports, nor its folder where it is a package.
     """
     method, weights = _with_weights(name)
-    if name in OWN or (method in TRAINED and weights is None):
-        return origin.shipped_weights()
-    if method in TRAINED:
+    if method in (*OWN, *TRAINED):
+        if weights is None:
+            return origin.shipped_weights()
         return _digest_or_none(Path(weights or ""))
     if ":" not in name:
         return ""

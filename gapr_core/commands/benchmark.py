@@ -113,7 +113,7 @@ def benchmark(
         raise ConfigError("methods", "none", f"name some of {', '.join(known_methods.names())} with --methods")
     known_methods.check(methods)
     config = config or RegistrarConfig()
-    if config != RegistrarConfig() and not any(name in known_methods.OWN for name in methods):
+    if config != RegistrarConfig() and not any(map(known_methods.is_own, methods)):
         raise ConfigError(f"settings with one of {', '.join(known_methods.OWN)}", ", ".join(methods), "leave them out")
     chosen = [path.resolve() for path in paths[shard[0] - 1 :: shard[1]]]
     facts = runner.check_pairs(tqdm(chosen, desc="checking pairs", disable=None, leave=False))

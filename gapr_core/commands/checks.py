@@ -133,7 +133,7 @@ def check_method(args: Namespace) -> None:
     from gapr_core.benchmark import methods
 
     wanted = [name for name in ("guide", "residuals", "slicer", "targets") if getattr(args, name)]
-    may_say = args.method in methods.OWN or (":" in args.method and "guide" not in wanted)
+    may_say = methods.is_own(args.method) or (":" in args.method and "guide" not in wanted)
     if wanted and not may_say:
         own = ", ".join(methods.OWN)
         raise ConfigError(f"--{wanted[0]} with one of {own}", args.method, f"leave --{wanted[0]} out")

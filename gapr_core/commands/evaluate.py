@@ -48,6 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """A pose or a refusal for every pair; never looks at the truth."""
     files.check_writable(args.out)
+    args.method = options.method_name(args)
     paths = pair_paths(args.pairs)[: args.limit]
     answers = _answers_so_far(args.out)
     config = options.registrar_config(args)
@@ -68,7 +69,7 @@ def run(args: Namespace) -> int:
                 pause_s = max(WRITE_SECONDS, WRITE_TIMES * (written - start))
     finally:  # of an interrupted run, too
         answers |= _written(args.out, new) if new else {}
-    if args.method not in methods.OWN and ":" not in args.method:
+    if not methods.is_own(args.method) and ":" not in args.method:
         say(f"warning: {uncalibrated(args.method)}")
     return _say_counts(args.out, {path.name: answers[path.stem] for path in paths})
 

@@ -26,7 +26,13 @@ def add_method(parser: ArgumentParser) -> None:
         help="gapr (default), gapr_search (needs no torch), gapr_network, gapr_tracker, module:factory, or a baseline, "
         "which refuses almost nothing: its confidence is its share of inliers, not calibrated",
     )
+    parser.add_argument("--weights", type=a_path, help="of a network of your own (gapr train), instead of the shipped")
     add_settings(parser)
+
+
+def method_name(args: Namespace) -> str:
+    """Join `--method` with `--weights` where there are some: "gapr@FILE"."""
+    return f"{args.method}@{args.weights}" if args.weights else str(args.method)
 
 
 def add_settings(parser: ArgumentParser) -> None:

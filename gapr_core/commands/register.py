@@ -88,11 +88,12 @@ def run(args: Namespace) -> int:
     from gapr_core import Registrar, Tracker
     from gapr_core.benchmark import methods
 
+    args.method = options.method_name(args)
     checks.check_outputs(args)
     checks.check_method(args)
     config = options.registrar_config(args)
     config = replace(config, guide=config.guide or args.guide)
-    is_guided = config.guide or (bool(args.report) and args.method in methods.OWN)  # for the page of a refusal
+    is_guided = config.guide or (bool(args.report) and methods.is_own(args.method))  # for the page of a refusal
     method = methods.make(args.method, replace(config, guide=is_guided))
     with checks.naming_old_files(args.out, args.residuals, args.slicer, args.json, args.report, args.rerun):
         plan, hints = _plan(args), _hints(args, method)

@@ -110,19 +110,23 @@ class Registrar:
         return f"<{type(self).__name__}: {', '.join(proposer.name for proposer in self.proposers)}; {self.config}>"
 
     @classmethod
-    def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu") -> Registrar:
+    def from_pretrained(
+        cls, config: RegistrarConfig | None = None, device: str = "cpu", weights: str | Path | None = None
+    ) -> Registrar:
         """Load the best registrar that ships: GAPR-Net, then the search; nothing is downloaded.
 
         Args:
             config: settings of the registration.
             device: device of the network: "cpu", "cuda", or "auto" for the GPU where there is one.
+            weights: of your own network; no confidence was fitted to it, and a warning says so.
 
         Raises:
+            WeightsError: `weights` are missing, damaged or of another format.
             MethodUnavailableError: torch is not installed; `Registrar()` works without.
             ConfigError: no such device, or something else than a `RegistrarConfig`.
         """
         config = RegistrarConfig() if config is None else as_config(config)
-        return cls(config, (shipped_network(device), _search(config)))
+        return cls(config, (pretrained_network(device, weights), _search(config)))
 
     def of_bone_alone(self: Own) -> Own:
         """Copy the registrar for sources that are all bone: those seen from several places."""
@@ -369,19 +373,19 @@ def as_config(config: object) -> RegistrarConfig:
     return config
 
 
-def shipped_network(device: str = "cpu") -> Proposer:
-    """Load GAPR-Net with the shipped weights.
+def pretrained_network(device: str = "cpu", weights: str | Path | None = None) -> Proposer:
+    """Load GAPR-Net with weights of one's own, or with the shipped ones.
 
     Raises:
         MethodUnavailableError: torch or safetensors is not installed.
         ConfigError: no such device.
     """
     try:
-        from gapr_core.registration.proposals.network import NetworkProposer
+        from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
     except ImportError as error:
         how = "run: pip install 'gapr_ros[network]', or do without: Registrar(), or --method gapr_search"
         raise MethodUnavailableError("torch and safetensors for GAPR-Net", str(error), how) from error
-    return NetworkProposer.from_weights(device=device)
+    return NetworkProposer.from_weights(weights or SHIPPED, device)
 
 
 def check_call(target: object, initial: ArrayLike | None) -> None:

@@ -159,7 +159,7 @@ def test_the_seconds_of_evaluate_are_without_the_first_call_and_without_preparin
     tmp_path, pair, monkeypatch, on_own_clock
 ):
     method = on_own_clock(evaluate)
-    monkeypatch.setitem(methods.OWN, "gapr", lambda config: method)
+    monkeypatch.setitem(methods.OWN, "gapr", lambda config, weights: method)
     (tmp_path / "pairs").mkdir()
     for name in "ab":
         np.savez(tmp_path / "pairs" / f"{name}.npz", source=pair.source, target=pair.target)

@@ -78,9 +78,15 @@ class Tracker:
         self.reset()
 
     @classmethod
-    def from_pretrained(cls, config: RegistrarConfig | None = None, device: str = "cpu", recheck: int = 10) -> Tracker:
+    def from_pretrained(
+        cls,
+        config: RegistrarConfig | None = None,
+        device: str = "cpu",
+        recheck: int = 10,
+        weights: str | Path | None = None,
+    ) -> Tracker:
         """Track with a `Registrar.from_pretrained`."""
-        return cls(Registrar.from_pretrained(config, device), recheck)
+        return cls(Registrar.from_pretrained(config, device, weights), recheck)
 
     @property
     def config(self) -> RegistrarConfig:

@@ -227,7 +227,7 @@ def test_the_seconds_of_a_record_are_without_the_first_call_and_without_preparin
     pairs, in_process, monkeypatch, on_own_clock
 ):
     method = on_own_clock(runner)
-    monkeypatch.setitem(known_methods.OWN, "gapr", lambda config: method)
+    monkeypatch.setitem(known_methods.OWN, "gapr", lambda config, weights: method)
     for path in sorted(pairs.glob("L1*.npz"))[:2]:
         found = runner.run_task(runner.Task(path, "gapr"))
         assert (found.prepare_seconds, found.seconds) == (2.0, 7.0)

@@ -21,6 +21,7 @@ from gapr_core.metrics import pose_error
 from gapr_core.model import weights
 from gapr_core.model.config import ModelConfig
 from gapr_core.model.network import GAPRNet
+from gapr_core.registration.proposals.network import SHIPPED
 
 TINY = ModelConfig(name="tiny", width=8, global_width=16, superpoints=(12, 24), test_pairs=16, reposition_top=8)
 
@@ -98,3 +99,14 @@ def test_table_four_trains_every_row_and_examines_it_with_ransac(tmp_path, monke
     assert cli.main(["paper", "--table", "4", "--pairs", "8", "--config", str(settings), "--out", str(tmp_path)]) == 0
     assert len(asked["rows"]) == 6 and asked["pose"] == "ransac" and asked["config"].pairs == 8
     assert asked["recipe"].protocols == ("paper",) and asked["recipe"].split == "test"
+
+
+def test_our_methods_take_weights_of_ones_own_with_a_warning_and_another_name_in_records(tmp_path, caplog):
+    own = tmp_path / "own.safetensors"
+    own.write_bytes(SHIPPED.read_bytes())
+    name = methods.OURS + f"@{own}"
+    method = methods.make(name)
+    assert not method.proposers[0].is_shipped and "fitted to the shipped weights" in caplog.text
+    assert methods.is_own(name) and methods.made_of(name) not in ("", methods.made_of(methods.OURS))
+    with pytest.raises(ConfigError, match="weights for a method with a network; got gapr_search"):
+        methods.make(f"gapr_search@{own}")

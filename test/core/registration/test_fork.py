@@ -20,14 +20,14 @@ from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem import target as targets
 from gapr_core.registration.proposals.search import NormalAlignedSearch
 from gapr_core.registration.fit.refinement import refine_fully
-from gapr_core.registration.registrar import shipped_network
+from gapr_core.registration.registrar import pretrained_network
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration.fit.verification import verify
 
 rng, config = np.random.default_rng(0), RegistrarConfig(num_threads=2)
 points = make_bone("femur", 3).sample(6000, rng)[0]
 target, source = targets.prepare(points), sources.prepare(points[points[:, 2] > np.quantile(points[:, 2], 0.6)])
-proposer = {"network": shipped_network, "search": lambda: NormalAlignedSearch(config.search, 2)}[sys.argv[1]]()
+proposer = {"network": pretrained_network, "search": lambda: NormalAlignedSearch(config.search, 2)}[sys.argv[1]]()
 
 def register():
     poses = proposer.propose(source, target, np.random.default_rng(0)).poses

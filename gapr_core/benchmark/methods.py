@@ -114,7 +114,7 @@ def _with_weights(name: str) -> tuple[str, str | None]:
 
 
 def is_own(name: str) -> bool:
-    """Whether a name is that of one of our methods, with weights of one's own ("gapr@FILE") or without."""
+    """Return whether a name is one of our methods, with weights of one's own ("gapr@FILE") or without."""
     return _with_weights(name)[0] in OWN
 
 

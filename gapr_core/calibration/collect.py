@@ -44,6 +44,7 @@ from gapr_core.registration.streams.memory import PreviousPoses
 from gapr_core.registration.uncertainty.error_calibration import Precision
 from gapr_core.results import Hypothesis, Refusal
 from gapr_core.runtime import cluster, origin
+from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.files import write_text
 from gapr_core.runtime.parallel import end_with_parent
 
@@ -231,7 +232,14 @@ class AskedOnce:
 def accepting(proposers: Sequence[Proposer], sensor: str, clutter_config: ClutterConfig = AS_IT_IS) -> Registrar:
     """Make a registrar that uses all proposers, accepts every answer and leaves its covariance as computed."""
     config = replace(SETTINGS, sensor=SensorConfig(kind=sensor), clutter=clutter_config)
-    return Registrar(config, proposers, ACCEPTING, Precision.unscaled())
+    return Unmirrored(config, proposers, ACCEPTING, Precision.unscaled())
+
+
+class Unmirrored(Registrar):
+    """Registers no mirror images: no feature rests on them."""
+
+    def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> None:
+        return None
 
 
 @cache

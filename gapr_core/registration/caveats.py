@@ -62,7 +62,7 @@ def answering(register: Callable[..., RegistrationResult]) -> Register:
 
 
 def _seen(method: Any, source: Source, viewpoint: Any) -> tuple[Any, ArrayLike, Any]:
-    """The method, the points and the viewpoint for a source: what was measured from several places is bone alone."""
+    """Choose the method, points and viewpoint for a source; one from several places is bone alone."""
     if isinstance(source, str | Path):
         source = clouds.load(source)
     if not isinstance(source, Surface):
@@ -75,7 +75,7 @@ def _seen(method: Any, source: Source, viewpoint: Any) -> tuple[Any, ArrayLike, 
 
 
 def _warnings(result: RegistrationResult, target: PreparedTarget, config: RegistrarConfig) -> tuple[ResultWarning, ...]:
-    """The caveats of an accepted pose, those that were there already first."""
+    """Collect the caveats of an accepted pose, known ones first."""
     if not result.ok:
         return result.warnings
     known = errors(config.sensor, 0)
@@ -92,7 +92,7 @@ def _warnings(result: RegistrationResult, target: PreparedTarget, config: Regist
 
 
 def _loose_turn(result: RegistrationResult, target: PreparedTarget) -> ResultWarning | None:
-    """The warning of a turn that may be larger than what counts as right."""
+    """Warn of a turn that may be larger than a right pose allows."""
     found = loosest_turn(result, target.points)
     if found is None or found[1] <= LOOSE_DEG:
         return None
@@ -101,7 +101,7 @@ def _loose_turn(result: RegistrationResult, target: PreparedTarget) -> ResultWar
 
 
 def loosest_turn(result: RegistrationResult, bone: Array) -> tuple[str, float] | None:
-    """The axis about which a pose is known worst, in words, and the turn that 95 of 100 stay below, deg.
+    """Name the axis about which a pose is known worst, and the 95 % bound of that turn, deg.
 
     Args:
         result: of registering to the bone.

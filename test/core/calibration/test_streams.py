@@ -91,7 +91,7 @@ def test_a_bias_is_that_of_the_bone_or_of_the_frame(people, monkeypatch, stays):
 
 
 def test_every_frame_is_an_answer_with_its_numbers_alone(specimen, quick, monkeypatch):
-    frames = simulate(specimen, 1, Motion(frames=3, share=0.35, points=1000))
+    frames = simulate(specimen, 1, Motion(frames=3, share=0.7, points=1500, noise_mm=0.3, bias_mm=0.0))
     monkeypatch.setattr(streams, "draw_stream", lambda task: ("waves", "own", ("p0",), frames))
     monkeypatch.setattr(streams, "_registrar", lambda: quick)
     record = collect.record_of(TASK)

@@ -57,7 +57,7 @@ def test_a_margin_that_is_not_positive_is_refused(margin_mm, target):
         crop_to_pose(target.points, np.eye(4), target, margin_mm=margin_mm)
 
 
-@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((5, 2)), np.zeros((2, 3, 3))])
+@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((5, 2)), np.zeros((2, 3, 2))])
 def test_what_is_not_a_list_of_points_is_refused(points, target):
     with pytest.raises(InvalidPointCloudError, match=r"\(N, 3\)"):
         crop_box(points, np.eye(4), np.zeros(3), np.ones(3))

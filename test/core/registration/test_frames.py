@@ -97,17 +97,7 @@ def test_who_changes_an_answer_changes_nothing_that_comes(registrar, seen, targe
                               result.residuals.points, result.residuals.distance_mm,
                               *(each.T_target_source for each in result.hypotheses)):  # fmt: skip
                     array /= 1000.0
-        assert tracker.follow(frames[0], target) is not None
         answers.append(of_these)
     for (confidence, tre95_mm, T), spoiled in zip(*answers, strict=True):
         assert (confidence, tre95_mm) == spoiled[:2]
         np.testing.assert_array_equal(T, spoiled[2])
-
-
-def test_what_two_limits_of_one_name_take_adds_up(registrar, seen, target):
-    found = registrar.assess(seen, target)
-    before = sum(found.contributions.values())
-    capped = found.capped(0.9, "doubled").capped(0.6, "doubled")
-    assert sum(capped.contributions.values()) - before == pytest.approx(
-        np.log(0.6 / 0.4) - np.log(found.probability / (1.0 - found.probability))
-    )

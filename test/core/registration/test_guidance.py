@@ -16,7 +16,7 @@ from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Hypothesis
 
-DOUBTFUL = {"judgement": Judgement(float(np.log(0.4 / 0.6)), 3.0), "other_bone_prior": 0.0}
+DOUBTFUL = Judgement(float(np.log(0.4 / 0.6)), 3.0)
 
 
 @pytest.fixture(autouse=True, scope="module")

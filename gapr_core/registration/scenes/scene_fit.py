@@ -32,6 +32,7 @@ AGREEING_COS = 0.7  # least cosine of normals of a point on the bone
 CROWD, MOST_ALONE = 12, 0.5  # compared neighbours, and the share of them that must lie on the bone, too
 MOSTLY_CLUTTER, MOSTLY_OFF = 0.5, 0.4  # least share that counts for the pose; the same without a viewpoint
 LARGEST_MARGIN = 3.0  # log of a ratio of scores
+CHECK_WHERE = "; check the viewpoint, too: it is the camera's place in the frame of the cloud"
 SAY_WHERE = ", or say where the camera was (viewpoint)"
 RIVAL_IF_ALONE = 1.0  # score of the assumed rival of a pose alone, over its own: as good, the careful choice
 
@@ -121,7 +122,7 @@ def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding |
         return None
     if in_scene:
         share, limit = assessment.features["inlier_ratio"], MOSTLY_CLUTTER
-        more = "" if assessment.inferred_viewpoint is None else SAY_WHERE
+        more = CHECK_WHERE if assessment.inferred_viewpoint is None else SAY_WHERE
     else:
         share = float(_on_surface(assessment.fit.T, source, assessment.target, config).mean())
         limit, more = MOSTLY_OFF, SAY_WHERE

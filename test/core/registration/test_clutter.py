@@ -245,7 +245,7 @@ def test_a_given_place_or_an_answer_as_bone_ends_a_stream_of_views(of_views, tar
     [
         ((0.09, 0.09, 0.9, 0.9), 4, 2),
         ((0.5, 0.09, 0.09, 0.9), 4, 3),
-        ((0.09, 0.1, 0.09, 0.1), 4, 4),
+        ((0.09, 0.11, 0.09, 0.11), 4, 4),
         ((0.96, 0.0, 0.0, 0.0), 4, 1),
         ((0.09, 0.09, 0.09, 0.09), None, 4),
     ],
@@ -271,6 +271,7 @@ def test_a_wound_on_the_model_of_the_other_side_is_refused(femur, target, scene,
     for name in ("LARGEST_TURN_DEG", "LARGEST_SHIFT_MM"):
         monkeypatch.setattr(table, name, 1e3)
     monkeypatch.setattr(table, "EQUAL_MM", 0.0)
+    monkeypatch.setattr(table, "COSTLY", ())
     method = Registrar(ONE_THREAD, classifier=by_score)
     result = method.register(scene[0], method.prepare(other), viewpoint=scene[1])
     assert not result.ok and "the mirror image of the source fits the bone better" in result.reason
@@ -376,7 +377,7 @@ def test_a_refusal_of_clutter_with_a_viewpoint_behind_the_surface_asks_to_check_
     seen = points[normals @ [0.0, 1.0, 0.0] > 0.3]
     viewpoint = seen.mean(axis=0) - [0.0, 400.0, 0.0]
     result = Registrar(ONE_THREAD).register(seen, target, viewpoint=viewpoint)
-    assert result.status is RegistrationStatus.CLUTTER and "where the viewpoint" in result.reason
+    assert result.status is RegistrationStatus.CLUTTER and "check the viewpoint" in result.reason
 
 
 def test_a_refused_cloud_that_lies_on_the_bone_is_not_called_clutter(target, femur):

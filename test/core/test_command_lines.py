@@ -273,7 +273,7 @@ def test_json_of_a_refusal_holds_no_error_of_a_pose(folder):
 
 @pytest.mark.parametrize(("choice", "expected"), [
     ("--label Femur", "a label map for --label (--source-label of the source, model_label of the node); got cloud.npy"),
-    ("--tip 1,2,3", "a recording of a tracked tool for --tip; got cloud.npy"),
+    ("--tip 1,2,3", "poses (N, 4, 4) as .npy for --tip; got cloud.npy"),
     ("--clouds 0:1", "a bag for --clouds; got cloud.npy"),
     ("--targets none.fcsv", "a file that exists; got none.fcsv"),
 ])  # fmt: skip

@@ -10,8 +10,8 @@ sys.path.insert(0, str(Path(__file__).parent))  # for benchmark_cases
 from benchmark_cases import FAKES, make_pair  # noqa: E402
 
 from gapr_core.benchmark import runner
-from gapr_core.commands import benchmark
 from gapr_core.data.pair_files import save_pair  # noqa: E402
+from gapr_core.pages import benchmark_report
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def fakes(tmp_path, monkeypatch):
 @pytest.fixture
 def no_report(monkeypatch):
     """Plots cost seconds and have their own tests."""
-    monkeypatch.setattr(benchmark.benchmark_report, "write", lambda *_: None)
+    monkeypatch.setattr(benchmark_report, "write", lambda *_: None)
 
 
 @pytest.fixture

@@ -211,7 +211,7 @@ class RegistrarConfig(Settings):
     guide: bool = setting(False, "add to every answer where another look would help most")
     min_confidence: float = setting(0.5, "poses with a lower confidence are refused", low=0, high=1)
     other_bone_prior: float = setting(
-        0.1, "probability, before the data, that the source is of another subject's bone", low=0, high=1
+        0.3, "probability, before the data, that the source is of another subject's bone", low=0, high=1
     )
     max_tre_mm: float = setting(0.0, "poses whose tre95_mm is larger are refused; 0: off", low=0, unit="mm")
     sure: float = setting(0.95, "confidence from which no other proposer and no region is tried", low=0, high=2)

@@ -55,7 +55,7 @@ class StandIn:
     name = "gapr"
     answer = staticmethod(accepted)
 
-    def __init__(self, config):
+    def __init__(self, config, weights):
         self.config = config
 
     def prepare(self, target, units="mm"):

@@ -76,7 +76,7 @@ class StandIn:
 
     name, answer = "gapr", None
 
-    def __init__(self, config):
+    def __init__(self, config, weights):
         pass
 
     def prepare(self, target, units="mm"):

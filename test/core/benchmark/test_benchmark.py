@@ -374,7 +374,7 @@ def ours(fakes, monkeypatch):
     """A method of ours, `mine`, that notes the settings it is made with."""
     seen = []
 
-    def make(config):
+    def make(config, weights):
         seen.append(config)
         return importlib.import_module("fakes").good()
 

@@ -187,7 +187,8 @@ def _show(args: Namespace, result: RegistrationResult) -> int:
     for line in (*result.targets, *(f"warning: {warning}" for warning in result.warnings)):
         say(str(line))
     for finding in result.findings:
-        say(f"{finding.text} {finding.advice}")
+        if finding.text not in result.reason:
+            say(str(finding))
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
             say(f"no pose: {path} is not written{checks.OF_EARLIER if path.exists() else ''}")

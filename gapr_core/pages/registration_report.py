@@ -145,7 +145,7 @@ def _details(result: RegistrationResult) -> dict[str, Any]:
 
 def _why(result: RegistrationResult) -> list[str]:
     """The reasons of the verdict, one sentence each."""
-    lines = [_sentence(f"{finding.text} {finding.advice}".strip()) for finding in result.findings]
+    lines = [_sentence(str(finding)) for finding in result.findings]
     if result.pose_probability is not None:
         lines.append(f"If this is the right bone, the pose is right with a probability of "
                      f"{confidence_text(result.pose_probability)}.")  # fmt: skip

@@ -80,6 +80,9 @@ class Finding:
     text: str
     advice: str = ""
 
+    def __str__(self) -> str:
+        return "; ".join(filter(None, (self.text, self.advice)))
+
 
 @dataclass(frozen=True)
 class ResultWarning:

@@ -277,7 +277,7 @@ def run(settings, anatomy, tmp_path):
     """A run before its first step, its gradients all 0.01."""
     made = trainer.Run(replace(settings, validation_pairs=0), tmp_path / "run", anatomy, distributed.start("cpu"), {})
     made.optimizer.param_groups[0]["lr"] = 0.01
-    for parameter in made.learns:
+    for parameter in made.network.parameters():
         parameter.grad = torch.full_like(parameter, 0.01)
     return made
 
@@ -301,10 +301,10 @@ def test_the_first_steps_hardly_count_the_weights_that_the_run_began_with(run):
 
 def test_a_step_whose_gradients_are_not_finite_changes_no_weight_and_the_next_one_does(run):
     before = values(run.network)
-    run.learns[0].grad[0] = float("inf")
+    next(run.network.parameters()).grad[0] = float("inf")
     run._move(0)
     assert torch.equal(values(run.network), before) and run.lost == 1
-    for parameter in run.learns:
+    for parameter in run.network.parameters():
         parameter.grad = torch.full_like(parameter, 0.01)
     run._move(1)
     assert torch.isfinite(values(run.network)).all() and not torch.equal(values(run.network), before) and not run.lost

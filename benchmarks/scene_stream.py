@@ -1,11 +1,11 @@
-"""A stream of scenes through register_node: right, wrong, refused and late, with and without `crop_to_track`.
+"""A stream of scenes through register_node: right, wrong, refused and late.
 
     python benchmarks/scene_stream.py [--anatomy DIR --split val] [--bone femur] [--frames 200] [--direct] [--unnamed]
 
 A camera circles a wound while the bone sways (`gapr_core.data.scenes.stream`); the clouds are in the camera's own
 frame, and the next one is sent when the last one was answered, so that none is dropped. With --direct the clouds go
-through a `Tracker` in this process, without ROS: cheaper, and without `crop_to_track`, which is the node's. With
---unnamed nobody says where the camera is, and its place is inferred.
+through a `Tracker` in this process, without ROS: cheaper. With --unnamed nobody
+says where the camera is, and its place is inferred.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +34,13 @@ from gapr_ros.demo.act import Act, act_of_pairs, write_stl
 from gapr_ros.demo.observer import Answer
 from gapr_ros.demo.report import Row, judge
 
-CROPS_M = (0.0, 0.04)
 HEAD = ("stream", "frames", "right %", "wrong", "of these at >= 0.9", "refused %", "no answer",
         "median error mm", "median ms", "95 % ms")  # fmt: skip
 Ask = Callable[[int], Answer | None]
 
 
 def main() -> int:
-    """Run the stream with each setting, print one table."""
+    """Run the stream, print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anatomy", type=Path, help="folder with the bones; else parametric ones")
     parser.add_argument("--split", default="val")
@@ -56,11 +55,11 @@ def main() -> int:
     specimen = people[args.seed % len(people)]
     say(f"`python {' '.join(sys.argv)}`, commit {origin.commit()}, {os.cpu_count()} cores of {origin.cpu_name()}\n")
     say(markdown.head(HEAD))
+    name = ("in-process" if args.direct else "node") + (", no viewpoint" if args.unnamed else "")
     with tempfile.TemporaryDirectory() as folder:
         act = stream(specimen, args.seed, SceneMotion(args.frames, args.level), Path(folder))
-        for name, run in runs(act, args.direct, args.unnamed, Path(folder)).items():
-            with run as ask:
-                say(line(f"{args.bone}, {args.level}, {name}", answered(act, ask)))
+        with asking(act, args.direct, args.unnamed, Path(folder)) as ask:
+            say(line(f"{args.bone}, {args.level}, {name}", answered(act, ask)))
     return 0
 
 
@@ -72,16 +71,11 @@ def stream(specimen: Specimen, seed: int, motion: SceneMotion, folder: Path) -> 
     return act_of_pairs(specimen, path, pairs, period_s=1.0)
 
 
-def runs(act: Act, direct: bool, unnamed: bool, folder: Path) -> dict[str, object]:
-    """What is compared: name to a context that gives a function from a frame's number to its answer."""
-    viewpoint, said = (None, ", no viewpoint") if unnamed else (np.zeros(3), "")
+def asking(act: Act, direct: bool, unnamed: bool, folder: Path) -> AbstractContextManager[Ask]:
+    """Give a function from a frame's number to its answer."""
     if direct:
-        return {f"in-process{said}": in_process(act, viewpoint)}
-    where = {"viewpoint": "auto" if unnamed else "origin"}
-    return {
-        f"node, crop_to_track {crop:g} m{said}": through_node(act, where | {"crop_to_track": crop}, folder)
-        for crop in CROPS_M
-    }
+        return in_process(act, None if unnamed else np.zeros(3))
+    return through_node(act, {"viewpoint": "auto" if unnamed else "origin"}, folder)
 
 
 @contextmanager

@@ -93,7 +93,7 @@ def act_of_pairs(specimen: Specimen, path: Path, pairs: Sequence[Pair], period_s
     lead = (
         f"A depth camera circles a wound with a {specimen.bone} at its bottom, while the bone moves. No point is known "
         "to be bone: the node knows where the camera is (viewpoint) and finds out from its lines of sight what can be "
-        "bone; after a good pose it looks only near the bone (crop_to_track)."
+        "bone."
     )
     shifts = (se3.from_rotation_translation(np.eye(3), pair.metadata["origin_mm"]) for pair in pairs)
     return Act(

@@ -141,7 +141,7 @@ def test_the_demo_does_not_write_over_a_bone_of_its_user(tmp_path, monkeypatch):
     for path in mine:
         path.write_bytes(b"of a CT")
     act = probe_sweep("femur", 1, 2, 1.0, tmp_path)
-    follow_scripted(monkeypatch, tmp_path, [(Answer(refusal="timeout: ..."), None)])  # on a tibia
+    follow_scripted(monkeypatch, tmp_path, [(Answer(refusal="tf_missing: ..."), None)])  # on a tibia
     assert [path.read_bytes() for path in mine] == [b"of a CT"] * 2
     assert act.path.is_file() and (tmp_path / "demo_tibia.stl").is_file()
 
@@ -251,7 +251,7 @@ def test_parameters_are_written_as_ros_reads_them():
 def test_the_truth_of_a_scene_lays_its_bone_on_the_file_of_the_bone():
     specimen = parametric_specimen("tibia", 3)
     act = act_of_pairs(specimen, Path("tibia.stl"), list(simulate(specimen, 2, SceneMotion(frames=3))), 2.0)
-    assert act.node_parameters["viewpoint"] == "origin" and act.node_parameters["crop_to_track"] > 0.0
+    assert act.node_parameters["viewpoint"] == "origin"
     for cloud, truth, is_bone in zip(act.clouds, act.truths, act.is_bone, strict=True):
         off = specimen.distance(se3.apply(truth, cloud))
         assert np.median(off[is_bone]) < 1.0 < np.median(off[~is_bone])
@@ -428,7 +428,7 @@ def test_the_probe_goes_where_the_node_says_until_it_knows_enough(tmp_path, monk
 
 
 def test_the_probe_stops_where_the_node_does_not_say_where_to_look(tmp_path, monkeypatch):
-    script = [(Answer(refusal="degenerate: ..."), towards(np.zeros(3))), (Answer(refusal="timeout: ..."), None)]
+    script = [(Answer(refusal="degenerate: ..."), towards(np.zeros(3))), (Answer(refusal="tf_missing: ..."), None)]
     probe, looks = follow_scripted(monkeypatch, tmp_path, script)
     assert len(looks) == 2 and not demo_report.passed(guided.judged(probe, looks))
     probe, looks = follow_scripted(monkeypatch, tmp_path, script[:1] * 4, most=3)

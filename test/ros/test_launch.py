@@ -259,7 +259,7 @@ NESTED = """
 /femur/register_node: {ros__parameters: {model_frame: a}}
 tibia/register_node: {ros__parameters: {model_frame: b}}
 tibia2: {register_node: {ros__parameters: {model_frame: c}}}
-/left/: {knee: {patella: {register_node: {ros__parameters: {model_frame: d}}}}, "*": {ros__parameters: {timeout: 9.0}}}
+/left/: {knee: {patella: {register_node: {ros__parameters: {model_frame: d}}}}, "*": {ros__parameters: {max_tre: 9.0}}}
 tibia2/register_node: {ros__parameters: {model_label: "2"}}
 """
 

@@ -37,8 +37,8 @@ def loaded(path, **how):
     ("bone", "lps_to_ras", -1.0),
 ])  # fmt: skip
 def test_a_model_is_turned_once_at_most_whatever_its_file_says(tmp_path, said, axes, sign):
-    points = loaded(bone(tmp_path / "bone.ply", said), model_axes=axes, model_scale=2.0)
-    assert np.allclose(points, 2.0 * POINTS * [sign, sign, 1.0])
+    points = loaded(bone(tmp_path / "bone.ply", said), model_axes=axes)
+    assert np.allclose(points, POINTS * [sign, sign, 1.0])
 
 
 def test_a_file_in_ras_that_is_read_as_it_is_names_the_parameter_whose_default_that_is(tmp_path, caplog):

@@ -81,7 +81,7 @@ class Finding:
     advice: str = ""
 
     def __str__(self) -> str:
-        return "; ".join(filter(None, (self.text, self.advice)))
+        return (" " if self.text.endswith(".") else "; ").join(filter(None, (self.text, self.advice)))
 
 
 @dataclass(frozen=True)

@@ -334,8 +334,8 @@ def test_a_scene_that_is_killed_at_any_step_is_of_one_run_alone(tmp_path, femur)
     runs = [(femur, np.eye(4)), (moved, se3.from_rotation_translation(np.eye(3), [100.0, 0.0, 0.0]))]
     made = []
     for number, (bone, T) in enumerate(runs):
-        result = replace(result_with(np.eye(6), residuals()), T_target_source=T)
-        scene.write_slicer(tmp_path / str(number), bone, result, [])
+        result = replace(result_with(np.eye(6), residuals()), T_target_source=T, bone=bone)
+        scene.write_slicer(tmp_path / str(number), result)
         made.append({path.name: path.read_bytes() for path in (tmp_path / str(number)).iterdir()})
     finished = False
     for steps in itertools.count():
@@ -343,7 +343,7 @@ def test_a_scene_that_is_killed_at_any_step_is_of_one_run_alone(tmp_path, femur)
         shutil.copytree(tmp_path / "0", folder)
         if (child := os.fork()) == 0:
             kill_after(steps)
-            scene.write_slicer(folder, moved, result, [])
+            scene.write_slicer(folder, result)
             os._exit(0)
         if os.waitpid(child, 0)[1] == 0:
             break

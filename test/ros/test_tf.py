@@ -275,9 +275,7 @@ def test_a_looped_bag_without_simulated_time_is_placed_by_its_own_round(blob_pat
                     client.send(GOOD, frame="camera", stamp_s=START_S + 0.1 * i - 0.05)
                     wait_until(lambda n=received: int(client.values()["frames_received"]) > n)
         wait_until(lambda: len(method.calls) >= 7)
-        clouds = [
-            call["source"] for call in method.calls if len(call["source"]) == len(GOOD)
-        ]  # not of the first warm-up
+        clouds = [call["source"] for call in method.calls if len(call["source"]) == len(GOOD)]  # no warm-up
         places = {round(cloud[:, 0].mean() - 1e3 * GOOD[:, 0].mean()) for cloud in clouds}
         assert places <= {100, 200} and len(places) == 2
 

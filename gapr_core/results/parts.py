@@ -63,7 +63,7 @@ class Finding:
     """One check that spoke: its statistic beyond its threshold, and the effect on the answer.
 
     Attributes:
-        check: name of the check, a row of `docs/checks.md`.
+        check: name of the check, a row of `docs/concepts/checks.md`.
         effect: REFUSE, WIDEN or ASK.
         statistic: measured value.
         threshold: the value that it passed.

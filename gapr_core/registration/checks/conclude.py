@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gapr_core.clouds import MM_PER_UNIT, PLAUSIBLE
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.table import MORE_BONE, trial_of
+from gapr_core.registration.checks.table import refuse, trial_of
 from gapr_core.registration.confidence import feature_labels
 from gapr_core.registration.fit import alternatives
 from gapr_core.results import Effect, Finding, RegistrationResult, RegistrationStatus, confidence_text
@@ -88,13 +88,13 @@ def by_threshold(
         status = RegistrationStatus.LOW_CONFIDENCE
         if pose_probability >= least:
             text = f"the points may be of another subject's bone (confidence {confidence_text(confidence)})"
-            return _refuse("min_confidence", confidence, least, status, text, "check that it is this subject's bone")
+            return refuse("min_confidence", confidence, least, status, text, "check that it is this subject's bone")
         why = f"; against it: {against}" if against else ""
         text = f"the best pose is right with a probability of only {confidence_text(confidence)}{why}"
-        return _refuse("min_confidence", confidence, least, status, text)
+        return refuse("min_confidence", confidence, least, status, text)
     if most_mm > 0.0 and not tre95_mm <= most_mm:
         text = f"the error over the bone is below {tre95_mm:.1f} mm (95 %), allowed are {most_mm:g} mm"
-        return _refuse("max_tre_mm", tre95_mm, most_mm, RegistrationStatus.IMPRECISE, text)
+        return refuse("max_tre_mm", tre95_mm, most_mm, RegistrationStatus.IMPRECISE, text)
     return None
 
 
@@ -140,9 +140,3 @@ def standoff_question(a: Assessment, config: RegistrarConfig) -> Finding | None:
         question = f"is the standoff_mm of {stated_mm:g} right?"
     text = f"it fits better {where}: {question}"
     return Finding("stand-off", Effect.ASK, log_ratio, -STANDOFF_BETTER, RegistrationStatus.OK, text)
-
-
-def _refuse(
-    check: str, statistic: float, threshold: float, status: RegistrationStatus, text: str, advice: str = MORE_BONE
-) -> Finding:
-    return Finding(check, Effect.REFUSE, float(statistic), float(threshold), status, text, advice)

@@ -38,9 +38,9 @@ def unobserved_motion(a: Assessment, config: RegistrarConfig) -> Assessment:
     turn_deg, shift_mm = a.uncertainty.largest_turn_deg, a.uncertainty.largest_shift_mm
     text = f"{turn_text(a)}; {shift_text(a)}"
     if turn_deg > LARGEST_TURN_DEG:
-        return a.with_finding(_refuse("unobserved turn", turn_deg, LARGEST_TURN_DEG, DEGENERATE, text))
+        return a.with_finding(refuse("unobserved turn", turn_deg, LARGEST_TURN_DEG, DEGENERATE, text))
     if shift_mm > LARGEST_SHIFT_MM:
-        return a.with_finding(_refuse("unobserved shift", shift_mm, LARGEST_SHIFT_MM, DEGENERATE, text))
+        return a.with_finding(refuse("unobserved shift", shift_mm, LARGEST_SHIFT_MM, DEGENERATE, text))
     return a
 
 
@@ -51,7 +51,7 @@ def equal_rival(a: Assessment, config: RegistrarConfig) -> Assessment:
         return a
     shift_mm, turn_deg = se3.pose_error(a.candidates.poses[1], a.candidates.poses[0], a.source.points)
     text = f"another pose, {shift_mm:.0f} mm and {turn_deg:.0f} deg away, explains the source as well"
-    return a.with_finding(_refuse("equal rival", scores[1] / scores[0], 1.0 + EQUAL_SHARE, AMBIGUOUS, text))
+    return a.with_finding(refuse("equal rival", scores[1] / scores[0], 1.0 + EQUAL_SHARE, AMBIGUOUS, text))
 
 
 def flat_valley(a: Assessment, config: RegistrarConfig) -> Assessment:
@@ -61,7 +61,7 @@ def flat_valley(a: Assessment, config: RegistrarConfig) -> Assessment:
     if not pushed_mm2 < limit_mm2:
         return a
     text = "a pose a few mm away fits as well: the observed surface is flat or straight"
-    return a.with_finding(_refuse("flat valley", pushed_mm2, limit_mm2, DEGENERATE, text))
+    return a.with_finding(refuse("flat valley", pushed_mm2, limit_mm2, DEGENERATE, text))
 
 
 def as_good_as(mean_square_mm2: float) -> float:
@@ -79,7 +79,7 @@ def mirror_image(a: Assessment, log_ratio: float) -> Assessment:
         return a
     text = "the mirror image of the source fits the bone better"
     advice = "check the side of the body, and whether a scan was flipped from left to right"
-    finding = _refuse("mirror image", log_ratio, -MIRRORED_BETTER, RegistrationStatus.LOW_CONFIDENCE, text, advice)
+    finding = refuse("mirror image", log_ratio, -MIRRORED_BETTER, RegistrationStatus.LOW_CONFIDENCE, text, advice)
     return a.with_finding(finding)
 
 
@@ -117,7 +117,8 @@ COSTLY: tuple[Check, ...] = (flat_valley,)  # checks of a pose that may be accep
 WIDENING: tuple[Check, ...] = (one_rigid_piece,)  # checks of an accepted pose
 
 
-def _refuse(
+def refuse(
     check: str, statistic: float, threshold: float, status: RegistrationStatus, text: str, advice: str = MORE_BONE
 ) -> Finding:
+    """Make a finding that refuses a pose."""
     return Finding(check, Effect.REFUSE, float(statistic), float(threshold), status, text, advice)

@@ -61,10 +61,10 @@ def main() -> int:
                 pair, rng = make_pair(protocol, specimen, number), np.random.default_rng(number)
                 bone_itself = registrars[kind].prepare(pair.target)
                 other = registrars[kind].prepare(make_pair(protocol, subjects[number - 1], number).target)
-                for what, target, result in cases_of(pair, bone_itself, other, registrars[kind], rng):
+                for case, target, result in cases_of(pair, bone_itself, other, registrars[kind], rng):
                     for count in COUNTS:
                         points = touched(pair, bone_itself, count, rng)
-                        seen[what, count, verdict_of(points, target, result)] += 1
+                        seen[case, count, verdict_of(points, target, result)] += 1
     say(table(seen))
     return 0
 
@@ -81,9 +81,9 @@ def cases_of(
     yield RIGHT, target, result
     wrong = [(RIVAL, rival.T_target_source) for rival in result.hypotheses[1:]]
     wrong.append((MOVED, moved(answered, target, rng)))
-    for what, T in wrong:
+    for case, T in wrong:
         if off_mm(T, truth, target) > se3.RIGHT_MM:
-            yield what, target, replace(result, T_target_source=T)
+            yield case, target, replace(result, T_target_source=T)
     there = registrar.register(pair.source, other).best
     if there is not None:
         centre_mm = se3.apply(there, pair.source).mean(axis=0)
@@ -122,13 +122,13 @@ def verdict_of(points: Array, target: PreparedTarget, result: RegistrationResult
 def table(seen: Counter[tuple[str, int, Verdict]]) -> str:
     """Shares of the verdicts for each kind of pose and number of points."""
     lines = [markdown.head(("the pose", "points", "poses", "holds", "says little", "contradicted"))]
-    for what in (RIGHT, RIVAL, MOVED, OTHER):
+    for case in (RIGHT, RIVAL, MOVED, OTHER):
         for count in COUNTS:
             verdicts = [
-                seen[what, count, verdict] for verdict in (Verdict.HOLDS, Verdict.SAYS_LITTLE, Verdict.CONTRADICTED)
+                seen[case, count, verdict] for verdict in (Verdict.HOLDS, Verdict.SAYS_LITTLE, Verdict.CONTRADICTED)
             ]
             poses = sum(verdicts)
-            lines.append(markdown.row((what, count, poses, *(f"{number / max(poses, 1):.1%}" for number in verdicts))))
+            lines.append(markdown.row((case, count, poses, *(f"{number / max(poses, 1):.1%}" for number in verdicts))))
     return "\n".join(lines)
 
 

@@ -38,8 +38,8 @@ def main() -> int:
     parser.add_argument("--model-mm", type=float, default=CovarianceConfig.model_mm,
                         help="what is said of the models: `covariance.model_mm` (default: %(default)s)")  # fmt: skip
     args = parser.parse_args()
-    said = RegistrarConfig(sensor=SensorConfig(kind=args.sensor), covariance=CovarianceConfig(model_mm=args.model_mm))
-    registrar = Registrar.from_pretrained(said)
+    config = RegistrarConfig(sensor=SensorConfig(kind=args.sensor), covariance=CovarianceConfig(model_mm=args.model_mm))
+    registrar = Registrar.from_pretrained(config)
     lines = [markdown.head(HEAD)]
     for pair in real.pairs(args.real):
         truth = pair.T_target_source

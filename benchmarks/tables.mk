@@ -66,13 +66,13 @@ BENCHMARKS := one_sided clean scenes scene_stereo scene_noisy scene_joint scene_
 MIX        := $(addprefix mix-,l3like wrong ultrasound pointer depth laser l2like clean)
 TRACED     := traced traced-named
 FEW        := $(addprefix few-,pointer ultrasound femora)
-SCRIPTS    := strangers similar short_scans streams streams_strangers damage damage_camera damage_camera_described damage_layer \
+SCRIPTS    := other_subjects similar short_scans streams streams_other_subjects damage damage_camera damage_camera_described damage_layer \
               guidance hollow unknowable check_points flat_ends proposals proposals_clean viewpoint viewpoint_wrong
-made_by_strangers         = strangers.py --anatomy $(ANATOMY) --split test --out $(OUT)/strangers
-made_by_similar           = strangers.py --anatomy $(ANATOMY) --split test --bones femur,tibia,pelvis --count 0 --mirrored 0 --sides 0 --similar 270 --out $(OUT)/similar
+made_by_other_subjects    = other_subjects.py --anatomy $(ANATOMY) --split test --out $(OUT)/other_subjects
+made_by_similar           = other_subjects.py --anatomy $(ANATOMY) --split test --bones femur,tibia,pelvis --count 0 --mirrored 0 --sides 0 --similar 270 --out $(OUT)/similar
 made_by_short_scans       = short_scans.py --anatomy $(ANATOMY) --split test --count 20
 made_by_streams           = tracking.py --anatomy $(ANATOMY) --split test --count 1
-made_by_streams_strangers = tracking.py --anatomy $(ANATOMY) --split test --count 10 --bones femur,tibia --kinds 'another subject'\''s bone'
+made_by_streams_other_subjects = tracking.py --anatomy $(ANATOMY) --split test --count 10 --bones femur,tibia --kinds 'another subject'\''s bone'
 made_by_damage            = damage.py --anatomy $(ANATOMY) --split test --count 24 --others 12 --out $(OUT)/damage
 made_by_damage_camera     = $(made_by_damage)_camera --damages 'wrong range,patches'
 made_by_damage_camera_described = $(made_by_damage)_described --damages 'wrong range,patches' --sensor depth_camera

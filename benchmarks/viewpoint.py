@@ -53,16 +53,16 @@ def main() -> int:
 def ask(registrar: Registrar, blind: Registrar, pair: Pair, wanted: Sequence[str]) -> tuple[list[str], float]:
     """Right, wrong or refused in each of the ways, and how far the camera that was found is off, mm (NaN: none)."""
     target, found = registrar.prepare(pair.target), pinhole.camera_of(image(pair))
-    said = []
+    outcomes = []
     ways = (registrar, pair.viewpoint), (registrar, found), (registrar, None), (blind, None)
     for method, viewpoint in (way for name, way in zip(WAYS, ways, strict=True) if name in wanted):
         result = method.register(pair.source, target, viewpoint=viewpoint)
         if result.T_target_source is None:
-            said.append("refused")
+            outcomes.append("refused")
             continue
-        said.append("right" if pair.has_truth and is_right(result.T_target_source, pair) else "wrong")
+        outcomes.append("right" if pair.has_truth and is_right(result.T_target_source, pair) else "wrong")
     assert pair.viewpoint is not None
-    return said, float("nan") if found is None else float(np.linalg.norm(found - pair.viewpoint))
+    return outcomes, float("nan") if found is None else float(np.linalg.norm(found - pair.viewpoint))
 
 
 def is_right(T: Array, pair: Pair) -> bool:

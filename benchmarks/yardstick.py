@@ -51,7 +51,7 @@ class List(NamedTuple):
     """A list of single sources: how a bone is seen, whose it is, how many, and what is left out of the pair."""
 
     family: str
-    what: str
+    source_kind: str
     count: int
     real: bool = False
     few: bool = False
@@ -160,7 +160,7 @@ def answers(case: Case) -> list[Row]:
 
 def drawn(how: List, folder: str, split: str, number: int) -> tuple[Pair, str]:
     """Source `number` of a list, and the sensor that the user names."""
-    found = pairs.draw(Task(folder, split, SEED, number, how.family, how.what, how.real))
+    found = pairs.draw(Task(folder, split, SEED, number, how.family, how.source_kind, how.real))
     pair = found.pair
     if how.few:
         rng = np.random.default_rng([SEED, number, 5])

@@ -163,10 +163,10 @@ def warn_of_size(path: Path, extent_mm: float, unit: str = "mm") -> None:
         else "name the unit with units, --units (of both files) or model_unit" + (f": it has {sizes}" if sizes else "")
     )
     if extent_mm < low:
-        said = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"
+        stated = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"
     else:
-        said = "longer than any human bone. If this is one bone"
-    log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, said, how)
+        stated = "longer than any human bone. If this is one bone"
+    log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, stated, how)
 
 
 def _warn_of_columns(path: Path, surface: Surface) -> None:
@@ -177,18 +177,18 @@ def _warn_of_columns(path: Path, surface: Surface) -> None:
                     "that is wrong, begin with a line of names", path.name, count)  # fmt: skip
 
 
-def _agreed(units: str, said: str | None, name: str) -> str:
+def _agreed(units: str, stated: str | None, name: str) -> str:
     """The unit named, or with "auto" the one that the file says.
 
     Raises:
         InvalidPointCloudError: they contradict each other.
     """
-    if said is None or units == said:
+    if stated is None or units == stated:
         return units
     if units != "auto":
-        given = f"{name} with coordinates in {said} by their names, read as {units}"
-        raise InvalidPointCloudError("the unit that the file says", given, OF_FILE.format(unit=said, read_as=units))
-    return said
+        given = f"{name} with coordinates in {stated} by their names, read as {units}"
+        raise InvalidPointCloudError("the unit that the file says", given, OF_FILE.format(unit=stated, read_as=units))
+    return stated
 
 
 def _known(surface: Surface, units: str, name: str) -> str:

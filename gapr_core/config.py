@@ -96,8 +96,8 @@ class RefinementConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.smallest_sigma_mm > self.largest_sigma_mm:
-            what, given = "a smallest_sigma_mm that is not above largest_sigma_mm", f"{self.smallest_sigma_mm:g}"
-            raise ConfigError(what, f"{given} and {self.largest_sigma_mm:g}", "lower it, or raise the other")
+            expected, given = "a smallest_sigma_mm that is not above largest_sigma_mm", f"{self.smallest_sigma_mm:g}"
+            raise ConfigError(expected, f"{given} and {self.largest_sigma_mm:g}", "lower it, or raise the other")
 
 
 @dataclass(frozen=True)

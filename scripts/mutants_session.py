@@ -100,13 +100,13 @@ def _serve(module: str, tests: Sequence[str], pipe: Connection) -> None:
                     return True
                 wanted = [item for item in items if not line or order.calls(item.nodeid, around)]
                 session.items = sorted(wanted, key=lambda item: order.rank(item.nodeid, line, first))
-                said, failed, seconds = _forked(session, module, text, line, limit_s)
+                outcome, failed, seconds = _forked(session, module, text, line, limit_s)
                 if not line and not failed:
                     limit_s = int(5.0 + 4.0 * seconds)
-                    order.called = json.loads(said)
+                    order.called = json.loads(outcome)
                 if failed:
-                    order.note(said, line)
-                pipe.send((said or NO_TEST) if failed else "")
+                    order.note(outcome, line)
+                pipe.send((outcome or NO_TEST) if failed else "")
 
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -184,10 +184,10 @@ def _forked(session: Any, module: str, text: str, line: int, limit_s: int) -> tu
         os.close(reading)
         _run(session, module, text, line, limit_s, writing)
     os.close(writing)
-    with os.fdopen(reading) as said:
-        words = said.read()
+    with os.fdopen(reading) as outcome:
+        text = outcome.read()
     _, status, used = os.wait4(child, 0)
-    return words, status != 0, used.ru_utime + used.ru_stime
+    return text, status != 0, used.ru_utime + used.ru_stime
 
 
 def _run(session: Any, module: str, text: str, line: int, limit_s: int, writing: int) -> None:

@@ -153,13 +153,13 @@ def doubt_of_truth(pair: Pair) -> str:
         return ""
     tree, T, some = cKDTree(pair.target), pair.T_target_source, pair.source[:: len(pair.source) // LOOKED_AT + 1]
     in_mm = se3.from_rotation_translation(T[:3, :3], 1000.0 * T[:3, 3])
-    said, turned, longer = (
+    as_given_mm, turned, longer = (
         float(np.median(tree.query(se3.apply(motion, some))[0])) for motion in (T, se3.inverse(T), in_mm)
     )
-    if said < FAR_MM or min(turned, longer) > MUCH_NEARER * said:
+    if as_given_mm < FAR_MM or min(turned, longer) > MUCH_NEARER * as_given_mm:
         return ""
     cause = "its inverse" if turned < longer else "with a translation in m, and not in mm, it would be"
-    return f"lays the source {said:.0f} mm from the target, {cause} {min(turned, longer):.0f} mm"
+    return f"lays the source {as_given_mm:.0f} mm from the target, {cause} {min(turned, longer):.0f} mm"
 
 
 def _timed(method: RegistrationMethod, pair: Pair) -> tuple[RegistrationResult, tuple[float, float]]:

@@ -102,8 +102,8 @@ def _show(found: PointCheck, within_mm: float, labels: list[str]) -> None:
     say(str(found))
     rows = zip(labels, found.distance_mm, found.expected_mm, strict=True)
     for number, (label, distance, expected) in enumerate(rows, 1):
-        said = f"{distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)"
-        say(f"{number}.{label} {'no surface is near' if np.isnan(distance) else said}")
+        shown = f"{distance:+.2f} mm, {expected:.2f} mm expected (standard deviation)"
+        say(f"{number}.{label} {'no surface is near' if np.isnan(distance) else shown}")
     if np.isnan(found.distance_mm).mean() > ELSEWHERE:
         return
     if found.verdict is Verdict.CONTRADICTED:

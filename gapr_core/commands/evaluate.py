@@ -88,8 +88,8 @@ def _say_counts(path: Path, answers: dict[str, Answer]) -> int:
     say(f"{path}: {len(answers)} pairs" + "".join(f", {count} {status}" for status, count in counts.most_common()))
     invalid = [(name, answer["reason"]) for name, answer in answers.items() if answer["status"] == INVALID_INPUT]
     for name, reason in invalid[:1]:
-        said = reason if name in reason else f"{name}: {reason}"
-        log.warning("the first of %d pairs that cannot be read: %s", len(invalid), said)
+        first = reason if name in reason else f"{name}: {reason}"
+        log.warning("the first of %d pairs that cannot be read: %s", len(invalid), first)
     return BAD_INPUT if len(invalid) == len(answers) else OK
 
 
@@ -105,10 +105,10 @@ def _answers_so_far(path: Path) -> dict[str, Answer]:
     """What an earlier run has written, by the name of the pair."""
     if not path.exists():
         return {}
-    what = "a file that `gapr evaluate` has written"
-    answers = files.read_json(path, what)
+    expected = "a file that `gapr evaluate` has written"
+    answers = files.read_json(path, expected)
     if not isinstance(answers, dict) or not all(isinstance(answer, dict) for answer in answers.values()):
-        raise ConfigError(what, f"{path} (no answers in it)", "name another file with --out, or remove it")
+        raise ConfigError(expected, f"{path} (no answers in it)", "name another file with --out, or remove it")
     return answers
 
 

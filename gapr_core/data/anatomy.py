@@ -54,17 +54,17 @@ def splits(folder: str | Path) -> dict[str, list[str]]:
     Raises:
         ConfigError: no such file, a damaged one, another key, or a subject in two splits.
     """
-    path, what = Path(folder) / "splits.json", "splits.json with subjects of train, val and test"
+    path, expected = Path(folder) / "splits.json", "splits.json with subjects of train, val and test"
     if not path.is_file():
-        raise ConfigError(what, f"none in {folder}", "write one")
-    people = files.read_json(path, what)
+        raise ConfigError(expected, f"none in {folder}", "write one")
+    people = files.read_json(path, expected)
     how = 'write {"train": [NAME, ...], "val": [...], "test": [...]}'
     if not isinstance(people, dict):
-        raise ConfigError(what, f"{path} ({type(people).__name__})", how)
+        raise ConfigError(expected, f"{path} ({type(people).__name__})", how)
     if set(people) != set(SPLITS):
         raise ConfigError(f"the keys {', '.join(SPLITS)}", f"{', '.join(people)} in {path}", "rename them")
     if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in people.values()):
-        raise ConfigError(what, f"{path} (a key without a list of names)", how)
+        raise ConfigError(expected, f"{path} (a key without a list of names)", how)
     everybody = [person for split in SPLITS for person in people[split]]
     twice = sorted({person for person in everybody if everybody.count(person) > 1})
     if twice:

@@ -158,10 +158,10 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     Raises:
         ConfigError: there is none, or it is damaged.
     """
-    path, what = Path(folder) / MANIFEST, "a manifest that gapr make-pairs has written"
-    manifest = files.read_json(path, what)
+    path, expected = Path(folder) / MANIFEST, "a manifest that gapr make-pairs has written"
+    manifest = files.read_json(path, expected)
     if not isinstance(manifest, dict) or not {"recipe", "hash", "pairs"} <= manifest.keys():
-        raise ConfigError(what, f"{path} (no recipe or no pairs in it)", "make the pairs again in another folder")
+        raise ConfigError(expected, f"{path} (no recipe or no pairs in it)", "make the pairs again in another folder")
     return manifest
 
 

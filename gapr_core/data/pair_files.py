@@ -138,10 +138,12 @@ def _check_facts(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> None:
             point = _of_shape(arrays, name, (3,), path)
             if not np.isfinite(point).all():  # type: ignore[arg-type]
                 raise _wrong(path, f"a finite {name}", str(point), "leave it out, or write x y z in mm")
-    for name, kinds, what in [(n, "fiu", "a number") for n in NUMBERS] + [(n, "U", "a text") for n in TEXTS]:
+    for name, kinds, expected in [(n, "fiu", "a number") for n in NUMBERS] + [(n, "U", "a text") for n in TEXTS]:
         array = arrays.get(name)
         if array is not None and (array.ndim or array.dtype.kind not in kinds):
-            raise _wrong(path, f"{name} as {what}", f"shape {array.shape} and type {array.dtype}", "write one, or none")
+            raise _wrong(
+                path, f"{name} as {expected}", f"shape {array.shape} and type {array.dtype}", "write one, or none"
+            )
 
 
 def _transform(arrays: Mapping[str, NDArray[Any]], path: str | Path) -> Array:
@@ -213,8 +215,8 @@ def pair_hash(pair: Pair) -> str:
 
 def facts_hash(pair: Pair) -> str:
     """sha256 of what a file says of its pair besides the clouds, whether these were read or not."""
-    said = {**{name: getattr(pair, name) for name in NAMES}, **pair.metadata, "transform": pair.T_target_source}
-    facts = {name: np.asarray(value).tolist() for name, value in said.items() if _is_fact(name)}
+    fields = {**{name: getattr(pair, name) for name in NAMES}, **pair.metadata, "transform": pair.T_target_source}
+    facts = {name: np.asarray(value).tolist() for name, value in fields.items() if _is_fact(name)}
     return sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 

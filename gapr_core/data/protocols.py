@@ -234,7 +234,7 @@ def _crop_centre(cloud: Array, rng: np.random.Generator) -> int:
     return int(rng.choice(np.flatnonzero(end)))
 
 
-STRANGERS: dict[str, Callable[..., Pair]] = {  # no pose is right
+NO_RIGHT_POSE: dict[str, Callable[..., Pair]] = {  # no pose is right
     "wrong": wrong,
     "scene-wrong": wrong_scene,
     "scene-wrong-stereo": partial(wrong_scene, levels=("scene-stereo", "scene-layers")),
@@ -251,7 +251,7 @@ DERIVED: dict[str, tuple[str, Change]] = {  # of the base's pair of the same see
     **{f"{name}-look": (f"{name}-looks", derived.first_look) for name in LOOKED_AT},
 }
 WITH_OTHERS: dict[str, Callable[..., Pair]] = {  # made with other bones
-    **STRANGERS,
+    **NO_RIGHT_POSE,
     "scene-joint": joint_scene,
     "scene-theatre": partial(joint_scene, level=IN_THEATRE),
     **{f"{name}-looks": partial(several_looks, kind=kind) for name, kind in LOOKED_AT.items()},

@@ -70,8 +70,8 @@ def pairs(folder: str | Path) -> Iterator[RealPair]:
 def _of_npz(path: Path) -> RealPair:
     pair = load_pair(path)
     T = pair.T_target_source if pair.has_truth else None
-    said = str(pair.metadata.get("truth", "as the file says")) if pair.has_truth else ""
-    return RealPair(path.stem, thinned(np.asarray(pair.source, dtype=np.float64)), Surface(pair.target), T, said)
+    truth = str(pair.metadata.get("truth", "as the file says")) if pair.has_truth else ""
+    return RealPair(path.stem, thinned(np.asarray(pair.source, dtype=np.float64)), Surface(pair.target), T, truth)
 
 
 def _records(folder: Path) -> Iterator[tuple[Path, Path]]:

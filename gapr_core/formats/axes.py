@@ -49,18 +49,18 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
         InvalidPointCloudError: as `stated`.
     """
     check(axes)
-    said, how = _said(path) or (None, "")
-    if axes == "lps_to_ras" and said == "ras":
+    stated, how = _stated(path) or (None, "")
+    if axes == "lps_to_ras" and stated == "ras":
         raise ConfigError("a file in LPS for lps_to_ras", f"{path.name}, which {how}", "use as_is: it is RAS")
-    if axes == "auto" and said == "ras":
+    if axes == "auto" and stated == "ras":
         log.warning("%s %s: x and y are negated, to LPS", path.name, how)
-    elif said == "ras" and axes == "as_is":
+    elif stated == "ras" and axes == "as_is":
         log.warning("%s %s and is read as it is (%s): auto turns it to LPS", path.name, how, OPTIONS)
-    elif said == "ras" and axes != "ras":
+    elif stated == "ras" and axes != "ras":
         log.warning("%s %s and is read as %s: %s says so", path.name, how, axes.upper(), OPTIONS)
-    elif said == "lps" and axes == "ras":
+    elif stated == "lps" and axes == "ras":
         log.warning("%s %s and is read as RAS: %s says so", path.name, how, OPTIONS)
-    return scaled(surface, FACTORS[said or "as_is" if axes == "auto" else axes])
+    return scaled(surface, FACTORS[stated or "as_is" if axes == "auto" else axes])
 
 
 def turned_as_named(surface: Surface, path: Path, axes: str, in_lps: bool) -> Surface:
@@ -95,11 +95,11 @@ def stated(path: Path) -> str | None:
         InvalidPointCloudError: comments that contradict each other, columns of several kinds, or others than the
             comment says.
     """
-    said = _said(path)
-    return said[0] if said else None
+    stated = _stated(path)
+    return stated[0] if stated else None
 
 
-def _said(path: Path) -> tuple[str, str] | None:
+def _stated(path: Path) -> tuple[str, str] | None:
     """The axes that a file says, and how it does."""
     comment = _in_comment(path)
     named = columns.space(path) if path.suffix.lower() in columns.ENDINGS else None

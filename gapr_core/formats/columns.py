@@ -155,15 +155,15 @@ def unit(path: Path) -> str | None:
         return None
     named = [pair for way in (IN_BRACKETS, BY_ITSELF) for pair in way.findall(header.line)]
     words = {word.lower() for letter, word in named if letter.lower() in (used.space or "xyz")}
-    said = {UNITS[word] for word in words if word in UNITS}
+    stated = {UNITS[word] for word in words if word in UNITS}
     if others := sorted(words.intersection(OTHER_UNITS)):
         given = f"{path.name} with columns in {' and '.join(others)}"
         raise InvalidPointCloudError("coordinates in mm, cm, m or in", given, "convert them, and name the columns so")
-    if not said:
+    if not stated:
         return None
-    if len(said) > 1:
-        raise InvalidPointCloudError("one unit of all coordinates", " and ".join(sorted(said)), "correct the names")
-    return said.pop()
+    if len(stated) > 1:
+        raise InvalidPointCloudError("one unit of all coordinates", " and ".join(sorted(stated)), "correct the names")
+    return stated.pop()
 
 
 def unnamed(path: Path) -> int:

@@ -92,10 +92,10 @@ def _load(path: Path, limits: FileLimits) -> Markups:
 
 def save(path: Path, markups: Markups, descriptions: list[str] | None = None) -> None:
     """Write a point list that 3D Slicer loads."""
-    words = descriptions or [""] * len(markups.labels)
+    texts = descriptions or [""] * len(markups.labels)
     points = [
-        {"id": str(i), "label": label, "description": said, "position": point.tolist(), "positionStatus": "defined"}
-        for i, (point, label, said) in enumerate(zip(markups.points, markups.labels, words, strict=True), start=1)
+        {"id": str(i), "label": label, "description": text, "position": point.tolist(), "positionStatus": "defined"}
+        for i, (point, label, text) in enumerate(zip(markups.points, markups.labels, texts, strict=True), start=1)
     ]
     node = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
     write_json(path, {"@schema": SCHEMA, "markups": [node]})
@@ -168,24 +168,24 @@ def _is_placed(row: list[str], count: int) -> bool:
     """
     more = [cell.strip() for cell in row[count:]]
     if more and not (len(more) == 2 and more[0] in STATUS and more[1].isdecimal()):
-        counts, said = f"a row of {len(row)} values under {count} names", ",".join(row)[:50]
-        raise ValueError(f"{counts}, {said!r}: quote texts and numbers with a comma, and end no row with one")
+        counts, start = f"a row of {len(row)} values under {count} names", ",".join(row)[:50]
+        raise ValueError(f"{counts}, {start!r}: quote texts and numbers with a comma, and end no row with one")
     return not more or more[0] == PLACED
 
 
-def _mm_per_unit(said: object) -> float:
+def _mm_per_unit(stated: object) -> float:
     """Of one unit, of one with its code (mm, UCUM, millimeter; schema 1.0.3), or of the same one for each axis."""
-    if isinstance(said, list) and len(said) in (2, 3) and said[1] == "UCUM":
-        said = said[0]
-    units = set(map(str, said)) if isinstance(said, list) else {str(said)}
+    if isinstance(stated, list) and len(stated) in (2, 3) and stated[1] == "UCUM":
+        stated = stated[0]
+    units = set(map(str, stated)) if isinstance(stated, list) else {str(stated)}
     if len(units) != 1 or not units <= MM_PER_UNIT.keys():
-        raise ValueError(f"coordinateUnits {said!r}, none of {' '.join(MM_PER_UNIT)}")
+        raise ValueError(f"coordinateUnits {stated!r}, none of {' '.join(MM_PER_UNIT)}")
     return MM_PER_UNIT[units.pop()]
 
 
-def _space(said: object) -> str:
+def _space(stated: object) -> str:
     """The axes by their name; never a guess: the wrong one turns every point by 180 deg."""
-    known = NUMBERED.get(str(said).strip().lower())
+    known = NUMBERED.get(str(stated).strip().lower())
     if known is None:
-        raise ValueError(f"coordinateSystem {said!r}, neither LPS nor RAS")
+        raise ValueError(f"coordinateSystem {stated!r}, neither LPS nor RAS")
     return known

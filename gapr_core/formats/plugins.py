@@ -52,9 +52,9 @@ class Plugin:
             return self.entry.load()
         except ModuleNotFoundError as error:
             is_ours = self.entry.value.startswith("gapr_ros.")
-            what = "reading bags" if is_ours else f"files of the kind {self.entry.name}"
+            missing = "reading bags" if is_ours else f"files of the kind {self.entry.name}"
             how = f"pip install {OURS if is_ours else error.name}"
-            raise MethodUnavailableError(what, f"no {error.name}", how) from error
+            raise MethodUnavailableError(missing, f"no {error.name}", how) from error
 
 
 def of(path: Path) -> Plugin | None:

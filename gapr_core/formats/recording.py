@@ -84,8 +84,8 @@ def _bone(rr: Any, target: Surface) -> Any:
 
 def _words(result: RegistrationResult) -> str:
     """The answer; of a refusal, that there is no pose to use."""
-    said = str(result) if result.ok else f"{result}\nRefused: what is shown is the best hypothesis, to look at only."
-    return f"{said}\n{TIMELINE} 1 is the best; blue points are inside the bone, red ones outside."
+    text = str(result) if result.ok else f"{result}\nRefused: what is shown is the best hypothesis, to look at only."
+    return f"{text}\n{TIMELINE} 1 is the best; blue points are inside the bone, red ones outside."
 
 
 def _poses(result: RegistrationResult) -> list[tuple[Array, float]]:

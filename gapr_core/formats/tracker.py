@@ -206,8 +206,8 @@ def rigid_poses(array: Array, path: Path) -> Array:
         raise never_seen([0], ["tool 0"], path)
     for number, T in enumerate(poses):
         if not (np.abs(T) <= FARTHEST_MM).all() or (why := se3.why_not_rigid(T)):
-            said = f"pose {number} whose {why}" if (np.abs(T) <= FARTHEST_MM).all() else f"pose {number} far too large"
-            raise InvalidPointCloudError("rigid poses in mm", f"{path.name} with {said}", "leave it out, or set it NaN")
+            fault = f"pose {number} whose {why}" if (np.abs(T) <= FARTHEST_MM).all() else f"pose {number} far too large"
+            raise InvalidPointCloudError("rigid poses in mm", f"{path.name} with {fault}", "leave it out, or set NaN")
     return np.stack([se3.nearest_rigid(T) for T in poses])
 
 

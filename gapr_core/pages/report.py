@@ -62,8 +62,8 @@ class Report:
         self.title, self.lead = title, lead
         self._shown: list[tuple[str, Any]] = []
 
-    def _show(self, kind: str, what: Any) -> None:
-        self._shown.append((kind, what))
+    def _show(self, kind: str, shown: Any) -> None:
+        self._shown.append((kind, shown))
 
     def verdict(self, tone: str, headline: str, lines: Sequence[str]) -> None:
         """The outcome in words and a colour: "accepted", "caution" or "refused"."""

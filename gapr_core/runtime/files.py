@@ -129,8 +129,8 @@ def alone_in(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = _locked(folder, wait=False)
     except BlockingIOError as error:
-        what, how = "a folder in which nothing runs yet", "wait for its end, stop it, or choose another folder"
-        raise ConfigError(what, f"{folder}, in which another process does", how) from error
+        expected, how = "a folder in which nothing runs yet", "wait for its end, stop it, or choose another folder"
+        raise ConfigError(expected, f"{folder}, in which another process does", how) from error
     except OSError as error:
         raise unwritable(folder, error) from error
     try:
@@ -194,7 +194,7 @@ def write_json(path: str | Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
-def read_json(path: str | Path, what: str, how: str = "check the path, or make the file again") -> Any:
+def read_json(path: str | Path, expected: str, how: str = "check the path, or make the file again") -> Any:
     """Read the content of a JSON file.
 
     Args:
@@ -209,7 +209,7 @@ def read_json(path: str | Path, what: str, how: str = "check the path, or make t
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
-        raise ConfigError(what, f"{path} ({why})", how) from error
+        raise ConfigError(expected, f"{path} ({why})", how) from error
 
 
 def _refuse_folder(path: Path) -> None:

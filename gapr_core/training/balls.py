@@ -85,8 +85,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _rows(bone: str, sizes: Counts, config: ModelConfig) -> list[list[str]]:
     facts = zip(sizes, caps_for(sizes), config.neighbors, share_cut(sizes, config.neighbors), strict=True)
     return [
-        [bone, str(stage), str(len(s)), f"{np.median(s):.0f}", str(enough), str(cap), f"{100 * cut:.1f} %"]
-        for stage, (s, enough, cap, cut) in enumerate(facts)
+        [bone, str(stage), str(len(s)), f"{np.median(s):.0f}", str(ball_size), str(cap), f"{100 * cut:.1f} %"]
+        for stage, (s, ball_size, cap, cut) in enumerate(facts)
     ]
 
 

@@ -28,8 +28,8 @@ def save_checkpoint(
     for index, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": t for name, t in moments.items()}
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
-    said = json.dumps(state)
-    write_tensors(contiguous, path, {"state": said, "sha256": checksum(contiguous, said)})
+    text = json.dumps(state)
+    write_tensors(contiguous, path, {"state": text, "sha256": checksum(contiguous, text)})
 
 
 def load_checkpoint(path: Path, network: GAPRNet, ema: GAPRNet, optimizer: torch.optim.Optimizer) -> dict[str, Any]:

@@ -66,10 +66,10 @@ def summary(folders: Iterable[Path]) -> list[str]:
 
 
 def _read(path: Path) -> list[Entry]:
-    what, how = "the provenance of a training run", "restore it, or move it out of the folder"
-    found = read_json(path, what, how)
+    expected, how = "the provenance of a training run", "restore it, or move it out of the folder"
+    found = read_json(path, expected, how)
     if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
-        raise ConfigError(what, f"{path} with other content", how)
+        raise ConfigError(expected, f"{path} with other content", how)
     return found
 
 

@@ -51,12 +51,12 @@ def _changes(begun: Settings, now: Settings) -> list[str]:
 
 def _begun_with(path: Path) -> tuple[TrainConfig, ModelConfig]:
     """The settings in a config.json."""
-    what, how = "the settings of a training run", "restore it, or choose a new folder"
-    begun = files.read_json(path, what, how)
+    expected, how = "the settings of a training run", "restore it, or choose a new folder"
+    begun = files.read_json(path, expected, how)
     try:
         return TrainConfig.from_dict(begun["train"]), ModelConfig.from_dict(begun["model"])
     except (KeyError, TypeError) as error:
-        raise ConfigError(what, f"{path} with other content", how) from error
+        raise ConfigError(expected, f"{path} with other content", how) from error
 
 
 def claim(
@@ -141,10 +141,10 @@ def append(path: Path, row: dict[str, Any]) -> None:
     with path.open("a+b") as file:
         size = file.seek(0, 2)
         file.seek(max(size - 4096, 0))
-        whole = size - len(file.read().rpartition(b"\n")[2])
-        file.truncate(whole)
+        full_lines = size - len(file.read().rpartition(b"\n")[2])
+        file.truncate(full_lines)
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, list(row))
-        if whole == 0:
+        if full_lines == 0:
             writer.writeheader()
         writer.writerow(row)

@@ -55,8 +55,8 @@ def test_the_command_line_answers_without_loading_torch_or_open3d():
 
 
 def test_message_adapters_import_numpy_and_messages_only():
-    strangers = {name for name in third_party("msg_adapters") if name != "numpy" and not is_message_package(name)}
-    assert not strangers
+    others = {name for name in third_party("msg_adapters") if name != "numpy" and not is_message_package(name)}
+    assert not others
 
 
 def is_message_package(name):

@@ -24,13 +24,13 @@ def read(path: Path, options: ReadOptions) -> Surface:
     limits = options.limits
     data = limits.read(path)
     header, start = _header(data)
-    count, fields = _whole(header, "POINTS"), _fields(header)
+    count, fields = _integer(header, "POINTS"), _fields(header)
     limits.check_counts(count)
     limits.check_unpacked(count * fields.itemsize)
     columns = _columns(data[start:], header["DATA"][0], fields, count)
     normals = ("normal_x", "normal_y", "normal_z")
     points = _stack(columns, ("x", "y", "z"))
-    camera = pinhole.centre_of(points.reshape(_whole(header, "HEIGHT"), -1, 3)) if count else None
+    camera = pinhole.centre_of(points.reshape(_integer(header, "HEIGHT"), -1, 3)) if count else None
     if not _is_identity(header.get("VIEWPOINT", [])):
         log.warning("%s: VIEWPOINT is not applied: the pose is of the numbers in the file", path.name)
     return Surface(points, None, _stack(columns, normals) if set(normals) <= set(columns) else None, camera)
@@ -49,13 +49,13 @@ def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
             header[words[0].upper()] = words[1:]
     if missing := [key for key in KEYS if not header.get(key)]:
         raise ValueError(f"no {' '.join(missing)} in its header")
-    width, height, points = (_whole(header, key) for key in ("WIDTH", "HEIGHT", "POINTS"))
+    width, height, points = (_integer(header, key) for key in ("WIDTH", "HEIGHT", "POINTS"))
     if width * height != points:
         raise ValueError(f"{width} x {height} points where {points} are announced")
     return header, at
 
 
-def _whole(header: dict[str, list[str]], key: str) -> int:
+def _integer(header: dict[str, list[str]], key: str) -> int:
     """The number after a key."""
     word = header[key][0]
     if not word.isdecimal():

@@ -30,7 +30,7 @@ from gapr_core.data.anatomy import SPLITS
 from gapr_core.data.make_pairs import MANIFEST, Recipe, read_manifest, write_pairs
 from gapr_core.data.pair_files import load_pair
 from gapr_core.data.pool import specimens
-from gapr_core.data.protocols import STRANGERS, Pair
+from gapr_core.data.protocols import NO_RIGHT_POSE, Pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.model import weights
 from gapr_core.model.network import GAPRNet
@@ -147,7 +147,7 @@ def ablate(
 
 def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
     """The pairs of the examination, made once: the same for every network."""
-    without = [name for name in recipe.protocols if name in STRANGERS]
+    without = [name for name in recipe.protocols if name in NO_RIGHT_POSE]
     if without:
         raise ConfigError("protocols with a true pose", ", ".join(without), "leave them out")
     complete = (folder / MANIFEST).exists() and read_manifest(folder)

@@ -118,7 +118,7 @@ def markdown(rows: Sequence[Record], apart: Sequence[Record], pictures: dict[str
             compared = [r for r in apart if (r["table"], r["protocol"]) == (table, protocol) and r["pairs"]]
             if compared:
                 parts.append(f"Less the last row, on the same pairs with the same seeds ({compared[0]['last']}):")
-                lines = [[r["network"], r["seeds"], *_figures(r, "+.1f")] for r in compared]
+                lines = [[r["network"], r["seeds"], *_cells(r, "+.1f")] for r in compared]
                 parts.append(table_of(["network", "seeds", *FIGURES.values()], lines))
         parts += [f"![curves]({picture})"] if picture else []
     return "\n\n".join([*parts, *settings["made"]]) + "\n"
@@ -139,10 +139,10 @@ def _preamble(settings: Record) -> str:
 
 def _cells(r: Record, has_paper: bool) -> list[str]:
     on_paper = ["–" if r["paper_rr_percent"] is None else f"{r['paper_rr_percent']:.1f}"]
-    return [r["network"], *_figures(r, ".1f"), *(on_paper if has_paper else [])]
+    return [r["network"], *_cells(r, ".1f"), *(on_paper if has_paper else [])]
 
 
-def _figures(r: Record, form: str) -> list[str]:
+def _cells(r: Record, form: str) -> list[str]:
     """Means and intervals in %, as text."""
     numbers = [[r[name + end] for end in ("", "_low", "_high")] for name in FIGURES]
     texts = [[format(100 * value, form) for value in found if value is not None] for found in numbers]

@@ -1,6 +1,7 @@
 """Bones that are not the target's: how many sources of another subject, or of the other side, are accepted.
 
-    `python benchmarks/strangers.py --anatomy DIR --out DIR [--count 2000] [--mirrored 300] [--sides 60] [--similar 0]`
+    `python benchmarks/other_subjects.py --anatomy DIR --out DIR [--count 2000] [--mirrored 300] [--sides 60]
+     [--similar 0]`
 
 Sources are of the same bone of another subject, seen as at L3, of every target and subject in turn; or of the mirrored
 femur or tibia, which has no pose on this one; or of the mirrored pelvis or rib cage, which is much the same bone and is

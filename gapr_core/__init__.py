@@ -71,5 +71,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """What a notebook offers after `gapr_core.`: the public names, those not loaded yet among them."""
+    """List the public names for a notebook, those not loaded yet among them."""
     return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

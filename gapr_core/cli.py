@@ -114,13 +114,13 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 
 def modules() -> Mapping[str, str]:
-    """The module of every command: ours, and those that other packages add."""
+    """Map every command to its module: ours, and those that other packages add."""
     others = {entry.name: entry.module for entry in entry_points(group="gapr.commands")}
     return COMMANDS | {name: others[name] for name in sorted(others.keys() - COMMANDS.keys())}
 
 
 def _load(command: argparse.ArgumentParser, name: str, runs: bool) -> None:
-    """The options of the one command that is called; no other module is imported.
+    """Add the options of the called command; import no other module.
 
     Help for a command whose libraries are not installed says what it does, and how to install them.
     """
@@ -138,12 +138,12 @@ def _load(command: argparse.ArgumentParser, name: str, runs: bool) -> None:
 
 
 def _first_line(module: str) -> str:
-    """What a command does, in a line."""
+    """Return a command's help in one line."""
     return _docstring(module).splitlines()[0].partition(": ")[2] or "not installed"
 
 
 def _docstring(module: str) -> str:
-    """What a module says of itself, read without running it."""
+    """Read the docstring of a module without running it."""
     try:
         spec = find_spec(module)
     except ModuleNotFoundError:

@@ -34,18 +34,16 @@ def load(
     *,
     of_bone: bool = True,
 ) -> Surface:
-    """A surface in mm from a file, an array or another surface.
+    """Load a surface in mm from a file, an array or another surface.
 
     Args:
-        source: path to a mesh or cloud (PLY, PCD, STL, OBJ, VTK, VTP, XYZ, CSV, NPY, or NPZ with `points` and `faces`),
-            a label map (NIfTI, NRRD, MHA, DICOM SEG), markups or tracked slices; an (N, 3) array of floats (rows that
-            are not finite are dropped); or a `Surface`.
-        units: what the numbers are, "mm", "cm", "m" or "in"; "auto" takes what the names of the columns say, or
-            guesses mm or m from the extent and logs a warning.
-            Files in patient coordinates (label maps, markups) and a tracker's recordings are in mm, whatever is named
-            here.
+        source: path to a mesh or cloud, a label map, markups or tracked slices (docs/reference/formats.md); an (N, 3)
+            array of floats, of which finite rows are kept; or a `Surface`.
+        units: "mm", "cm", "m" or "in"; "auto" takes the unit in the names of the columns, or guesses mm or m from the
+            extent and logs a warning. Files in patient coordinates (label maps, markups) and a tracker's recordings are
+            in mm, whatever is named here.
         options: axes of a mesh, labels of a label map, limits (see `ReadOptions`).
-        of_bone: whether it must have the size of a bone or of a piece of one; False for single points.
+        of_bone: checks for the size of a bone or a piece of one; False for single points.
 
     A mesh file or a label of several separate long bones is read as one body, with a warning.
 
@@ -87,7 +85,7 @@ def load(
 
 
 def _checked(surface: Surface) -> Surface:
-    """A surface of the caller's own, with arrays where it has lists."""
+    """Check a caller's surface; turn its lists into arrays."""
     points, faces, normals = as_points(surface.points), surface.faces, surface.normals
     if faces is not None:
         faces = as_array(faces, "triangles as (F, 3) integers", "triangulate the mesh")
@@ -100,7 +98,7 @@ def _checked(surface: Surface) -> Surface:
 
 
 def finite_points(array: ArrayLike) -> Array:
-    """The rows of an (N, 3) array that can be points: finite, and none beyond 1e12; may be empty."""
+    """Keep the finite rows of an (N, 3) array below 1e12; the result may be empty."""
     points = as_points(array)
     return points[is_point(points)]
 
@@ -178,7 +176,7 @@ def _warn_of_columns(path: Path, surface: Surface) -> None:
 
 
 def _agreed(units: str, stated: str | None, name: str) -> str:
-    """The unit named, or with "auto" the one that the file says.
+    """Return the named unit, or with "auto" the file's.
 
     Raises:
         InvalidPointCloudError: they contradict each other.
@@ -192,7 +190,7 @@ def _agreed(units: str, stated: str | None, name: str) -> str:
 
 
 def _known(surface: Surface, units: str, name: str) -> str:
-    """The unit named, or with "auto" the one that the extent suggests."""
+    """Return the named unit, or with "auto" the one that fits the extent."""
     if units == "auto":
         units = "m" if surface.extent_mm < EXTENT_LIMITS_MM[0] else "mm"
         log.warning("%s is %.3g across: taken to be in %s; name the unit to be sure", name, surface.extent_mm, units)
@@ -202,7 +200,7 @@ def _known(surface: Surface, units: str, name: str) -> str:
 
 
 def _check_size(surface: Surface, unit: str, name: str, how: str) -> None:
-    """As `check_extent`; a few points that are metres from all others are named as such, also in no face of a mesh."""
+    """Check the extent, and name a few points metres from all others, also in no face of a mesh."""
     mm, (low, high) = MM_PER_UNIT[unit], EXTENT_LIMITS_MM
     if surface.extent_mm * mm > high:
         far = np.linalg.norm(surface.points - np.median(surface.points, axis=0), axis=1) * mm > high
@@ -236,7 +234,7 @@ def _drop_non_finite(surface: Surface, name: str) -> Surface:
 
 
 def _warn_of_several_bones(surface: Surface, name: str) -> None:
-    """A rigid pose of two bones that move against each other is that of neither."""
+    """Warn of several bones: if they move apart, no rigid pose fits any of them."""
     if surface.faces is None or not len(surface.faces):
         return
     from gapr_core.geometry.long_bones import separate_long_bones

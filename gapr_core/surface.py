@@ -43,7 +43,7 @@ class Surface:
         return cls(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
 
     def to_open3d(self) -> Any:
-        """The mesh as an `open3d.geometry.TriangleMesh`, mm, without normals.
+        """Return the mesh as an `open3d.geometry.TriangleMesh`, mm, without normals.
 
         Raises:
             InvalidPointCloudError: for a cloud without faces.
@@ -79,7 +79,7 @@ class Surface:
         return 0.5 * self._face_crosses()[1]
 
     def mirrored(self) -> Surface:
-        """The mesh of the other side of the body: x negated, faces turned so that normals stay outward.
+        """Mirror the mesh to the other side of the body: x negated, normals still outward.
 
         Raises:
             InvalidPointCloudError: for a cloud without faces.
@@ -132,7 +132,7 @@ def check_faces(surface: Surface, name: str) -> None:
 
 
 def as_points(array: ArrayLike) -> Array:
-    """An (N, 3) float64 array from anything of that shape; masked entries become NaN.
+    """Convert anything of the shape (N, 3) to a float64 array; masked entries become NaN.
 
     Fields x y z of a structured array, such as `read_points` of ROS gives, are its columns. Of a camera's image
     (H, W, 3) the rows follow each other, and a pixel of 0 0 0 has no depth: it becomes NaN.
@@ -169,7 +169,7 @@ def as_points(array: ArrayLike) -> Array:
 
 
 def as_array(array: Any, expected: str, how: str) -> NDArray[Any]:
-    """A NumPy array; a tensor is taken without its gradient, from whatever device it is on.
+    """Convert to a NumPy array; a tensor may need a gradient or live on any device.
 
     Raises:
         InvalidPointCloudError: what cannot be one, such as rows of several lengths; with these words.

@@ -16,7 +16,7 @@ from gapr_core.runtime import files, origin
 
 
 def read_json(path: Path) -> RegistrationResult:
-    """The accepted pose that `RegistrationResult.to_json` gave, with its covariance.
+    """Read the accepted pose that `RegistrationResult.to_json` wrote, with its covariance.
 
     Raises:
         ConfigError: no such file, another one, or an answer without a pose.
@@ -52,7 +52,7 @@ def _array(values: Any, shape: tuple[int, ...], path: Path) -> NDArray[np.float6
 
 
 def made_by(method: str, config: RegistrarConfig) -> dict[str, Any]:
-    """What made an answer: the method, whether its confidence is calibrated, the version, settings and weights."""
+    """Name the makers of an answer: method, calibration of its confidence, version, settings and weights."""
     from gapr_core.benchmark import methods
 
     by = {"method": method, "calibrated": method in methods.OWN, "weights": methods.made_of(method)}

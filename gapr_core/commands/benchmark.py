@@ -39,7 +39,7 @@ DEFAULT_METHODS = "gapr,kiss4,fpfh_ransac+point_to_plane,icp"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr benchmark`."""
+    """Add the options of `gapr benchmark`."""
     parser.add_argument("merge", nargs="*", help="`merge DIR...`: join the outputs of several shards into --out")
     parser.add_argument("--pairs", type=a_path, help="folder of NAME.npz, as gapr make-pairs writes it")
     parser.add_argument(
@@ -86,7 +86,7 @@ def benchmark(
     config: RegistrarConfig | None = None,
     dask: str | None = None,
 ) -> list[Row]:
-    """Run what is not yet in `out`, then write table, plots and report there.
+    """Run missing cases of `out`, then write table, plots and report there.
 
     Args:
         pairs: folder of NAME.npz (see `gapr_core.data.pair_files`).
@@ -103,8 +103,8 @@ def benchmark(
         The rows of the table.
 
     Raises:
-        ConfigError: no pairs, an unknown method, settings without a method of ours, or results of other pairs or
-            settings in `out`; a pair without a truth; `ours` that is none of the methods.
+        ConfigError: no pairs, an unknown method, settings without a method of ours, other pairs or settings in `out`; a
+            pair without a truth; an unknown `ours`.
         InvalidPointCloudError: a file that is no pair, or whose truth, landmarks or facts cannot be.
         MethodUnavailableError: a method whose library is not installed.
     """
@@ -163,7 +163,7 @@ def merge(folders: Sequence[Path], out: Path, ours: str | None = None) -> list[R
 
 
 def _join(folders: Sequence[Path], out: Path, ours: str | None) -> None:
-    """The records and the plan of all shards in `out`."""
+    """Collect the records and the plan of all shards in `out`."""
     plans = [records.read_plan(folder) for folder in folders]
     pairs: dict[str, str] = {}
     for folder, plan in zip(folders, plans, strict=True):
@@ -202,7 +202,7 @@ def write(out: Path, plan: Plan) -> list[Row]:
 
 
 def _hashes(pairs: Path, paths: Sequence[Path]) -> dict[str, str]:
-    """Name to sha256 of all pairs of a folder, with a warning of truths that seem to be written in another way."""
+    """Map name to sha256 for all pairs of a folder; warn of truths with suspicious conventions."""
     listed = listed_hashes(pairs)
     missing = [path for path in paths if path.stem not in listed]
     read, doubts = {}, []
@@ -229,7 +229,7 @@ def _plan(pairs: Path, hashes: dict[str, str], methods: Sequence[str], ours: str
 
 
 def listed_hashes(pairs: Path) -> dict[str, str]:
-    """Name to sha256 of what the folder's manifest lists, so that no shard has to read all pairs; empty without one."""
+    """Map name to sha256 from the folder's manifest, so no shard reads all pairs; empty without one."""
     if not (pairs / MANIFEST).is_file():
         return {}
     return {entry["name"]: entry["sha256"] for entry in read_manifest(pairs)["pairs"]}
@@ -249,14 +249,14 @@ def _check_ours(ours: str | None, methods: Sequence[str]) -> None:
 
 
 def _check_same_pairs(joined: Sequence[Record], pairs: dict[str, str], out: Path) -> None:
-    """No record of another run may be lost, nor mixed with these."""
+    """Refuse to lose records of another run, or to mix them with these."""
     unknown = [r.pair for r in joined if pairs.get(r.pair) != r.sha256]
     if unknown:
         raise ConfigError("an --out that is empty, or of the same pairs", f"{unknown[0]} in {out}", "choose another")
 
 
 def _notes(found: Sequence[Record], plan: Plan, conditions: dict[str, list[str]]) -> list[str]:
-    """What a reader must know before the numbers."""
+    """List notes a reader needs before the numbers."""
     notes = []
     wanted, there = len(plan.pairs) * len(plan.methods), len(found)
     if there < wanted:

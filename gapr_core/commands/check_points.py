@@ -28,7 +28,7 @@ CLOSE_MM = 1.0  # a bone in m has less than one of them
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr check-points`; docs/how-to/check_points.md explains the answer."""
+    """Add the options of `gapr check-points`; docs/how-to/check_points.md explains the answer."""
     parser.add_argument(
         "--points", required=True, type=a_path, help="touched points, source frame: markups, cloud or recording"
     )
@@ -49,7 +49,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Print the answer; exit code 0 where the pose holds, 2 where it does not or the points say too little.
+    """Print the answer; exit code 0 if the pose holds, 2 if not or if points are too few.
 
     Raises:
         GaprError: options or files that cannot be used.
@@ -88,7 +88,7 @@ def _warn_of_units(path: Path, extent_mm: float) -> None:
 
 
 def _labels(path: Path, count: int) -> list[str]:
-    """What markups call their points, since some of a list may not be placed; nothing of other files."""
+    """Return the labels of placed markups; empty for other files."""
     from gapr_core.formats import markups, reading
 
     labels = markups.load(path).labels if reading.format_of(path) is reading.MARKUPS else ("",) * count
@@ -96,7 +96,7 @@ def _labels(path: Path, count: int) -> list[str]:
 
 
 def _show(found: PointCheck, within_mm: float, labels: list[str]) -> None:
-    """The answer in words, every point, and what to do."""
+    """Print the answer in words, every point, and the next step."""
     from gapr_core.results import Verdict
 
     say(str(found))
@@ -132,7 +132,7 @@ def _say_elsewhere(points: Array, bone: Array, result: RegistrationResult) -> No
 
 
 def _as_json(found: PointCheck) -> dict[str, Any]:
-    """The keys of docs/reference/json.md."""
+    """Return the keys of docs/reference/json.md."""
     return {
         "verdict": str(found.verdict),
         "probability": found.probability,

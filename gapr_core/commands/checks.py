@@ -29,11 +29,11 @@ MUCH_NEARER = 0.3  # share of that distance that is left with the axes turned, o
 
 
 def check_outputs(args: Namespace) -> None:
-    """Raise before the work for outputs that cannot be written, or that do not go with an input.
+    """Raise before the work for outputs that cannot be written, or do not fit an input.
 
     Raises:
-        ConfigError: an ending that nothing is written to, a folder that cannot be written, the file of another
-            option, files of others in the folder of a scene, or files in LPS of a bone that is turned to RAS.
+        ConfigError: an unknown ending, a folder that cannot be written, the file of another option, foreign files in a
+            scene's folder, or files in LPS of a bone in RAS.
         MethodUnavailableError: a library that an output needs is not installed.
     """
     _check_kinds(args)
@@ -72,7 +72,7 @@ def _check_kinds(args: Namespace) -> None:
 
 
 def _inputs(args: Namespace) -> list[Named]:
-    """The option and the path of every file or folder that is read."""
+    """List option and path of every file or folder to read."""
     named = [("--source", args.source), ("--target", args.target), ("--targets", args.targets)]
     named += [("--landmarks", path) for path in args.landmarks or ()] + [("--config", args.config)]
     named += [("--initial", args.initial)]
@@ -80,7 +80,7 @@ def _inputs(args: Namespace) -> list[Named]:
 
 
 def _outputs(args: Namespace) -> list[Named]:
-    """The option and the path of every file that is written, those of a scene as well."""
+    """List option and path of every file to write, those of a scene as well."""
     named = [(f"--{name}", getattr(args, name)) for name in ("out", "residuals", "report", "rerun", "json")]
     outputs = [(option, path) for option, path in named if path]
     if not args.slicer:
@@ -152,7 +152,7 @@ def check_answer(args: Namespace, result: RegistrationResult) -> None:
 
 
 def files_in_lps(args: Namespace) -> dict[str, Path]:
-    """The option and the path of every file that is LPS by definition and in the frame of the target."""
+    """List option and path of every file that is LPS by definition and in the target's frame."""
     residuals = args.residuals if args.residuals and args.residuals.suffix.lower() == ".ply" else None
     landmarks = args.landmarks[1] if args.landmarks else None
     named = {"--out": args.out, "--slicer": args.slicer, "--residuals": residuals, "--targets": args.targets,
@@ -193,7 +193,7 @@ def warn_of_tracker(args: Namespace) -> None:
 
 
 def _is_tracked(args: Namespace) -> bool:
-    """Whether the numbers of the source are a tracker's."""
+    """Tell whether the numbers of the source are a tracker's."""
     from gapr_core.formats import reading
     from gapr_core.formats.options import ReadOptions
 
@@ -202,12 +202,12 @@ def _is_tracked(args: Namespace) -> bool:
 
 
 def _files_of_itk(args: Namespace) -> list[Path]:
-    """The outputs whose transform is LPS on both sides, as ITK and 3D Slicer want it."""
+    """List the outputs whose transform is LPS on both sides, for ITK and 3D Slicer."""
     return [path for path in (args.out, args.slicer) if path and path.suffix != ".txt"]
 
 
 def warn_of_units(args: Namespace) -> None:
-    """Warn of a unit that no file takes, since those it is of are of a kind that is in mm."""
+    """Warn of a unit without effect: files of such kinds are in mm."""
     from gapr_core.formats import reading
     from gapr_core.formats.options import ReadOptions
 
@@ -225,7 +225,7 @@ def warn_of_units(args: Namespace) -> None:
 
 
 def warn_of_landmarks(args: Namespace, source: Array, target: Array) -> None:
-    """Warn of landmarks that are far from their cloud, source or target (N, 3), mm, and near it with other axes."""
+    """Warn of landmarks far from their cloud (N, 3), mm, that other axes would bring near."""
     from gapr_core.formats import markups
 
     files = zip(args.landmarks or (), (args.source, args.target), (source, target), strict=False)
@@ -264,7 +264,7 @@ def warn_of_frames(args: Namespace, source: Array, target: Array) -> None:
 
 
 def warn_of_start(args: Namespace, start: Array | None, source: Array, target: Array) -> None:
-    """Warn of a transform whose inverse would lay the source (N, 3) on the target (M, 3), mm, and which does not."""
+    """Warn of a transform whose inverse, but not itself, lays the source on the target (mm)."""
     if start is None or not args.initial:
         return
     apart_mm, turned_mm = (median_mm(se3.apply(T, source), target) for T in (start, se3.inverse(start)))
@@ -274,7 +274,7 @@ def warn_of_start(args: Namespace, start: Array | None, source: Array, target: A
 
 
 def _is_elsewhere(path: Path, cloud: Array, other: Array) -> bool:
-    """Whether markups are far from the cloud (N, 3), mm, in whose frame they should be, and near the other one."""
+    """Tell whether markups are far from their own cloud (N, 3), mm, and near the other one."""
     from gapr_core.formats import markups
 
     points = markups.load(path).points

@@ -29,7 +29,7 @@ OK = 0
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The command has no options."""
+    """Add no options."""
 
 
 def run(args: Namespace) -> int:
@@ -65,7 +65,7 @@ def all_ways() -> Iterator[Callable[[], Any]]:
 
 
 def made_up_bone() -> Surface:
-    """A closed mesh of the size of a knee, mm, that is symmetric in y alone."""
+    """Make a closed mesh of the size of a knee, mm, symmetric in y alone."""
     directions = fibonacci_directions(6000)
     x, y, z = directions.T
     radius = 1.0 + 0.2 * np.sin(3.0 * x + 1.0) * np.cos(2.0 * y) + 0.1 * np.sin(5.0 * z + 2.0 * x)

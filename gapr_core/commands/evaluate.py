@@ -36,7 +36,7 @@ OK, BAD_INPUT = 0, 1
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr evaluate`."""
+    """Add the options of `gapr evaluate`."""
     parser.add_argument("--pairs", required=True, type=a_path, help="folder of NAME.npz with source and target, mm")
     parser.add_argument(
         "--out", required=True, type=a_path, help="file for the answers, poses.json; keys: docs/reference/json.md"
@@ -46,7 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """A pose or a refusal for every pair; never looks at the truth."""
+    """Answer every pair with a pose or a refusal; never looks at the truth."""
     files.check_writable(args.out)
     args.method = options.method_name(args)
     paths = pair_paths(args.pairs)[: args.limit]
@@ -75,7 +75,7 @@ def run(args: Namespace) -> int:
 
 
 def _written(path: Path, new: dict[str, Answer]) -> dict[str, Answer]:
-    """All answers in the file, the new ones among them: another run may have written some meanwhile."""
+    """Write the new answers beside those of other runs, read again from the file."""
     with files.one_at_a_time(path):
         answers = _answers_so_far(path) | new
         files.write_json(path, answers)
@@ -83,7 +83,7 @@ def _written(path: Path, new: dict[str, Answer]) -> dict[str, Answer]:
 
 
 def _say_counts(path: Path, answers: dict[str, Answer]) -> int:
-    """How many pairs had which status; the first that cannot be read says why; exit code 1 where none can be."""
+    """Count pairs by status, with the first invalid pair's error; exit code 1 if none is valid."""
     counts = Counter(str(answer["status"]) for answer in answers.values())
     say(f"{path}: {len(answers)} pairs" + "".join(f", {count} {status}" for status, count in counts.most_common()))
     invalid = [(name, answer["reason"]) for name, answer in answers.items() if answer["status"] == INVALID_INPUT]
@@ -94,7 +94,7 @@ def _say_counts(path: Path, answers: dict[str, Answer]) -> int:
 
 
 def _digest(path: Path) -> str:
-    """What tells a pair from another one of the same name; empty when it cannot be read."""
+    """Return a hash of a pair, for pairs of one name; empty for an unreadable one."""
     try:
         return sha256(path.read_bytes()).hexdigest()
     except OSError:
@@ -102,7 +102,7 @@ def _digest(path: Path) -> str:
 
 
 def _answers_so_far(path: Path) -> dict[str, Answer]:
-    """What an earlier run has written, by the name of the pair."""
+    """Read an earlier run's answers, by the name of the pair."""
     if not path.exists():
         return {}
     expected = "a file that `gapr evaluate` has written"
@@ -113,7 +113,7 @@ def _answers_so_far(path: Path) -> dict[str, Answer]:
 
 
 def _answer(path: Path, method: RegistrationMethod) -> Answer:
-    """The answer to one pair; one that cannot be read, or on which the method fails, is refused; the others go on."""
+    """Answer one pair; refuse one that is unreadable or fails, so the others go on."""
     try:
         source, target, viewpoint = load_clouds(path)
         start = time.perf_counter()

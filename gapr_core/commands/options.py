@@ -45,7 +45,7 @@ def add_settings(parser: ArgumentParser) -> None:
 
 
 def registrar_config(args: Namespace) -> RegistrarConfig:
-    """The settings that the arguments name, the defaults for all others.
+    """Read the settings from the arguments, with defaults for all others.
 
     Raises:
         ConfigError: an unknown setting, a value out of range, or a file that cannot be read.
@@ -81,7 +81,7 @@ def place(text: str) -> tuple[float, float, float]:
 
 
 def load(path: Path, units: str | None, of_bone: bool = True, **how: Any) -> Surface:
-    """A file in the unit that is named, or that files of its kind usually have; `how` are fields of `ReadOptions`.
+    """Load a file in the named unit or the usual one; `how` are fields of `ReadOptions`.
 
     See `clouds.load` for `of_bone`.
     """

@@ -32,7 +32,7 @@ TRAINED = {4: ("Backbone (table IV)", "Final cross-attention (table IV)"), 5: ("
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr paper`."""
+    """Add the options of `gapr paper`."""
     parser.add_argument("--table", type=int, required=True, choices=(*PROTOCOLS, *TRAINED), help="of the paper")
     parser.add_argument("--out", type=a_path, required=True, help="folder of the table; an interrupted one goes on")
     parser.add_argument("--weights", type=a_path, help="of the network in tables 1 to 3 (gapr train wrote them)")

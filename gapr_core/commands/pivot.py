@@ -13,7 +13,7 @@ OK = 0
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr pivot`."""
+    """Add the options of `gapr pivot`."""
     parser.add_argument("recording", type=a_path, help="NDI Track's CSV, or a PLUS sequence (.igs.mha)")
     parser.add_argument("--tool", type=int, help="which of several recorded tools, from 0")
     parser.add_argument("--reference", type=int, metavar="TOOL", help="the tool that the dimple moves with, from 0")

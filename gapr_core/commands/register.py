@@ -27,7 +27,7 @@ OK, REFUSED = 0, 2
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr register`; docs/reference/formats.md explains formats, axes and units."""
+    """Add the options of `gapr register`; docs/reference/formats.md explains formats, axes and units."""
     parser.add_argument(
         "--source", required=True, type=a_path, help="partial cloud, markups, recording, folder of slices, bag"
     )
@@ -167,7 +167,7 @@ def _hints(args: Namespace, method: Any) -> dict[str, Any]:
 
 
 def _seen(args: Namespace, method: Any, source: Surface) -> dict[str, Any]:
-    """Where the camera was, if the source shows it, nobody says otherwise, and the method wants to know."""
+    """Take the camera's place from the source, if it is not given and the method needs one."""
     from gapr_core.baselines.base import takes
     from gapr_core.geometry import pinhole
 
@@ -182,7 +182,7 @@ def _seen(args: Namespace, method: Any, source: Surface) -> dict[str, Any]:
 
 
 def _show(args: Namespace, result: RegistrationResult) -> int:
-    """The result in words, before a file can fail."""
+    """Print the result in words, before a file can fail."""
     say(str(result))
     for line in (*result.targets, *(f"warning: {warning}" for warning in result.warnings)):
         say(str(line))
@@ -198,7 +198,7 @@ def _show(args: Namespace, result: RegistrationResult) -> int:
 
 
 def _say_where_next(result: RegistrationResult) -> None:
-    """The best patches in order, or why there are none."""
+    """List the best patches in order, or why there are none."""
     if result.guidance is None:
         seen = "the source shows the whole bone" if result.best is not None else "no hypothesis was found"
         say(f"where to look next: not known, {seen}")
@@ -212,7 +212,7 @@ def _say_where_next(result: RegistrationResult) -> None:
 
 
 def _write(args: Namespace, result: RegistrationResult, config: RegistrarConfig) -> None:
-    """The files that were asked for; those of a pose only where there is one."""
+    """Write the requested files; those of a pose only after one was accepted."""
     with files.together():
         _write_all(args, result, config)
 

@@ -78,7 +78,7 @@ class Picture:
 def draw(
     surface: Surface, view: View, mm_per_pixel: float = 0.7, margin_mm: float = 8.0, values: Array | None = None
 ) -> Picture:
-    """An orthographic picture: light from the eye and from above, what is farther away darker.
+    """Draw an orthographic picture: light from the eye and from above, farther is darker.
 
     Args:
         surface: mesh or cloud, mm.

@@ -33,10 +33,10 @@ OPTIONS = "--axes, --source-axes or model_axes"
 
 
 def turned(surface: Surface, path: Path, axes: str) -> Surface:
-    """The surface of a mesh or cloud file, turned once at most.
+    """Turn the surface of a mesh or cloud file into LPS, once at most.
 
-    What the caller says wins over the file, and a contradiction is logged; "lps_to_ras" says LPS as well, and what it
-    makes of a file that says RAS would be neither, so that is refused.
+    The caller's axes win over the file's, and a contradiction is logged. "lps_to_ras" states LPS as well, so a file in
+    RAS is refused.
 
     Args:
         surface: as it is in the file.
@@ -64,7 +64,7 @@ def turned(surface: Surface, path: Path, axes: str) -> Surface:
 
 
 def turned_as_named(surface: Surface, path: Path, axes: str, in_lps: bool) -> Surface:
-    """The surface of a file that is LPS by its kind (`in_lps`), or in the axes of a tracker, which the caller may name.
+    """Turn the surface of a file in LPS (`in_lps`), or in a tracker's axes, into the named axes.
 
     Raises:
         ConfigError: unknown axes, or "ras" of a file that says its axes.
@@ -89,7 +89,7 @@ def scaled(surface: Surface, factors: Array) -> Surface:
 
 
 def stated(path: Path) -> str | None:
-    """What a comment in the file's beginning or the names of its columns say, "lps" or "ras"; None without.
+    """Return the axes in the file's first comment or column names, "lps" or "ras"; None without.
 
     Raises:
         InvalidPointCloudError: comments that contradict each other, columns of several kinds, or others than the
@@ -100,7 +100,7 @@ def stated(path: Path) -> str | None:
 
 
 def _stated(path: Path) -> tuple[str, str] | None:
-    """The axes that a file says, and how it does."""
+    """Return the axes that a file states, and where."""
     comment = _in_comment(path)
     named = columns.space(path) if path.suffix.lower() in columns.ENDINGS else None
     if comment and named and comment != named:

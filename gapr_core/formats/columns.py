@@ -68,7 +68,7 @@ FIRST = Columns([0, 1, 2])
 
 
 def header_of(lines: Iterable[str]) -> Header:
-    """Of the lines of a file, which are taken up to the first one that is neither empty nor a comment."""
+    """Read the header from lines up to the first one with data."""
     comment = first = ""
     for line in lines:
         if line.lstrip().startswith(COMMENTS):
@@ -84,12 +84,12 @@ def header_of(lines: Iterable[str]) -> Header:
 
 
 def delimiter_of(line: str) -> str | None:
-    """What separates the cells of a line; None for white space."""
+    """Find the delimiter of a line; None for white space."""
     return next((d for d in DELIMITERS if d in line), None)
 
 
 def words(line: str, delimiter: str | None) -> list[str]:
-    """The names in a line; those that are empty, at its end or between spaces, are left out."""
+    """Return the names in a line, without empty ones at its end or between spaces."""
     if delimiter is None:
         return [word for word in line.split() if axis(word)]
     names = _cells(line.lstrip("\ufeff"), delimiter)
@@ -99,17 +99,17 @@ def words(line: str, delimiter: str | None) -> list[str]:
 
 
 def axis(name: str) -> str:
-    """A name in lower case without its unit: x of `X (mm)` and `x_mm`."""
+    """Strip the unit from a name, in lower case: x of `X (mm)` and `x_mm`."""
     return re.sub(r"[\s(\[_/].*", "", name.strip(' "\ufeff').lower())
 
 
 def kinds_in(short: list[str]) -> list[str]:
-    """The kinds of axes of which all three names are there once."""
+    """Return the kinds of axes with all three names, once each."""
     return [kind for kind in AXES if all(short.count(letter) == 1 for letter in kind)]
 
 
 def found(names: list[str]) -> Columns | None:
-    """The columns named x y z, l p s or r a s, or with a unit where none is; None unless there is one of each.
+    """Find the columns x y z, l p s or r a s, with units or not; None unless complete.
 
     Raises:
         InvalidPointCloudError: names of several kinds.
@@ -133,7 +133,7 @@ def found_in_comment(names: list[str], count: int) -> Columns | None:
 
 
 def space(path: Path) -> str | None:
-    """The axes that the names of the columns say, "lps" or "ras"; None where they say none.
+    """Return the axes in the names of the columns, "lps" or "ras"; None without.
 
     Raises:
         InvalidPointCloudError: names of several kinds.
@@ -143,7 +143,7 @@ def space(path: Path) -> str | None:
 
 
 def unit(path: Path) -> str | None:
-    """The unit that the names of the coordinates say, "mm", "cm" or "m", as in `x (cm)`; None where they say none.
+    """Return the unit in the coordinates' names, "mm", "cm" or "m", as in `x (cm)`; None without.
 
     Raises:
         InvalidPointCloudError: several units or another one, or as `space`.
@@ -167,7 +167,7 @@ def unit(path: Path) -> str | None:
 
 
 def unnamed(path: Path) -> int:
-    """How many columns a text file has of which the first three are taken, since no name says which; 0 for others."""
+    """Count the columns of a text file whose first three are taken without names; 0 for others."""
     if not path.is_file() or path.suffix.lower() not in ENDINGS:
         return 0
     header = _header(path)
@@ -180,7 +180,7 @@ def _header(path: Path) -> Header:
 
 
 def _used(header: Header) -> Columns | None:
-    """The columns that its names choose."""
+    """Choose columns by their names."""
     return found(header.names) if header.is_line else found_in_comment(header.names, header.cells)
 
 
@@ -189,12 +189,12 @@ def _cells(line: str, delimiter: str | None) -> list[str]:
 
 
 def _is_point(cells: list[str], columns: Columns | None) -> bool:
-    """Whether the cells that a comment names are numbers."""
+    """Tell whether the cells of a comment are numbers."""
     return columns is not None and len(cells) >= 3 and are_numbers([cells[place] for place in columns.places])
 
 
 def are_numbers(cells: list[str]) -> bool:
-    """Whether there are numbers alone, quoted or not; some of them may be missing."""
+    """Tell whether all cells are numbers, quoted or not; some may be missing."""
     filled = [cell for cell in (cell.strip(' \t"') for cell in cells) if cell]
     try:
         return len([float(cell) for cell in filled]) > 0

@@ -46,7 +46,7 @@ def _check_whole(path: Path, transform: Any) -> None:
 
 
 def _parts(transform: Any) -> list[Any]:
-    """The transforms that one is composed of."""
+    """List the parts of a composed transform."""
     import SimpleITK
 
     composite = SimpleITK.CompositeTransform(transform)

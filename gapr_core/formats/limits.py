@@ -28,7 +28,7 @@ class FileLimits:
 
     @classmethod
     def from_environment(cls) -> FileLimits:
-        """The defaults, or what GAPR_MAX_FILE_MB, GAPR_MAX_UNPACKED_MB and GAPR_MAX_VERTICES say.
+        """Read GAPR_MAX_FILE_MB, GAPR_MAX_UNPACKED_MB and GAPR_MAX_VERTICES over the defaults.
 
         Raises:
             ConfigError: a variable that is no positive number.
@@ -40,7 +40,7 @@ class FileLimits:
         )
 
     def read(self, path: Path) -> bytes:
-        """The whole file, once its size has passed.
+        """Read the whole file, once its size has passed.
 
         It is read, not mapped: a mapped file that another program cuts meanwhile kills the process.
         """

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def decompress(packed: bytes, size: int) -> bytes:
-    """The `size` bytes that LZF data unpack to.
+    """Unpack LZF data to `size` bytes.
 
     Raises:
         ValueError: damaged data, or data of another size.

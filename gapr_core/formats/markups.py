@@ -49,7 +49,7 @@ class Markups:
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """The points alone, LPS mm; those of several lists are joined, with a warning."""
+    """Read the points alone, LPS mm; several lists are joined, with a warning."""
     found = _load(path, options.limits)
     if len(found.lists) > 1:
         log.warning("%s: %d lists are joined (%s); save one by itself if they are not points of one bone",
@@ -125,7 +125,7 @@ def _nodes(content: Any) -> list[dict[str, Any]]:
 
 
 def _objects(holder: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    """The list of this name, of objects alone."""
+    """Return the list of this name, which holds objects alone."""
     listed = holder[name]
     if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
         raise ValueError(f"`{name}` that is no list of objects")
@@ -162,7 +162,7 @@ def _of_fcsv(data: bytes) -> Markups:
 
 
 def _is_placed(row: list[str], count: int) -> bool:
-    """Whether the point of a row under `count` names was placed.
+    """Tell whether the point of a row under `count` names was placed.
 
     Some versions add two cells without a name: the status of the position, and the type of the point.
     """
@@ -174,7 +174,7 @@ def _is_placed(row: list[str], count: int) -> bool:
 
 
 def _mm_per_unit(stated: object) -> float:
-    """Of one unit, of one with its code (mm, UCUM, millimeter; schema 1.0.3), or of the same one for each axis."""
+    """Look up a unit, alone, with its code (mm, UCUM, millimeter; schema 1.0.3) or once per axis."""
     if isinstance(stated, list) and len(stated) in (2, 3) and stated[1] == "UCUM":
         stated = stated[0]
     units = set(map(str, stated)) if isinstance(stated, list) else {str(stated)}
@@ -184,7 +184,7 @@ def _mm_per_unit(stated: object) -> float:
 
 
 def _space(stated: object) -> str:
-    """The axes by their name; never a guess: the wrong one turns every point by 180 deg."""
+    """Look up axes by name; never guess: wrong ones turn every point by 180 deg."""
     known = NUMBERED.get(str(stated).strip().lower())
     if known is None:
         raise ValueError(f"coordinateSystem {stated!r}, neither LPS nor RAS")

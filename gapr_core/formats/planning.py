@@ -33,7 +33,7 @@ MISTAKES = {  # of a plan: what undoes it, and what to do
 
 
 def start_of(source: Path, target: Path) -> LandmarkPose:
-    """The pose that lays the landmarks of one file on those of the other: by name if both have the same, else in order.
+    """Lay landmarks of one file on those of the other: by equal names, else in order.
 
     Small and capital letters are not distinguished. Names that are the same only in part are warned of.
 
@@ -94,7 +94,7 @@ def distances_mm(points: Array, bone: Surface) -> Array:
 
 
 def _far_targets(points: Array, apart_mm: Array, result: RegistrationResult) -> tuple[ResultWarning, ...]:
-    """The warning of planned targets (N, 3) that are far from the bone, with the mistake that is likely."""
+    """Warn of planned targets (N, 3) far from the bone, with the likely mistake."""
     far = apart_mm > FAR_MM
     if result.bone is None or not far.any():
         return ()
@@ -103,7 +103,7 @@ def _far_targets(points: Array, apart_mm: Array, result: RegistrationResult) -> 
 
 
 def _mistake(points: Array, result: RegistrationResult) -> str:
-    """What to do about targets (N, 3) far from the bone."""
+    """Suggest a remedy for targets (N, 3) far from the bone."""
     assert result.bone is not None
     median_mm = np.median(distances_mm(points, result.bone))
     for advice, factors in MISTAKES.items():
@@ -131,7 +131,7 @@ def _error(label: str, point: Array, covariance: Array, apart_mm: float, draws: 
 
 
 def save_targets(path: Path, errors: Sequence[TargetError]) -> None:
-    """The targets as markups, each with its expected error as the description."""
+    """Save targets as markups, each with its expected error as the description."""
     points = np.array([error.position_mm for error in errors]).reshape(-1, 3)
     words = [f"expected error {error.expected_mm:.2f} mm, 95 %: {error.bound95_mm:.2f} mm" for error in errors]
     markups.save(path, Markups(points, tuple(error.label for error in errors)), words)

@@ -38,7 +38,7 @@ class Plugin:
         return str(self._module().UNIT)
 
     def read(self, path: Path, options: ReadOptions) -> Surface:
-        """The points, in the unit of the file.
+        """Read the points, in the file's unit.
 
         Raises:
             InvalidPointCloudError: what the reader cannot read.
@@ -58,7 +58,7 @@ class Plugin:
 
 
 def of(path: Path) -> Plugin | None:
-    """The plug-in that reads a file or folder, or the folder of the file that makes it one; None without one."""
+    """Find the plug-in for a file or folder, or for a file that marks its folder; None without."""
     for entry in _entries():
         has_ending = path.is_file() and path.name.lower().endswith(f".{entry.name}")
         if has_ending or (_folder_of(path, entry) / entry.name).is_file():
@@ -67,7 +67,7 @@ def of(path: Path) -> Plugin | None:
 
 
 def kinds() -> list[str]:
-    """What plug-ins read: endings, and names of files that make a folder one of their kind."""
+    """List the plug-ins' endings, and names of files that mark a folder."""
     return sorted(entry.name if _is_file_name(entry) else f".{entry.name}" for entry in _entries())
 
 
@@ -76,11 +76,11 @@ def _is_file_name(entry: EntryPoint) -> bool:
 
 
 def _folder_of(path: Path, entry: EntryPoint) -> Path:
-    """The folder, where the path is that of the file that makes it one of its kind; else the path itself."""
+    """Return the folder of a file that marks it; else the path itself."""
     return path.absolute().parent if _is_file_name(entry) and path.name == entry.name and path.is_file() else path
 
 
 @cache
 def _entries() -> tuple[EntryPoint, ...]:
-    """Of the packages that are installed; looked up once, since it reads the metadata of all of them."""
+    """List entry points of installed packages, once, since all metadata is read."""
     return tuple(entry_points(group=GROUP))

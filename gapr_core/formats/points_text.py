@@ -29,21 +29,21 @@ DEFINED, UNDEFINED = "defined", ("0", "false")  # of a control point of 3D Slice
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """X y z, or x y z nx ny nz, in the first columns or where a line of names says: x y z, l p s or r a s.
+    """Read x y z, or x y z nx ny nz, from the first columns or those named.
 
     Raises:
-        InvalidPointCloudError: names that do not say which columns are the coordinates, numbers of the points in the
-            first one, decimal commas, a cell that is no number, or a row for each coordinate.
+        InvalidPointCloudError: names without coordinates, numbers of the points in the first column, decimal commas, a
+    cell that is no number, or a row for each coordinate.
     """
     return _surface(options.limits.read(path))
 
 
 def read_csv(path: Path, options: ReadOptions) -> Surface:
-    """Columns named x y z, l p s or r a s (any case), or the first three; of a tracked tool, where its tip was.
+    """Read named columns x y z, l p s or r a s, the first three, or tracked tips.
 
     Raises:
-        InvalidPointCloudError: a recording of a tracked tool without the tip, or of several tools and none chosen; a
-            tip, a tool or a reference for a file that is no such recording; columns as in `read`.
+        InvalidPointCloudError: a recording without the tip, or of several tools and none chosen; a tip, a tool or a
+    reference for another kind of file; columns as in `read`.
     """
     data = options.limits.read(path)
     header = next(text.lines(data), "")
@@ -61,7 +61,7 @@ def read_csv(path: Path, options: ReadOptions) -> Surface:
 
 
 def read_pts(path: Path, options: ReadOptions) -> Surface:
-    """A count, then so many lines of x y z, often with an intensity and a colour.
+    """Read a count, then as many lines of x y z, often with an intensity and a colour.
 
     Raises:
         ValueError: another count, or fewer than three columns.
@@ -91,7 +91,7 @@ def _surface(data: bytes) -> Surface:
 
 
 def _of_numbers(values: Array, header: Header, rows: list[str]) -> Surface:
-    """Of a file with numbers alone below its names."""
+    """Read a file with numbers alone below its names."""
     if values.shape[1] < 3:
         raise ValueError(f"{values.shape[1]} columns, not x y z")
     if len(values) == 3 and values.shape[1] > MOST_OF_POINT and len(header.names) != values.shape[1]:
@@ -108,7 +108,7 @@ def _of_numbers(values: Array, header: Header, rows: list[str]) -> Surface:
 
 
 def _by_cells(data: bytes, header: Header, error: ValueError | None = None) -> Array:
-    """(N, 3) points where other columns may be text and cells may be empty; a point without a number is NaN.
+    """Read (N, 3) points beside text and empty cells; a missing number is NaN.
 
     Raises:
         InvalidPointCloudError: a file without names of its columns, one that is no number, or a row of another length.
@@ -133,7 +133,7 @@ def _by_cells(data: bytes, header: Header, error: ValueError | None = None) -> A
 
 
 def _rows(data: bytes, header: Header) -> Iterator[Row]:
-    """The rows below the names; empty cells at the end, for which there is no name, are left out."""
+    """Return the rows below the names, without empty cells beyond the last name."""
     kept = ((n, line) for n, line in enumerate(text.lines(data), start=1) if _is_row(line))
     if header.is_line:
         next(kept, None)
@@ -148,7 +148,7 @@ def _is_row(line: str) -> bool:
 
 
 def _split(lines: Iterator[tuple[int, str]], delimiter: str | None) -> Iterator[Row]:
-    """Lines with their numbers as cells; a quoted one may have the delimiter in it, and no end of a line."""
+    """Split numbered lines into cells; a quoted cell may hold the delimiter, but no end of line."""
     if delimiter is None:
         yield from ((number, [cell.strip('"') for cell in line.split()]) for number, line in lines)
         return
@@ -173,7 +173,7 @@ def _chained(first: Row, rows: Iterable[Row]) -> Iterator[Row]:
 
 
 def _defined(header: Header) -> int | None:
-    """The column in which 3D Slicer says whether a control point was placed."""
+    """Find 3D Slicer's column of the state of a control point."""
     short = [name.strip().lower() for name in header.names]
     is_slicer = header.is_line and short.count(DEFINED) == 1 and columns.kinds_in(short) in (["lps"], ["ras"])
     return short.index(DEFINED) if is_slicer else None
@@ -207,7 +207,7 @@ def _decimal_commas(row: str, is_named: bool = False) -> InvalidPointCloudError:
 
 
 def _columns(header: Header, count: int, has_normals: bool) -> Columns:
-    """Where the coordinates are: by the line of names, or a comment, else in the first three."""
+    """Find the coordinates by the line of names, or a comment, else take the first three."""
     if not header.is_line:
         return columns.found_in_comment(header.names, count) or FIRST
     if len(header.names) != count:
@@ -246,7 +246,7 @@ def _of_title(header: Header, count: int, has_normals: bool) -> Columns:
 
 
 def _check_first(names: list[str], values: Array) -> None:
-    """Raise where the first column is no x, but the number or the time of each point, and no comment says so.
+    """Raise where the first column counts points or time, and no comment names it.
 
     Numbers of frames have gaps, and times are no whole numbers: what rises from each of many rows to the next is one.
     So is a whole number that never turns back, where the columns behind it are none: several points of each frame.

@@ -41,11 +41,11 @@ class Format:
         return "tip_mm" in self.uses
 
     def is_in_mm(self, options: ReadOptions) -> bool:
-        """Whether it is in mm as read with these options: places of a tool's tip are, since a tracker records them."""
+        """Tell whether the file is in mm under these options; a tracked tip always is."""
         return self.in_mm or (self.is_tracked and options.tip_mm is not None)
 
     def read(self, path: Path, options: ReadOptions) -> Surface:
-        """The surface in the file's unit; in its own axes where it has some, otherwise turned as asked."""
+        """Read the surface in the file's unit; in its own axes if it states any, otherwise turned as asked."""
         self._check(path, options)
         module, function = self.reader.split(":")
         reader: Reader = getattr(import_module(f"gapr_core.formats.{module}"), function)
@@ -55,7 +55,7 @@ class Format:
         return axes.turned(surface, path, options.axes)
 
     def _check(self, path: Path, options: ReadOptions) -> None:
-        """A choice that this kind of file cannot follow means that it is the wrong file, or the wrong choice."""
+        """Refuse an option that this kind of file cannot follow: the file or the option is wrong."""
         nothing = ReadOptions(limits=options.limits)
         for name, (files, option) in CHOICES.items():
             if name not in self.uses and getattr(options, name) != getattr(nothing, name):
@@ -102,7 +102,7 @@ BARE = (LookupError, TypeError, AttributeError, StopIteration, AssertionError)  
 
 
 def read(path: Path, options: ReadOptions | None = None) -> Surface:
-    """The points and faces of a file, a folder of tracked slices, or what an installed plug-in reads.
+    """Read points and faces of a file, a folder of tracked slices, or a plug-in's kind.
 
     Raises:
         InvalidPointCloudError: an unknown format, a missing, damaged, cut or empty file, or one beyond the limits.
@@ -137,7 +137,7 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
 
 
 def format_of(path: Path) -> Format | plugins.Plugin:
-    """The kind of a file, by its name.
+    """Return the kind of a file, by its name.
 
     Raises:
         InvalidPointCloudError: nothing there, an unknown ending, a packed file, a recording named as a label map, or a
@@ -166,20 +166,20 @@ def format_of(path: Path) -> Format | plugins.Plugin:
 
 
 def says_axes(path: Path) -> bool:
-    """Whether a file says that it is in LPS or RAS: a label map, markups, or by a comment or names of columns."""
+    """Tell whether a file states LPS or RAS: label maps, markups, a comment, or columns."""
     kind = format_of(path)
     return kind.in_lps or (not kind.in_mm and path.is_file() and axes.stated(path) is not None)
 
 
 def reason_of(error: Exception) -> str:
-    """What an error of a reader says of the file."""
+    """Explain an error of a reader."""
     if isinstance(error, BARE):
         return f"its content is not laid out as the format wants it ({type(error).__name__})"
     return str(error) or type(error).__name__
 
 
 def unreadable(path: Path, why: str) -> InvalidPointCloudError:
-    """The error for a file that cannot be read, in one line."""
+    """Build the error for an unreadable file, in one line."""
     if path.is_dir():
         how = "name a file in it" if why.startswith("no slices") else "correct it: a slice by itself has no pose"
         return InvalidPointCloudError("a readable folder", f"{path.name} ({_short(why)})", how)
@@ -200,6 +200,6 @@ def _short(why: str) -> str:
 
 
 def ending_of(path: Path) -> str:
-    """The longest known ending of a name, so that `.igs.mha` is no `.mha`."""
+    """Return the longest known ending of a name, so `.igs.mha` is no `.mha`."""
     name = path.name.lower()
     return max((end for end in FORMATS if name.endswith(end)), key=len, default=path.suffix.lower())

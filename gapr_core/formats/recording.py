@@ -38,7 +38,7 @@ def check(path: Path) -> None:
 
 
 def write(path: Path, result: RegistrationResult) -> None:
-    """One .rrd file, for an accepted pose and for a refusal. Its timeline goes through the hypotheses.
+    """Write one .rrd file, for an accepted pose and for a refusal. Its timeline goes through the hypotheses.
 
     Args:
         path: ends with .rrd; open it with `rerun PATH`.
@@ -83,19 +83,19 @@ def _bone(rr: Any, target: Surface) -> Any:
 
 
 def _words(result: RegistrationResult) -> str:
-    """The answer; of a refusal, that there is no pose to use."""
+    """Return the answer as text; for a refusal, state that no pose may be used."""
     text = str(result) if result.ok else f"{result}\nRefused: what is shown is the best hypothesis, to look at only."
     return f"{text}\n{TIMELINE} 1 is the best; blue points are inside the bone, red ones outside."
 
 
 def _poses(result: RegistrationResult) -> list[tuple[Array, float]]:
-    """The best pose and its rivals, each with its probability."""
+    """Show the best pose and its rivals, each with its probability."""
     ranked = [(h.T_target_source, h.probability) for h in result.hypotheses[:MOST_HYPOTHESES]]
     return ranked or ([] if result.best is None else [(result.best, result.confidence)])
 
 
 def _points(rr: Any, source: Array, result: RegistrationResult, number: int) -> Any:
-    """The source, coloured by its distance under the best pose; grey under its rivals."""
+    """Show the source, coloured by distance under the best pose; grey under its rivals."""
     if result.residuals is None:
         return rr.Points3D(source, colors=GREY, radii=POINT_MM)
     colours = colours_of(result.residuals.distance_mm) if number == 1 else GREY

@@ -34,7 +34,7 @@ def residuals_json(residuals: Residuals) -> dict[str, object]:
 
 
 def write_coloured(path: Path, points: Array, residuals: Residuals) -> None:
-    """A PLY of points (N, 3): blue inside the bone, white on it, red outside, grey where no surface is near."""
+    """Write a PLY of points (N, 3): blue inside, white on the bone, red outside, grey far away."""
     from plyfile import PlyData, PlyElement
 
     kinds = [(axis, "f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")]
@@ -77,12 +77,12 @@ def check_slicer(folder: Path, files_of_scene: Sequence[Path]) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a scene is there, and as `write_slicer` left it."""
+    """Tell whether a scene is there as `write_slicer` left it."""
     return path.is_file() and f"<!-- {WRITTEN_BY} -->".encode() in path.read_bytes()
 
 
 def write_slicer(folder: Path, result: RegistrationResult) -> None:
-    """A folder with target, source, transform and planned targets, and the scene.mrml that loads them together.
+    """Write a folder: target, source, transform, planned targets, and a scene.mrml for all.
 
     Points of the source near which no surface is have no distance: they are a grey model of their own, `off_bone`.
 
@@ -131,7 +131,7 @@ def _vtk(points: Array, faces: NDArray[np.int64] | None, distances: Array | None
 
 
 def _mrml(with_off_bone: bool, with_targets: bool) -> str:
-    """The scene: each node with its storage, and the source under the transform."""
+    """Write the scene: each node with its storage, and the source under the transform."""
     moved = {"transformNodeRef": "vtkMRMLLinearTransformNodepose"}
     scene = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
     scene.append(ElementTree.Comment(f" {WRITTEN_BY} "))

@@ -64,18 +64,18 @@ def check_sequence(path: Path, ending: str) -> None:
 
 
 def hint_of_markups(path: Path) -> str:
-    """How to rename control points of 3D Slicer that lie in a plain .json; empty for other files."""
+    """Explain how to rename control points in a plain .json; empty for other files."""
     is_markups = path.suffix.lower() == ".json" and b'"markups"' in _head(path, SEQUENCE_BYTES)
     return f"it looks like markups of 3D Slicer: rename it to {path.stem}.mrk.json" if is_markups else ""
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether a file is DICOM, by its ending or its content."""
+    """Tell whether a file is DICOM, by its ending or its content."""
     return path.is_file() and (path.suffix.lower() == ".dcm" or _head(path, DICOM_AT + 4)[DICOM_AT:] == DICOM)
 
 
 def dicom_images(given: str) -> InvalidPointCloudError:
-    """The error for images where a surface is wanted."""
+    """Build the error for images in place of a surface."""
     how = "DICOM images hold no surface: segment the bone (3D Slicer) and give its .seg.nrrd, or a DICOM SEG as .dcm"
     return InvalidPointCloudError("the surface of a bone", given, how)
 
@@ -89,7 +89,7 @@ def _unpacks_to_nifti(path: Path) -> bool:
 
 
 def _head(path: Path, size: int = STL_HEADER_BYTES) -> bytes:
-    """The first bytes; none where the file cannot be read."""
+    """Read the first bytes; none of an unreadable file."""
     try:
         with path.open("rb") as file:
             return file.read(size)
@@ -98,12 +98,12 @@ def _head(path: Path, size: int = STL_HEADER_BYTES) -> bytes:
 
 
 def is_utf_16(path: Path) -> bool:
-    """Whether a file that cannot be read is text in UTF-16."""
+    """Tell whether an unreadable file is text in UTF-16."""
     return text.is_utf_16(_head(path))
 
 
 def ending_of(path: Path) -> str:
-    """The ending that the content asks for; empty where the content does not tell, or cannot be read."""
+    """Return the ending that fits the content; empty if unknown or unreadable."""
     head = _head(path)
     facets = int.from_bytes(head[80:84], "little")
     if facets and path.stat().st_size == STL_HEADER_BYTES + STL_FACET_BYTES * facets:

@@ -45,12 +45,11 @@ def read_igs(path: Path, options: ReadOptions) -> Surface:
 
 
 def pose_of(poses: dict[str, Frames], tool: int | None, path: Path, reference: int | None = None) -> Array:
-    """(N, 4, 4) of one transform by its place in the list of their names, in the frame of another one if it is named.
+    """Return poses (N, 4, 4) of one named transform, in the frame of another if one is named.
 
     Raises:
-        InvalidPointCloudError: none of them, several and none chosen, one that leads from the tracker to a tool, two
-            that are not valid together or do not lead to one frame, or one that is not rigid, as those of an image's
-            pixels.
+        InvalidPointCloudError: none or several to choose from, or one from the tracker to a tool. Two without a common
+    frame or time, or one that is not rigid (of pixels).
     """
     names, valid = list(poses), [i for i, frames in enumerate(poses.values()) if frames]
     if tool is None and len(valid) == 1:
@@ -114,16 +113,15 @@ def transforms(path: Path, options: ReadOptions | None = None) -> dict[str, Fram
 
 
 def read_folder(path: Path, options: ReadOptions) -> Surface:
-    """The slices of a folder as one cloud, in mm.
+    """Read the slices of a folder as one cloud, in mm.
 
-    Each slice is a file of points (x y z) in one common frame; or, where `poses.csv` gives a 4x4 matrix in 16 numbers
-    for each slice in the order of their names (slice_2 before slice_10), of points in the slice's own frame. Axes turn
-    the whole cloud, and no slice before its pose.
+    Each slice is a file of points (x y z) in one common frame. With `poses.csv`, points are in the slice's own frame:
+    it gives 16 numbers for each slice in the order of names (slice_2 before slice_10). Axes turn the whole cloud, and
+    no slice before its pose.
 
     Raises:
-        InvalidPointCloudError: poses under another name than `poses.csv`, or one that is not rigid; a slice that says
-            that it is in RAS or in another unit, or slices with poses that all are too small; DICOM files and no
-            slices.
+        InvalidPointCloudError: poses in another file than `poses.csv`, or one that is not rigid; a slice in RAS or
+            another unit; slices that all are too small; DICOM files alone.
         ValueError: no slices, or another number of poses.
     """
     files = [f for f in path.iterdir() if f.name != POSES and not f.name.startswith(".")]
@@ -170,7 +168,7 @@ def _check_unit(slices: list[Array]) -> None:
 
 
 def _by_numbers(path: Path) -> tuple[list[str | int], str]:
-    """The order of names in which numbers count as numbers; words and numbers alternate."""
+    """Sort names with numbers by value; words and numbers alternate."""
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 

@@ -21,7 +21,7 @@ LOOKED_AT = 64  # bytes at the beginning: enough to see that every other one is 
 
 
 def lines(data: bytes) -> Iterator[str]:
-    """The lines of a text file, one at a time, without the byte order mark that Windows puts before them.
+    """Yield the lines of a text file, without the byte order mark of Windows.
 
     Raises:
         InvalidPointCloudError: UTF-16.
@@ -54,13 +54,13 @@ def check_encoding(data: bytes) -> None:
 
 
 def is_utf_16(data: bytes) -> bool:
-    """Whether a file begins with the byte order mark of UTF-16, or with letters of two bytes, one of which is zero."""
+    """Tell whether a file begins with UTF-16's byte order mark, or letters of two bytes."""
     even, odd = data[:LOOKED_AT:2], data[1:LOOKED_AT:2]
     return data.startswith(UTF_16) or any(len(a) > 1 and not any(a) and all(b) for a, b in ((even, odd), (odd, even)))
 
 
 def table(rows: Iterable[str], columns: int | None = None, delimiter: str | None = None, quotes: bool = False) -> Array:
-    """(N, columns) numbers, one row a line, in quotes or not if those are asked for; (0, 0) without any line.
+    """Return numbers (N, columns), one row a line, in quotes if asked for; (0, 0) without lines.
 
     Raises:
         ValueError: rows of different lengths, another number of columns, or something that is no number.

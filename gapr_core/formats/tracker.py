@@ -56,14 +56,14 @@ class Tip:
 
 
 def is_recording(names: Sequence[str]) -> bool:
-    """Whether these names of columns, in lower case, are those of a tool's poses by NDI Track."""
+    """Tell whether column names, in lower case, are those of a tool's poses by NDI Track."""
     return PLACE[0] in names and (QUATERNION[0] in names or ANGLES[0] in names)
 
 
 def read_poses(
     path: Path, limits: FileLimits | None = None, tool: int | None = None, reference: int | None = None
 ) -> Array:
-    """(N, 4, 4) poses of one tool, mm, of the rows in which it was seen, in the frame of the tracker or of a reference.
+    """Read poses (N, 4, 4) of one tool where seen, mm, in the tracker's or a reference's frame.
 
     Args:
         path: NDI Track's CSV: for each tool columns State, Q0 Qx Qy Qz (the scalar first) or Rz Ry Rx (degrees, the
@@ -73,8 +73,8 @@ def read_poses(
         reference: the tool in whose frame the poses are, row by row, where both were seen; None for the tracker's.
 
     Raises:
-        InvalidPointCloudError: no such columns, several tools and none chosen, a reference that is not another one of
-            them, no row in which they were seen, or one with a number that is not finite or far too large.
+        InvalidPointCloudError: no such columns; several tools and none chosen; a reference that is not another tool; no
+            row with all seen; a number not finite or far too large.
         ValueError: a file that is cut.
     """
     data = (limits or FileLimits.from_environment()).read(path)
@@ -95,7 +95,7 @@ def read_poses(
 
 
 def _columns(names: Sequence[str], start: int, tool: int, path: Path) -> tuple[int | None, slice]:
-    """Where the state of a tool is, if anywhere, and where its pose is."""
+    """Find the columns of a tool's state, if any, and of its pose."""
     rotation = QUATERNION if names[start] == QUATERNION[0] else ANGLES
     wanted = [*rotation, *PLACE]
     if names[start : start + len(wanted)] != wanted:
@@ -127,13 +127,13 @@ def relative(poses: Sequence[Array]) -> Array:
 
 
 def _tool_name(before: Sequence[str], number: int) -> str:
-    """What NDI Track calls a tool: the title of its port, which stands before its columns."""
+    """Return NDI Track's name of a tool: the title of its port, before its columns."""
     ports = [name.strip() for name in before if name.strip().lower().startswith("port ")]
     return ports[-1] if ports else f"tool {number}"
 
 
 def chosen_with(tool: int | None, reference: int | None, names: Sequence[str], path: Path) -> list[int]:
-    """The places of the tool and, where one is named, of its reference.
+    """Return the places of the tool and, if named, of its reference.
 
     Raises:
         InvalidPointCloudError: as `chosen`, of either; or a reference that is the tool itself.
@@ -148,7 +148,7 @@ def chosen_with(tool: int | None, reference: int | None, names: Sequence[str], p
 
 
 def never_seen(used: Sequence[int], names: Sequence[str], path: Path) -> InvalidPointCloudError:
-    """The error for a recording without a row to use."""
+    """Build the error for a recording without a row to use."""
     if len(used) == 1:
         return InvalidPointCloudError("rows with the tool in view", f"none in {path.name}", "record it again")
     expected = f"rows with tool {used[0]} and its reference {used[1]} in view"
@@ -163,7 +163,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
-    """The place in the list of the tool that is meant, never a guess: a reference may be among them.
+    """Return the place of the chosen tool; never guess: a reference may be among them.
 
     Raises:
         InvalidPointCloudError: none of the recorded tools, or several and none chosen.
@@ -177,13 +177,13 @@ def chosen(tool: int | None, names: Sequence[str], path: Path) -> int:
 
 
 def needs_tip(path: Path) -> InvalidPointCloudError:
-    """The error for a recording of poses without the tip of the tool."""
+    """Build the error for a tool's poses without its tip."""
     how = "give it with --tip X,Y,Z; gapr pivot finds it"
     return InvalidPointCloudError("the tip of the tool", f"{path.name}, a recording of its poses", how)
 
 
 def given_tip(tip_mm: tuple[float, float, float] | None, path: Path) -> tuple[float, float, float]:
-    """The tip of the tool that a recording is of.
+    """Return the tip of a recording's tool.
 
     Raises:
         InvalidPointCloudError: none is given.
@@ -216,7 +216,7 @@ def _is_seen_in(row: Sequence[str], state: int | None) -> bool:
 
 
 def poses_of(rotations: ArrayLike, translations: ArrayLike) -> Array:
-    """(N, 4, 4) of quaternions (N, 4), the scalar first, or angles (N, 3) about z y x, deg, and translations (N, 3)."""
+    """Build (N, 4, 4) from quaternions (N, 4), scalar first, or angles (N, 3) about z y x, deg."""
     rotations = np.asarray(rotations, dtype=np.float64)
     poses = np.tile(np.eye(4), (len(rotations), 1, 1))
     poses[:, :3, :3] = _matrices(rotations)
@@ -239,7 +239,7 @@ def tips(poses: Array, tip_mm: ArrayLike) -> Array:
 
 
 def touched(poses: Array, tip_mm: ArrayLike) -> Array:
-    """The tips (N, 3) of a pointer, with a warning where its tip is not as far from its marker as any is."""
+    """Return a pointer's tips (N, 3); warn of a tip at an unusual distance from its marker."""
     length = float(np.linalg.norm(tip_mm))
     if length and not TIP_MM[0] <= length <= TIP_MM[1]:
         log.warning(
@@ -249,7 +249,7 @@ def touched(poses: Array, tip_mm: ArrayLike) -> Array:
 
 
 def pivot(poses: Array) -> Tip:
-    """The tip of a tool that was turned about it: least squares of R_i tip + t_i = pivot (Yaniv 2015, algebraic).
+    """Find the tip of a tool turned about it: least squares of R_i tip + t_i = pivot (Yaniv 2015, algebraic).
 
     Poses before the tip stood in its place, or after it was lifted, are left out: a robust fit (Cauchy's loss) finds
     them first.

@@ -43,11 +43,11 @@ class FusedEncoder(nn.Module):
     """An encoder whose attention has a shorter way than by the four hooks, where it fits; both say the same."""
 
     def fits(self, pairs: Pairs, x: Tensor) -> bool:
-        """Whether there is such a way for these pairs and features."""
+        """Tell whether the fused way takes these pairs and features."""
         raise NotImplementedError
 
     def attend(self, q: Tensor, k: Tensor, v: Tensor, pairs: Pairs, heads: int) -> Tensor:
-        """What attention sees of projected queries, keys and values; all in the layout of `pairs`."""
+        """Return attention's context of projected queries, keys and values, in the layout of `pairs`."""
         raise NotImplementedError
 
 
@@ -104,7 +104,7 @@ class TransformerLayer(nn.Module):
 
 
 def _projection(width_in: int, width: int, mlp: bool) -> nn.Module:
-    """The W of the equations, behind the MLP that makes f from the point's feature where the paper's is wanted."""
+    """Build W of the equations, behind the paper's MLP of the point's feature if configured."""
     if not mlp:
         return nn.Linear(width_in, width)
     return nn.Sequential(nn.Linear(width_in, width), nn.ReLU(), nn.Linear(width, width))

@@ -1,8 +1,7 @@
 """Compiled loops of attention with geometry: softmax and sums of every query over its own neighbours.
 
-What torch would write out for every pair (keys, values, the hidden layer of the geometry, and all of their gradients)
-stays in the processor's cache here, and neighbours that do not exist cost nothing. The hidden layer is made again on
-the way back.
+Keys, values, the geometry's hidden layer and all gradients of a pair stay in the processor's cache. Missing neighbours
+cost nothing. The hidden layer is made again on the way back.
 
 Shapes: N queries with up to K neighbours among M keys; H heads of D channels; G geometry channels, E hidden ones.
 """
@@ -89,7 +88,7 @@ def backward(
 
 @numba.njit(inline="always", **FAST)
 def existing(valid, n, columns):
-    """The columns of the neighbours that query n has; returns how many there are."""
+    """List the columns of query n's real neighbours; returns their number."""
     count = np.int64(0)
     for column in range(valid.shape[1]):
         if valid[n, column]:

@@ -77,7 +77,7 @@ class ModelConfig(Settings):
 
 
 def choose(slot: str, options: Mapping[str, Any], name: str) -> Any:
-    """The entry of a slot's dict.
+    """Look up the entry of a slot's dict.
 
     Raises:
         ConfigError: when the slot has no such option.

@@ -17,7 +17,7 @@ Arrays = list[NDArray[Any]]
 
 
 def fits(pairs: Pairs, *tensors: Tensor) -> bool:
-    """Whether the loops can take these tensors and the geometry of these pairs: float32 on a CPU, not autocast."""
+    """Tell whether the loops take these tensors and pairs: float32 on a CPU, not autocast."""
     plain = all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (*tensors, pairs.p_i))
     return plain and not torch.is_autocast_enabled("cpu")
 

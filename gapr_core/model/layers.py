@@ -22,7 +22,7 @@ class GroupNorm(nn.Module):
         self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor, lengths: tuple[int, ...], slope: float = 1.0) -> Tensor:
-        """The norm, and a leaky ReLU of this slope below zero after it."""
+        """Apply the norm, then a leaky ReLU of the given slope."""
         x = x.float()
         centred = x - self._mean(x, lengths)
         variance = self._mean(centred * centred, lengths)
@@ -47,7 +47,7 @@ class GroupNorm(nn.Module):
 
 @lru_cache(maxsize=64)  # the norms of one level ask for the same segments, some twenty times a pass
 def segments(lengths: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """For clouds one after the other: which cloud each of the N points belongs to, and the clouds' sizes (B, 1)."""
+    """Return for concatenated clouds the cloud of each of N points, and the sizes (B, 1)."""
     counts = torch.tensor(lengths, device=device)
     cloud = torch.repeat_interleave(torch.arange(len(lengths), device=device), counts, output_size=sum(lengths))
     return cloud, counts[:, None]
@@ -69,7 +69,7 @@ NORMS = {"group": GroupNorm, "layer": LayerNorm}
 
 
 def make_norm(name: str, width: int) -> nn.Module:
-    """The norm of the configuration; called with (N, C) and the lengths of the clouds."""
+    """Make the configured norm; called with (N, C) and the lengths of the clouds."""
     return choose("norm", NORMS, name)(width)
 
 

@@ -31,10 +31,10 @@ class GAPRNet(nn.Module):
 
     Shapes for one pair, default widths (C = 128, fine 64):
         source, target          N = 850, M = 1200 fine points; n = 40, m = 65 superpoints
-        ├── backbone            fine (N, 64), (M, 64); coarse (n, 256), (m, 256)
-        ├── aggregation         (1, n, 128), (1, m, 128), unit length; T_reposition (1, 3, 4)
-        ├── coarse matching     (1, n, m) -> P = 128 patch pairs
-        └── fine matching       (P, a + 1, b + 1), a, b <= 32 -> C correspondences
+        - backbone              fine (N, 64), (M, 64); coarse (n, 256), (m, 256)
+        - aggregation           (1, n, 128), (1, m, 128), unit length; T_reposition (1, 3, 4)
+        - coarse matching       (1, n, m) -> P = 128 patch pairs
+        - fine matching         (P, a + 1, b + 1), a, b <= 32 -> C correspondences
     """
 
     def __init__(self, config: ModelConfig | None = None) -> None:

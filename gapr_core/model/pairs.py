@@ -62,7 +62,7 @@ class Pairs:
         return columns[..., skipped:] if keys > skipped else columns
 
     def table(self) -> tuple[Tensor, Tensor]:
-        """Rows of the keys (B n, m) that every query looks at, of all (B m, C) or (M, C) of them; bool, which exist."""
+        """Gather each query's rows (B n, m) of keys (B m, C) or (M, C), with a mask."""
         raise NotImplementedError
 
     def queries(self, x: Tensor) -> Tensor:
@@ -124,7 +124,7 @@ class LocalPairs(Pairs):
         return zeros.index_add(0, self.support.up, x) / count.clamp(min=1.0)
 
     def regroup(self, index: Tensor) -> LocalPairs:
-        """The same centres looking at other support points, (N, K)."""
+        """Pair the same centres with other support points, (N, K)."""
         return LocalPairs(self.centres, self.support, self.hood, index)
 
 

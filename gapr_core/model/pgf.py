@@ -14,7 +14,7 @@ _POINT = 2e-4  # squared length in radii below which three points are one, so th
 
 
 def pgf(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | float) -> Tensor:
-    """The seven features l_ij = (d_ij, d_jh, d_jk, b_ijk, b_ijh, b_hjk, theta_h-ik-j).
+    """Compute seven features l_ij = (d_ij, d_jh, d_jk, b_ijk, b_ijh, b_hjk, theta_h-ik-j).
 
     Args:
         p_i, p_j, c_h, c_k: (..., 3), broadcast against each other: the centre, its neighbour, and the centroids of the
@@ -33,7 +33,7 @@ def pgf(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | flo
 
 
 def embed(p_i: Tensor, p_j: Tensor, c_h: Tensor, c_k: Tensor, radius: Tensor | float) -> Tensor:
-    """The same features with each angle as (sine, cosine), both scaled by how well the angle is defined.
+    """Embed each angle as (sine, cosine), both scaled by the angle's certainty.
 
     A degenerate angle has sine = cosine = 0 and fades in smoothly, so that neither the features nor their gradients
     jump or grow where points coincide or lie in a line.

@@ -47,7 +47,7 @@ def matching_radius(frame: Frame) -> float:
 
 
 def build_cloud(points_mm: ArrayLike, frame: Frame, config: ModelConfig) -> Cloud:
-    """The pyramid of one cloud (N, 3), mm, N >= 16.
+    """Build the pyramid of one cloud (N, 3), mm, N >= 16.
 
     Raises:
         InvalidPointCloudError: for a wrong shape, too few or not finite points.
@@ -107,13 +107,13 @@ def stage_radii(voxel: float, config: ModelConfig) -> list[float]:
 
 
 def pyramid(points: Array, voxel: float, config: ModelConfig) -> list[Array]:
-    """The points of every stage, finest first."""
+    """Sample the points of every stage, finest first."""
     axes = principal_axes(points)
     return [p @ axes.T for p in _stages(points @ axes, voxel, config)]
 
 
 def _stages(turned: Array, voxel: float, config: ModelConfig) -> list[Array]:
-    """The points of every stage, of points along their principal axes."""
+    """Sample every stage of points along their principal axes."""
     resolutions = [voxel_means(turned, voxel)]
     for _ in range(config.stages - 1):
         voxel *= config.voxel_growth
@@ -141,7 +141,7 @@ def voxel_means(points: Array, voxel: float) -> Array:
 
 
 def neighborhood(centres: Array, tree: cKDTree, cap: int, radius: float, small_ball: float) -> Neighborhood:
-    """The `cap` nearest support points within `radius` of each centre, and the centroids of both balls.
+    """Find `cap` nearest support points within `radius` of each centre, and both balls' centroids.
 
     A centre without any neighbour gets its nearest point; an empty small ball has the centre as its centroid.
     """
@@ -160,7 +160,7 @@ def neighborhood(centres: Array, tree: cKDTree, cap: int, radius: float, small_b
 
 
 def _inside(ups: list[Index], coarsest: Neighborhood) -> list[Array]:
-    """For every point of every level, the centroid of the coarsest ball around its nearest superpoint."""
+    """Compute for each point of each level the coarsest ball's centroid around its nearest superpoint."""
     inside = [coarsest.c_h.double().numpy()]
     for up in reversed(ups):
         inside.insert(0, inside[0][up])

@@ -38,7 +38,7 @@ def balls(centres, support, distance, index, radius, small, valid, c_h, c_k):
 
 @numba.njit(**FAST)
 def spreads(points, index, valid, c_h):
-    """(N, 3, 3) sums of the outer products of neighbours, rows `index` (N, K) of the points, about c_h (N, 3)."""
+    """Sum outer products (N, 3, 3) of neighbours, rows `index` (N, K) of the points, about c_h (N, 3)."""
     found = np.zeros((len(index), 3, 3))
     for n in range(len(index)):
         for j in range(index.shape[1]):

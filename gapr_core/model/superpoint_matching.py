@@ -28,14 +28,14 @@ def coarse_scores(f_p: Tensor, f_q: Tensor, valid_p: Tensor, valid_q: Tensor, te
 
 
 def top_pairs(log_scores: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The `count` highest entries of each (n, m): rows, columns (B, count) and scores, 0 where there are fewer."""
+    """Take the `count` highest entries of each (n, m): rows, columns (B, count), scores, 0 where missing."""
     batch, n, m = log_scores.shape
     best = log_scores.reshape(batch, n * m).topk(min(count, n * m), dim=1)
     return best.indices // m, best.indices % m, best.values.exp()
 
 
 def patch_pairs(log_scores: Tensor, count: int, lengths_p: tuple[int, ...], lengths_q: tuple[int, ...]) -> PatchPairs:
-    """The set C': top patch pairs of every pair of clouds, as rows of the concatenated superpoints."""
+    """Select C': top patch pairs of every pair of clouds, as rows of the concatenated superpoints."""
     rows, columns, score = top_pairs(log_scores, count)
     start_p, start_q = (_starts(lengths, rows.device) for lengths in (lengths_p, lengths_q))
     pair = torch.arange(len(rows), device=rows.device)[:, None].expand_as(rows)

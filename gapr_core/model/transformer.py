@@ -27,7 +27,7 @@ class Nodes:
 
     @classmethod
     def of(cls, cloud: Cloud, small_ball: str = "part") -> Nodes:
-        """The coarsest level of a cloud; `small_ball` as `global_small_ball` of the configuration."""
+        """Take the coarsest level of a cloud; `small_ball` as `global_small_ball` of the configuration."""
         level = cloud.coarse
         inner = level.within.c_h if small_ball == "whole" else level.within.c_k
         points, normals, c_k = (pad(x, level.lengths) for x in (level.points, level.normals, inner))
@@ -43,7 +43,7 @@ class Nodes:
         return cross_pairs(self.points, self.normals, other.points, other.normals, other.valid, other.reach)
 
     def moved(self, T: Tensor) -> Nodes:
-        """The same superpoints after a motion (B, 3, 4)."""
+        """Move the superpoints by (B, 3, 4)."""
         turned = self.normals @ T[:, :, :3].transpose(1, 2)
         return Nodes(move(T, self.points), turned, move(T, self.c_k), self.reach, self.valid)
 

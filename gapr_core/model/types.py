@@ -34,7 +34,7 @@ class Neighborhood:
     radius: Tensor
 
     def turned(self, R: Tensor) -> Neighborhood:
-        """The same neighbours after a turn by R (3, 3)."""
+        """Turn the neighbours by R (3, 3)."""
         return replace(self, c_h=self.c_h @ R.T, c_k=self.c_k @ R.T)
 
 
@@ -61,7 +61,7 @@ class Level:
     up: Tensor | None
 
     def turned(self, R: Tensor) -> Level:
-        """The same level turned by R (3, 3)."""
+        """Turn the level by R (3, 3)."""
         below = self.below.turned(R) if self.below is not None else None
         return replace(
             self, points=self.points @ R.T, normals=self.normals @ R.T, within=self.within.turned(R), below=below
@@ -102,11 +102,11 @@ class Cloud:
         return len(self.coarse.lengths)
 
     def to(self, device: torch.device | str) -> Cloud:
-        """The same on another device."""
+        """Copy to another device."""
         return on_device(self, device)
 
     def turned(self, T: NDArray[np.float64]) -> Cloud:
-        """One cloud after a rigid motion (4, 4), mm; nothing is searched again."""
+        """Turn one cloud by a rigid motion (4, 4), mm, without a new search."""
         R = torch.from_numpy(T[:3, :3]).float()
         centre = self.centre_mm @ torch.from_numpy(T[:3, :3]).T + torch.from_numpy(T[:3, 3])
         return replace(self, levels=tuple(level.turned(R) for level in self.levels), centre_mm=centre)
@@ -120,7 +120,7 @@ class Features:
     coarse: Tensor
 
     def chosen(self, clouds: Cloud, rows: tuple[int, ...]) -> Features:
-        """The features of some of `clouds`, in this order; one may stand several times."""
+        """Choose the features of some of `clouds`, in this order; one may repeat."""
         fine, coarse = self.fine.split(clouds.fine.lengths), self.coarse.split(clouds.coarse.lengths)
         return Features(torch.cat([fine[row] for row in rows]), torch.cat([coarse[row] for row in rows]))
 
@@ -162,7 +162,7 @@ def on_device(value: T, device: torch.device | str) -> T:
 
 
 def mapped(value: T, change: Callable[[Tensor], Tensor]) -> T:
-    """The same with every tensor inside nested dataclasses and tuples changed."""
+    """Change every tensor inside nested dataclasses and tuples."""
     if isinstance(value, Tensor):
         return change(value)  # type: ignore[return-value]
     if isinstance(value, tuple):

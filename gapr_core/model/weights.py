@@ -62,7 +62,7 @@ def write_tensors(tensors: dict[str, Tensor], path: str | Path, header: dict[str
 
 
 def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet, dict[str, Any]]:
-    """The network that a file describes, in evaluation mode, and its card.
+    """Load the network of a file, in evaluation mode, and its card.
 
     Raises:
         WeightsError: the file is missing, damaged, of another format, or does not fit its own configuration.
@@ -84,7 +84,7 @@ def load(path: str | Path, device: torch.device | str = "cpu") -> tuple[GAPRNet,
 
 
 def _config(settings: dict[str, Any]) -> ModelConfig:
-    """The configuration in a header, without settings of earlier files at values that change no match."""
+    """Read the configuration of a header; drop former settings at values without effect on matches."""
     return ModelConfig.from_dict(
         {name: value for name, value in settings.items() if value not in DROPPED.get(name, ())}
     )

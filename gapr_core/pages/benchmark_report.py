@@ -73,7 +73,7 @@ def _plots(records: Sequence[Record], plan: Plan) -> list[tuple[str, Figure]]:
 
 
 def _case(out: Path, number: int, record: Record, plan: Plan) -> Image:
-    """One case; without its picture when its pair is not on this machine."""
+    """Show one case; without a picture if its pair is not on this machine."""
     folder = Path(plan.folder)
     is_here = (folder / record.file).is_file()
     png = _saved(out, f"worst_{number:02d}", pictures.picture(record, folder)) if is_here else None
@@ -81,7 +81,7 @@ def _case(out: Path, number: int, record: Record, plan: Plan) -> Image:
 
 
 def _saved(out: Path, name: str, figure: Figure) -> bytes:
-    """The PNG, which is written into the folder `plots` as well."""
+    """Return the PNG, and write it into the folder `plots`."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
     with files.replacing(out / "plots" / f"{name}.png") as path:

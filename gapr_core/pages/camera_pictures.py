@@ -39,7 +39,7 @@ class CameraView:
 
 
 def views_as_png(views: Sequence[CameraView], columns: int = 4) -> bytes:
-    """All images in rows, as a PNG."""
+    """Draw all images in rows, as a PNG."""
     rows = -(-len(views) // columns)
     figure = _figure(2.6 * columns, 2.75 * rows)
     _draw_views(figure, views, rows, columns)

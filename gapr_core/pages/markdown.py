@@ -6,16 +6,16 @@ from collections.abc import Iterable, Sequence
 
 
 def table(header: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
-    """All lines of a table; a cell is what `str` says of it."""
+    """Write all lines of a table; a cell is shown as `str` shows it."""
     return "\n".join([head(header), *map(row, rows)])
 
 
 def head(header: Sequence[object]) -> str:
-    """The two lines above the rows."""
+    """Write the two lines above the rows."""
     return f"{row(header)}\n{row(['---'] * len(header))}"
 
 
 def row(cells: Iterable[object]) -> str:
-    """One line; a `|` in a cell, which would end it, and a `<`, which would begin HTML, are escaped."""
+    """Write one line; a `|` or `<` in a cell is escaped."""
     escaped = (" ".join(str(cell).split()).replace("|", r"\|").replace("<", r"\<") for cell in cells)
     return f"| {' | '.join(escaped)} |"

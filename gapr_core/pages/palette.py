@@ -15,5 +15,5 @@ GAIN = (BONE, "#f2a541", "#7a1fa2")  # of a further look: none, ever more
 
 
 def dash(number: int) -> str:
-    """The style of line `number`, whose colour is taken once more after ten lines."""
+    """Choose the style of line `number`; colours repeat after ten lines, with other dashes."""
     return DASHES[number // len(SERIES) % len(DASHES)]

@@ -95,7 +95,7 @@ TABLE_3: dict[str, Figures] = {  # GAPR-Net with an incomplete target
 
 
 def of(protocol: str, bone: str) -> dict[str, Figures]:
-    """The paper's rows for one of our protocols and bones, by method; empty where it has none."""
+    """Look up the paper's rows of one protocol and bones, by method; may be empty."""
     if protocol == "paper":
         return TABLE_1.get(bone, {})
     if protocol == "incomplete":

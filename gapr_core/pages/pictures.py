@@ -34,7 +34,7 @@ def _badness(record: Record) -> tuple[float, float, float]:
 
 
 def caption(record: Record) -> str:
-    """One line on what went wrong."""
+    """Describe in one line how a case went wrong."""
     head = f"{record.pair} ({record.protocol}, {record.bone}): "
     if not record.accepted:
         return f"{head}refused, {record.status}, confidence {confidence_text(record.confidence)}. {record.reason}"

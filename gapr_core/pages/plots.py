@@ -38,7 +38,7 @@ def recall_against_threshold(records: Sequence[Record], methods: Sequence[str]) 
 
 
 def recall_against(records: Sequence[Record], methods: Sequence[str], key: str, label: str) -> Figure | None:
-    """Recall at 4 mm / 5 deg in bins of overlap or noise; None when the pairs do not vary in it."""
+    """Draw recall at 4 mm / 5 deg in bins of overlap or noise; None if all pairs are alike."""
     known = [r for r in records if r.has_truth and getattr(r, key) is not None]
     edges = _bins(np.array([getattr(r, key) for r in known], dtype=np.float64))
     if len(edges) < 3:
@@ -148,7 +148,7 @@ def _bins(values: Array) -> Array:
 
 
 def _style(k: int) -> dict[str, Any]:
-    """Every line has other dashes than the next ones: two methods that are always wrong lie on each other."""
+    """Give each line other dashes than the next ones: two methods that are always wrong coincide."""
     dash = palette.DASHES[k % len(palette.DASHES)]
     return {"color": palette.SERIES[k % len(palette.SERIES)], "ls": dash, "lw": 2.6 if k == 0 else 1.6}
 

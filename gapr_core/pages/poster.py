@@ -52,7 +52,7 @@ def save_poster(
 
 
 def draw_bone(figure: Any, target: Surface, points: Array, distances_mm: Array, facing: Array | None = None) -> None:
-    """The bone with points on it by signed distance, from `facing` (3,), or from where most points are seen."""
+    """Draw points on the bone by signed distance, seen from `facing` (3,) or the best side."""
     on = OnBone(target, points, distances_mm, NOWHERE)
     axes = figure.subplots()
     dots = views.paint(axes, on, views.picture_of(on, on.side_facing(facing)))
@@ -69,7 +69,7 @@ def charts_as_png(charts: Mapping[str, tuple[Sequence[float], float | None]], x_
 
 
 def draw_chart(axes: Any, name: str, values: Sequence[float], limit: float | None, x_title: str) -> None:
-    """One curve over the frames, counted from 1, with a dashed line at the limit."""
+    """Draw one curve over the frames, counted from 1, with a dashed line at the limit."""
     axes.plot(np.arange(1, len(values) + 1), values, "o-", color=palette.FIRST, markersize=4, linewidth=1.2)
     if limit is not None:
         axes.axhline(limit, color="0.5", linestyle="--", linewidth=1.0)

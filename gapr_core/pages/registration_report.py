@@ -40,7 +40,7 @@ STRENGTHS = ((2.0, "strongly"), (0.5, "clearly"), (0.0, "slightly"))  # log odds
 
 
 def write(path: str | Path, result: RegistrationResult, name: str = "") -> None:
-    """One self-contained HTML file, for an accepted pose and for a refusal."""
+    """Write one self-contained HTML file, for an accepted pose and for a refusal."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise ConfigError("a report as .html", Path(path).name, "let its name end with .html")
     report.write(path, "registration.html", title=name or "Registration", **_answer(result, name), **_details(result))
@@ -53,7 +53,7 @@ def fragment(result: RegistrationResult) -> str:
 
 
 def _answer(result: RegistrationResult, name: str) -> dict[str, Any]:
-    """What is not folded."""
+    """Add all parts that are not folded."""
     spots = [] if result.guidance is None or result.ok else result.guidance.spots()
     shown = views.of_result(result) if result.bone is not None and result.best is not None else None
     by = f"GAPR {origin.release() or ''}".strip()
@@ -81,7 +81,7 @@ def _headline(result: RegistrationResult) -> str:
 
 
 def _lines(result: RegistrationResult) -> list[str]:
-    """The verdict in words: what may be trusted, or why there is no pose."""
+    """Say in words what may be trusted, or why there is no pose."""
     if not result.ok:
         return [_sentence(result.reason or str(result.status).replace("_", " ").lower())]
     within = f"{se3.RIGHT_MM:g} mm and {se3.RIGHT_DEG:g} degrees"
@@ -97,7 +97,7 @@ def _sentence(text: str) -> str:
 
 
 def _next(result: RegistrationResult) -> list[str]:
-    """The one thing to do after a refusal."""
+    """Name the one thing to do after a refusal."""
     if result.ok:
         return []
     advised = [finding.advice for finding in result.findings if finding.advice]
@@ -144,7 +144,7 @@ def _details(result: RegistrationResult) -> dict[str, Any]:
 
 
 def _why(result: RegistrationResult) -> list[str]:
-    """The reasons of the verdict, one sentence each."""
+    """List the reasons of the verdict, one sentence each."""
     lines = [_sentence(str(finding)) for finding in result.findings]
     if result.pose_probability is not None:
         lines.append(f"If this is the right bone, the pose is right with a probability of "
@@ -211,7 +211,7 @@ def _features(result: RegistrationResult) -> list[tuple[str, ...]]:
 
 
 def _hypotheses(result: RegistrationResult) -> Sequence[tuple[str, ...]]:
-    """The ranked poses, and how far each puts the source from where the best one does."""
+    """List the ranked poses, and how far each moves the source from the best one."""
     if result.source is None or not len(result.source):
         return []
     best = np.eye(4) if result.best is None else result.best

@@ -46,7 +46,7 @@ class Image:
 
 @cache
 def environment() -> Environment:
-    """The templates; every text is escaped, and a name without a value is an error."""
+    """Load the templates; texts are escaped, and a name without a value is an error."""
     return Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined)
 
 
@@ -66,15 +66,15 @@ class Report:
         self._shown.append((kind, shown))
 
     def verdict(self, tone: str, headline: str, lines: Sequence[str]) -> None:
-        """The outcome in words and a colour: "accepted", "caution" or "refused"."""
+        """Add the outcome in words and a colour: "accepted", "caution" or "refused"."""
         self._show("verdict", {"tone": tone, "headline": headline, "lines": lines})
 
     def heading(self, text: str) -> None:
-        """A section begins."""
+        """Begin a section."""
         self._show("h2", text)
 
     def subheading(self, text: str) -> None:
-        """A part of a section begins."""
+        """Begin a part of a section."""
         self._show("h3", text)
 
     def paragraph(self, text: str) -> None:
@@ -86,7 +86,7 @@ class Report:
         self._show("note", text)
 
     def bullets(self, lines: Sequence[str]) -> None:
-        """A list."""
+        """Add a list."""
         self._show("bullets", lines)
 
     def images(self, images: Sequence[Image]) -> None:
@@ -98,7 +98,7 @@ class Report:
         self._show("film", images)
 
     def facts(self, values: Mapping[str, str]) -> None:
-        """What matters most, in big type: name to value."""
+        """Add main values in big type: name to value."""
         self._show("facts", values)
 
     def table(
@@ -109,7 +109,7 @@ class Report:
         text: Sequence[str] = (),
         best: Set[tuple[int, int]] = frozenset(),
     ) -> None:
-        """A table of strings.
+        """Add a table of strings.
 
         Args:
             columns: the headings.
@@ -121,7 +121,7 @@ class Report:
         self._show("table", {"columns": columns, "rows": rows, "marks": marks, "text": text, "best": best})
 
     def write(self, path: str | Path) -> None:
-        """One self-contained HTML file."""
+        """Write one self-contained HTML file."""
         write(path, "report.html", title=self.title, lead=self.lead, shown=self._shown)
 
 

@@ -111,7 +111,7 @@ LEGEND = (
 
 
 def sections(rows: Sequence[Row]) -> list[Section]:
-    """A summary over all bones; per protocol how accurate (the paper's numbers below ours), and how safe and fast."""
+    """Summarise all bones; then per protocol accuracy (the paper's numbers below ours), safety and time."""
     protocols = dict.fromkeys(row["protocol"] for row in rows)
     last_bone = {row["protocol"]: row["bone"] for row in rows}  # `all`, or the only one
     over_bones = [row for row in rows if row["bone"] == last_bone[row["protocol"]]]
@@ -138,13 +138,13 @@ def compared(differences: Sequence[Row], ours: str) -> list[Section]:
 
 
 def _signed(row: Row) -> str:
-    """A difference of shares in percent with its interval."""
+    """Format a difference of shares in percent with its interval."""
     middle, low, high = (100.0 * row[f"difference{end}"] for end in ("", "_low", "_high"))
     return f"{middle:+.1f} [{low:+.0f} to {high:+.0f}]"
 
 
 def where_beaten(rows: Sequence[Row], ours: str) -> list[str]:
-    """One line for each protocol and column in which another method is better than ours, over all its bones."""
+    """List the columns of each protocol in which another method is better, over all its bones."""
     lines = []
     for protocol in dict.fromkeys(row["protocol"] for row in rows):
         of_protocol = [row for row in rows if row["protocol"] == protocol]
@@ -158,7 +158,7 @@ def where_beaten(rows: Sequence[Row], ours: str) -> list[str]:
 
 
 def _beaten(own: Row, others: Sequence[Row], column: Column) -> tuple[str, str]:
-    """The methods that are better in one column (empty if none), and what ours has."""
+    """Return the methods that are better in one column, and our value."""
     if own[column.key] is None:
         return "", ""
     there = [row for row in others if row[column.key] is not None]
@@ -182,7 +182,7 @@ def _section(
 
 
 def _best(group: Sequence[Row], columns: Sequence[Column]) -> set[tuple[int, int]]:
-    """The best cells of each ranked column, unless all are equal."""
+    """Find the best cells of each ranked column, unless all are equal."""
     marked = set()
     for j, column in enumerate(columns):
         ranked = [(i, row[column.key]) for i, row in enumerate(group) if column.better]

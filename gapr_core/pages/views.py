@@ -62,11 +62,11 @@ class OnBone:
         return bool(size[2] > LONG * size[:2].max())
 
     def view(self, side: str) -> View:
-        """A side, with a long bone lying."""
+        """Return a side, with a long bone lying."""
         return VIEWS[side].lying if self.is_long else VIEWS[side]
 
     def side_facing(self, direction: Array | None) -> str:
-        """The side that is nearest to a direction (3,) towards the eye; the best one where it is None."""
+        """Choose the side nearest to a direction (3,) towards the eye; without one, the best."""
         if direction is None:
             return self.sides(1)[0]
         return max(VIEWS, key=lambda name: float(np.dot(VIEWS[name].eye, direction)))
@@ -79,7 +79,7 @@ class OnBone:
         return next((scale for scale in SCALES_MM if most <= scale), SCALES_MM[-1])
 
     def sides(self, count: int = SHOWN) -> list[str]:
-        """The sides that see most of the points and the places, the best first; no two show the same outline."""
+        """Choose the sides with most points and places, best first, each of another outline."""
         wanted = np.vstack([self.targets if self.gain is not None else self.points[:: len(self.points) // 300 + 1]])
         wanted = wanted if len(wanted) else self.bone.points[:1]
         names = [name for name, view in VIEWS.items() if not (self.is_long and view.eye[2])]
@@ -93,7 +93,7 @@ class OnBone:
 
 
 def of_result(result: RegistrationResult, with_gain: bool = False) -> OnBone:
-    """The points under the best hypothesis, accepted or not; `with_gain`, where to measure next."""
+    """Draw points under the best hypothesis, accepted or not; `with_gain`: where to measure next."""
     if result.bone is None:
         raise ValueError("a picture needs a result that knows its bone: take it from `register`")
     points, distance_mm = np.zeros((0, 3)), np.zeros(0)
@@ -111,7 +111,7 @@ def of_result(result: RegistrationResult, with_gain: bool = False) -> OnBone:
 
 
 def figure(result: RegistrationResult) -> Figure:
-    """The result from up to three sides, for a notebook or a file."""
+    """Draw the result from up to three sides, for a notebook or a file."""
     on = of_result(result)
     pictures = [picture_of(on, side) for side in on.sides()]
     aspects = [picture.light.shape[1] / picture.light.shape[0] for picture in pictures]
@@ -131,7 +131,7 @@ def figure(result: RegistrationResult) -> Figure:
 
 
 def png(on: OnBone, side: str) -> bytes:
-    """One side as a PNG."""
+    """Draw one side as a PNG."""
     picture = picture_of(on, side)
     height, width = picture.light.shape
     made = Figure((width / DPI, height / DPI), DPI)
@@ -141,7 +141,7 @@ def png(on: OnBone, side: str) -> bytes:
 
 
 def as_png(made: Figure) -> bytes:
-    """A figure as a PNG of few colours: about half of the bytes."""
+    """Save a figure as a PNG of few colours: about half of the bytes."""
     from PIL import Image
 
     out = BytesIO()
@@ -153,7 +153,7 @@ def as_png(made: Figure) -> bytes:
 
 
 def picture_of(on: OnBone, side: str) -> Picture:
-    """The bone alone, with room for all that is drawn on it, in `PIXELS` at most."""
+    """Draw the bone alone, with room for all points on it, in `PIXELS` at most."""
     values, view = None, on.view(side)
     if on.gain is not None:
         values = on.gain.gain_mm[cKDTree(on.gain.points).query(on.bone.points)[1]]
@@ -210,7 +210,7 @@ def _letters(axes: Any, view: View, size: float) -> None:
 
 
 def place_in_words(centre: Array, normal: Array, bone: Surface) -> str:
-    """Where on a bone a patch is, such as "upper third, front"; LPS."""
+    """Name a patch's place on a bone, such as "upper third, front"; LPS."""
     low, high = bone.points[:, 2].min(), bone.points[:, 2].max()
     third = ("lower third", "middle", "upper third")[int(np.clip(3.0 * (centre[2] - low) / (high - low), 0, 2))]
     axis = int(np.abs(normal).argmax())

@@ -20,7 +20,7 @@ def write_json(path: Path, rows: Sequence[Row], apart: Sequence[Row], plan: Plan
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """One line per row; a cell is empty where there is no value."""
+    """Write one line per row; a cell without a value is empty."""
     with files.replacing(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
@@ -30,7 +30,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 def write_markdown(
     path: Path, rows: Sequence[Row], apart: Sequence[Row], plan: Plan, ran: Mapping[str, str], notes: Sequence[str]
 ) -> None:
-    """The tables as Markdown."""
+    """Write the tables as Markdown."""
     parts = ["# Benchmark", *(f"> {note}" for note in notes)]
     for section in [*sections(rows), *compared(apart, plan.ours)]:
         body = [[f"**{c}**" if (i, j) in section.best else c for j, c in enumerate(line)]

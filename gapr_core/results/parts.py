@@ -202,7 +202,7 @@ class Guidance:
     patch_mm: float = 30.0
 
     def spots(self, most: int = 5) -> tuple[Patch, ...]:
-        """The best patches that do not overlap, best first, at most `most`."""
+        """Pick the best patches that do not overlap, best first, at most `most`."""
         chosen: list[Patch] = []
         for patch in self.patches:
             if len(chosen) == most:

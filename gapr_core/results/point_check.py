@@ -54,7 +54,7 @@ class PointCheck:
         return self.text()
 
     def text(self, none_near: str = "none near the bone: are they in the frame and the unit of the source?") -> str:
-        """The answer in one line; `none_near` is what it says where no point has a surface near."""
+        """Return the answer in one line; `none_near` stands for points without a surface near."""
         sizes = np.abs(self.distance_mm)
         far, count = int(np.isnan(sizes).sum()), f"{len(sizes)} point{'s' if len(sizes) > 1 else ''}"
         largest = f"{far} with no surface near" if far else f"{sizes.max():.1f} mm off at most"

@@ -36,7 +36,7 @@ PLANNING, PAGE = "gapr_core.formats.planning", "gapr_core.pages.registration_rep
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
-    """The answer to one `register` call.
+    """Answer of one `register` call.
 
     Attributes:
         status: `OK`, or why there is no pose.
@@ -54,8 +54,8 @@ class RegistrationResult:
         stage_ms: wall time of each stage, ms.
         method: name of the method that answered.
         reason: one sentence for users: why it was refused; empty when there is nothing to say.
-        centre_mm: (3,) mean of the source points that the pose was found with, drawn from those that were used where
-            there are many, in the target frame; None unless `OK`, and where a method does not say.
+        centre_mm: (3,) mean of the used source points (of a sample, where there are many) in the target frame; None
+            unless `OK`, and where a method does not say.
         proposer: name of the last proposer that was asked; empty where nothing was registered.
         rounds: rounds of proposals: of how many proposers, of a camera's cloud of how many sets of regions.
         features: what the confidence is computed from, by name.
@@ -118,7 +118,7 @@ class RegistrationResult:
         return self.ok
 
     def refused(self, status: RegistrationStatus, reason: str) -> RegistrationResult:
-        """The same without its pose and all that goes with one; its confidence and hypotheses stay, to look at."""
+        """Return the refusal: no pose and nothing that needs one; confidence and hypotheses stay."""
         return replace(
             self,
             status=status,
@@ -154,11 +154,11 @@ class RegistrationResult:
         return se3.apply(self.T_target_source, points)
 
     def errors_at(self, points: ArrayLike, labels: Sequence[str] = ()) -> tuple[TargetError, ...]:
-        """The error to expect at points (N, 3), mm, of the target's frame; see `with_targets`."""
+        """Expect the error at points (N, 3), mm, target frame; see `with_targets`."""
         return self.with_targets(points, labels).targets
 
     def with_targets(self, points: ArrayLike, labels: Sequence[str] = ()) -> RegistrationResult:
-        """The same result with planned targets: their errors, and a warning of those that are far from the bone.
+        """Add planned targets: their errors, and a warning of those far from the bone.
 
         Args:
             points: (N, 3) mm, target frame; a refusal has no error at them.
@@ -224,7 +224,7 @@ class RegistrationResult:
         }
 
     def _repr_html_(self) -> str:
-        """The result in a notebook: verdict, targets and picture; plain text where `reports` is not installed."""
+        """Show a result in a notebook: verdict, targets and picture; plain text without `reports`."""
         try:
             shown: str = import_module(PAGE).fragment(self)
         except ImportError:

@@ -44,7 +44,7 @@ def ball_sizes(points_mm: Array, voxel: float, scale_mm: float, config: ModelCon
 
 
 def bone_sizes(specimens: Iterable[Specimen], config: ModelConfig, seed: int = 0) -> Counts:
-    """The balls of the target and of the source of one pair of protocol paper for every bone."""
+    """Count points in balls of target and source of one pair of protocol paper per bone."""
     found = []
     for specimen in specimens:
         pair = make_pair("paper", specimen, seed)
@@ -54,12 +54,12 @@ def bone_sizes(specimens: Iterable[Specimen], config: ModelConfig, seed: int = 0
 
 
 def share_cut(sizes: Counts, caps: Iterable[int]) -> list[float]:
-    """Of each stage, the share of the balls with more points than the cap."""
+    """Return per stage the share of balls with more points than the cap."""
     return [float((stage > cap).mean()) for stage, cap in zip(sizes, caps, strict=True)]
 
 
 def caps_for(sizes: Counts, most_cut: float = MOST_CUT) -> list[int]:
-    """Of each stage, the smallest cap that cuts at most this share of the balls."""
+    """Return per stage the smallest cap that cuts at most this share of balls."""
     return [int(np.sort(stage)[int(np.ceil((1.0 - most_cut) * len(stage))) - 1]) for stage in sizes]
 
 

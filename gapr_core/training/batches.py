@@ -18,7 +18,7 @@ from gapr_core.training.targets import TrainingPair
 
 
 def bones_folder(folder: Path, config: TrainConfig, anatomy: Path | None) -> Path:
-    """Where the bones in use of a run are kept: a scratch folder of this machine, the same at every call.
+    """Return a run's scratch folder of bones in use, the same at every call.
 
     Other meshes, and other code that draws parametric bones, have another one: it outlives a run that is stopped.
     """

@@ -59,7 +59,7 @@ def save(path: Path, bone: PooledBone) -> None:
 
 
 def load(path: Path) -> PooledBone:
-    """The bone that was written, bit by bit."""
+    """Load the stored bone, bit by bit."""
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     specimen = Specimen(Surface(arrays["vertices"], arrays["faces"]), *(str(name) for name in arrays["names"]))

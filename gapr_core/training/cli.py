@@ -17,7 +17,7 @@ from gapr_core.runtime.console import say
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr train`."""
+    """Add the options of `gapr train`."""
     parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
     parser.add_argument("--model", default=None, help="yaml of config/model; over the one that --config names")
     parser.add_argument("--initial", default=None, help="weights (safetensors) of the same network to begin with")
@@ -52,7 +52,7 @@ def run(args: Namespace) -> int:
 
 
 def plot(runs: list[Path], out: Path | None) -> int:
-    """Draw the curves of one run into its folder, or of several (or of one) into the PNG that is named."""
+    """Draw the curves of one run into its folder, or of any number into the named PNG."""
     from gapr_core.training import curves
 
     if out is None and len(runs) > 1:

@@ -67,12 +67,12 @@ class TrainConfig(Settings):
             raise ConfigError("bones to train on", "none", "name some in `bones`")
 
     def network(self) -> ModelConfig:
-        """What is trained: `model` with `model_settings` over it."""
+        """Return the trained network: `model` with `model_settings` over it."""
         return network_of(self.model, self.model_settings)
 
 
 def read_config(path: Path | None, assignments: Sequence[str] = ()) -> TrainConfig:
-    """The settings in a yaml, with `name=value` over them.
+    """Read the settings of a yaml, with `name=value` over them.
 
     `model` and `initial` are paths from the working folder, or from a folder above the yaml: config/train_paper.yaml
     names config/model/NAME.yaml, and means it wherever it is called from.
@@ -87,7 +87,7 @@ def read_config(path: Path | None, assignments: Sequence[str] = ()) -> TrainConf
 
 
 def _found(named: str, path: Path) -> str:
-    """A path in a yaml, from the working folder: as it stands, or in a folder above the yaml if it is only there."""
+    """Resolve a yaml's path from the working folder, else from a folder above the yaml."""
     if not named or Path(named).exists():
         return named
     places = (folder / named for folder in path.resolve().parents)
@@ -95,7 +95,7 @@ def _found(named: str, path: Path) -> str:
 
 
 def network_of(model: str | Path, settings: Mapping[str, Any]) -> ModelConfig:
-    """The network of a yaml (the default one without) with settings over it."""
+    """Configure a yaml's network, or the default one, with settings over it."""
     return ModelConfig.from_dict((read_yaml(model) if model else {}) | dict(settings))
 
 
@@ -124,7 +124,7 @@ def default_plan() -> Path:
 
 
 def read_plan(path: Path) -> list[Variant]:
-    """The rows of all tables; paths relative to the working folder, so that they mean the same on another machine.
+    """Read the rows of all tables; paths stay relative to the working folder, for other machines.
 
     Raises:
         ConfigError: the file cannot be read, or holds something else than lists of rows.
@@ -148,7 +148,7 @@ def _variant(table: str, row: Any, models: Path, path: Path) -> Variant:
 
 
 def trained_as(plan: Sequence[Variant], settings: Mapping[str, Any] | None = None) -> dict[Path, Path]:
-    """For every yaml the first one with the same network: what is equal but for its name is trained once.
+    """Map every yaml to the first one with the same network but for its name.
 
     `settings` are those that the run has over every yaml.
     """

@@ -43,7 +43,7 @@ class Run:
 
 
 def draw(folders: Sequence[Path], out: Path, names: Sequence[str] = ()) -> Path:
-    """One PNG: protocols apart where there is one run, one line a run where there are several.
+    """Draw one PNG: a line per protocol for one run, a line per run for several.
 
     Args:
         folders: of the runs.
@@ -60,7 +60,7 @@ def draw(folders: Sequence[Path], out: Path, names: Sequence[str] = ()) -> Path:
 
 
 def draw_or_warn(folder: Path) -> None:
-    """The curves of a run under way, in its folder; a warning where that fails, so that the run goes on."""
+    """Draw the curves of a run under way, in its folder; warn if that fails, so training goes on."""
     try:
         draw([folder], folder / "curves.png")
     except Exception as error:
@@ -68,7 +68,7 @@ def draw_or_warn(folder: Path) -> None:
 
 
 def labels(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that differ."""
+    """Shorten paths to ends that differ."""
     parts = [folder.resolve().parts for folder in folders]
     for length in range(1, max(map(len, parts), default=1) + 1):
         ends = ["/".join(p[-length:]) for p in parts]
@@ -78,7 +78,7 @@ def labels(folders: Sequence[Path]) -> list[str]:
 
 
 def read(folder: Path, name: str) -> Run:
-    """The run in a folder.
+    """Read the run in a folder.
 
     Raises:
         ConfigError: none has logged anything there.
@@ -93,7 +93,7 @@ def read(folder: Path, name: str) -> Run:
 
 
 def read_csv(path: Path) -> list[dict[str, float | str]]:
-    """The whole lines of a file that is being written, none if there is no file; tells how many others it left out."""
+    """Read the whole lines of a growing file, none without one; logs a count of broken ones."""
     lines = path.read_text(errors="replace").splitlines(keepends=True) if path.exists() else []
     head = lines[0].rstrip().split(",") if lines else []
     parsed = [_parse(head, line) for line in lines[1:]]
@@ -128,7 +128,7 @@ def _columns(rows: list[dict[str, float | str]]) -> Table:
 
 
 def smooth(values: Array, reach: int) -> Array:
-    """Mean of each of the values (N,) and `reach` on either side of it; those that are not finite do not count."""
+    """Average the values (N,) within `reach` on either side, finite ones only."""
     known = np.isfinite(values)
     sums, counts = (np.r_[0.0, np.cumsum(part)] for part in (np.where(known, values, 0.0), known))
     first = np.maximum(np.arange(len(values)) - reach, 0)
@@ -163,7 +163,7 @@ def figure(runs: Sequence[Run]) -> Figure:
 
 
 def _legend_columns(texts: list[str]) -> int:
-    """Of a legend below the axes: as many as fit next to each other."""
+    """Fit columns of a legend below the axes side by side."""
     return max(1, min(8, len(texts), LEGEND_LETTERS // (max(map(len, texts)) + 8)))
 
 
@@ -215,7 +215,7 @@ def _inliers(axes: Axes, run: Run, colour: str, one: bool) -> None:
 
 
 def _recalls(axes: Axes, runs: Sequence[Run], recall: str) -> None:
-    """One run: a line a protocol, all of several in black. Several runs: a line a run, over all protocols."""
+    """Draw a line per protocol and all in black for one run; for several, a line per run."""
     if len(runs) > 1:
         lines = [(run.name, run.scores.get(ALL, {}), colour, "-", 1.8) for run, colour in
                  zip(runs, _colours(len(runs)), strict=True)]  # fmt: skip
@@ -231,7 +231,7 @@ def _recalls(axes: Axes, runs: Sequence[Run], recall: str) -> None:
 
 
 def _kinds(axes: Axes, kinds: dict[str, str], one: bool) -> None:
-    """Which line is coarse and which is fine."""
+    """Label the coarse and the fine line."""
     colours = _colours(len(kinds)) if one else ["#444444"] * len(kinds)
     styles = ["-"] * len(kinds) if one else list(kinds.values())
     handles = [Line2D([], [], color=c, ls=s, lw=1.8) for c, s in zip(colours, styles, strict=True)]

@@ -83,7 +83,7 @@ class SampledOnce(Specimen):
     cloud: Array | None = None
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Any, Any]:
-        """The cloud; normals are not known."""
+        """Sample the cloud; normals are unknown."""
         return self.cloud, None
 
 
@@ -114,7 +114,7 @@ class TrainingPairs(Dataset[TrainingPair]):
         return join([self.pair(first + i) for i in range(self.train.micro_batch)])
 
     def pair(self, number: int) -> TrainingPair:
-        """Pair `number`; the rare one with too few points or overlap gives way to a later draw of the same number."""
+        """Make pair `number`; one with too few points or overlap gives way to a later draw."""
         rng = np.random.default_rng([self.train.seed, 1, number])
         which = self._bone_number(number)
         for _ in range(20):
@@ -143,14 +143,14 @@ class TrainingPairs(Dataset[TrainingPair]):
         return LANES * row + lane
 
     def _seen_by(self, protocol: str, bone: PooledBone) -> Specimen:
-        """What a protocol makes its pair of: the bone, or the target's own points where they are to be cropped."""
+        """Return a protocol's input: the bone, or the target's own points for a crop."""
         whose = bone.specimen
         if self.train.source_points == "new" or not protocol.startswith(CROPPED):
             return whose
         return SampledOnce(whose.surface, whose.bone, whose.person, whose.cohort, bone.points)
 
     def _sizes(self, bone: int) -> ModelConfig:
-        """The network's settings for pairs of this bone: fewer superpoints for the bones that come in first."""
+        """Return the network's settings for this bone: fewer superpoints for bones that come in first."""
         if bone // LANES * LANES * self.train.reuse >= self.train.coarse_first * self.train.pairs:
             return self.model
         few, many = (max(4, round(COARSE * count)) for count in self.model.superpoints)
@@ -212,7 +212,7 @@ def prune(folder: Path, train: TrainConfig, pairs: int) -> None:
 
 
 def _oldest_row(train: TrainConfig, number: int) -> int:
-    """The first row of `LANES` bones that pair `number` and those after it may ask for."""
+    """Return the first row of `LANES` bones that pairs from `number` on may need."""
     return number // (train.reuse * LANES)
 
 

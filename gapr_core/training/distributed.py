@@ -23,7 +23,7 @@ class Group:
     device: torch.device
 
     def wrap(self, module: nn.Module) -> nn.Module:
-        """The module whose backward pass leaves the mean gradient of all processes; the module itself for one."""
+        """Wrap a module so its backward pass averages gradients of all processes; one needs none."""
         if self.world == 1:
             return module
         devices = [self.device] if self.device.type == "cuda" else None
@@ -38,7 +38,7 @@ class Group:
         return bool(flag.item())
 
     def mean(self, values: dict[str, float]) -> dict[str, float]:
-        """The mean of each value over all processes; every process calls this, with the same names."""
+        """Average each value over all processes; every process calls this, with the same names."""
         if self.world == 1:
             return values
         sums = torch.tensor(list(values.values()), device=self.device)

@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def card(trained: dict[str, Any], licences: Path | None = None) -> dict[str, Any]:
-    """What the header says about the weights: the run's own card, its data, and the licences that are stated.
+    """Build the header's card of the weights: the run's own, its data, and the stated licences.
 
     Raises:
         ConfigError: `licences` is no yaml with a mapping.

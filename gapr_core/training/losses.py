@@ -76,7 +76,7 @@ def assignment_loss(log_z: Tensor, labels: Tensor) -> Tensor:
 
 
 def features(network: GAPRNet, pair: TrainingPair) -> tuple[Features, Features]:
-    """What the backbone makes of sources and targets: all clouds in one pass, each different target once."""
+    """Run the backbone on sources and targets in one pass, each different target once."""
     targets = pair.target if pair.distinct is None else pair.distinct
     which = tuple(range(len(targets))) if pair.distinct is None else pair.which
     clouds, sources = collate([pair.source, targets]), len(pair.source)
@@ -87,7 +87,7 @@ def features(network: GAPRNet, pair: TrainingPair) -> tuple[Features, Features]:
 def compute_losses(
     network: GAPRNet, pair: TrainingPair, generator: torch.Generator, early_weight: float = 0.5
 ) -> tuple[Losses, Aggregated]:
-    """One pass of a batch with the truth: the fine loss looks at true patch pairs and need not wait for good ones."""
+    """Run a batch with the truth: the fine loss uses true patch pairs from the first step."""
     f_p, f_q = features(network, pair)
     a = network.aggregation(pair.source, pair.target, f_p.coarse, f_q.coarse)
     coarse = circle_loss(a.source, a.target, pair.overlaps, a.source_valid, a.target_valid)

@@ -47,7 +47,7 @@ class Lessons(Protocol):
     names: tuple[str, ...]
 
     def __call__(self, network: nn.Module, pair: TrainingPair, voxel: float, log: Log) -> dict[str, Tensor] | None:
-        """The losses by their names; None where the pair teaches nothing.
+        """Return losses by name; None where the pair teaches nothing.
 
         Args:
             network: the one that learns.
@@ -127,7 +127,7 @@ def train(code: Checkout, teacher: Teacher, config: TrainConfig, anatomy: Path |
 
 
 def seed(number: int) -> None:
-    """Of all that the authors' code draws: kernels that are turned, pairs of points that the loss looks at."""
+    """Seed all draws of the authors' code: turned kernels, and the loss's pairs of points."""
     torch.manual_seed(number)
     np.random.seed(number)
 
@@ -189,7 +189,7 @@ class Learner:
         return [float(found[name].detach()) for name in self._lessons.names]
 
     def state(self) -> dict[str, Any]:
-        """What `go_on` needs."""
+        """Return everything `go_on` needs."""
         parts = {"network": self.network.state_dict(), "optimizer": self._optimizer.state_dict()}
         return parts | {"of": self._name, "log": self._log, "left_out": self._left_out}
 
@@ -206,12 +206,12 @@ class Learner:
         self._log, self._left_out = state["log"], state["left_out"]
 
     def card(self) -> dict[str, Any]:
-        """What the weights were trained on."""
+        """Return the data of the weights' training."""
         pairs = self.steps_done * self.config.batch
         return {"pairs": pairs, "left_out": self._left_out[-1], "run": self.config.to_dict()}
 
     def table(self) -> str:
-        """The log, one line a step, as CSV."""
+        """Write the log, one line a step, as CSV."""
         rows = zip(self._left_out, self._log, strict=True)
         lines = (
             ",".join(f"{value:.5g}" for value in (step, step * self.config.batch, left_out, *losses.values()))

@@ -50,7 +50,7 @@ class Lessons:
 
 
 def knows_features(log: peer.Log) -> bool:
-    """Whether features found enough of their true matches, on average over the last steps."""
+    """Tell whether features found enough true matches, on average over the last steps."""
     return len(log) >= RECENT and float(np.nanmean([step["recall"] for step in log[-RECENT:]])) > RECALL
 
 

@@ -52,7 +52,7 @@ def append(folder: Path, config: TrainConfig, bones: Path | None, step: int, wor
 
 
 def entries(folder: Path) -> list[Entry]:
-    """All entries of a folder's provenance.json, the oldest first; none where there is no file.
+    """Read all entries of a folder's provenance.json, oldest first; none without the file.
 
     Raises:
         ConfigError: the file there cannot be read.
@@ -61,7 +61,7 @@ def entries(folder: Path) -> list[Entry]:
 
 
 def summary(folders: Iterable[Path]) -> list[str]:
-    """One sentence for every kind of code, machine and data that these runs had, in order; none of runs not begun."""
+    """Summarise code, machines and data of these runs in order; runs not begun have none."""
     return list(dict.fromkeys(_sentence(entry) for folder in folders for entry in entries(folder)))
 
 
@@ -84,7 +84,7 @@ def _sentence(entry: Entry) -> str:
 
 
 def code() -> Entry:
-    """When, and what runs: the commit of the source tree (`-dirty` where it was changed since), and versions."""
+    """Record time, commit of the source tree (`-dirty` after changes), and versions."""
     return {
         "time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "commit": commit(), "gapr": release(),
         "torch": torch.__version__, "python": platform.python_version(),
@@ -101,7 +101,7 @@ def machine() -> Entry:
 
 
 def data(bones: Iterable[str], folder: Path | None) -> Entry:
-    """Where the bones come from: how many train subjects, a hash over them and their meshes, the parametric model."""
+    """Record the bones: number of train subjects, a hash of subjects and meshes, the parametric model."""
     people = sorted(anatomy.splits(folder)["train"]) if folder else []
     return {
         "train_people": len(people), "anatomy": meshes_hash(bones, people, folder) if folder else None,

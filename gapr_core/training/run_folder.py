@@ -26,7 +26,7 @@ MOST_NAMED = 4  # settings that an error names
 
 
 def check(folder: Path, config: TrainConfig, model: ModelConfig) -> None:
-    """The folder is empty, or holds a run with these settings.
+    """Check for an empty folder, or a run with these settings.
 
     The network's settings count, not the path of their yaml; an entry that did not exist then stood at its default.
 
@@ -50,7 +50,7 @@ def _changes(begun: Settings, now: Settings) -> list[str]:
 
 
 def _begun_with(path: Path) -> tuple[TrainConfig, ModelConfig]:
-    """The settings in a config.json."""
+    """Read the settings in a config.json."""
     expected, how = "the settings of a training run", "restore it, or choose a new folder"
     begun = files.read_json(path, expected, how)
     try:
@@ -87,7 +87,7 @@ def _check_bones(folder: Path, config: TrainConfig, anatomy: Path | None) -> Non
 
 
 def _bones(data: dict[str, Any], folder: Path | None) -> str:
-    """The real bones of an entry of provenance.json in words."""
+    """Describe the real bones of an entry of provenance.json."""
     if data["anatomy"] is None:
         return "parametric bones alone"
     where = f" in {folder}" if folder else ""
@@ -95,13 +95,13 @@ def _bones(data: dict[str, Any], folder: Path | None) -> str:
 
 
 def log_row(state: dict[str, Any], config: TrainConfig, values: dict[str, float]) -> dict[str, Any]:
-    """One line of log.csv: how far the run is, and five digits of each value."""
+    """Format one line of log.csv: progress, and five digits of each value."""
     row = {"step": state["step"], "pairs": state["step"] * config.batch, "seconds": round(state["seconds"], 1)}
     return row | {name: float(f"{value:.5g}") for name, value in values.items()}
 
 
 def mean_losses(parts: list[Losses]) -> dict[str, float]:
-    """The total and each loss, averaged over the micro-batches that one process had in a step."""
+    """Average the total and each loss over one process's micro-batches of a step."""
     names = ["total", "coarse", "fine", "early"]
     means = {name: sum(float(getattr(part, name).detach()) for part in parts) / len(parts) for name in names}
     return {"loss": means.pop("total"), **means}
@@ -137,7 +137,7 @@ def draw_curves(folder: Path) -> None:
 
 
 def append(path: Path, row: dict[str, Any]) -> None:
-    """One line at the end of a CSV file, with a head if it is new; in place of one that a crash cut off."""
+    """Append one line to a CSV file, with a head if new; replaces a line cut by a crash."""
     with path.open("a+b") as file:
         size = file.seek(0, 2)
         file.seek(max(size - 4096, 0))

@@ -34,12 +34,12 @@ class ShapeModel:
         return cls(mean, points - mean, np.asarray(people.faces, dtype=np.int64))
 
     def draw(self, rng: np.random.Generator) -> Surface:
-        """A subject of the Gaussian that the subjects span: the same as drawing every principal component."""
+        """Draw a subject of the Gaussian over the subjects, equal to drawing every principal component."""
         weights = rng.normal(size=len(self.deviations)) / np.sqrt(max(len(self.deviations) - 1, 1))
         return Surface(self.mean + np.tensordot(weights, self.deviations, axes=1), self.faces, None)
 
 
 def vary(surface: Surface, rng: np.random.Generator) -> Surface:
-    """The same bone as another subject's: up to 10 % larger or smaller, other waves and texture, left or right."""
+    """Vary a bone to another subject's: up to 10 % in size, other waves and texture, either side."""
     changed = deform(replace(surface, points=surface.points * rng.uniform(0.9, 1.1)), rng)
     return changed if rng.random() < 0.5 else changed.mirrored()

@@ -12,7 +12,7 @@ from gapr_core.training.config import TrainConfig
 
 
 def begin(config: TrainConfig, model: ModelConfig) -> GAPRNet:
-    """A network to train: with the weights of `config.initial`, or random ones.
+    """Begin with the weights of `config.initial`, or random ones.
 
     Raises:
         ConfigError: the tensors of `config.initial` are not those of this network, other settings may differ.

@@ -32,7 +32,7 @@ class Drawn:
 
     @classmethod
     def of(cls, folder: Path | None, path: Path) -> Drawn:
-        """The record that an earlier call left in `path`, or a new one; `folder` has the bones and splits.json."""
+        """Read an earlier call's record in `path`, or begin one; `folder` has the bones and splits.json."""
         people = anatomy.splits(folder) if folder else {"val": [], "test": []}
         known = files.read_json(path, WHAT) if path.exists() else {}
         return cls(path, frozenset([*people["val"], *people["test"]]), Counter(known))
@@ -55,7 +55,7 @@ class Drawn:
         files.write_json(self.path, dict(sorted(self.pairs.items())))
 
     def count(self) -> int:
-        """How many subjects contributed so far, by what the other processes of the run have written as well."""
+        """Count the subjects so far, by the files of the run's other processes as well."""
         others = (path for path in self.path.parent.glob(RECORDS) if path != self.path)
         return len(set(self.pairs).union(*(files.read_json(path, WHAT) for path in others)))
 

@@ -45,11 +45,11 @@ class TrainingPair:
     subjects: tuple[str, ...] = ()
 
     def to(self, device: torch.device | str) -> TrainingPair:
-        """The same on another device."""
+        """Copy to another device."""
         return on_device(self, device)
 
     def pin_memory(self) -> TrainingPair:
-        """The same in memory that a GPU copies from without waiting; a `DataLoader` asks for it."""
+        """Copy to pinned memory for a GPU; a `DataLoader` asks for it."""
         return mapped(self, Tensor.pin_memory)
 
 
@@ -72,7 +72,7 @@ def to_units(T_target_source: Array, source: Cloud, target: Cloud) -> Array:
 
 
 def _matches(source: Cloud, target: Cloud, T: Array, radius: float) -> NDArray[Any]:
-    """Fine points i of the source and j of the target within `radius` of each other, and how far apart, v."""
+    """Match fine points i of the source and j of the target within `radius`; v is their distance."""
     p, q = se3.apply(T, source.fine.points.numpy()), target.fine.points.double().numpy()
     return cKDTree(p).sparse_distance_matrix(cKDTree(q), radius, output_type="ndarray")  # type: ignore[no-any-return]
 
@@ -90,7 +90,7 @@ def _overlaps(source: Cloud, target: Cloud, matches: NDArray[Any]) -> NDArray[np
 
 
 def _nodes(cloud: Cloud) -> NDArray[np.int64]:
-    """The patch of every fine point, -1 for those that no patch has room for."""
+    """Return the patch of every fine point, -1 without room in any."""
     node = np.full(len(cloud.fine.points), -1, dtype=np.int64)
     row, column = np.nonzero(cloud.patches_valid.numpy())
     node[cloud.patches.numpy()[row, column]] = row
@@ -98,7 +98,7 @@ def _nodes(cloud: Cloud) -> NDArray[np.int64]:
 
 
 def _hits(point: NDArray[np.int64], node: NDArray[np.int64], other: NDArray[np.int64], shape: tuple[int, int]) -> Array:
-    """How many different points of each own patch, `node` of every point, have a match in each other patch."""
+    """Count different points of each own patch, `node` of every point, with matches in each other patch."""
     has_match = np.zeros((len(node), shape[1]), dtype=bool)
     has_match[point, other] = True
     point, other = np.nonzero(has_match)
@@ -107,7 +107,7 @@ def _hits(point: NDArray[np.int64], node: NDArray[np.int64], other: NDArray[np.i
 
 
 def join(pairs: list[TrainingPair]) -> TrainingPair:
-    """A batch; overlaps are padded with zeros, targets that are one and the same object are kept as one as well."""
+    """Join a batch: pad overlaps with zeros, keep one copy of identical target objects."""
     if len(pairs) == 1:
         return pairs[0]
     n, m = (max(p.overlaps.shape[axis] for p in pairs) for axis in (1, 2))
@@ -140,7 +140,7 @@ def true_patch_pairs(pair: TrainingPair, count: int, generator: torch.Generator)
 
 
 def _starts(clouds: Cloud, which: Tensor) -> Tensor:
-    """For each entry of `which` the row of its cloud's first superpoint."""
+    """Return the row of the cloud's first superpoint for each entry of `which`."""
     counts = torch.tensor(clouds.coarse.lengths)
     return (counts.cumsum(0) - counts).to(which.device)[which]
 

@@ -181,7 +181,7 @@ class Run:
         run_folder.draw_curves(self.folder)
 
     def _has_weights(self) -> bool:
-        """Whether whole weights of this step are on disk: a run can be killed between its checkpoint and them."""
+        """Tell whether whole weights of this step are on disk: a run can die between checkpoint and weights."""
         try:
             return bool(weights.load(self.weights)[1]["step"] == self.state["step"])
         except WeightsError:
@@ -206,7 +206,7 @@ class Learner(nn.Module):
         self.network, self.config = network, config
 
     def forward(self, pair: TrainingPair, generator: torch.Generator) -> Losses:
-        """The losses of one micro-batch."""
+        """Compute the losses of one micro-batch."""
         with torch.autocast(pair.T.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             return compute_losses(self.network, pair, generator, self.config.early_loss)[0]
 

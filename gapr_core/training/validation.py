@@ -64,7 +64,7 @@ class Scores:
 
 
 def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) -> list[ValidationPair]:
-    """The same pairs at every call: `validation_pairs` of each protocol, bones of the validation split in turn.
+    """Make the same pairs at every call: `validation_pairs` per protocol, validation bones in turn.
 
     Bones of which nobody is in that split are left out.
 
@@ -88,7 +88,7 @@ def validation_set(train: TrainConfig, model: ModelConfig, folder: Path | None) 
 
 
 def _validation_pair(protocol: str, specimen: Specimen, seed: int, model: ModelConfig) -> ValidationPair:
-    """The pair of this seed; one that a network cannot see gives way to a later seed, as in training."""
+    """Make the pair of this seed; one invisible to the network gives way to a later seed."""
     for turn in range(TRIES):
         try:
             made = make_pair(protocol, specimen, seed + turn * NEXT_SEED)
@@ -116,7 +116,7 @@ def validate(network: GAPRNet, pairs: list[ValidationPair], device: torch.device
 
 
 def score_pair(network: GAPRNet, v: ValidationPair, device: torch.device) -> Scores:
-    """One pair, one forward pass, local-to-global consensus."""
+    """Score one pair in one forward pass with local-to-global consensus."""
     pair = v.pair.to(device)
     output = network(pair.source, pair.target)
     found = correspondences_mm(output.matches, v.pair.source, v.pair.target)

@@ -13,17 +13,6 @@ NO_VERB = re.compile(
     r"(what|where|whether|how|which|who|why|when|that|the|a|an|all|each|every|one|no|of|for|in|if|it)\b"
 )
 TO_DO = (  # packages whose docstrings are still to be shortened: this list only shrinks
-    "gapr_core/__init__.py",
-    "gapr_core/cli.py",
-    "gapr_core/clouds.py",
-    "gapr_core/commands",
-    "gapr_core/data/picture.py",
-    "gapr_core/formats",
-    "gapr_core/model",
-    "gapr_core/pages",
-    "gapr_core/results",
-    "gapr_core/surface.py",
-    "gapr_core/training",
     "gapr_ros/demo",
     "gapr_ros/node",
     "gapr_ros/parameters.py",

@@ -19,7 +19,7 @@ from gapr_core.surface import Surface, as_points
 
 
 def read_npy(path: Path, options: ReadOptions) -> Surface:
-    """An (N, 3) array, a camera's image (H, W, 3), or poses (N, 4, 4) of a tool, mm, NaN where it was not seen.
+    """Read an array (N, 3), an image (H, W, 3), or tool poses (N, 4, 4), mm.
 
     Raises:
         InvalidPointCloudError: poses without the tip, a tip without poses, or poses that are not rigid.
@@ -38,7 +38,7 @@ def read_npy(path: Path, options: ReadOptions) -> Surface:
 
 
 def read_npz(path: Path, options: ReadOptions) -> Surface:
-    """The arrays `points` (N, 3) and, where there is one, `faces` (F, 3) integers.
+    """Read the arrays `points` (N, 3) and, if there is one, `faces` (F, 3) integers.
 
     Raises:
         InvalidPointCloudError: no array of that name.
@@ -63,7 +63,7 @@ def read_npz(path: Path, options: ReadOptions) -> Surface:
 
 
 def array_of(data: bytes, limits: FileLimits) -> np.ndarray:
-    """The array of an .npy file, whose header says exactly as many bytes as there are.
+    """Read the array of an .npy file, whose length must fit its header.
 
     Raises:
         ValueError: a damaged header, Python objects, or another length.

@@ -23,7 +23,7 @@ FEWEST_USED = 0.95  # share of the vertices that belong to a face; the file ends
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """A mesh. The format says nothing of its own length, so a file without faces or with unused vertices is refused.
+    """Read a mesh. The format states no length, so a file without faces or with unused vertices is refused.
 
     A cut at the end of a line that leaves every vertex with a face cannot be known: an open mesh is logged.
     """

@@ -20,7 +20,7 @@ KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """A cloud, with its normals where all three components are there, and its camera where it is an image that says."""
+    """Read a cloud, its normals if all three components are there, and an image's camera."""
     limits = options.limits
     data = limits.read(path)
     header, start = _header(data)
@@ -56,7 +56,7 @@ def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _integer(header: dict[str, list[str]], key: str) -> int:
-    """The number after a key."""
+    """Return the number after a key."""
     word = header[key][0]
     if not word.isdecimal():
         raise ValueError(f"{key} {word[:20]!r} in its header, which is no whole number from 0")
@@ -64,7 +64,7 @@ def _integer(header: dict[str, list[str]], key: str) -> int:
 
 
 def _is_identity(viewpoint: list[str]) -> bool:
-    """Whether the words after VIEWPOINT, if any, move nothing."""
+    """Tell whether the words after VIEWPOINT, if any, move nothing."""
     try:
         return not viewpoint or [float(word) for word in viewpoint] == IDENTITY
     except ValueError:
@@ -72,7 +72,7 @@ def _is_identity(viewpoint: list[str]) -> bool:
 
 
 def _fields(header: dict[str, list[str]]) -> np.dtype:
-    """The layout of one point; a name that comes twice (padding) is kept once."""
+    """Return the layout of one point; a repeated name (padding) is kept once."""
     names, sizes, kinds = header["FIELDS"], header["SIZE"], [kind.upper() for kind in header["TYPE"]]
     counts = header.get("COUNT", ["1"] * len(names))
     if not len(names) == len(sizes) == len(kinds) == len(counts):

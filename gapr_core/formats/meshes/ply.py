@@ -34,7 +34,7 @@ MOST_LISTS = 3  # of one element: vertices, texture coordinates, and one more
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """A mesh, or a cloud with its normals."""
+    """Read a mesh, or a cloud with its normals."""
     data = options.limits.read(path)
     _check_header(data, options.limits)
     ply = _parse(_with_ascii_header(_without_grid(data)))
@@ -69,7 +69,7 @@ def _without_grid(data: bytes) -> bytes:
 
 
 def _with_ascii_header(data: bytes) -> bytes:
-    """The same, with a question mark for each byte of another alphabet in a comment, which plyfile refuses."""
+    """Put a question mark for each non-ASCII byte in a comment, which plyfile refuses."""
     header, body = _halves(data)
     return data if header.isascii() else re.sub(rb"[\x80-\xff]", b"?", header) + body
 
@@ -91,7 +91,7 @@ def _columns(table: Any, names: Any) -> Array:
 
 
 def _check_header(data: bytes, limits: FileLimits) -> None:
-    """Every row that the header announces has room in the file.
+    """Check the file's size against every row of the header.
 
     Raises:
         ValueError: no header, or a file that is shorter.

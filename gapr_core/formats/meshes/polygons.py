@@ -9,7 +9,7 @@ Indices = NDArray[np.int64]
 
 
 def integers(values: NDArray[np.float64]) -> Indices:
-    """The same as integers.
+    """Convert to integers.
 
     Raises:
         ValueError: one of them is none.

@@ -50,7 +50,7 @@ def _corners_of_text(data: bytes) -> Array:
 
 
 def share_vertices(corners: Array) -> Surface:
-    """The mesh of (3 F, 3) corners, in which equal ones are one vertex."""
+    """Join equal corners (3 F, 3) to shared vertices of a mesh."""
     if len(corners) == 0:
         raise ValueError("no facets in it")
     order = np.lexsort(corners.T)

@@ -25,7 +25,7 @@ CLOUD = "save a cloud as PLY, NPY or VTP, or with VERTICES; export a mesh again"
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """A mesh; a cloud has its points as VERTICES.
+    """Read a mesh; a cloud has its points as VERTICES.
 
     Raises:
         InvalidPointCloudError: points without cells, as those of a mesh that is cut.
@@ -53,7 +53,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def space(path: Path, limits: FileLimits) -> str:
-    """The text of the field array SPACE, in which 3D Slicer writes the axes, before the points; empty without one.
+    """Read 3D Slicer's axes in the field array SPACE before the points; empty without one.
 
     Raises:
         ValueError: a damaged file.
@@ -78,7 +78,7 @@ class _File:
             raise ValueError("no polygonal data in it")
 
     def line(self) -> str:
-        """The next line; empty at the end of the file."""
+        """Read the next line; empty at the end of the file."""
         end = self._data.find(b"\n", self._at)
         end = len(self._data) if end < 0 else end
         line, self._at = self._data[self._at : end], end + 1
@@ -165,7 +165,7 @@ class _File:
 
 
 def _counts(words: list[str], length: int, *places: int) -> list[int]:
-    """The counts in the line of a section, which has so many words at least.
+    """Read the counts in the line of a section with a minimum of words.
 
     Raises:
         ValueError: a line that is shorter, or something else at these places.

@@ -26,7 +26,7 @@ RAW = re.compile(rb'<AppendedData\s+encoding="raw"\s*>\s*_')
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """A mesh, or a cloud where it has no polygons: XML says its own end, so that a cut file is no cloud."""
+    """Read a mesh, or a cloud without polygons: XML marks its own end, so a cut file fails."""
     file = _File(options.limits.read(path), options.limits)
     points, faces, start = [], [], 0
     for piece in file.pieces():
@@ -43,7 +43,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def space(path: Path, limits: FileLimits) -> str:
-    """The text of the field array SPACE, in which 3D Slicer writes the axes; empty without one of three letters.
+    """Read 3D Slicer's axes in the field array SPACE; empty without three letters.
 
     Raises:
         ValueError, ElementTree.ParseError: a damaged file.
@@ -81,7 +81,7 @@ class _File:
         return np.concatenate([[0], ends]), corners
 
     def numbers(self, element: ElementTree.Element | None, count: int) -> Array:
-        """The so many numbers of a DataArray."""
+        """Read a given count of numbers of a DataArray."""
         if element is None:
             raise ValueError("an array that is missing")
         if count < 0:
@@ -93,7 +93,7 @@ class _File:
         return values
 
     def text(self, name: str, letters: int) -> str:
-        """The first string of a field array, of so many letters; VTK ends each with a zero."""
+        """Read the first string of a field array; VTK ends each with a zero."""
         element = self._root.find(f"PolyData/FieldData/Array[@Name='{name}']")
         if element is None:
             return ""

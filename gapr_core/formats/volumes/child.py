@@ -128,7 +128,7 @@ def _check_binary(metadata: dict[str, str]) -> None:
 def _read_dicom(
     path: Path, limits: FileLimits, labels: list[str]
 ) -> tuple[list[NDArray[np.int64]], Array, list[Segment]]:
-    """A DICOM segmentation: each segment is a layer, since segments may overlap; of many, those that are asked for.
+    """Read the segments of a DICOM segmentation, which may overlap; of many, the chosen ones.
 
     The background of a label map, number 0, is no segment.
     """
@@ -188,7 +188,7 @@ def _affine(columns: Array, origin: Any) -> Array:
 
 
 def _cropped(mask: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """The mask around its voxels, [k, j, i], and the (i, j, k) where it starts."""
+    """Crop the mask [k, j, i] to its voxels; return the (i, j, k) of its start as well."""
     spans = []
     for axis in range(3):
         used = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))

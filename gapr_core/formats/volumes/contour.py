@@ -24,7 +24,7 @@ SPECK = 0.01  # share of the largest component below which another one is noise 
 
 
 def surface_of(mask: NDArray[np.uint8], affine: Array, smoothing_voxels: float = SMOOTHING_VOXELS) -> Surface:
-    """The triangle mesh around the voxels of a mask; open where the mask touches the image's border.
+    """Mesh the voxels of a mask; open where the mask touches the image's border.
 
     Args:
         mask: [k, j, i], 0 or 1.

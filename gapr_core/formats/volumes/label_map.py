@@ -31,7 +31,7 @@ COMPLAINT = re.compile(r"error|fail|corrupt|truncated", re.IGNORECASE)  # ITK pr
 
 
 def read(path: Path, options: ReadOptions) -> Surface:
-    """The surface of the labels, in patient coordinates (LPS, mm), whatever the file's own axes are.
+    """Read the labels' surface in patient coordinates (LPS, mm), whatever the file's own axes.
 
     Raises:
         InvalidPointCloudError: a file that is damaged or too large, or a label that is not in it.
@@ -52,7 +52,7 @@ def read(path: Path, options: ReadOptions) -> Surface:
 
 
 def _with_small_ending(path: Path, folder: Path) -> Path:
-    """The file under a name that ends in small letters, as of SCAN.MHA: ITK knows others by none of its readers."""
+    """Return SCAN.MHA under a name in small letters: ITK has no readers for others."""
     ending = "".join(path.suffixes[-2:]) if path.suffix.lower() == ".gz" else path.suffix
     if ending == ending.lower():
         return path
@@ -62,7 +62,7 @@ def _with_small_ending(path: Path, folder: Path) -> Path:
 
 
 def _in_a_child(path: Path, options: ReadOptions, out: Path) -> tuple[Mask, NDArray[np.float64], list[str]]:
-    """The cropped mask [k, j, i], the affine of its own indices (i, j, k), and what there is to say."""
+    """Return the cropped mask [k, j, i], the affine of its indices (i, j, k), and notes."""
     request = {"path": str(path.absolute()), "labels": list(options.labels), "limits": asdict(options.limits),
                "seconds": LONGEST_READ_S}  # fmt: skip
     try:
@@ -78,7 +78,7 @@ def _in_a_child(path: Path, options: ReadOptions, out: Path) -> tuple[Mask, NDAr
 
 
 def _refusal(done: subprocess.CompletedProcess[str]) -> Exception:
-    """What the child said, or how it ended."""
+    """Return the child's error, or how it ended."""
     if done.returncode == 1 and done.stdout.startswith("["):
         return InvalidPointCloudError(*json.loads(done.stdout))
     lines = done.stderr.strip().splitlines() or [f"its reader ended with {done.returncode}"]

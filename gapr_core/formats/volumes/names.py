@@ -56,7 +56,7 @@ def of_seg_nrrd(metadata: Mapping[str, str], layers: int = 1) -> list[Segment]:
 
 
 def choose(wanted: Iterable[str], named: list[Segment], present: Present) -> tuple[list[Segment], list[str]]:
-    """The segments that are meant, and notes on what numbers were taken for.
+    """Choose segments by name or number, with notes on how numbers were read.
 
     Args:
         wanted: names or numbers; none for the only segment of a file.
@@ -98,7 +98,7 @@ def _segments(named: list[Segment], present: Present) -> list[Segment]:
 
 
 def _present(named: list[Segment], present: Present) -> str:
-    """What the file has voxels of, by name where it has one."""
+    """List the segments with voxels, by name if they have one."""
     return _listed([s.name or str(s.value) for s in _segments(named, present)])
 
 
@@ -111,7 +111,7 @@ def _by_number(value: int, named: list[Segment], present: Present) -> Segment:
 
 
 def _by_digits(label: str, named: list[Segment], present: Present) -> Segment:
-    """The segment of a number, or the one that has these digits for a name.
+    """Find the segment of a number, or the one with these digits for a name.
 
     Raises:
         InvalidPointCloudError: these are two.
@@ -155,7 +155,7 @@ def _nearest(label: str, named: list[Segment]) -> list[str]:
 
 
 def _nameless(label: str, present: Present) -> InvalidPointCloudError:
-    """The error for a name where the file has none, with its numbers in TotalSegmentator's versions."""
+    """Build the error for a name without names in the file, with TotalSegmentator's numbers."""
     entries = [(version, item) for version, table in TOTALSEGMENTATOR.items() for item in table.items()]
     numbers = [f"{value} in {version}" for version, (value, name) in entries if _key(name) == _key(label)]
     known = f" ({', '.join(numbers)}; TotalSegmentator writes names with --ml)" if numbers else ""

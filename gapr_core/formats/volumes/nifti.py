@@ -79,7 +79,7 @@ def geometry(path: Path) -> Geometry:
 
 
 def check_length(path: Path, limits: FileLimits) -> None:
-    """Every voxel that the header announces is in the file, undamaged where it has a checksum, and no other.
+    """Check that all announced voxels are in the file and no others, undamaged by any checksum.
 
     Raises:
         InvalidPointCloudError: more than the limit, NIfTI-2, or voxels in another file.
@@ -96,7 +96,7 @@ def check_length(path: Path, limits: FileLimits) -> None:
 
 
 def _order(head: bytes) -> str:
-    """Of the bytes in a number, by a header of NIfTI-1."""
+    """Return the byte order of a NIfTI-1 header."""
     if len(head) < HEADER_BYTES:
         raise ValueError(f"{len(head)} bytes, less than a header")
     sizes = {order: struct.unpack(order + "i", head[:4])[0] for order in "<>"}

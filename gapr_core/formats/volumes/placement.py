@@ -45,7 +45,7 @@ def check(path: Path) -> None:
 
 
 def _check_nifti(geometry: nifti.Geometry) -> None:
-    """One place: ITK takes the qform of some files and the sform of others, and its voxels' size from pixdim."""
+    """Check for one placement: ITK takes the qform or the sform, and voxel sizes from pixdim."""
     sform, corners = geometry.sform, geometry.corners
     if sform is None:  # then pixdim is the size of the voxels
         return

@@ -85,7 +85,7 @@ def check_length(given: int, announced: int) -> None:
 
 
 def unpacked_bytes(file: IO[bytes], window_bits: int) -> int:
-    """How many bytes a zlib or gzip stream holds, up to the end of the file.
+    """Count the unpacked bytes of a zlib or gzip stream, up to the end of the file.
 
     Raises:
         ValueError: another checksum, no end of the stream, or data behind it.
@@ -105,7 +105,7 @@ def unpacked_bytes(file: IO[bytes], window_bits: int) -> int:
 
 
 def gzip_bytes(path: Path) -> int:
-    """How many bytes a .gz file holds, of one stream or of several.
+    """Count the unpacked bytes of a .gz file, of one stream or of several.
 
     Raises:
         ValueError: another checksum, no end of a stream, or data behind it.

@@ -34,10 +34,10 @@ def world_places(pairs: LocalPairs) -> Tensor:
 
 
 def surface_places(pairs: LocalPairs) -> Tensor:
-    """Rotation-invariant places: height over the tangent plane, distance along it, and bending.
+    """Compute rotation-invariant places: height over the tangent plane, distance along it, bending.
 
-    Height is signed as far as the normal's side is certain and fades to zero where it is not; bending joins the
-    unsigned height and the angle between the normals, which need no side.
+    Height is signed where the normal's side is certain, and fades to zero elsewhere. Bending joins the unsigned height
+    and the angle between the normals, which need no side.
     """
     p_i, p_j, n_i, n_j = (parts(v[:, 0]) for v in (pairs.p_i, pairs.p_j, pairs.n_i, pairs.n_j))
     offset = [x / pairs.reach[:, 0] for x in minus(p_j, p_i)]

@@ -21,5 +21,5 @@ TRANSFORMERS: dict[str, Callable[[int, ModelConfig], nn.Module]] = {
 
 
 def make_transformer(name: str, dim: int, config: ModelConfig) -> nn.Module:
-    """A layer `(x_q, x_s, pairs) -> x_q`, for local and for dense pairs alike."""
+    """Make a layer `(x_q, x_s, pairs) -> x_q`, for local and for dense pairs alike."""
     return choose("encoding", TRANSFORMERS, name)(dim, config)

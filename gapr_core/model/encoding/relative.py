@@ -10,9 +10,9 @@ from gapr_core.model.attention import PairEncoding
 class RelativeEncoding(PairEncoding):
     """r_ij = W_2 hidden_ij + b_2, of which only `hidden` is ever computed per pair.
 
-    Everything after it is linear, so it is folded into the query,
-    (f_q W^Q) (r_ij W^R)^T = (f_q W^Q W^R^T W_2) hidden_ij, and into the weighted sum of the values; the constant b_2
-    shifts all logits of a query alike and drops out of the softmax.
+    Everything after it is linear, so it is folded into the query, (f_q W^Q) (r_ij W^R)^T = (f_q W^Q W^R^T W_2)
+    hidden_ij, and into the weighted sum of the values. The constant b_2 shifts all logits of a query alike and drops
+    out of the softmax.
     """
 
     def __init__(self, hidden: Tensor, key_map: Tensor, value_map: nn.Module | None) -> None:

@@ -9,5 +9,5 @@ from gapr_core.model.config import ModelConfig
 
 
 def layer(dim: int, config: ModelConfig) -> nn.Module:
-    """A transformer layer whose pair encoding is the identity."""
+    """Make a transformer layer whose pair encoding is the identity."""
     return TransformerLayer(dim, config.heads, VanillaEncoder(), config.mlp_projections)

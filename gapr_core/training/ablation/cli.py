@@ -66,7 +66,7 @@ class Task:
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """The options of `gapr ablate`."""
+    """Add the options of `gapr ablate`."""
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison; an interrupted one goes on")
     parser.add_argument("--pairs", type=at_least_one, required=True, help="budget of every network, in training pairs")
     parser.add_argument("--config", type=Path, help="yaml with what differs from the defaults (config/train.yaml)")
@@ -146,7 +146,7 @@ def ablate(
 
 
 def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
-    """The pairs of the examination, made once: the same for every network."""
+    """Make the pairs of the examination once: the same for every network."""
     without = [name for name in recipe.protocols if name in NO_RIGHT_POSE]
     if without:
         raise ConfigError("protocols with a true pose", ", ".join(without), "leave them out")
@@ -157,7 +157,7 @@ def examination(recipe: Recipe, folder: Path, anatomy: Path | None) -> None:
 
 
 def finish_all(tasks: Sequence[Task], jobs: int) -> Iterator[bool]:
-    """Finish one task after the other, or `jobs` at a time, each in a process with its share of the cores."""
+    """Finish tasks in order, or `jobs` at a time, each in a process with its share of cores."""
     if jobs == 1:
         yield from map(finish, tasks)
         return
@@ -194,7 +194,7 @@ def finish(task: Task) -> bool:
 
 
 def examined(task: Task) -> bool:
-    """Whether the network has its examination; one that does not say how poses were found had the default way.
+    """Tell whether the network has its examination; without a stated way of poses, the default one counts.
 
     Raises:
         ConfigError: it was of other pairs, or with poses found in another way.
@@ -212,14 +212,14 @@ def examined(task: Task) -> bool:
 
 
 def trained(task: Task) -> bool:
-    """Whether the schedule is at its end."""
+    """Tell whether the schedule is at its end."""
     path = task.folder / "weights.safetensors"
     return path.exists() and weights.load(path)[1]["step"] >= task.config.pairs // task.config.batch
 
 
 @torch.inference_mode()
 def examine(network: GAPRNet, pair: Pair, pose: str = METHODS[0]) -> Record:
-    """Inlier ratios and the best raw pose of one pair, as it is and refined; a pair without a pose is a failure."""
+    """Measure inlier ratios and the best pose of one pair, raw and refined; none is a failure."""
     record: Record = {"pair": pair.name, "protocol": pair.protocol, "bone": pair.bone, "person": pair.person}
     frame = target_frame(pair.target, network.config)
     try:

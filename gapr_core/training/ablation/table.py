@@ -28,7 +28,7 @@ ALL = "all"
 
 
 def folder_of(out: Path, model: Path, seed: int) -> Path:
-    """Where a network is trained."""
+    """Return the folder of a network's training."""
     return out / f"{model.stem}_seed{seed}"
 
 
@@ -62,7 +62,7 @@ def row(variant: Variant, protocol: str, folders: Sequence[Path]) -> Record:
 
 
 def difference(variant: Variant, last: Variant, protocol: str, folders: Mapping[Variant, Sequence[Path]]) -> Record:
-    """How much a network has more than the last one of its table, on the same pairs with the same seeds.
+    """Subtract the last network of its table, on the same pairs with the same seeds.
 
     As `row`: means with 95 % intervals over subjects. Paired, so that what is hard for both says nothing.
     """
@@ -95,7 +95,7 @@ def _mean(name: str, values: Sequence[float], people: Sequence[str]) -> Record:
 
 
 def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
-    """The curves of one table's networks; the picture's name, None while there is nothing to draw."""
+    """Draw the curves of one table's networks; returns the picture's name, None without data."""
     begun = {v.label: found[0] for v, found in folders.items() if (found[0] / "log.csv").exists()}
     if not begun:
         return None
@@ -104,7 +104,7 @@ def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
 
 
 def markdown(rows: Sequence[Record], apart: Sequence[Record], pictures: dict[str, str | None], settings: Record) -> str:
-    """The tables as Markdown, the paper's numbers in a column of their own."""
+    """Write the tables as Markdown, the paper's numbers in a column of their own."""
     parts = ["# Ablations", _preamble(settings)]
     for table, picture in pictures.items():
         own = [r for r in rows if r["table"] == table]

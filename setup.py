@@ -47,7 +47,7 @@ TEST = [
     "setuptools<80",  # later ones no longer have the commands that colcon calls
     "vtk",  # writes the files that the project's own readers are held against
 ]
-DOCS = ["mkdocs-material>=9.5", "mkdocstrings[python]>=0.26"]
+DOCS = ["mkdocs-jupyter>=0.25", "mkdocs-material>=9.5", "mkdocstrings[python]>=0.26"]
 
 
 def files(folder, *patterns):

@@ -1,19 +1,22 @@
 """Hook of MkDocs: what the site takes from outside docs/.
 
-Pages that live elsewhere, the help of every command, and the settings of the library.
+Pages and the notebook that live elsewhere, the help of every command, and the settings of the library.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tempfile
 from operator import attrgetter
 from pathlib import Path
 from posixpath import dirname, join, normpath, relpath
 from typing import Any
 
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
 from gapr_core.cli import modules
@@ -31,17 +34,34 @@ SETTINGS = """# Settings
 | command line | `gapr register --set refinement.iterations=5` |
 
 A value out of range is an error. `gapr settings` prints these tables as one."""
-ELSEWHERE = {"contributing.md": "CONTRIBUTING.md", "weights.md": "gapr_core/weights/README.md"}  # page: where it lives
+ELSEWHERE = {
+    "contributing.md": "CONTRIBUTING.md",
+    "weights.md": "gapr_core/weights/README.md",
+    "tutorials/register.ipynb": "examples/register.ipynb",
+}  # page: where it lives
 LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
 
 
+@event_priority(1)
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages that live elsewhere, and the one with the help of the commands."""
+    """Add the pages that live elsewhere, before mkdocs-jupyter looks for notebooks, and the help of the commands."""
     for page, path in ELSEWHERE.items():
-        files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
+        if page.endswith(".ipynb"):
+            files.append(notebook(page, ROOT / path, config))
+        else:
+            files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
     files.append(File.generated(config, "reference/commands.md", content=help_of_commands()))
     files.append(File.generated(config, "reference/settings.md", content=settings_of_the_library()))
     return files
+
+
+def notebook(page: str, path: Path, config: Any) -> File:
+    """Copy a notebook to a folder of its own: it runs beside its file, and writes there."""
+    os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] = "true"  # or Open3D prints into the cell
+    folder = Path(tempfile.mkdtemp())
+    (folder / page).parent.mkdir(parents=True)
+    shutil.copy(path, folder / page)
+    return File(page, str(folder), config.site_dir, config.use_directory_urls)
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:

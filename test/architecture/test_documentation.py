@@ -200,6 +200,17 @@ def test_an_example_runs(path, here):
     shell([sys.executable, str(path), *EXAMPLES.get(path.name, [])])
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=name_of)
+def test_the_cells_of_a_notebook_run(path, here):
+    names, cells = {}, json.loads(path.read_text(encoding="utf-8"))["cells"]
+    for cell in cells:
+        assert not cell.get("outputs"), "clear the outputs: the site has them"
+        if cell["cell_type"] == "code":
+            run(Block("", "python", "".join(cell["source"])), names)
+    assert names["result"].ok and names["planned"].targets, names["result"]
+    assert all((here / name).is_file() for name in ("femur.html", "pose.tfm", "pose.json", "femur.png"))
+
+
 def test_every_example_in_a_folder_has_a_test_of_its_own():
     tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "test").rglob("test_examples.py"))
     examples = [path for path in (ROOT / "examples").glob("*/*") if path.is_file() and path.suffix != ".pyc"]

@@ -1,8 +1,10 @@
 """The metadata of the package: for pip and, through ament_python, for colcon."""
 
 import os
+import re
 import subprocess
 import sys
+import sysconfig
 from glob import glob
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
 
 PACKAGE = "gapr_ros"
+HOME = "https://gapr.invalid/gapr"
 HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file, elsewhere
 
 CORE = [
@@ -56,10 +59,16 @@ def files(folder, *patterns):
     return f"share/{PACKAGE}/{folder}", found
 
 
+def readme():
+    """The README with links that hold outside of the repository."""
+    return re.sub(r"\]\((?!\w+:|#)", f"]({HOME}/blob/main/", (HERE / "README.md").read_text(encoding="utf-8"))
+
+
 class BuildCompiled(build_py):
     """Copy the modules, then compile their loops, so that the first registration after an installation need not wait.
 
-    Without the libraries that this takes, and on another processor later, loops are compiled when they first run.
+    Without the libraries that this takes, with GAPR_COMPILED=no, and on another processor, loops are compiled when they
+    first run. A wheel with compiled loops is tagged with its Python and its platform.
     """
 
     def run(self):
@@ -69,6 +78,8 @@ class BuildCompiled(build_py):
         folder = Path(self.build_lib).resolve()
         for old in folder.rglob("*.nb[ic]"):
             old.unlink()  # of a build before: Numba does not see that a loop in another file has changed
+        if os.environ.get("GAPR_COMPILED") == "no":
+            return
         kept_there = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
         environment = kept_there | {
             "PYTHONPATH": os.pathsep.join([str(folder), *sys.path]),
@@ -76,25 +87,26 @@ class BuildCompiled(build_py):
         }
         command = [sys.executable, "-m", "gapr_core.cli", "compile"]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+        wheel = self.distribution.command_obj.get("bdist_wheel")
         if done.returncode or not list(folder.rglob("*.nbc")):
             why = done.stderr.strip().splitlines()[-1:]
             self.warn(f"the loops are not compiled, so the first registration takes half a minute: {why}")
+        elif wheel is not None:
+            wheel.python_tag = f"cp{sysconfig.get_config_var('py_version_nodot')}"
+            wheel.plat_name, wheel.plat_name_supplied = sysconfig.get_platform(), True
 
 
 setup(
     name=PACKAGE,
     version="0.2.0",
     description="Partial-to-full registration of bones with a calibrated confidence: library, command line, ROS 2 node",
-    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
+    long_description=readme(),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     maintainer="GAPR maintainers",
     maintainer_email="maintainers@gapr.invalid",
-    url="https://gapr.invalid/gapr",
-    project_urls={
-        "Source": "https://gapr.invalid/gapr.git",
-        "Issues": "https://gapr.invalid/gapr/issues",
-    },
+    url=HOME,
+    project_urls={"Source": f"{HOME}.git", "Issues": f"{HOME}/issues", "Changelog": f"{HOME}/blob/main/CHANGELOG.rst"},
     classifiers=[
         "Development Status :: 4 - Beta",
         "Intended Audience :: Healthcare Industry",

@@ -249,7 +249,7 @@ def line(kind: str, bone: str, of_bone: Sequence[Record]) -> list[object]:
     """One row of the table."""
     subjects = [r.source_person if kind == SIMILAR else r.person for r in of_bone]  # whose bone was grown to many sizes
     wrong = [r.false_accept for r in of_bone]
-    low, high = (100.0 * end for end in metrics.interval(wrong, subjects))
+    low, high = (100.0 * end for end in metrics.share_interval(wrong, subjects))
     right = sum(r.right for r in of_bone) if kind == SIDE else "-"
     share = f"{100.0 * np.mean(wrong):.2f} ({low:.2f} to {high:.2f})"
     sure = sum(r.false_accept and r.confidence >= SURE for r in of_bone)

@@ -88,7 +88,7 @@ def of_bound(groups: Groups) -> str:
         below = [
             r.predicted_tre95_mm is not None and (r.whole_bone_mm or 0.0) <= r.predicted_tre95_mm for r in accepted
         ]
-        low, high = (100.0 * end for end in metrics.interval(below, people(accepted)))
+        low, high = (100.0 * end for end in metrics.share_interval(below, people(accepted)))
         share = f"{100.0 * sum(below) / len(below):.1f} ({low:.1f} to {high:.1f})"
         lines.append((name, len(accepted), sum(below), share, shown(summary(accepted)["tre95_ratio"], 2)))
     return markdown.table(head, lines)

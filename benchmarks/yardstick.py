@@ -343,7 +343,7 @@ def of_evidence(rows: Sequence[Row]) -> str:
     lines = []
     for share in (0.01, 0.05):
         doubted = means < np.quantile(own, share)
-        low, high = metrics.interval(doubted.tolist(), [key[1] for key in pairs_of])
+        low, high = metrics.share_interval(doubted.tolist(), [key[1] for key in pairs_of])
         lines.append((f"{share:.0%}", f"{doubted.mean():.3f} [{low:.3f}-{high:.3f}]", len(means), len(own)))
     return markdown.table(("own bones doubted", "pairs of subjects doubted", "pairs", "own"), lines)
 

@@ -43,7 +43,8 @@ def differences(records: Sequence[Record], methods: Sequence[str], ours: str) ->
 
     Returns:
         Rows with `protocol`, `method`, `pairs` that both have, and the counts right for `ours_alone` and `other_alone`.
-        `difference` is that of the recall at 4 mm and 5 deg, -1 to 1, with its 95 % bootstrap interval by subject.
+        `difference` is that of the recall at 4 mm and 5 deg, -1 to 1, with its 95 % bootstrap interval by subject,
+        None where all subjects agree.
     """
     judged = [r for r in records if r.has_truth]
     own, found = {r.pair: r for r in judged if r.method == ours}, []
@@ -89,9 +90,9 @@ def _bones(records: Sequence[Record]) -> list[str]:
 def _answers(records: Sequence[Record]) -> Row:
     accepted, wrong = [r.accepted for r in records], [r.false_accept for r in records]
     sure = [r.false_accept and r.confidence >= SURE for r in records]
-    low, high = metrics.interval(wrong, people(records))
+    low, high = metrics.share_interval(wrong, people(records))
     return {
-        "accepted": sum(accepted), "refused": len(records) - sum(accepted),
+        "accepted": sum(accepted), "refused": len(records) - sum(accepted), "refused_rate": 1.0 - np.mean(accepted),
         "errors": sum(r.status == ERROR for r in records), "false_accepts": sum(wrong),
         "false_accepts_sure": sum(sure), "false_accept_rate": np.mean(wrong), "false_accept_rate_low": low,
         "false_accept_rate_high": high,
@@ -102,8 +103,9 @@ def _accuracy(records: Sequence[Record]) -> Row:
     """Over ALL pairs that have a truth: refusals are no success, and count with their stand-in pose in the errors."""
     row: Row = {"pairs_with_truth": len(records)}
     for name, key in RECALLS.items():
-        row[name] = metrics.recall([getattr(r, key) for r in records])
-        row[f"{name}_low"], row[f"{name}_high"] = metrics.interval([getattr(r, key) for r in records], people(records))
+        hits = [getattr(r, key) for r in records]
+        row[name] = metrics.recall(hits)
+        row[f"{name}_low"], row[f"{name}_high"] = metrics.share_interval(hits, people(records))
     rmse = _values(records, "rmse_mm")
     judged, true = _values(records, "judged"), _values(records, "true")
     return row | {

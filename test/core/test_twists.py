@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from gapr_core.geometry import se3
 from gapr_core.geometry.twists import covariance_about, error_twist, motion_jacobians, nees, predicted_rmse_mm
 from gapr_core.metrics import bootstrap, cramer_rao
-from gapr_core.metrics.bootstrap import interval
+from gapr_core.metrics.bootstrap import interval, share_interval
 
 
 def random_pose(rng):
@@ -171,18 +171,13 @@ def test_bootstrap_of_a_mean_has_the_width_of_the_normal_approximation():
     low, high = interval(values)
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
     assert low < values.mean() < high and interval(values) == (low, high)
-    people = np.arange(400) // 4
-    assert interval(values, people, np.mean) == pytest.approx(interval(values, people))
-    assert interval(values, statistic=np.median) != (low, high)
 
 
-@pytest.mark.parametrize("statistic", [None, np.median])
-@pytest.mark.parametrize("groups", [None, np.arange(90) % 7])
-def test_an_interval_does_not_depend_on_how_many_resamples_are_drawn_at_once(monkeypatch, statistic, groups):
+def test_an_interval_does_not_depend_on_how_many_resamples_are_drawn_at_once(monkeypatch):
     values = np.random.default_rng(11).normal(size=90)
-    whole = interval(values, groups, statistic, resamples=301)
+    whole = interval(values, np.arange(90) % 7)
     monkeypatch.setattr(bootstrap, "DRAWN_AT_ONCE", 1000)
-    assert interval(values, groups, statistic, resamples=301) == whole
+    assert interval(values, np.arange(90) % 7) == whole
 
 
 def test_an_interval_of_many_values_needs_little_memory():
@@ -194,17 +189,20 @@ def test_an_interval_of_many_values_needs_little_memory():
     assert most < 200e6
 
 
-def test_the_interval_of_two_values_follows_from_the_four_resamples():
-    """Means of 0, 1/2, 1/2 and 1, equally often: a quarter lies at either end."""
-    values = [0.0, 1.0]
-    for statistic in (None, np.mean):
-        assert interval(values, statistic=statistic, resamples=300) == (0.0, 1.0)
-        assert interval(values, statistic=statistic, resamples=300, level=0.4) == (0.5, 0.5)
-
-
-def test_an_interval_of_no_width_is_the_median_of_the_resamples():
-    low, high = interval(np.random.default_rng(15).normal(size=50), resamples=301, level=0.0)
-    assert low == high
+@pytest.mark.parametrize(("hits", "people", "ends"), [
+    ([1], None, (0.2065, 1.0)),  # 1 / (1 + 1.96^2)
+    ([1, 1, 1, 1], "aaaa", (0.2065, 1.0)),  # one subject, however many pairs
+    ([1, 0, 1], "aaa", (0.2065, 1.0)),
+    ([0] * 20, None, (0.0, 0.1611)),  # 1.96^2 / (20 + 1.96^2)
+    ([1, 0] * 5, "aabbccddee", (0.1176, 0.7693)),  # subjects that agree: 2 of 5, rounded to even
+    ([0, 1], None, (0.0, 1.0)),  # means of 0, 1/2, 1/2 and 1, equally often
+    ([], None, (np.nan, np.nan)),
+])  # fmt: skip
+def test_a_share_on_which_all_subjects_agree_has_wilsons_interval(hits, people, ends):
+    names = None if people is None else list(people)
+    assert share_interval(hits, names) == pytest.approx(ends, abs=1e-4, nan_ok=True)
+    agree = ends[0] > 0.0 or len(hits) != 2
+    assert np.isnan(interval(hits, names)).all() == agree, "a mean of values that agree has none"
 
 
 def test_pairs_of_one_person_do_not_count_as_independent():

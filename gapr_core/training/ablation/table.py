@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ def row(variant: Variant, protocol: str, folders: Sequence[Path]) -> Record:
     on_paper = variant.paper if protocol == "paper" else None
     found |= {"protocol": protocol, "seeds": len(exams), "pairs": len(chosen), "paper_rr_percent": on_paper}
     for name in FIGURES:
-        found |= _mean(name, [r[name] for r in chosen], [r["person"] for r in chosen])
+        found |= _mean(name, [r[name] for r in chosen], [r["person"] for r in chosen], metrics.share_interval)
     return found
 
 
@@ -73,7 +73,8 @@ def difference(variant: Variant, last: Variant, protocol: str, folders: Mapping[
     found: Record = {"table": variant.table, "network": variant.label, "last": last.label, "protocol": protocol}
     found |= {"seeds": len(both), "pairs": len(chosen)}
     for name in FIGURES:
-        found |= _mean(name, [own[name] - other[name] for own, other in chosen], [own["person"] for own, _ in chosen])
+        more = [own[name] - other[name] for own, other in chosen]
+        found |= _mean(name, more, [own["person"] for own, _ in chosen], metrics.interval)
     return found
 
 
@@ -88,10 +89,10 @@ def _same(first: Sequence[Record], second: Sequence[Record]) -> list[tuple[Recor
     return [(r, by_pair[r["pair"]]) for r in first if r["pair"] in by_pair]
 
 
-def _mean(name: str, values: Sequence[float], people: Sequence[str]) -> Record:
-    numbers = (float(np.mean(values)), *metrics.interval(values, people)) if values else (None,) * 3
+def _mean(name: str, values: Sequence[float], people: Sequence[str], interval: Callable[..., Any]) -> Record:
+    numbers = (float(np.mean(values)), *interval(values, people)) if values else (np.nan,) * 3
     ends = zip(("", "_low", "_high"), numbers, strict=True)
-    return {name + end: None if value is None else round(value, 4) for end, value in ends}
+    return {name + end: None if np.isnan(value) else round(value, 4) for end, value in ends}
 
 
 def draw(out: Path, folders: dict[Variant, list[Path]]) -> str | None:
@@ -146,7 +147,7 @@ def _cells(r: Record, form: str) -> list[str]:
     """Means and intervals in %, as text."""
     numbers = [[r[name + end] for end in ("", "_low", "_high")] for name in FIGURES]
     texts = [[format(100 * value, form) for value in found if value is not None] for found in numbers]
-    return [f"{found[0]} ({found[1]} to {found[2]})" if found else "–" for found in texts]
+    return [f"{found[0]} ({' to '.join(found[1:])})" if found[1:] else "".join(found) or "–" for found in texts]
 
 
 def _protocols(recipe: Recipe) -> list[str]:

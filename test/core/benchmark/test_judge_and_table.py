@@ -134,11 +134,21 @@ def test_methods_are_compared_on_the_pairs_that_both_have_and_subjects_are_drawn
 
 def test_the_table_says_where_another_method_is_better_and_only_there():
     lines = sections.where_beaten(table.rows(some_records(), ["a", "b"]), "a")
-    assert any(line.startswith("L1, RR % 4 mm/5°: b 100.0") and line.endswith("a 33.3 [0–100]") for line in lines)
-    assert any(line.startswith("L1, false accepts: b 0; a 1") for line in lines)
+    assert any(line.startswith("L1, right %: b 100.0") and line.endswith("a 33.3 [0–100]") for line in lines)
+    assert any(line.startswith("L1, wrong and accepted: b 0; a 1") for line in lines)
     assert not any("RR % 1 mm" in line for line in lines)
     assert not any(line.startswith("wrong") for line in lines)
     assert sections.where_beaten(table.rows(some_records()[:3], ["a"]), "a") == ["nowhere in these pairs"]
+
+
+def test_every_table_begins_with_right_beside_wrong_and_one_pair_has_an_interval():
+    (accuracy, safety) = sections.sections(
+        table.rows([record(make_pair(0), ok(shifted(make_pair(0), 1.0)), "a")], "a")
+    )[1:]
+    six = ["method", "pairs", "right %", "wrong and accepted %", "refused %", "median error mm"]
+    for section in (accuracy, safety):
+        assert section.header[1:7] == six
+        assert section.cells[0][1:6] == ["a", "1", "100.0 [21–100]", "0.0 [0–79]", "0.0"]
 
 
 def test_the_numbers_of_the_paper_stand_below_ours_and_are_marked():
@@ -155,7 +165,7 @@ def test_the_numbers_of_the_paper_stand_below_ours_and_are_marked():
 def test_the_best_cell_of_a_column_is_marked_unless_all_are_equal():
     rows = table.rows(some_records(), ["a", "b"])
     accuracy = next(s for s in sections.sections(rows) if s.title == "Protocol L1: accuracy")
-    column = accuracy.header.index("RR % 4 mm/5°")
+    column = accuracy.header.index("right %")
     assert (1, column) in accuracy.best and (0, column) not in accuracy.best
     same = [{**row, "rr_4_5": 0.5} for row in rows if row["protocol"] == "L1"]
     accuracy = next(s for s in sections.sections(same) if s.title == "Protocol L1: accuracy")

@@ -32,7 +32,7 @@ from gapr_core.calibration.fit import (
     of_unseen_families,
     of_unseen_people,
 )
-from gapr_core.calibration.pairs import HELD_OUT, Task, look_alikes, scenes
+from gapr_core.calibration.pairs import HELD_OUT, IN_A_ROW, Task, look_alikes, scenes
 from gapr_core.data.anatomy import SPLITS
 from gapr_core.errors import ConfigError
 from gapr_core.registration.confidence import classifier
@@ -92,12 +92,16 @@ def _parser() -> ArgumentParser:
 
 
 def _tasks(args: Namespace) -> list[Task]:
-    """List the pairs that the options ask for, in the order of their registration."""
+    """List the pairs that the options ask for, each list spread evenly: a stopped run holds some of each."""
     which = (str(args.anatomy), args.split, args.seed)
-    tasks = [Task(*which, number) for number in range(args.count)]
-    tasks += scenes(*which, args.scenes)
-    tasks += look_alikes(*which, args.look_alikes)
-    return tasks + streams.tasks(*which, args.streams)
+    lists = [
+        [Task(*which, number) for number in range(args.count)],
+        scenes(*which, args.scenes),
+        look_alikes(*which, args.look_alikes),
+        streams.tasks(*which, args.streams),
+    ]
+    placed = [(place // IN_A_ROW * IN_A_ROW / len(tasks), task) for tasks in lists for place, task in enumerate(tasks)]
+    return [task for _, task in sorted(placed, key=lambda each: each[0])]
 
 
 def write_models(records: Sequence[dict[str, Any]], folder: Path, made: dict[str, Any]) -> dict[str, Any]:

@@ -152,7 +152,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "gapr = gapr_core.cli:main",
+            "gapr = gapr_core.__main__:main",
             "register_node = gapr_ros.register_node:main",
             "bag_replay = gapr_ros.bags.replay:main",
         ],

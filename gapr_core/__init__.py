@@ -6,11 +6,13 @@ Heavy parts load when first used: `import gapr_core` takes neither torch, open3d
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from gapr_core.runtime import compiled_code
 
+TYPE_CHECKING = False  # as of typing, which is not loaded here: nothing catches a Ctrl-C that comes meanwhile
 if TYPE_CHECKING:  # `X as X`: what mypy --strict takes for exported
+    from typing import Any
+
     from gapr_core.clouds import load as load
     from gapr_core.config import RegistrarConfig as RegistrarConfig
     from gapr_core.config import SensorConfig as SensorConfig

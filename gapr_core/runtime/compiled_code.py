@@ -5,12 +5,8 @@ It refuses to compile at all where it can write to neither, as a service without
 
 from __future__ import annotations
 
-import atexit
-import logging
 import os
-import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -21,6 +17,11 @@ def find_a_place() -> None:
     """Give numba a temporary folder, for this process alone, where it has no other; say so once."""
     if os.environ.get(VARIABLE) or _can_write(PACKAGE / "__pycache__") or _can_write(_of_user()):
         return
+    import atexit  # not above: see `gapr_core.TYPE_CHECKING`
+    import logging
+    import shutil
+    import tempfile
+
     folder = tempfile.mkdtemp(prefix="gapr-compiled-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ[VARIABLE] = folder

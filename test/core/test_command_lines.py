@@ -1,6 +1,8 @@
 """Whatever is wrong with a command line or its files: one line on stderr, exit code 1, and no file is harmed."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -234,6 +236,24 @@ def test_a_command_that_is_stopped_says_only_what_it_has_kept(capsys, monkeypatc
     monkeypatch.setattr(f"gapr_core.commands.{command}.run", stopped)
     assert cli.main([command, *(["--pairs", "a", "--out", "b"] if command == "evaluate" else [])]) == 130
     assert capsys.readouterr().err.startswith(f"gapr: {said}" + "\n" * (command == "settings"))
+
+
+@pytest.mark.parametrize("module", ["gapr_core.cli", "gapr_core.errors", "numpy", "scipy.spatial", "numba"])
+def test_a_command_that_is_stopped_while_it_loads_says_so_in_one_line(tmp_path, module):
+    (tmp_path / "cloud.xyz").write_text("0 0 0\n50 0 0\n0 80 0\n")
+    script = f"""
+import signal, sys
+class Press:
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Press())
+from gapr_core.__main__ import main
+sys.argv = ["gapr", "register", "--source", "cloud.xyz", "--target", "cloud.xyz"]
+sys.exit(main())
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "gapr: stopped\n")
 
 
 def test_the_version_is_said(capsys):

@@ -12,8 +12,8 @@ from gapr_core.runtime import compiled_code
 def nowhere(monkeypatch, tmp_path):
     monkeypatch.delenv(compiled_code.VARIABLE, raising=False)
     monkeypatch.setattr(compiled_code, "_can_write", lambda _: False)
-    monkeypatch.setattr(compiled_code.tempfile, "mkdtemp", lambda prefix: str(tmp_path))
-    monkeypatch.setattr(compiled_code.atexit, "register", lambda *_, **__: None)
+    monkeypatch.setattr("tempfile.mkdtemp", lambda prefix: str(tmp_path))
+    monkeypatch.setattr("atexit.register", lambda *_, **__: None)
     yield tmp_path
     os.environ.pop(compiled_code.VARIABLE, None)
 

@@ -33,15 +33,31 @@ def save(
         dtype: float32, or float16 for half the size.
     """
     tensors = {name: t.detach().to("cpu", dtype).contiguous() for name, t in network.state_dict().items()}
+    header = {"format": FORMAT, "config": json.dumps(network.config.to_dict()), "card": json.dumps(card or {})}
+    return _write_signed(tensors, path, header)
+
+
+def sign(path: str | Path, out: str | Path) -> str:
+    """Write a file again with the checksum over its configuration and card, which older files lack.
+
+    Tensors, configuration and card stay as they are.
+
+    Returns:
+        The sha256 of its tensors.
+
+    Raises:
+        WeightsError: see `load`.
+    """
+    load(path)
+    header, tensors = _read(path)
+    return _write_signed(tensors, out, header)
+
+
+def _write_signed(tensors: dict[str, Tensor], path: str | Path, header: dict[str, str]) -> str:
+    """Write tensors and header with the checksums of both; returns that of the tensors."""
     digest = checksum(tensors)
-    header = {
-        "format": FORMAT,
-        "config": json.dumps(network.config.to_dict()),
-        "card": json.dumps(card or {}),
-        "sha256": digest,
-    }
-    header["signature"] = checksum(tensors, header["config"], header["card"])
-    write_tensors(tensors, path, header)
+    signature = checksum(tensors, header["config"], header["card"])
+    write_tensors(tensors, path, header | {"sha256": digest, "signature": signature})
     return digest
 
 

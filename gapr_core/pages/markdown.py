@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from gapr_core.runtime.console import printable
+
 
 def table(header: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
     """Write all lines of a table; a cell is shown as `str` shows it."""
@@ -16,6 +18,11 @@ def head(header: Sequence[object]) -> str:
 
 
 def row(cells: Iterable[object]) -> str:
-    """Write one line; a `|` or `<` in a cell is escaped."""
-    escaped = (" ".join(str(cell).split()).replace("|", r"\|").replace("<", r"\<") for cell in cells)
+    """Write one line; a `|` in a cell is escaped."""
+    escaped = (text(cell).replace("|", r"\|") for cell in cells)
     return f"| {' | '.join(escaped)} |"
+
+
+def text(said: object) -> str:
+    """Make one line of any name; a `<`, which begins HTML, and what steers a terminal are escaped."""
+    return printable(" ".join(str(said).split())).replace("<", r"\<")

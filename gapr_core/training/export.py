@@ -1,6 +1,9 @@
 """Turn the weights of a run into the file that ships: half precision, with a card in its header.
 
 python -m gapr_core.training.export runs/best --licences config/licences.yaml --out NEW.safetensors
+
+Of a file in place of a run, the same tensors and card are written with a checksum that covers them and the
+configuration.
 """
 
 from __future__ import annotations
@@ -22,12 +25,15 @@ NOT_STATED = "of the real subjects not stated"
 def main(arguments: list[str] | None = None) -> int:
     """Read a run's averaged weights, write them as they ship."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="folder that `gapr train` wrote")
+    parser.add_argument("run", type=Path, help="folder that `gapr train` wrote, or a file of weights")
     parser.add_argument("--licences", type=Path, help="yaml: data that it was trained on, and its licence, a line each")
     parser.add_argument("--out", required=True, type=Path, help="*.safetensors")
     args = parser.parse_args(arguments)
-    network, trained = weights.load(args.run / "weights.safetensors")
-    digest = weights.save(network, args.out, card(trained, args.licences), torch.float16)
+    if args.run.is_file():
+        digest = weights.sign(args.run, args.out)
+    else:
+        network, trained = weights.load(args.run / "weights.safetensors")
+        digest = weights.save(network, args.out, card(trained, args.licences), torch.float16)
     say(f"{args.out}: {args.out.stat().st_size / 1e6:.1f} MB, sha256 of the tensors {digest}")
     return 0
 

@@ -1,6 +1,8 @@
 """Records and rows from hand-made answers."""
 
+import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +12,9 @@ from benchmark_cases import make_pair, ok, record, shifted, some_records
 from gapr_core.benchmark import table
 from gapr_core.benchmark.judge import judge, pair_facts
 from gapr_core.benchmark.record import Verdict
+from gapr_core.benchmark.records import Plan
 from gapr_core.geometry import se3
-from gapr_core.pages import sections
+from gapr_core.pages import sections, writers
 from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus
 
 
@@ -239,3 +242,18 @@ def test_pairs_of_nobody_known_are_no_subject():
     found = some_records()
     assert table.summary(found)["persons"] == 3
     assert table.summary([replace(r, person="") for r in found])["persons"] == 0
+
+
+def test_names_from_files_are_no_formula_no_html_and_no_escape_in_a_table(tmp_path):
+    pair = make_pair(1, "\x1b[31m<script>a", "=1+2")
+    found = [record(pair, ok(shifted(pair, 1.0)), method) for method in ("@a<b", "-b")]
+    rows, ran = table.rows(found, ["@a<b", "-b"]), {"commit": "1", "threads": "1", "machine": "m"}
+    apart = table.differences(found, ["@a<b", "-b"], "@a<b")
+    writers.write_csv(tmp_path / "table.csv", rows)
+    writers.write_markdown(tmp_path / "table.md", rows, apart, Plan("c", "", "@a<b", [], "", {}), ran, ["<i>\x1b"])
+    with (tmp_path / "table.csv").open(newline="") as file:
+        (first, second) = csv.DictReader(file)
+    assert (first["protocol"], first["bone"], first["method"]) == (r"\x1b[31m<script>a", "'=1+2", "'@a<b")
+    assert second["method"] == "'-b" and second["pairs"] == "1"
+    text = (tmp_path / "table.md").read_text()
+    assert "\x1b" not in text and not re.search(r"(?<!\\)<", text) and r"\<script>" in text

@@ -18,6 +18,8 @@ from gapr_core.model.encoding import TRANSFORMERS, ptv3
 from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.model.types import collate
+from gapr_core.runtime.origin import WEIGHTS
+from gapr_core.training import export
 from gapr_core.training.checkpoint import load_checkpoint, save_checkpoint
 from gapr_core.training.losses import compute_losses
 from gapr_core.training.targets import join, training_pair
@@ -282,6 +284,17 @@ def test_the_signature_of_weights_covers_their_configuration_and_card(toy, tmp_p
     save_file(tensors, str(path), metadata=header | {entry: header[entry].replace(said, other, 1)})
     with pytest.raises(WeightsError, match="checksum"):
         weights.load(path)
+
+
+def test_an_older_file_is_signed_again_with_the_same_tensors_as_the_shipped_one_is(toy, tmp_path):
+    path, again = tmp_path / "w.safetensors", tmp_path / "again.safetensors"
+    weights.save(network(toy.small_config()), path, {"of": "a card"})
+    header, tensors = weights._read(path)
+    unsigned = {key: value for key, value in header.items() if key != "signature"}
+    save_file(tensors, str(path), metadata=unsigned)
+    assert export.main([str(path), "--out", str(again)]) == 0
+    assert weights._read(again)[0] == header and weights.checksum(weights._read(again)[1]) == header["sha256"]
+    assert "signature" in weights._read(WEIGHTS / "gapr_net.safetensors")[0]
 
 
 def test_a_checkpoint_with_a_flipped_bit_is_refused(toy, tmp_path):

@@ -13,11 +13,13 @@ from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.formats import columns, reading
 from gapr_core.formats.options import ReadOptions
 from gapr_core.geometry.extent import BEYOND
+from gapr_core.results import ResultWarning
 from gapr_core.surface import Array, Surface, as_array, as_points, check_faces
 
 log = logging.getLogger(__name__)
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "in": 25.4}
+NAMES = {unit: unit for unit in MM_PER_UNIT} | {"in": "inches"}
 PLAUSIBLE = (0.15, 1.2)  # a cloud of a bone has this share of its extent
 EXTENT_LIMITS_MM = (10.0, 2500.0)  # bounding-box diagonal of a piece of bone, and of the longest skeleton part
 CONVERT, OF_HEADER = "convert it to {read_as}", "correct the unit in its header, or convert it to mm"
@@ -78,7 +80,8 @@ def load(
         _check_size(surface, units, name, how)
     scale = MM_PER_UNIT[units]
     camera = None if surface.camera is None else surface.camera * scale
-    surface = replace(surface, points=surface.points * scale, camera=camera)
+    unit = surface.unit if path is None else units
+    surface = replace(surface, points=surface.points * scale, camera=camera, unit=unit)
     if path is not None:
         _warn_of_several_bones(surface, name)
     return surface
@@ -139,32 +142,28 @@ def _across_mm(extent: float, limits_mm: tuple[float, float]) -> dict[str, float
     return {unit: size for unit, size in sizes.items() if limits_mm[0] <= size <= limits_mm[1]}
 
 
-def warn_of_size(path: Path, extent_mm: float, unit: str = "mm") -> None:
-    """Warn of a whole bone of an uncommon size: it and a source in the same wrong unit fit each other.
+def odd_size(bone: Surface) -> ResultWarning | None:
+    """Give the warning of a whole bone from a file, mm, of an uncommon size, or of one that cm and inches make.
 
-    Args:
-        path: the file that was read.
-        extent_mm: the diagonal of what is in it.
-        unit: that it was read as; cm are easily named for inches.
+    A bone and a source in the same wrong unit fit each other: only the size can show it.
     """
     low, high = WHOLE_BONE_MM
-    others = _across_mm(extent_mm / MM_PER_UNIT.get(unit, 1.0), WHOLE_BONE_MM)
-    sizes = ", ".join(f"{size:.0f} mm in {other}" for other, size in others.items() if other != unit)
-    if low <= extent_mm <= high and unit == "cm" and "in" in others:
-        log.warning("%s is %.3g mm across in cm, and %s (inches): a femur has 350 to 550 mm, a pelvis 250 to 350 mm. "
-                    "Name the unit that is right", path.name, extent_mm, sizes)  # fmt: skip
-    if low <= extent_mm <= high:
-        return
-    how = (
-        OF_HEADER
-        if reading.format_of(path).in_mm
-        else "name the unit with units, --units (of both files) or model_unit" + (f": it has {sizes}" if sizes else "")
-    )
-    if extent_mm < low:
-        stated = "as small as a patella; a femur has 350 to 550 mm, a pelvis 250 to 350 mm. If this bone is larger"
-    else:
-        stated = "longer than any human bone. If this is one bone"
-    log.warning("%s is %.3g mm across, %s, %s", path.name, extent_mm, stated, how)
+    extent_mm = bone.extent_mm
+    others = _across_mm(extent_mm / MM_PER_UNIT.get(bone.unit, 1.0), WHOLE_BONE_MM)
+    sizes = ", ".join(f"{size:.0f} mm in {NAMES[unit]}" for unit, size in others.items() if unit != bone.unit)
+    if not bone.unit or (low <= extent_mm <= high and not (bone.unit == "cm" and "in" in others)):
+        return None
+    what = "longer than any human bone" if extent_mm > high else "as small as a patella" if extent_mm < low else ""
+    text = f"The bone is {extent_mm:.3g} mm across, read in {NAMES[bone.unit]}{', ' * bool(what)}{what}."
+    advice = "A femur has 350 to 550 mm, a pelvis 250 to 350 mm" + (f"; this one has {sizes}. " if sizes else ". ")
+    how = "If the unit is wrong, name it (units, --units of both files, model_unit), or correct a label map's header."
+    return ResultWarning("bone_size", text, advice + how)
+
+
+def warn_of_size(name: str, bone: Surface) -> None:
+    """Log the warning of `odd_size` where a bone is loaded."""
+    if found := odd_size(bone):
+        log.warning("%s: %s", name, found)
 
 
 def _warn_of_columns(path: Path, surface: Surface) -> None:

@@ -29,6 +29,7 @@ class Surface:
         normals: (N, 3) float64 unit normals as read, or None.
         camera: (3,) float64, mm: where a camera saw a cloud from, if its pixels say (`geometry.pinhole`), or None.
         joined: the points were measured from several places, as several clouds or slices, or by a tip.
+        unit: that its file was read in, such as "cm"; empty for what is from no file.
     """
 
     points: Array
@@ -36,6 +37,7 @@ class Surface:
     normals: Array | None = None
     camera: Array | None = None
     joined: bool = False
+    unit: str = ""
 
     @classmethod
     def from_open3d(cls, mesh: Any) -> Surface:

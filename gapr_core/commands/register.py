@@ -87,6 +87,7 @@ def run(args: Namespace) -> int:
     """
     from gapr_core import Registrar, Tracker
     from gapr_core.benchmark import methods
+    from gapr_core.registration import caveats
 
     args.method = options.method_name(args)
     checks.check_outputs(args)
@@ -104,7 +105,7 @@ def run(args: Namespace) -> int:
         hints |= _seen(args, method, source)
         result = method.register(source.points, method.prepare(target), **hints)  # type: ignore[call-arg]
     if result.bone is None:
-        result = replace(result, bone=target, source=source.points)
+        result = caveats.completed(result, target, source.points)
     if plan is not None and not (result.ok and result.covariance is None):
         result = result.with_targets(plan.points, plan.labels)
     code = _show(args, result)
@@ -117,10 +118,7 @@ def run(args: Namespace) -> int:
 
 def _read(args: Namespace) -> tuple[Surface, Surface]:
     """Target and source, with a warning of everything that may be wrong and can be read nevertheless."""
-    from gapr_core import clouds
-
     target = options.load(args.target, args.units, axes=args.axes, labels=tuple(args.label))
-    clouds.warn_of_size(args.target, target.extent_mm, args.units or "mm")
     how = {"axes": args.source_axes, "tip_mm": args.tip, "tool": args.tool, "reference": args.reference}
     how |= {"topic": args.topic, "clouds": args.clouds, "labels": tuple(args.source_label)}
     source = options.load(args.source, args.source_units or args.units, **how)

@@ -55,10 +55,16 @@ def answering(register: Callable[..., RegistrationResult]) -> Register:
         result = register(method, points, target, initial, viewpoint)
         if result.bone is not None or not isinstance(target, PreparedTarget):
             return result
-        source_mm = clouds.finite_points(points)
-        return replace(result, bone=target.surface, source=source_mm, warnings=_warnings(result, target, self.config))
+        result = replace(result, warnings=_warnings(result, target, self.config))
+        return completed(result, target.surface, clouds.finite_points(points))
 
     return call  # type: ignore[return-value]  # as a method it is bound
+
+
+def completed(result: RegistrationResult, bone: Surface, source: Array) -> RegistrationResult:
+    """Give a result its bone, its source (N, 3), both mm, and the warning of the bone's size, on refusals too."""
+    odd = clouds.odd_size(bone)
+    return replace(result, bone=bone, source=source, warnings=(*result.warnings, *((odd,) if odd else ())))
 
 
 def _seen(method: Any, source: Source, viewpoint: Any) -> tuple[Any, ArrayLike, Any]:

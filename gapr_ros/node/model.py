@@ -73,7 +73,7 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
     path = _path(parameters)
     stamp = _stamp_of(path)
     surface = surface_of(parameters)
-    clouds.warn_of_size(path, surface.extent_mm)
+    clouds.warn_of_size(path.name, surface)
     target = method.prepare(surface, units="mm")
     points_mm = _for_display(surface)
     return Model(parameters.model_path, target, points_mm, surface.extent_mm, stamp)

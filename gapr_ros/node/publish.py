@@ -21,7 +21,7 @@ from gapr_ros.node.frames import Frames
 from gapr_ros.node.host import Host
 from gapr_ros.node.model import Model
 from gapr_ros.node.outcome import Found, Outcome, stamp_ns
-from gapr_ros.node.report import status_message
+from gapr_ros.node.report import status_message, warnings_of
 from msg_adapters import covariance_to_list, matrix_to_pose, matrix_to_transform, xyz_to_cloud
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ def status_of(outcome: Outcome, name: str, hardware_id: str) -> DiagnosticStatus
         "inlier_ratio": 0.0 if result is None else float(result.inlier_ratio),
         "points_used": outcome.points_used,
         "seconds": outcome.exec_s,
-        "warnings": "" if result is None else "; ".join(f"{each.code}: {each.text}" for each in result.warnings),
+        "warnings": warnings_of(result),
         "findings": "" if result is None else "; ".join(f"{each.check}: {each.text}" for each in result.findings),
     }
     if found is not None:

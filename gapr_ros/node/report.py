@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import QoSProfile
 
+from gapr_core.results import RegistrationResult
 from gapr_ros.node import units
 from gapr_ros.node.host import THROTTLE_S, Host, guarded
 from gapr_ros.node.outcome import Counters, Outcome, Reason
@@ -142,8 +143,14 @@ def registration_status(now: Snapshot) -> DiagnosticStatus:
         "frames_accepted": counters.accepted, "frames_refused": counters.refused, "frames_merged": counters.merged,
         "frames_lost": counters.lost, "consecutive_refusals": counters.consecutive_refusals,
         "last_refusal": counters.last_refusal, "cloud_qos": topic.qos, "publishers_on_points": topic.publishers,
+        "warnings": warnings_of(result),
     }  # fmt: skip
     return status_message(level, f"{now.name}: registration", now.hardware_id, message, values)
+
+
+def warnings_of(result: RegistrationResult | None) -> str:
+    """The caveats of a result, each with its code."""
+    return "" if result is None else "; ".join(f"{each.code}: {each.text}" for each in result.warnings)
 
 
 def _level(now: Snapshot) -> tuple[bytes, str]:

@@ -192,38 +192,21 @@ def test_what_may_be_in_metres_or_centimetres_is_taken_for_metres():
         clouds.load(VERTICES / Surface(VERTICES).extent_mm * 1.5, units="mm")
 
 
-def test_a_label_map_of_an_uncommon_size_is_warned_of_its_header(tmp_path, caplog):
-    (tmp_path / "bone.nii.gz").touch()
-    clouds.warn_of_size(tmp_path / "bone.nii.gz", 45.0)
-    assert "correct the unit in its header" in caplog.text and "units=" not in caplog.text
-
-
-@pytest.mark.parametrize(("extent_mm", "said"), [
-    (45.0, "45 mm across, as small as a patella"), (59.0, "59 mm across, as small as a patella"), (61.0, ""),
-    (690.0, ""), (710.0, "710 mm across, longer than any"), (900.0, "900 mm across, longer than any"),
-])  # fmt: skip
-def test_a_target_of_an_uncommon_size_is_warned_of(tmp_path, caplog, extent_mm, said):
-    """A bone in cm and a source in cm, both read as mm, fit each other: only the size can show it."""
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(400, 3))
-    np.save(tmp_path / "bone.npy", points * extent_mm / Surface(points).extent_mm)
-    target.prepare(tmp_path / "bone.npy")
-    assert said in caplog.text and ("bone.npy is" in caplog.text) == bool(said)
-    caplog.clear()
-    target.prepare(np.load(tmp_path / "bone.npy"))
-    assert not caplog.text, "arrays come from programs, which may register small things"
-
-
 @pytest.mark.parametrize(("extent", "unit", "said"), [
-    (18.7, "mm", "it has 187 mm in cm, 475 mm in in"), (18.7, "cm", "475 mm in in (inches): a femur has 350 to 550 mm"),
-    (45.0, "cm", ""), (18.7, "in", ""),
+    (45.0, "mm", "45 mm across, read in mm, as small as a patella."), (59.0, "mm", "as small as a patella"),
+    (61.0, "mm", ""), (690.0, "mm", ""), (710.0, "mm", "longer than any human bone"), (45.0, "cm", ""),
+    (18.7, "mm", "this one has 187 mm in cm, 475 mm in inches"), (18.7, "in", ""),
+    (18.7, "cm", "187 mm across, read in cm. A femur has 350 to 550 mm, a pelvis 250 to 350 mm; this one has 475 mm"),
 ])  # fmt: skip
-def test_a_bone_in_inches_is_not_taken_for_one_in_centimetres_without_a_word(tmp_path, caplog, extent, unit, said):
-    """Both fit a cloud in the same unit: only the size can show it."""
+def test_a_bone_from_a_file_is_warned_of_where_its_size_is_that_of_another_unit(tmp_path, caplog, extent, unit, said):
+    """A bone in cm or inches and a source in the same, both read as mm, fit each other: only the size can show it."""
     points = np.random.default_rng(0).normal(size=(400, 3))
     np.save(tmp_path / "bone.npy", points * extent / Surface(points).extent_mm)
-    clouds.warn_of_size(tmp_path / "bone.npy", clouds.load(tmp_path / "bone.npy", unit).extent_mm, unit)
-    assert said in caplog.text and bool(caplog.text) == bool(said)
+    found = clouds.odd_size(clouds.load(clouds.load(tmp_path / "bone.npy", unit)))
+    assert said in str(found or "") and (found is None) == (said == "")
+    target.prepare(tmp_path / "bone.npy", unit)
+    assert ("bone.npy: The bone is" in caplog.text) == bool(said)
+    assert clouds.odd_size(clouds.load(np.load(tmp_path / "bone.npy"), unit)) is None, "arrays come from programs"
 
 
 def test_a_cloud_in_inches_is_not_called_one_in_centimetres_alone():

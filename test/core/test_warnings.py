@@ -90,11 +90,11 @@ class StandIn:
 def register(tmp_path, monkeypatch):
     """`gapr register` on a box of 60 x 60 x 300 mm; what the terminal, the page and the JSON say."""
     bone = box([60.0, 60.0, 300.0])
-    np.savez(tmp_path / "bone.npz", points=bone.points, faces=bone.faces)
     np.save(tmp_path / "cloud.npy", bone.sample(40, np.random.default_rng(0))[0])
     monkeypatch.setitem(methods.OWN, "gapr", StandIn)
 
-    def call(answer, capsys, plan=None):
+    def call(answer, capsys, plan=None, scale=1.0):
+        np.savez(tmp_path / "bone.npz", points=scale * bone.points, faces=bone.faces)
         monkeypatch.setattr(StandIn, "answer", answer)
         line = ["register", "--source", f"{tmp_path}/cloud.npy", "--target", f"{tmp_path}/bone.npz"]
         line += ["--json", f"{tmp_path}/out.json", "--report", f"{tmp_path}/page.html"]
@@ -118,6 +118,25 @@ def test_a_warning_is_in_the_terminal_on_the_page_and_in_the_json(register, caps
     assert f"warning: {warning}\n" in shown
     assert warning.text.replace("'", "&#39;") in page and warning.advice in page
     assert answer["warnings"] == [{"code": warning.code, "text": warning.text, "advice": warning.advice}]
+
+
+@pytest.mark.parametrize("answer", [accepted(), RegistrationResult(RegistrationStatus.AMBIGUOUS, reason="two fit")])
+def test_a_bone_of_no_adult_is_in_the_terminal_on_the_page_and_in_the_json_also_of_a_refusal(register, capsys, answer):
+    shown, page, found = register(answer, capsys, scale=0.1)
+    (warning,) = found["warnings"]
+    assert warning["code"] == "bone_size" and "31.2 mm across, read in mm, as small as a patella" in warning["text"]
+    assert f"warning: {warning['text']} {warning['advice']}" in shown
+    assert warning["text"] in page and "312 mm in cm" in warning["advice"]
+
+
+def test_a_registrar_warns_of_the_size_of_a_bone_from_a_file(tmp_path, femur):
+    small = replace(femur, points=femur.points / 10.0)
+    np.savez(tmp_path / "bone.npz", points=small.points, faces=small.faces)
+    registrar = Registrar(RegistrarConfig(num_threads=1))
+    result = registrar.register(
+        small.sample(300, np.random.default_rng(5))[0], registrar.prepare(tmp_path / "bone.npz")
+    )
+    assert "bone_size" in [warning.code for warning in result.warnings]
 
 
 def test_a_finding_is_in_the_terminal_on_the_page_and_in_the_json(register, capsys):

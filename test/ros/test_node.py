@@ -68,6 +68,7 @@ def test_an_accepted_cloud_gives_pose_covariance_confidence_and_bound_under_one_
     np.testing.assert_allclose(np.array(values["pose"].split(), dtype=float), [p.x, p.y, p.z, q.x, q.y, q.z, q.w], 1e-6)
     assert values["warnings"] == "sensor_unknown: the sensor is not named" and values["reason"] == ""
     assert values["line"] == "pose with confidence 0.90, tre95 0.0014 m"
+    wait_until(lambda: client.values()["warnings"] == values["warnings"])
 
 
 LATE = {  # what was done after an accepted cloud: what a late joiner gets of pose and model; whether it is withdrawn

@@ -133,7 +133,7 @@ def prepare(
     config = config or TargetConfig()
     surface = clouds.load(target, units)
     if isinstance(target, str | Path):
-        clouds.warn_of_size(Path(target), surface.extent_mm, units)
+        clouds.warn_of_size(Path(target).name, surface)
     points, normals = _surface_elements(surface, config, num_threads)
     _check_is_a_body(points, config)
     spacing_mm = quadrics.spacing(points, num_threads=num_threads)

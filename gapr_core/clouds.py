@@ -143,7 +143,7 @@ def _across_mm(extent: float, limits_mm: tuple[float, float]) -> dict[str, float
 
 
 def odd_size(bone: Surface) -> ResultWarning | None:
-    """Give the warning of a whole bone from a file, mm, of an uncommon size, or of one that cm and inches make.
+    """Give the warning of a whole bone from a file, mm, whose size is that of another unit.
 
     A bone and a source in the same wrong unit fit each other: only the size can show it.
     """

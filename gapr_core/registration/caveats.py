@@ -62,7 +62,7 @@ def answering(register: Callable[..., RegistrationResult]) -> Register:
 
 
 def completed(result: RegistrationResult, bone: Surface, source: Array) -> RegistrationResult:
-    """Give a result its bone, its source (N, 3), both mm, and the warning of the bone's size, on refusals too."""
+    """Add bone, source (N, 3), both mm, and the warning of the bone's size, on refusals too."""
     odd = clouds.odd_size(bone)
     return replace(result, bone=bone, source=source, warnings=(*result.warnings, *((odd,) if odd else ())))
 

@@ -65,7 +65,7 @@ class Act:
 
 
 def probe_sweep(bone: str, seed: int, frames: int, period_s: float, folder: Path) -> Act:
-    """A probe that sweeps along a parametric bone; each cloud holds all that it has seen so far."""
+    """Make a probe that sweeps along a parametric bone; each cloud holds all points so far."""
     from gapr_core.data import sweep
 
     specimen, path = _specimen(bone, seed, folder)
@@ -79,7 +79,7 @@ def probe_sweep(bone: str, seed: int, frames: int, period_s: float, folder: Path
 
 
 def camera_round(bone: str, seed: int, frames: int, period_s: float, folder: Path) -> Act:
-    """A camera that circles a wound while the bone moves; each cloud is one image, in the camera's own frame."""
+    """Make a camera that circles a wound while the bone moves; each cloud is one image, in the camera's frame."""
     from gapr_core.data.scenes.stream import SceneMotion, simulate
 
     specimen, path = _specimen(bone, seed, folder)
@@ -87,7 +87,7 @@ def camera_round(bone: str, seed: int, frames: int, period_s: float, folder: Pat
 
 
 def act_of_pairs(specimen: Specimen, path: Path, pairs: Sequence[Pair], period_s: float) -> Act:
-    """A camera's frames as `gapr_core.data.scenes.stream` makes them; `path` is the file of the bone."""
+    """Make an act of the camera's frames of `gapr_core.data.scenes.stream`; `path` is the file of the bone."""
     from gapr_core.geometry import se3
 
     lead = (
@@ -106,7 +106,7 @@ def act_of_pairs(specimen: Specimen, path: Path, pairs: Sequence[Pair], period_s
 
 
 def _specimen(bone: str, seed: int, folder: Path) -> tuple[Specimen, Path]:
-    """A parametric bone, and its file."""
+    """Make a parametric bone, and write its file."""
     from gapr_core.data.pool import parametric_specimen
 
     specimen = parametric_specimen(bone, seed)
@@ -114,14 +114,14 @@ def _specimen(bone: str, seed: int, folder: Path) -> tuple[Specimen, Path]:
 
 
 def write_bone(specimen: Specimen, folder: Path) -> Path:
-    """STL (mm) of a bone, as a segmented CT would be, under a name that no bone of a user has; returns its path."""
+    """Write the bone as STL (mm), as a segmented CT would be, and return its path. No user's bone has its name."""
     path = folder / f"demo_{specimen.bone}.stl"
     write_stl(specimen.surface, path)
     return path
 
 
 def write_stl(surface: Surface, path: Path) -> None:
-    """A mesh as binary STL."""
+    """Write a mesh as binary STL."""
     import open3d as o3d
 
     mesh = surface.to_open3d()
@@ -131,7 +131,7 @@ def write_stl(surface: Surface, path: Path) -> None:
 
 
 def write_bag(act: Act, path: Path, storage: str) -> None:
-    """The clouds as a rosbag2 bag: one PointCloud2 a frame, metres, in the frame of the sensor.
+    """Write the clouds as a rosbag2 bag: one PointCloud2 a frame, metres, in the frame of the sensor.
 
     Raises:
         DemoError: something is there that no demo has written.

@@ -43,5 +43,5 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def last_lines(log: Path, count: int = 5) -> str:
-    """The end of a child's output, for an error message."""
+    """Read the end of a child's output, for an error message."""
     return "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-count:])

@@ -1,8 +1,8 @@
-"""`gapr demo`: a bone, simulated clouds of it in a bag, the node as its own process, poses, a table and a report.
+"""The node registers simulated clouds of a bone; a table and a report hold its poses against the truth.
 
-Three acts: a probe that sweeps along the bone; with --scene a camera that circles a wound; with --guided a probe that
-goes where the node says that a look would help most. With --real DIR public real clouds are registered instead, without
-the node; docs/results/real.md says where they are.
+A probe sweeps along the bone. With --scene a camera circles a wound; with --guided a probe goes where the node says
+that a look would help most. With --real DIR public real clouds are registered instead, without the node;
+docs/results/real.md says where they are.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAKERS = {"sweep": probe_sweep, "scene": camera_round}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `gapr demo`."""
+    """Add the options of `gapr demo`."""
     parser.description = __doc__
     act = parser.add_mutually_exclusive_group()
     act.add_argument("--scene", dest="act", action="store_const", const="scene", default="sweep",
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _seed(text: str) -> int:
-    """A whole number, 0 or more."""
+    """Read a whole number, 0 or more."""
     if not text.strip().isdecimal():
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
     return int(text)

@@ -62,12 +62,12 @@ class Look:
 
 
 def make_probe(bone: str, seed: int) -> LookingProbe:
-    """A probe in front of a parametric bone."""
+    """Put a probe in front of a parametric bone."""
     return LookingProbe(parametric_specimen(bone, seed), seed)
 
 
 def follow(probe: LookingProbe, observer: Observer, most: int, folder: Path, console: Any) -> list[Look]:
-    """Look, ask the node, look where it says; until it is enough, most looks are done, or it does not say where.
+    """Look, ask the node, and look where the answer says, until the pose is good enough or advice ends.
 
     Raises:
         DemoError: the node did not start, or ended too early.
@@ -92,7 +92,7 @@ def follow(probe: LookingProbe, observer: Observer, most: int, folder: Path, con
 
 
 def _line(number: int, look: Look) -> str:
-    """What came of a look, for the terminal."""
+    """Describe a look for the terminal."""
     answer, points = look.answer, len(look.cloud)
     if answer is None:
         return f"look {number}, {points} points: no answer"
@@ -103,7 +103,7 @@ def _line(number: int, look: Look) -> str:
 
 
 def judged(probe: LookingProbe, looks: Sequence[Look]) -> list[Row]:
-    """Every look against the truth."""
+    """Hold every look against the truth."""
     act = Act(
         probe.specimen.bone, probe.specimen.surface, Path(), tuple(look.cloud for look in looks),
         (probe.T_target_source,) * len(looks), 1.0, TITLE, LEAD,
@@ -135,7 +135,7 @@ def write(probe: LookingProbe, looks: Sequence[Look], rows: Sequence[Row], folde
 
 
 def verdict(looks: Sequence[Look], rows: Sequence[Row]) -> str:
-    """The outcome in a sentence."""
+    """Sum the outcome up in a sentence."""
     return "  ".join(f"{name}: {value}." for name, value in _facts(looks, rows).items())
 
 
@@ -146,7 +146,7 @@ def _facts(looks: Sequence[Look], rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _on_bone(probe: LookingProbe, look: Look) -> OnBone:
-    """What is known after a look, and where the next one would help."""
+    """Draw what is known after a look, and where the next one would help."""
     bone, points = probe.specimen.surface, se3.apply(probe.T_target_source, look.cloud)
     old, new = np.split(points, [len(points) - look.newest])
     advice, place = look.advice, np.zeros((0, 3))

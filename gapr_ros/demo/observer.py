@@ -126,11 +126,11 @@ class Observer(Node):
         return None if self._gain is None or self._centre is None else Advice(*self._gain, self._centre)
 
     def forget_advice(self) -> None:
-        """What comes next is of the next cloud."""
+        """Forget the advice of the cloud before."""
         self._gain = self._centre = None
 
     def note_sent(self, topic: str, stamp_ns: int) -> None:
-        """A cloud with this stamp has just been sent."""
+        """Note that a cloud with this stamp has just been sent."""
         self._sent[_ms(stamp_ns)] = time.monotonic()
 
     def complete(self) -> None:

@@ -30,7 +30,7 @@ def run(folder: Path, console: Any) -> int:
 
 
 def judged(pair: RealPair, result: RegistrationResult) -> tuple[list[str], bool | None]:
-    """A row of the table, and whether the pose is right; None for a refusal, or where no truth is known."""
+    """Make a row of the table, and say if the pose is right; None without pose or truth."""
     size = "" if result.tre_mm is None else f"{result.tre_mm:.1f}"
     row = [pair.name, str(len(pair.source)), str(result.status), confidence_text(result.confidence), size]
     if result.T_target_source is None or pair.T_target_source is None:

@@ -43,7 +43,7 @@ class Taken:
         return float(self.is_bone[self.is_taken].mean()) if self.is_taken.any() else float("nan")
 
     def cells(self) -> tuple[str, ...]:
-        """The part of a row, as text."""
+        """Return the part of a row, as text."""
         right = f"{100.0 * self.right_share:.0f}" if self.is_taken.any() else ""
         return f"{100.0 * self.is_bone.mean():.0f}", str(int(self.is_taken.sum())), right
 
@@ -69,7 +69,7 @@ class Row:
         return "ok" if se3.PoseError(self.error_mm, self.error_deg).is_right else "bad"
 
     def cells(self) -> tuple[str, ...]:
-        """The row as text, one string a column."""
+        """Return the row as text, one string a column."""
         head = (str(self.frame), str(self.points), *(self.taken.cells() if self.taken else ()))
         answer = self.answer
         if answer is None:
@@ -85,7 +85,7 @@ class Row:
 
 
 def columns(rows: Sequence[Row]) -> tuple[str, ...]:
-    """The headings of the rows' cells."""
+    """Return the headings of the rows' cells."""
     bone = BONE_COLUMNS if rows and rows[0].taken else ()
     return (
         "frame",
@@ -102,7 +102,7 @@ def columns(rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def judge(act: Act, answers: Mapping[int, Answer]) -> list[Row]:
-    """Every frame of the bag with its answer, against the truth that only the simulation knows."""
+    """Hold every frame's answer against the truth, which only the simulation knows."""
     rows = []
     for number, (cloud, truth) in enumerate(zip(act.clouds, act.truths, strict=True)):
         answer = answers.get(act.stamp_ms(number))
@@ -115,7 +115,7 @@ def judge(act: Act, answers: Mapping[int, Answer]) -> list[Row]:
 
 
 def _taken(cloud: np.ndarray, is_bone: NDArray[np.bool_], answer: Answer | None) -> Taken:
-    """What the node says of the points that it used, for every point of the cloud; of a refused cloud none is taken."""
+    """Mark the points of the cloud that the node took for bone; none of a refused cloud."""
     if answer is None or answer.used is None or not len(answer.used.points):
         return Taken(np.zeros(len(cloud), dtype=bool), np.zeros(len(cloud), dtype=bool), is_bone)
     used = answer.used
@@ -131,13 +131,13 @@ def passed(rows: Sequence[Row]) -> bool:
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """The outcome in a sentence."""
+    """Sum the outcome up in a sentence."""
     counts = facts(rows)
     return "  ".join(f"{name}: {value}." for name, value in counts.items())
 
 
 def rich_table(rows: Sequence[Row]) -> Table:
-    """For the terminal."""
+    """Make the table of the terminal."""
     table, names = Table(box=None, header_style="bold", pad_edge=False), columns(rows)
     shown = [k for k, name in enumerate(names) if not (rows[0].taken and name in LEFT_OUT)]
     for k in shown:
@@ -192,7 +192,7 @@ def _page(
 
 
 def add_verdict(report: Report, rows: Sequence[Row]) -> None:
-    """How many poses are right, and whether one is wrong."""
+    """Report how many poses are right, and if one is wrong."""
     right, wrong, refused = ([row.mark for row in rows].count(mark) for mark in ("ok", "bad", "hold"))
     tone = "refused" if wrong or not right else "accepted"
     headline = f"{wrong} wrong poses" if wrong else f"{right} right poses, none wrong"
@@ -200,7 +200,7 @@ def add_verdict(report: Report, rows: Sequence[Row]) -> None:
 
 
 def add_frames(report: Report, rows: Sequence[Row]) -> None:
-    """The charts and the table of all frames."""
+    """Add the charts and the table of all frames."""
     report.heading("Frame by frame")
     report.paragraph(
         "Errors are against the truth of the simulation, which the node never sees: at the centroid of the cloud and "
@@ -212,7 +212,7 @@ def add_frames(report: Report, rows: Sequence[Row]) -> None:
 
 
 def _on_bone(row: Row, cloud: np.ndarray, act: Act) -> OnBone:
-    """One frame; what the node did not take for bone is grey, and without a pose there is nothing on the bone."""
+    """Draw one frame: grey is what the node took for no bone. Without a pose nothing is on the bone."""
     if row.answer is None or row.answer.T_target_source is None:
         return OnBone(act.bone, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))
     aligned = se3.apply(row.answer.T_target_source, cloud)
@@ -232,7 +232,7 @@ def _caption(row: Row) -> str:
 
 
 def _facing(act: Act, frame: int) -> np.ndarray | None:
-    """Where the camera is, seen from its points, in the bone's frame; None for a probe, which is on all sides."""
+    """Find the camera from its points, in the bone's frame; None for a probe, which is on all sides."""
     if not act.is_bone:
         return None
     middle = act.clouds[frame].mean(axis=0)
@@ -240,7 +240,7 @@ def _facing(act: Act, frame: int) -> np.ndarray | None:
 
 
 def _views(act: Act, rows: Sequence[Row]) -> list[CameraView]:
-    """The images of a camera, in its own frame; none where a probe sweeps."""
+    """Draw the images of a camera, in its own frame; none of a probe."""
     words = {"ok": "pose", "hold": "refused", "bad": "WRONG pose", "": "no answer"}
     return [
         CameraView(f"frame {row.frame}: {words[row.mark]}", cloud, row.taken.looked_at, row.taken.is_taken)
@@ -264,7 +264,7 @@ def _charts(rows: Sequence[Row]) -> dict[str, tuple[list[float], float | None]]:
 
 
 def facts(rows: Sequence[Row]) -> dict[str, str]:
-    """What matters most."""
+    """List what matters most."""
     marks = [row.mark for row in rows]
     names = {
         "ok": "right poses",

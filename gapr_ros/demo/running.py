@@ -27,7 +27,7 @@ STARTING = "waiting for the node to read the bone (the first time it compiles, u
 
 @contextmanager
 def observing(log_folder: Path) -> Iterator[Observer]:
-    """An observer in a ROS graph of its own on this machine, which the children of this process share.
+    """Run an observer in a ROS graph of its own on this machine, shared with the children of this process.
 
     ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE are respected where they are set.
     """
@@ -92,7 +92,7 @@ class RunningNode:
         observer.complete()
 
     def check(self) -> None:
-        """It is still there, and nobody pressed Ctrl-C.
+        """Raise if the node has ended, or somebody pressed Ctrl-C.
 
         Raises:
             DemoError: it ended with an error.
@@ -118,7 +118,7 @@ class Sender:
         self._publisher = node.observer.create_publisher(PointCloud2, "points", 10)
 
     def ask(self, cloud_mm: NDArray[np.float64], stamp_ms: int) -> Answer | None:
-        """The answer to a cloud (N, 3), mm, of this time; None when none came for a minute."""
+        """Send a cloud (N, 3), mm, of this time and return the answer; None if none comes for a minute."""
         from rclpy.time import Time
         from std_msgs.msg import Header
 

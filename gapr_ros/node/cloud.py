@@ -47,7 +47,7 @@ class Taken(NamedTuple):
 
 
 def read_message(data: bytes) -> PointCloud2:
-    """The message, or a refusal when its bytes are none."""
+    """Read the message, or refuse bytes that are none."""
     try:
         return deserialize_message(data, PointCloud2)
     except Exception as error:  # the middleware raises several kinds
@@ -55,7 +55,7 @@ def read_message(data: bytes) -> PointCloud2:
 
 
 def read_header(data: bytes) -> Header | None:
-    """The header alone, in microseconds, however large the cloud is; None when the bytes are no message."""
+    """Read the header alone, in microseconds for a cloud of any size; None if the bytes are no message."""
     try:
         return deserialize_message(data, Header)
     except Exception:  # the middleware raises several kinds
@@ -68,7 +68,7 @@ def count(cloud: PointCloud2) -> int:
 
 
 def plain_frame(frame_id: str) -> str:
-    """A frame's name as tf2 knows it: without the leading slash of ROS 1."""
+    """Return a frame's name as tf2 knows it: without the leading slash of ROS 1."""
     return frame_id.lstrip("/")
 
 
@@ -128,9 +128,9 @@ def seen_from(cloud: PointCloud2, parameters: NodeParameters) -> Array | None:
 
 
 def without_table(points_mm: Array, bone_mm: float) -> Array:
-    """The points that stand out of a plane larger than the bone, in pieces of the bone's size; all without one.
+    """Keep the points that stand out of a plane larger than the bone, in pieces of its size.
 
-    No bone has a plane larger than itself, so that such a plane is a table, a floor or a drape.
+    Such a plane is a table, a floor or a drape. Without one all points are kept.
     """
     distance_mm = _table(points_mm, bone_mm)
     if distance_mm is None:
@@ -176,7 +176,7 @@ def _pieces(points: Array) -> list[NDArray[np.bool_]]:
 
 
 def _in_box(points_mm: Array, parameters: NodeParameters, T_crop_cloud: Array) -> Array:
-    """The points inside the box, whose corners are in metres."""
+    """Keep the points inside the box, whose corners are in metres."""
     low, high = (np.asarray(corner) for corner in (parameters.crop_min, parameters.crop_max))
     if not (low < high).all():
         text = f"the box is empty: crop_min {low.tolist()} is not below crop_max {high.tolist()}: correct them"
@@ -247,7 +247,7 @@ def _finite_points(cloud: PointCloud2) -> Array:
 
 
 def _looks_like(extent_mm: float, model_extent_mm: float, unit: str) -> str:
-    """The other units in which the cloud would be a piece of the bone, else those in which it may be one; or ""."""
+    """Name the other units in which the cloud would be a piece of the bone, else may be one, or ""."""
     per_mm = extent_mm / units.MM_PER_UNIT[unit] / model_extent_mm
     shares = {name: per_mm * units.MM_PER_UNIT[other] for other, name in UNIT_NAMES.items() if other != unit}
     low, high = PLAUSIBLE

@@ -121,7 +121,7 @@ class Frames:
             self._held_ns = self._sent_ns + KEPT_NS
 
     def forget(self) -> None:
-        """The listeners start over: older stamps are news again."""
+        """Start the listeners again, so that older stamps count as new."""
         self.start_over()
         self._sent_ns, self._held_ns, self.behind = -1, -1, False
 
@@ -137,7 +137,7 @@ class Frames:
 
 
 def needs_frames(parameters: NodeParameters) -> bool:
-    """Whether clouds cannot be read without tf2."""
+    """Say if clouds cannot be read without tf2."""
     has_frame = parameters.viewpoint not in (*NO_FRAME, "origin")
     return bool(parameters.output_frame or parameters.crop_frame or has_frame)
 

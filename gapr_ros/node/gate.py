@@ -21,14 +21,13 @@ ALIKE_M = 1e-5  # two poses of one stamp that move no point of the bone by more 
 
 
 class Gate:
-    """Judges clouds as they arrive, and their answers. What it refuses changes nothing.
+    """Judges clouds when they arrive, and their answers; a refused one changes nothing.
 
     Of the executor's thread; the worker's reads the attributes.
 
-    Poses go out in the order of their stamps, one for each stamp. A stamp that went back by more than a second is that
-    of a straggler, or time has started over, as in a bag that is looped without simulated time. Three in a row with
-    stamps that go forward among themselves start time over; so does the very stamp with which this round began, where
-    all clouds come from one publisher.
+    Poses go out in the order of their stamps, one for each stamp. A stamp more than a second back is a straggler's, or
+    time has started over, as in a bag looped without simulated time. Three such in a row, with increasing stamps, start
+    time over. So does this round's very first stamp, if all clouds come from one publisher.
 
     Attributes:
         epoch: the clouds of earlier ones are refused.
@@ -165,7 +164,7 @@ def check_age(stamp: int, now_ns: int, max_age_s: float) -> None:
 
 
 def is_far_ahead(stamp: int, now_ns: int) -> bool:
-    """Whether the stamp of a transform is a second more ahead of the clock than that of a cloud may be."""
+    """Say if a transform is a second more ahead of the clock than a cloud may be."""
     return now_ns > 0 and stamp - now_ns > MAX_FUTURE_S * 1e9 + BACK_NS
 
 

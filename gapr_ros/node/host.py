@@ -36,7 +36,7 @@ class Host(Protocol):
         ...
 
     def now_ns(self) -> int:
-        """The node's time, ns; 0 while simulated time has not started."""
+        """Return the node's time, ns; 0 while simulated time has not started."""
         ...
 
     def call_soon(self, call: Callable[[], None]) -> None:
@@ -49,12 +49,12 @@ class Host(Protocol):
 
 
 def steady_timer(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
-    """A timer that does not stop with simulated time."""
+    """Start a timer that goes on when simulated time stops."""
     return node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def guarded(callback: Callable[..., Any]) -> Callable[..., Any]:
-    """For subscription, timer and event callbacks: an exception is logged (throttled), never raised."""
+    """Log an exception of a subscription, timer or event callback (throttled), and never raise it."""
 
     @functools.wraps(callback)
     def wrapper(self: Any, *args: Any) -> Any:
@@ -69,7 +69,7 @@ def guarded(callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def transition(callback: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
-    """For lifecycle callbacks: an exception makes the transition fail and leaves its reason in log and diagnostics."""
+    """Make a lifecycle callback fail on an exception, and leave the reason in log and diagnostics."""
 
     @functools.wraps(callback)
     def wrapper(self: Any, state: Any) -> TransitionCallbackReturn:
@@ -86,7 +86,7 @@ def transition(callback: Callable[..., TransitionCallbackReturn]) -> Callable[..
 
 
 def describe(error: BaseException) -> str:
-    """The sentence of an error that names its cure; anything else with the place where it happened."""
+    """Return the sentence of an error that names its cure; of another one also the place where it happened."""
     if isinstance(error, ValueError) and str(error).startswith("expected "):
         return str(error)
     place = traceback.extract_tb(error.__traceback__)[-1:]
@@ -102,7 +102,7 @@ class RosLogHandler(logging.Handler):
         self._logger = logger
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One record, at its own level."""
+        """Log one record at its own level."""
         write = self._logger.error if record.levelno >= logging.ERROR else self._logger.warning
         error = record.exc_info[1] if record.exc_info else None
         write(f"{record.getMessage()}: {describe(error)}" if error else record.getMessage())

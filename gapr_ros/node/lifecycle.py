@@ -94,7 +94,7 @@ class RegisterNode(LifecycleNode):
         return self.session
 
     def now_ns(self) -> int:
-        """The node's time, ns; 0 while simulated time has not started."""
+        """Return the node's time, ns; 0 while simulated time has not started."""
         return int(self.get_clock().now().nanoseconds)
 
     def call_soon(self, call: Callable[[], None]) -> None:
@@ -104,7 +104,7 @@ class RegisterNode(LifecycleNode):
             self._bell.trigger()
 
     def report_failure(self, text: str) -> None:
-        """A transition failed: keep its reason for log and diagnostics."""
+        """Keep the reason of a failed transition for log and diagnostics."""
         if self.state == "configuring":
             how = NEXT.format(self.get_fully_qualified_name())
             text = f"{text}; it stays unconfigured: correct it, then {how}, or start again"
@@ -129,7 +129,7 @@ class RegisterNode(LifecycleNode):
     # --- lifecycle ---
 
     def _load_before_configuring(self) -> None:
-        """Who asks to configure waits until the bone is read, the executor does not; then the state changes."""
+        """Read the bone, then change the state; only the caller waits, the executor does not."""
         service = self._service_change_state
         service.callback = partial(self._on_change_asked, service.callback)  # type: ignore[assignment]  # it is awaited
 

@@ -80,7 +80,7 @@ def load_model(method: Any, parameters: NodeParameters) -> Model:
 
 
 def surface_of(parameters: NodeParameters) -> Surface:
-    """The bone that `model_path` names, mm, by the unit, axes and label that stand with it.
+    """Read the bone of `model_path`, mm, by the unit, axes and label given with it.
 
     Raises:
         GaprError: no path, an unreadable file, or something that cannot be a bone in the unit named.
@@ -102,7 +102,7 @@ def _expanded(path: str) -> Path:
 
 
 def _stamp_of(path: Path) -> tuple[int, int] | None:
-    """When a file was written, ns, and its size; None where it cannot be read."""
+    """Return when a file was written, ns, and its size; None if it cannot be read."""
     try:
         seen = path.stat()
     except OSError:
@@ -111,7 +111,7 @@ def _stamp_of(path: Path) -> tuple[int, int] | None:
 
 
 def labels_of(text: str) -> tuple[str, ...]:
-    """The names or numbers of a parameter, with commas between them; a name with a comma in it is in double quotes."""
+    """Split a parameter at its commas into names or numbers; a name with a comma is in double quotes."""
     words = next(csv.reader([text], skipinitialspace=True), [])
     return tuple(word.strip() for word in words if word.strip())
 
@@ -195,7 +195,7 @@ class ShippedMethod:
 
 
 def _read_settings(path: str) -> RegistrarConfig:
-    """The library's settings in a file; no path: its own.
+    """Read the library's settings from a file; without a path return its defaults.
 
     Raises:
         ConfigError: the file cannot be read, or holds what no setting is.
@@ -242,7 +242,7 @@ def _named_in(path: str) -> set[str]:
 
 
 def _decided(config: RegistrarConfig, parameters: NodeParameters) -> dict[tuple[str, str], Any]:
-    """What parameters of the node decide, by (setting, parameter); some of them leave it to the file."""
+    """Return the settings that parameters decide, by (setting, parameter); some are left to the file."""
     decided: dict[tuple[str, str], Any] = {
         ("sensor.kind", "sensor"): config.sensor.kind,
         ("min_confidence", "min_confidence"): config.min_confidence,
@@ -255,7 +255,7 @@ def _decided(config: RegistrarConfig, parameters: NodeParameters) -> dict[tuple[
 
 
 def configured(config: RegistrarConfig, parameters: NodeParameters) -> RegistrarConfig:
-    """The library's settings with the node's own parameters over them."""
+    """Put the node's own parameters over the library's settings."""
     is_inferred = config.clutter.infer_viewpoint and parameters.viewpoint != "none"
     clutter = replace(config.clutter, infer_viewpoint=is_inferred)
     return replace(
@@ -306,7 +306,7 @@ class Loader:
         return done
 
     def _run(self, parameters: NodeParameters, done: Future) -> None:
-        """In the loading thread."""
+        """Read the bone, in the loading thread."""
         try:
             outcome: Ready | BaseException = make_ready(self._method_factory, parameters)
         except BaseException as error:  # who waits gets a MemoryError too

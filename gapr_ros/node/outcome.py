@@ -209,7 +209,7 @@ class Counters:
             self.last_lost_at = time.monotonic()
 
     def count_received(self) -> None:
-        """A cloud came."""
+        """Count a cloud that came."""
         self.received += 1
         self.last_cloud_at = time.monotonic()
 
@@ -218,7 +218,7 @@ class Counters:
         self.consecutive_refusals, self.last_refusal = 0, ""
 
     def count_answer(self, outcome: Outcome) -> None:
-        """A cloud was answered."""
+        """Count a cloud that was answered."""
         if outcome.ok:
             self.accepted += 1
             self.forget_refusals()
@@ -229,17 +229,17 @@ class Counters:
 
 
 def stamp_ns(header: Header) -> int:
-    """The stamp, ns; 0 when there is none."""
+    """Return the stamp, ns; 0 if there is none."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def normal(header: Header) -> Header:
-    """The header with a stamp whose nanoseconds are less than a second; stamp 0 where it is no time."""
+    """Return the header with less than a second of nanoseconds; a stamp that is no time becomes 0."""
     stamp = stamp_ns(header)
     known = stamp if 0 <= stamp < LAST_NS else 0
     return Header(frame_id=header.frame_id, stamp=Time(nanoseconds=known).to_msg())
 
 
 def age_s(stamp: int, now_ns: int) -> float | None:
-    """How old a stamp, ns, is, s; None without one, and while no clock runs."""
+    """Return the age, s, of a stamp, ns; None without one, and while no clock runs."""
     return (now_ns - stamp) * 1e-9 if stamp and now_ns else None

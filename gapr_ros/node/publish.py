@@ -53,12 +53,12 @@ class Publishers:
         self._topics = {name: self._advertise(name) for name in self._kinds}
 
     def send_model(self, model: Model) -> None:
-        """The bone, latched, in its own frame."""
+        """Send the bone, latched, in its own frame."""
         header = self._of_model(Time())  # stamp 0: wherever the frame is now; tf2 has forgotten the start after 10 s
         self._topics["model"].publish(xyz_to_cloud(units.to_metres(model.points_mm).astype("f4"), header))
 
     def send(self, outcome: Outcome, model: Model) -> None:
-        """The outcome of a cloud."""
+        """Send the outcome of a cloud."""
         self._topics["status"].publish(self._status(outcome.header, status_of(outcome, self._name, model.file)))
         if self._vision is not None:
             class_id = self._host.parameters.model_frame
@@ -82,7 +82,7 @@ class Publishers:
         self._topics["status"].publish(self._status(header, status))
 
     def withdraw_all(self) -> None:
-        """No late listener gets anything: the node does not know where the bone is."""
+        """Empty the latched topics: the node no longer knows the pose."""
         for name in ("pose", "status", "model", *(["detection"] if self._vision is not None else [])):
             self._renew(name)
 
@@ -126,7 +126,7 @@ class Publishers:
         self._frames.send(transform, stamp_ns(header))
 
     def _send_seen(self, result: RegistrationResult, outcome: Outcome) -> None:
-        """What users look at: with refusals above all."""
+        """Send the topics for people, above all with refusals."""
         if result.residuals is not None and self._is_heard("debug/residuals"):
             self._topics["debug/residuals"].publish(residuals(result.residuals, outcome.header))
         if result.guidance is not None and result.guidance.patches:
@@ -137,7 +137,7 @@ class Publishers:
 
 
 def status_of(outcome: Outcome, name: str, hardware_id: str) -> DiagnosticStatus:
-    """All that a consumer needs to decide on a pose, or on doing without one; lengths in metres, angles in radians.
+    """Make the status from which a consumer decides; lengths in metres, angles in radians.
 
     The confidence and the errors are those of the registration, whatever the node decided later.
     """
@@ -167,7 +167,7 @@ def status_of(outcome: Outcome, name: str, hardware_id: str) -> DiagnosticStatus
 
 
 def detection(types: Any, outcome: Outcome, class_id: str, points_mm: Array) -> Any:
-    """A vision_msgs/Detection3DArray: pose, covariance, confidence and box of the bone; empty for a refusal.
+    """Make a vision_msgs/Detection3DArray: pose, covariance, confidence and box of the bone; empty for a refusal.
 
     Args:
         types: the module `vision_msgs.msg`.
@@ -190,7 +190,7 @@ def detection(types: Any, outcome: Outcome, class_id: str, points_mm: Array) -> 
 
 
 def residuals(found: Residuals, header: Header) -> PointCloud2:
-    """The used points with their signed distance from the bone, m, NaN where none is near, and 1 for inliers.
+    """Make a cloud of the used points: distance from the bone, m (NaN if none is near), and 1 for inliers.
 
     The stand-off of the sensor is taken off.
     """
@@ -202,20 +202,20 @@ def residuals(found: Residuals, header: Header) -> PointCloud2:
 
 
 def guidance(found: Guidance, header: Header) -> PointCloud2:
-    """The bone's points; intensity is by how much a look there would lower the bound of the error, m."""
+    """Make a cloud of the bone; intensity is how far a look there would lower the error's bound, m."""
     gain = units.to_metres(found.gain_mm).astype("f4")
     return xyz_to_cloud(units.to_metres(found.points).astype("f4"), header, fields={"intensity": gain})
 
 
 def next_view(found: Guidance, header: Header) -> PoseStamped:
-    """The middle of the best patch; the x axis leaves the bone there: look from where it points."""
+    """Make the pose of the best patch's middle; its x axis leaves the bone, towards the sensor."""
     best = found.patches[0]
     T = se3.from_rotation_translation(_with_x(best.normal), units.to_metres(best.centre))
     return PoseStamped(header=header, pose=matrix_to_pose(T))
 
 
 def vision_types() -> Any | None:
-    """The module `vision_msgs.msg`, part of a ROS installation and not of the wheels; None without it."""
+    """Return the module `vision_msgs.msg`, part of a ROS installation and not of the wheels; None without it."""
     try:
         import vision_msgs.msg
     except ImportError:

@@ -52,10 +52,9 @@ class Registration:
 
     Args:
         frames: look-up of transforms.
-        context: asked at the start of each job; its method satisfies `RegistrationMethod`, `register` takes `initial`
-            when there is such a pose, and with `accumulate` it has `collect` and `together_with` as an `Accumulator`,
-            or where `viewpoint` names a place as a `LookAccumulator`.
-        report_collected: called for every cloud of `collect`: why it was not collected, empty where it was.
+        context: asked at the start of each job. Its method satisfies `RegistrationMethod` and takes `initial`. With
+            `accumulate` it is an `Accumulator`, or a `LookAccumulator` if `viewpoint` names a place.
+        report_collected: called for every cloud of `collect`: why it was not collected, empty if it was.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class Registration:
         self._frame = ""  # of the last answer; what the method remembers holds there only
 
     def process(self, job: Job) -> Outcome:
-        """The outcome of one cloud; never raises."""
+        """Answer one cloud; never raises."""
         outcome, start = Outcome(job), time.monotonic()
         try:
             self._run(outcome, self._context())
@@ -127,13 +126,13 @@ class Registration:
         return units.moved_mm(T_frame_cloud, taken.points_mm)
 
     def _watch_frame(self, frame: str, now: JobContext) -> None:
-        """What the method remembers is of one frame."""
+        """Make the method forget what was found in another frame."""
         if self._frame and frame != self._frame:
             forget(now.method, f"the clouds come in '{frame}' and no longer in '{self._frame}'")
         self._frame = frame
 
     def _initial(self, outcome: Outcome, now: JobContext) -> Array | None:
-        """The initial pose as T_target_source, mm; None without one, and while its frame is missing."""
+        """Return the initial pose as T_target_source, mm; None without one, and while its frame is missing."""
         given = now.initial_pose
         if given is None:
             return None

@@ -57,7 +57,7 @@ class Conflicts:
 
 
 def names_of(publishers: Iterable[Any]) -> str:
-    """The full names of the nodes that publish, with commas, from what the graph says of each publisher."""
+    """Join the full names of the nodes that publish with commas."""
     return ", ".join(f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in publishers)
 
 
@@ -125,7 +125,7 @@ class Snapshot:
 
 
 def registration_status(now: Snapshot) -> DiagnosticStatus:
-    """The state of the registration."""
+    """Report the state of the registration."""
     level, message = _level(now)
     counters, topic, last = now.counters, now.topic or CloudTopic(), now.last
     result = None if last is None else last.result
@@ -154,7 +154,7 @@ def warnings_of(result: RegistrationResult | None) -> str:
 
 
 def _level(now: Snapshot) -> tuple[bytes, str]:
-    """How bad it is, and the sentence that says so; the worst wins."""
+    """Choose level and sentence; the worst wins."""
     refusals, counters = now.counters.consecutive_refusals, now.counters
     if now.failure and not now.loading:
         return DiagnosticStatus.ERROR, now.failure
@@ -175,7 +175,7 @@ def _level(now: Snapshot) -> tuple[bytes, str]:
 
 
 def input_status(now: Snapshot) -> DiagnosticStatus:
-    """Whether clouds come, and come whole."""
+    """Report if clouds come, and come whole."""
     last_at = now.counters.last_cloud_at
     silent_s = None if last_at is None else time.monotonic() - last_at
     level, message = _level_of_input(now, silent_s)
@@ -214,7 +214,7 @@ def _level_of_input(now: Snapshot, silent_s: float | None) -> tuple[bytes, str]:
 def status_message(
     level: bytes, name: str, hardware_id: str, message: str, values: Mapping[str, object]
 ) -> DiagnosticStatus:
-    """A status with its values as text; None is empty."""
+    """Make a status with its values as text; None is empty."""
     pairs = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
     return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
 
@@ -257,7 +257,7 @@ class Reporter:
         self._publisher = node.ros.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
     def get_logger(self) -> object:
-        """The node's logger (for `guarded`)."""
+        """Return the node's logger (for `guarded`)."""
         return self._node.ros.get_logger()
 
     @guarded

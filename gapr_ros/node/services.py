@@ -27,7 +27,7 @@ class NotNowError(Exception):
 
 
 def answering(service: Callable[..., Any]) -> Callable[..., Any]:
-    """A method that returns (success, message) as a service callback of rclpy; an exception is a failed answer."""
+    """Turn a method that returns (success, message) into a service callback; an exception is a failed answer."""
 
     @functools.wraps(service)
     async def callback(self: Services, request: Any, response: Any) -> Any:
@@ -56,7 +56,7 @@ class Answers:
         self._waiting: deque[Future] = deque()
 
     async def in_turn(self, known: Future | None = None) -> None:
-        """Wait until an answer is known, now or when a future is done, and those that were known before have gone."""
+        """Wait until an answer is known, now or with a future, and those before have gone."""
         turn = Future()
         if known is None:
             self._line_up(turn)

@@ -100,13 +100,13 @@ class Session:
         self._frames.close()
 
     def get_logger(self) -> Any:
-        """The node's logger (for `guarded`)."""
+        """Return the node's logger (for `guarded`)."""
         return self._log
 
     # --- in: the executor's thread ---
 
     def take_cloud(self, data: bytes, alone: bool = False) -> None:
-        """A serialised cloud, from the only publisher or not: into the mailbox, unless time or frame is refused."""
+        """Put a serialised cloud into the mailbox, unless its time or frame is refused."""
         counters, now_ns = self._host.counters, self._host.now_ns()
         counters.count_received()
         if not self.enabled:
@@ -132,7 +132,7 @@ class Session:
         counters.dropped += pushed_out and not collects
 
     def take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """A pose from outside, where the next registrations start until one is accepted."""
+        """Start the next registrations at a pose from outside, until one is accepted."""
         try:
             T_frame_model = pose_to_matrix(message)
         except InvalidMessageError as error:
@@ -153,7 +153,7 @@ class Session:
         self._host.ros.get_logger().warning(text, throttle_duration_sec=THROTTLE_S)
 
     def _is_future(self, stamp_ns: int) -> bool:
-        """Of a transform."""
+        """Say if a transform is from the future."""
         return is_far_ahead(stamp_ns, self._host.now_ns())
 
     def register_newest(self, waiter: Any) -> bool:
@@ -169,7 +169,7 @@ class Session:
         self._host.call_soon(partial(self._conclude, self._registration.process(job)))
 
     def _report_collected(self, why: str) -> None:
-        """A cloud that a newer one pushed out of the mailbox is registered with it, or could not be."""
+        """Count a cloud that a newer one pushed out of the mailbox: registered with it, or why not."""
         self._host.call_soon(partial(self._count_collected, why))
 
     def _context(self) -> JobContext:
@@ -217,7 +217,7 @@ class Session:
             self._host.report()
 
     def _note_pose(self, outcome: Outcome) -> None:
-        """A pose stands from now on."""
+        """Note an accepted pose."""
         if self._posed_at is None:
             self._log.info(f"{'poses are back' if self.withdrawn else 'first pose'}: {outcome.line}")
         self._posed_at, self.withdrawn = time.monotonic(), ""
@@ -261,7 +261,7 @@ class Session:
         self.withdrawn = ""  # whoever did this knows
 
     def clock_jumped(self, is_another: bool) -> None:
-        """The node's clock went back, or is another one: `use_sim_time` was set. Everybody who uses it knows."""
+        """Start over: the node's clock went back, or is another one since `use_sim_time` was set."""
         why = CLOCK_CHANGED if is_another else CLOCK_WENT_BACK
         self._forget_time()
         clocks = [] if is_another else self._host.ros.get_publishers_info_by_topic("/clock")
@@ -272,7 +272,7 @@ class Session:
         self._clear(why)
 
     def _moved(self, frame: str) -> None:
-        """A frame that clouds are moved through has another place: what was found so far is of the one before."""
+        """Start over: a frame that clouds are moved through has another place."""
         self._clear(f"another place of '{frame}' on /tf_static")
 
     def look_at_file(self) -> None:
@@ -281,7 +281,7 @@ class Session:
         self.conflicts.note("bone file", text)
 
     def reload_failed(self, why: str) -> None:
-        """The old bone stays, and the diagnostics say so until another one is read."""
+        """Keep the old bone, and say so in the diagnostics until another one is read."""
         self.conflicts.note("reload", f"~/reload_model failed, {why}")
 
     def parameters_changed(self) -> None:
@@ -323,14 +323,14 @@ class Session:
         self._publishers.withdraw_all()
 
     def _withdraw_pose(self, why: str) -> None:
-        """The last pose holds no more."""
+        """Withdraw the last pose."""
         self._posed_at, self.withdrawn = None, why
         frame = self.last_outcome.header.frame_id if self.last_outcome else ""
         header = Header(frame_id=frame, stamp=self._host.ros.get_clock().now().to_msg())
         self._publishers.withdraw(why, header, self.model)
 
     def stop_waiting(self, why: str) -> None:
-        """A pause: drop the cloud in the mailbox, tell those who wait for it why, and refuse the one on its way.
+        """Drop the cloud in the mailbox, with the reason for those who wait, and refuse the one on its way.
 
         What was collected stays, with that cloud, and so do the poses against which jumps are measured.
         """
@@ -356,10 +356,10 @@ class Session:
 
 
 def _reading(parameters: NodeParameters) -> tuple[Any, ...]:
-    """What decides how a cloud is read: collected with other values, clouds do not go together."""
+    """Return the values that decide how a cloud is read; clouds read with others are not collected together."""
     return parameters.cloud_unit, parameters.crop_min, parameters.crop_max
 
 
 def _limits(parameters: NodeParameters) -> tuple[float, ...]:
-    """What the method itself refuses by: with other values a new method is needed, for the same bone."""
+    """Return the limits of the method itself; others need a new method for the same bone."""
     return parameters.min_confidence, parameters.max_tre

@@ -43,7 +43,7 @@ class Subscriptions:
         self._looking = steady_timer(host.ros, LOOK_S, self.look)
 
     def describe(self) -> CloudTopic:
-        """For /diagnostics."""
+        """Describe the subscriptions for /diagnostics."""
         publishers = self._host.ros.count_publishers(self._clouds.topic_name)
         mismatch = self._mismatch if publishers else ""
         return CloudTopic("reliable" if self._second is None else "reliable and best_effort", publishers, mismatch)
@@ -59,7 +59,7 @@ class Subscriptions:
                 self._host.ros.destroy_subscription(subscription)
 
     def get_logger(self) -> Any:
-        """The node's logger (for `guarded`)."""
+        """Return the node's logger (for `guarded`)."""
         return self._host.ros.get_logger()
 
     @guarded
@@ -113,7 +113,7 @@ class Subscriptions:
         self._session.take_cloud(data, alone=publishers == 1)
 
     def _is_taken(self, key: tuple[int, int | None]) -> bool:
-        """Whether the other subscription brought this cloud already."""
+        """Say if the other subscription brought this cloud already."""
         if self._second is None or not key[0]:
             return False
         if key in self._taken:

@@ -123,7 +123,7 @@ class TfHistory:
         return found
 
     def why_missing(self, parent: str, child: str, stamp: int) -> str:
-        """What to do where tf2 has no transform at a stamp, ns."""
+        """Say what to do if tf2 has no transform at a stamp, ns."""
         with self._lock:
             frames = self._between(parent, child)
             known = {*self._heard, *self._static, *(self._up_from(parent) | self._up_from(child)) - {parent, child}}
@@ -147,7 +147,7 @@ class TfHistory:
         return f"'{frame}' comes late: raise tf_timeout, or send it more often"
 
     def _why_not(self, frame: str, stamp: int) -> str:
-        """Why the place of a frame at a stamp, ns, is not believed; empty where it is."""
+        """Say why the place of a frame at a stamp, ns, is not believed; empty if it is."""
         row = self._heard.get(frame, [])
         if not row:
             return ""
@@ -172,11 +172,11 @@ class TfHistory:
         return ""
 
     def _between(self, parent: str, child: str) -> set[str]:
-        """The frames whose transforms lead from one frame to the other."""
+        """List the frames whose transforms lead from one frame to the other."""
         return self._up_from(plain_frame(parent)) ^ self._up_from(plain_frame(child))
 
     def _up_from(self, frame: str) -> set[str]:
-        """A frame and all above it."""
+        """List a frame and all above it."""
         found: set[str] = set()
         while frame and frame not in found:
             found.add(frame)
@@ -189,7 +189,7 @@ class TfHistory:
 
 
 def _led_to(first: Heard, second: Heard, third: Heard) -> Heard:
-    """Where the motion from the first to the second leads by the time of the third."""
+    """Continue the motion from the first to the second to the time of the third."""
     share = (third.stamp - second.stamp) / max(second.stamp - first.stamp, 1)
     (p0, q0), (p1, q1) = ((np.array(each.place[:3]), Rotation.from_quat(each.place[3:])) for each in (first, second))
     turn = Rotation.from_rotvec(share * (q1 * q0.inv()).as_rotvec())
@@ -198,7 +198,7 @@ def _led_to(first: Heard, second: Heard, third: Heard) -> Heard:
 
 
 def _agree(one: Heard, other: Heard) -> bool:
-    """Whether two places are one."""
+    """Say if two places are one."""
     way_m = np.linalg.norm(np.subtract(one.place[:3], other.place[:3]))
     cos_half = min(abs(float(np.dot(one.place[3:], other.place[3:]))), 1.0)
     return bool(way_m <= AGREE_M and 2.0 * np.arccos(cos_half) <= AGREE_RAD)
@@ -211,7 +211,7 @@ def _place(transform: TransformStamped) -> tuple[float, ...]:
 
 
 def _why_none(transform: TransformStamped) -> str:
-    """Why a transform is none, as tf2 judges; empty where it is one. Trackers send such of a hidden marker."""
+    """Say why a transform is none, as tf2 judges; empty if it is one. Trackers send such of a hidden marker."""
     p, q = transform.transform.translation, transform.transform.rotation
     child, parent = plain_frame(transform.child_frame_id), plain_frame(transform.header.frame_id)
     if not child or not parent or child == parent:

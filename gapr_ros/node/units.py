@@ -34,30 +34,30 @@ def moved_mm(T: Array, points_mm: Array) -> Array:
 
 
 def in_mm(T: Array) -> Array:
-    """A ROS transform (4, 4), metres, as one of points in mm."""
+    """Turn a ROS transform (4, 4), metres, into one of points in mm."""
     scaled = T.copy()
     scaled[:3, 3] *= MM_PER_M
     return scaled
 
 
 def ros_pose(T_target_source: Array) -> Array:
-    """The core's answer (4, 4), mm, as T_cloud_model in metres."""
+    """Turn the core's answer (4, 4), mm, into T_cloud_model in metres."""
     T = se3.inverse(se3.nearest_rigid(T_target_source))
     T[:3, 3] /= MM_PER_M
     return T
 
 
 def core_pose(T_cloud_model: Array) -> Array:
-    """A pose from ROS (4, 4), metres, as T_target_source in mm."""
+    """Turn a pose from ROS (4, 4), metres, into T_target_source in mm."""
     return in_mm(se3.inverse(T_cloud_model))
 
 
 def ros_covariance(covariance: Array, T_target_source: Array, centre_mm: Array, floors: tuple[float, float]) -> Array:
-    """The core's covariance as that of T_cloud_model in the cloud's frame.
+    """Turn the core's covariance into that of T_cloud_model in the cloud's frame.
 
-    The core's error xi = (v, w) is a twist in the target's frame that acts on the left of T_target_source about the
-    source's middle c. To first order exp(xi)^-1 p = p - w x (p - c) - v, so that the model's origin p = 0 and its
-    axes, seen from the cloud, with R = R_cloud_target, move by
+    The core's error xi = (v, w) is a twist in the target's frame. It acts on the left of T_target_source, about the
+    source's middle c. To first order exp(xi)^-1 p = p - w x (p - c) - v. Seen from the cloud, with R = R_cloud_target,
+    the model's origin p = 0 and its axes move by
         dt = -R (v + [c]x w),   dr = -R w.
     Both signs cancel in J C J^T.
 
@@ -81,7 +81,7 @@ def ros_covariance(covariance: Array, T_target_source: Array, centre_mm: Array, 
 
 
 def floor_covariance(covariance: Array, translation: float, rotation: float) -> Array:
-    """The covariance with no direction surer than the floors (standard deviations): eigenvalues in their unit >= 1."""
+    """Make no direction surer than the floors (standard deviations): eigenvalues in their unit >= 1."""
     scale = np.diag([translation] * 3 + [rotation] * 3)
     inverse = np.diag(1.0 / scale.diagonal())
     values, vectors = np.linalg.eigh(symmetric(inverse @ covariance @ inverse))
@@ -95,5 +95,5 @@ def skew(v: Array) -> Array:
 
 
 def symmetric(matrix: Array) -> Array:
-    """The matrix without the asymmetry of rounding."""
+    """Take off the asymmetry of rounding."""
     return 0.5 * (matrix + matrix.T)

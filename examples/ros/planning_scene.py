@@ -8,6 +8,7 @@ on the other side of the patient. A refusal leaves the obstacle where it was las
 
 import argparse
 import sys
+from contextlib import suppress
 
 import numpy as np
 import rclpy
@@ -59,4 +60,5 @@ if __name__ == "__main__":
     import moveit_msgs.msg
 
     rclpy.init()
-    rclpy.spin(BoneInScene(mesh_of(given.bone, given.units, given.axes), moveit_msgs.msg))
+    with suppress(KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+        rclpy.spin(BoneInScene(mesh_of(given.bone, given.units, given.axes), moveit_msgs.msg))

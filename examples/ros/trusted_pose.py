@@ -1,7 +1,6 @@
-"""Acts on a pose of the bone only while it may: one subscription, to ~/detection.
+"""Usage: python examples/ros/trusted_pose.py --ros-args -p topic:=/register_node/detection -p min_confidence:=0.9."""
 
-python examples/ros/trusted_pose.py --ros-args -p topic:=/register_node/detection -p min_confidence:=0.9 -p max_age:=1.0
-"""
+from contextlib import suppress
 
 import rclpy
 from rclpy.node import Node
@@ -11,7 +10,7 @@ from vision_msgs.msg import Detection3DArray
 
 
 class TrustedPose(Node):
-    """Calls `act` with every pose that may be used, and `hold` with the reason otherwise."""
+    """Calls `act` with every pose that may be used, else `hold` with the reason: one subscription, to ~/detection."""
 
     def __init__(self, **kwargs):
         super().__init__("trusted_pose", **kwargs)
@@ -37,4 +36,5 @@ class TrustedPose(Node):
 
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(TrustedPose())
+    with suppress(KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+        rclpy.spin(TrustedPose())

@@ -10,46 +10,31 @@
 
 using vision_msgs::msg::Detection3DArray;
 
-class TrustedPose : public rclcpp::Node
+struct TrustedPose : rclcpp::Node
 {
-public:
-  TrustedPose()
-  : Node("trusted_pose")
-  {
-    least_ = declare_parameter("min_confidence", 0.9);
-    oldest_ = declare_parameter("max_age", 1.0);  // s; 0: any, as of a bag without /clock
-    const auto topic = declare_parameter("topic", std::string("/register_node/detection"));
-    subscription_ = create_subscription<Detection3DArray>(
-      topic, rclcpp::QoS(10).transient_local(),
-      [this](const Detection3DArray & message) {on_detection(message);});
-  }
-
-private:
+  TrustedPose() : Node("trusted_pose") {}
   void on_detection(const Detection3DArray & message)
   {
     const double age = (now() - rclcpp::Time(message.header.stamp, get_clock()->get_clock_type())).seconds();
-    if (message.detections.empty() || message.detections[0].results.empty()) {
-      RCLCPP_WARN(get_logger(), "hold: no pose");
+    const auto * best = message.detections.empty() ? nullptr : &message.detections[0].results.at(0);
+    if (!best || !(best->hypothesis.score >= least) || (0.0 < oldest && oldest < age)) {
+      RCLCPP_WARN(get_logger(), "hold: confidence %.2f, %.1f s old", best ? best->hypothesis.score : 0.0, age);
       return;
     }
-    const auto & best = message.detections[0].results[0];
-    if (!(best.hypothesis.score >= least_) || (oldest_ > 0.0 && age > oldest_)) {
-      RCLCPP_WARN(get_logger(), "hold: confidence %.2f, %.1f s old", best.hypothesis.score, age);
-      return;
-    }
-    const auto & p = best.pose.pose.position;  // act on best.pose.pose and best.pose.covariance
-    RCLCPP_INFO(
-      get_logger(), "%s in %s at (%.4f, %.4f, %.4f) m, sd of x %.4f m", best.hypothesis.class_id.c_str(),
-      message.header.frame_id.c_str(), p.x, p.y, p.z, std::sqrt(best.pose.covariance[0]));
+    const auto & p = best->pose.pose.position;  // act on best->pose.pose and best->pose.covariance
+    RCLCPP_INFO(get_logger(), "%s in %s at (%.4f, %.4f, %.4f) m, sd of x %.4f m", best->hypothesis.class_id.c_str(),
+      message.header.frame_id.c_str(), p.x, p.y, p.z, std::sqrt(best->pose.covariance[0]));
   }
 
-  double least_, oldest_;
-  rclcpp::Subscription<Detection3DArray>::SharedPtr subscription_;
+  double least = declare_parameter("min_confidence", 0.9);
+  double oldest = declare_parameter("max_age", 1.0);  // s; 0: any, as of a bag without /clock
+  rclcpp::SubscriptionBase::SharedPtr subscription = create_subscription<Detection3DArray>(
+    declare_parameter("topic", std::string("/register_node/detection")), rclcpp::QoS(10).transient_local(),
+    [this](const Detection3DArray & message) {on_detection(message);});
 };
 
 int main(int argc, char ** argv)
 {
   rclcpp::init(argc, argv);
   rclcpp::spin(std::make_shared<TrustedPose>());
-  rclcpp::shutdown();
 }

@@ -25,7 +25,7 @@ def setup_py(field):
     return re.search(rf'{field}="([^"]+)"', (ROOT / "setup.py").read_text())[1]
 
 
-@pytest.mark.parametrize("field", ["version", "license", "maintainer"])
+@pytest.mark.parametrize("field", ["version", "license", "maintainer", "url"])
 def test_package_xml_and_setup_py_agree_on(field):
     assert MANIFEST.find(field).text == setup_py(field)
 

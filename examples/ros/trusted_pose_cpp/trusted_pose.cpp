@@ -1,5 +1,4 @@
 // Acts on a pose of the bone only while it may: one subscription, to ~/detection.
-//
 // ros2 run trusted_pose_cpp trusted_pose --ros-args -p topic:=/register_node/detection -p min_confidence:=0.9
 #include <cmath>
 #include <memory>
@@ -18,7 +17,8 @@ struct TrustedPose : rclcpp::Node
     const double age = (now() - rclcpp::Time(message.header.stamp, get_clock()->get_clock_type())).seconds();
     const auto * best = message.detections.empty() ? nullptr : &message.detections[0].results.at(0);
     if (!best || !(best->hypothesis.score >= least) || (0.0 < oldest && oldest < age)) {
-      RCLCPP_WARN(get_logger(), "hold: confidence %.2f, %.1f s old", best ? best->hypothesis.score : 0.0, age);
+      const char * bone = best ? best->hypothesis.class_id.c_str() : "no pose";
+      RCLCPP_WARN(get_logger(), "hold: %s, %.2f, %.1f s old", bone, best ? best->hypothesis.score : 0.0, age);
       return;
     }
     const auto & p = best->pose.pose.position;  // act on best->pose.pose and best->pose.covariance

@@ -149,7 +149,7 @@ def registration_status(now: Snapshot) -> DiagnosticStatus:
 
 
 def warnings_of(result: RegistrationResult | None) -> str:
-    """The caveats of a result, each with its code."""
+    """List the caveats of a result, each with its code."""
     return "" if result is None else "; ".join(f"{each.code}: {each.text}" for each in result.warnings)
 
 

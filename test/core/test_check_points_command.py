@@ -68,7 +68,6 @@ def test_points_that_say_little_name_the_next_place_and_exit_with_2(folder, caps
 
 @pytest.mark.parametrize("places", [[0], [0, 0], [0, 1, 2, 3]])
 def test_few_points_and_near_ones_are_no_reason_to_acquire_more_or_to_change_the_unit(folder, capsys, places):
-    """A cloud of that size was refused: as too small for a bone, and as one in cm."""
     near = np.loadtxt("touched.txt")[0] + [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]]
     np.savetxt("near.txt", near[places])
     markups.save("near.mrk.json", markups.Markups(near[places], tuple("abcd"[: len(places)])))
@@ -102,7 +101,6 @@ def test_a_pose_that_does_not_hold_exits_with_2_and_says_what_to_do(folder, caps
 
 
 def test_points_of_markups_are_called_as_there_though_some_were_not_placed(folder, capsys):
-    """The number of a point in the answer was not its place in the list: another one was touched again."""
     points = np.loadtxt("touched.txt")[:4]
     points[2] += [0.0, 40.0, 0.0]
     markups.save("m.mrk.json", markups.Markups(points, ("head", "neck", " far\none ", "")))
@@ -127,7 +125,6 @@ def test_points_of_markups_are_called_as_there_though_some_were_not_placed(folde
 def test_most_points_far_from_the_bone_are_asked_for_their_frame_and_not_for_another_registration(
     folder, capsys, in_source, said
 ):
-    """One of them by chance near the bone was enough for the advice to register again."""
     touched = np.loadtxt("touched.txt")
     np.savetxt("other.txt", np.vstack([in_source(touched), touched[:1]]))
     assert run(points="other.txt") == 2

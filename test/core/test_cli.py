@@ -124,7 +124,6 @@ def test_an_answer_is_added_to_those_of_another_run(tmp_path):
 
 
 def test_evaluate_spends_little_of_its_time_on_writing(tmp_path, monkeypatch):
-    """The file holds all answers: at 20 000 of them it took half of the time."""
     (tmp_path / "pairs").mkdir()
     for number in range(40):
         np.savez(tmp_path / "pairs" / f"{number}.npz", source=np.zeros((5, 3)), target=np.zeros((5, 3)))
@@ -273,7 +272,6 @@ def test_the_pose_is_written_though_nobody_reads_the_output(tmp_path, files, is_
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
 def test_names_that_the_output_cannot_hold_are_said_nevertheless(tmp_path, encoding):
-    """Of a planned target in Chinese, or a file whose name is no UTF-8: a traceback after the work lost files."""
     script = "from gapr_core.runtime.console import say; say('\\u9aa8: 1.2 mm \\udce9')"
     environment = os.environ | {"PYTHONIOENCODING": encoding}
     ended = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True)

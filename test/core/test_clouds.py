@@ -1,5 +1,4 @@
 import struct
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -52,12 +51,14 @@ def same_corners(surface):
     return {tuple(p) for p in surface.points.round(4)} == {tuple(p) for p in VERTICES}
 
 
-@pytest.mark.parametrize("name", ["bone.ply", "bone.stl", "bone.obj"])
+@pytest.mark.parametrize("name", ["bone.ply", "bone.stl", "bone.obj", "bone.vtk", "bone.vtp"])
 def test_meshes_come_back_with_their_vertices_and_faces(tmp_path, name):
-    write_with_open3d(tmp_path / name, mesh=True)
+    if name.startswith("bone.vt"):
+        write_vtk(tmp_path / name, binary=name == "bone.vtk")
+    else:
+        write_with_open3d(tmp_path / name, mesh=True)
     surface = clouds.load(tmp_path / name)
-    assert same_corners(surface)
-    assert surface.faces.shape == (4, 3)
+    assert same_corners(surface) and surface.faces.shape == (4, 3)
     assert surface.face_areas_mm2.sum() == pytest.approx(Surface(VERTICES, FACES).face_areas_mm2.sum(), rel=1e-5)
 
 
@@ -70,13 +71,6 @@ def test_polygons_of_a_ply_file_become_triangles(tmp_path):
     surface = clouds.load(tmp_path / "quad.ply")
     np.testing.assert_array_equal(surface.faces, [[0, 1, 2], [0, 2, 3], [0, 1, 4]])
     assert surface.face_areas_mm2.sum() == pytest.approx(100 * 50 + 100 * 70 / 2)
-
-
-@pytest.mark.parametrize("name", ["bone.vtk", "bone.vtp"])
-def test_vtk_files_come_back_with_their_vertices_and_faces(tmp_path, name):
-    write_vtk(tmp_path / name, binary=name == "bone.vtk")
-    surface = clouds.load(tmp_path / name)
-    assert same_corners(surface) and surface.faces.shape == (4, 3)
 
 
 @pytest.mark.parametrize("binary", [False, True])
@@ -103,34 +97,30 @@ def test_numpy_files_are_read(tmp_path):
     assert clouds.load(tmp_path / "a.npz").faces.shape == (4, 3)
 
 
-def test_metres_become_millimetres(tmp_path):
-    assert clouds.load(VERTICES / 1000.0, units="m").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
+@pytest.mark.parametrize(("unit", "mm"), [("m", 1000.0), ("cm", 10.0)])
+def test_units_become_millimetres(unit, mm):
+    assert clouds.load(VERTICES / mm, units=unit).extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
 
 
-def test_metres_read_as_millimetres_are_refused_with_the_way_to_fix_it():
-    with pytest.raises(InvalidPointCloudError, match="it looks like m: pass units='m'"):
-        clouds.load(VERTICES / 1000.0, units="mm")
+OF_UNIT_EXTENT = VERTICES / Surface(VERTICES).extent_mm
+OPTIONS = r"\(--units cm; --source-units cm, of the source alone; model_unit of the node\)"
 
 
-def test_millimetres_read_as_metres_are_refused_with_the_way_to_fix_it():
-    with pytest.raises(InvalidPointCloudError, match="it looks like mm"):
-        clouds.load(VERTICES, units="m")
-
-
-def test_centimetres_become_millimetres_and_are_asked_for(tmp_path):
-    assert clouds.load(VERTICES / 10.0, units="cm").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
-    with pytest.raises(
-        InvalidPointCloudError, match="looks like cm .* or in .*: pass units='cm', or convert it to mm$"
-    ):
-        clouds.load(VERTICES / 10.0, units="mm")
-    np.save(tmp_path / "a.npy", VERTICES / 10.0)
-    options = r"\(--units cm; --source-units cm, of the source alone; model_unit of the node\)"
-    with pytest.raises(InvalidPointCloudError, match=rf"cm .* or in .*: pass units='cm' {options}, or convert it"):
-        clouds.load(tmp_path / "a.npy", units="mm")
+@pytest.mark.parametrize(("points", "unit", "said"), [
+    (VERTICES / 1000.0, "mm", "it looks like m: pass units='m'"), (VERTICES, "m", "it looks like mm"),
+    (VERTICES / 10.0, "mm", "looks like cm .* or in .*: pass units='cm', or convert it to mm$"),
+    (OF_UNIT_EXTENT * 1.5, "mm", "it looks like m: pass units='m'"),  # or cm: scanners and ROS write m
+    (OF_UNIT_EXTENT * 3.1, "mm", r"looks like cm \(31 mm across\) or in \(79 mm across\): pass"),
+])  # fmt: skip
+def test_a_cloud_in_another_unit_is_refused_with_its_likely_unit(tmp_path, points, unit, said):
+    with pytest.raises(InvalidPointCloudError, match=said):
+        clouds.load(points, units=unit)
+    np.save(tmp_path / "a.npy", points)
+    with pytest.raises(InvalidPointCloudError, match=said.replace("pass units='cm',", f"pass units='cm' {OPTIONS},")):
+        clouds.load(tmp_path / "a.npy", units=unit)
 
 
 def test_a_source_of_a_call_without_units_is_to_be_converted():
-    """It was to be read with options of the command line."""
     search = Registrar(RegistrarConfig(num_threads=1))
     dense = np.random.default_rng(0).normal(size=(900, 3))
     prepared = search.prepare(dense * 60.0)
@@ -159,16 +149,62 @@ def test_points_that_no_unit_helps_are_not_blamed_on_the_unit(tmp_path, monkeypa
     (lambda o3d: {"a": 1}, "shape .N, 3.; got a dict; pass x y z in columns"), (lambda o3d: None, "NoneType"),
 ])  # fmt: skip
 def test_objects_of_other_libraries_are_named_with_what_to_pass_of_them(made, said):
-    """They were objects to be converted to float."""
     o3d = pytest.importorskip("open3d", reason="open3d is optional: pip install '.[data]'")
     with pytest.raises(InvalidPointCloudError, match=said):
         clouds.load(made(o3d))
 
 
-def test_a_vertex_of_no_face_that_is_metres_away_is_named_and_not_the_unit():
-    mesh = Surface(np.vstack([VERTICES, [0.0, 9e3, 0.0]]), FACES)
-    with pytest.raises(InvalidPointCloudError, match="with 1 of its 5 points metres from the others; take these out"):
-        clouds.load(mesh, units="mm")
+def written(write, ending):
+    """Make a file with another format's writer."""
+
+    def made(folder):
+        write(folder / f"written.{ending}")
+        return (folder / f"written.{ending}").read_bytes()
+
+    return made
+
+
+DICOM = bytes(128) + b"DICM" + bytes(16)
+BONE_STL = written(lambda path: write_with_open3d(path, mesh=True), "stl")
+CUT_PLY = written(lambda path: write_with_open3d(path, mesh=True), "ply")
+PLY = b"ply\nformat %s 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\n"
+
+
+@pytest.mark.parametrize(("name", "content", "said"), [
+    ("text.ply", b"this is not a bone\n", "text.ply"), ("text.vtp", b"<VTKFile>", "text.vtp"),
+    ("text.vtk", b"no header", "text.vtk"), ("text.npz", b"PK nothing", "text.npz"),
+    ("text.pcd", b"# .PCD\nVERSION 7\n", "text.pcd"),
+    ("cut.ply", PLY % (b"binary_little_endian", 9) + b"end_header\n" + struct.pack("<5f", *range(5)), "cut.ply"),
+    ("faces.ply", PLY % (b"ascii", 3) + b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+                  b"0 0 0\n100 0 0\n0 100 0\n3 0 1 9\n", "faces.ply"),
+    *[(f"bone.{kind}", BONE_STL, rf"bone.{kind} .*looks like \.stl: rename it")
+      for kind in ("ply", "vtp", "npz", "csv", "obj")],
+    ("bone.stl", written(lambda path: np.save(path, VERTICES), "npy"), r"looks like \.npy: rename it"),
+    ("bone.stl", written(lambda path: np.savez(path, points=VERTICES), "npz"), r"looks like \.npz: rename it"),
+    ("bone.ply", lambda folder: CUT_PLY(folder)[:-9], "bone.ply .*export it again"),
+    *[(f"bone.{kind}", b"", rf"bone\.{kind} \(0 bytes, an empty file\)")
+      for kind in ("ply", "stl", "obj", "vtk", "vtp", "pcd", "npy", "npz", "csv", "txt", "xyz")],
+    ("pc.npz", written(lambda path: np.savez(path, VERTICES), "npz"),
+     r"points; got pc.npz: only arr_0; .*np\.savez\(file, points=P\)"),
+    ("IM0001", DICOM, r"IM0001, a DICOM file; .* or a DICOM SEG as \.dcm"),
+    ("none.dicom", b"", r"\.ply \.pcd"), ("none.ply", None, "a file that exists"),
+])  # fmt: skip
+def test_a_file_that_cannot_be_read_is_named_with_the_remedy(tmp_path, name, content, said):
+    if content is not None:
+        (tmp_path / name).write_bytes(content(tmp_path) if callable(content) else content)
+    with pytest.raises(InvalidPointCloudError, match=said):
+        clouds.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(("name", "content", "said"), [
+    ("bone.stl", BONE_STL, "no slices .*; name a file in it"),
+    ("1.dcm", lambda _: DICOM, r"a folder of DICOM files; .*segment the bone .*\.seg\.nrrd"),
+    ("IM0001", lambda _: DICOM, r"a folder of DICOM files; .*segment the bone .*\.seg\.nrrd"),
+])  # fmt: skip
+def test_a_folder_without_slices_is_answered_with_what_to_load(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content(tmp_path))
+    with pytest.raises(InvalidPointCloudError, match=said):
+        clouds.load(tmp_path)
 
 
 @pytest.mark.parametrize(("points", "unit"), [([[1.0, 2.0, 3.0]], "mm"), (VERTICES / 1e3, "mm"), (VERTICES, "m")])
@@ -184,12 +220,6 @@ def test_rows_with_a_number_beyond_any_coordinate_are_dropped_as_they_are_by_a_r
     dirty = np.vstack([VERTICES, [[1e300, 0, 0], [0, -1e15, 0]]])
     np.testing.assert_array_equal(clouds.load(dirty).points, VERTICES)
     np.testing.assert_array_equal(clouds.finite_points(dirty), VERTICES)
-
-
-def test_what_may_be_in_metres_or_centimetres_is_taken_for_metres():
-    """Bones of 0.1 to 2.5 in the file may be either; metres are what scanners and ROS write."""
-    with pytest.raises(InvalidPointCloudError, match="it looks like m: pass units='m'"):
-        clouds.load(VERTICES / Surface(VERTICES).extent_mm * 1.5, units="mm")
 
 
 @pytest.mark.parametrize(("extent", "unit", "said"), [
@@ -209,105 +239,28 @@ def test_a_bone_from_a_file_is_warned_of_where_its_size_is_that_of_another_unit(
     assert clouds.odd_size(clouds.load(np.load(tmp_path / "bone.npy"), unit)) is None, "arrays come from programs"
 
 
-def test_a_cloud_in_inches_is_not_called_one_in_centimetres_alone():
-    with pytest.raises(InvalidPointCloudError, match=r"looks like cm \(31 mm across\) or in \(79 mm across\): pass"):
-        clouds.load(VERTICES / Surface(VERTICES).extent_mm * 3.1, units="mm")
-
-
 def test_auto_guesses_the_unit_and_warns(caplog):
     assert clouds.load(VERTICES / 1000.0, units="auto").extent_mm == pytest.approx(Surface(VERTICES).extent_mm)
     assert "taken to be in m" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("text.ply", b"this is not a bone\n"),
-        ("empty.stl", b""),
-        ("cut.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
-                    b"property float z\nend_header\n" + struct.pack("<5f", *range(5))),
-        ("faces.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-                      b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-                      b"0 0 0\n100 0 0\n0 100 0\n3 0 1 9\n"),
-        ("text.vtp", b"<VTKFile>"),
-        ("text.vtk", b"no header"),
-        ("text.npz", b"PK nothing"),
-        ("text.pcd", b"# .PCD\nVERSION 7\n"),
-    ],
-)  # fmt: skip
-def test_an_unreadable_file_is_named_in_one_sentence(tmp_path, name, content):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(InvalidPointCloudError, match=name):
-        clouds.load(tmp_path / name)
-
-
-@pytest.mark.parametrize("name", ["bone.ply", "bone.vtp", "bone.npz", "bone.csv", "bone.obj"])
-def test_a_binary_stl_file_under_another_ending_is_refused_with_its_own(tmp_path, name):
-    write_with_open3d(tmp_path / "bone.stl", mesh=True)
-    (tmp_path / "bone.stl").rename(tmp_path / name)
-    with pytest.raises(InvalidPointCloudError, match=rf"{name} .*looks like \.stl: rename it"):
-        clouds.load(tmp_path / name)
-
-
-def test_an_array_file_under_the_ending_of_a_mesh_is_refused_with_its_own(tmp_path):
-    for save, kind in ((np.save, "npy"), (lambda file, points: np.savez(file, points=points), "npz")):
-        with (tmp_path / "bone.stl").open("wb") as file:
-            save(file, VERTICES)
-        with pytest.raises(InvalidPointCloudError, match=rf"looks like \.{kind}: rename it"):
-            clouds.load(tmp_path / "bone.stl")
-
-
-def test_a_cut_file_under_its_own_ending_is_to_be_exported_again(tmp_path):
-    write_with_open3d(tmp_path / "bone.ply", mesh=True)
-    (tmp_path / "bone.ply").write_bytes((tmp_path / "bone.ply").read_bytes()[:-9])
-    with pytest.raises(InvalidPointCloudError, match="bone.ply .*export it again"):
-        clouds.load(tmp_path / "bone.ply")
-
-
-@pytest.mark.parametrize("ending", ["ply", "stl", "obj", "vtk", "vtp", "pcd", "npy", "npz", "csv", "txt", "xyz"])
-def test_an_empty_file_is_called_empty(tmp_path, ending):
-    (tmp_path / f"bone.{ending}").touch()
-    with pytest.raises(InvalidPointCloudError, match=rf"bone\.{ending} \(0 bytes, an empty file\)"):
-        clouds.load(tmp_path / f"bone.{ending}")
-
-
-def test_a_folder_of_meshes_is_no_cloud_and_a_file_in_it_is_asked_for(tmp_path):
-    write_with_open3d(tmp_path / "bone.stl", mesh=True)
-    with pytest.raises(InvalidPointCloudError, match=r"no slices .*; name a file in it"):
-        clouds.load(tmp_path)
-
-
-def test_an_npz_file_without_a_name_for_its_points_says_how_to_save_it(tmp_path):
-    np.savez(tmp_path / "pc.npz", VERTICES)
-    with pytest.raises(InvalidPointCloudError, match=r"points; got pc.npz: only arr_0; .*np\.savez\(file, points=P\)"):
-        clouds.load(tmp_path / "pc.npz")
-
-
-@pytest.mark.parametrize("name", ["1.dcm", "IM0001"])
-def test_a_folder_of_dicom_images_is_no_surface_and_a_segmentation_is_asked_for(tmp_path, name):
-    (tmp_path / name).write_bytes(bytes(128) + b"DICM" + bytes(16))
-    with pytest.raises(InvalidPointCloudError, match=r"a folder of DICOM files; .*segment the bone .*\.seg\.nrrd"):
-        clouds.load(tmp_path)
-
-
-def test_a_dicom_file_without_its_ending_is_recognised(tmp_path):
-    (tmp_path / "IM0001").write_bytes(bytes(128) + b"DICM" + bytes(16))
-    with pytest.raises(InvalidPointCloudError, match=r"IM0001, a DICOM file; .* or a DICOM SEG as \.dcm"):
-        clouds.load(tmp_path / "IM0001")
-
-
-def test_a_missing_file_and_an_unknown_format_are_distinguished(tmp_path):
-    with pytest.raises(InvalidPointCloudError, match="a file that exists"):
-        clouds.load(tmp_path / "none.ply")
-    (tmp_path / "none.dicom").touch()
-    with pytest.raises(InvalidPointCloudError, match=r"\.ply \.pcd"):
-        clouds.load(tmp_path / "none.dicom")
-
-
-@pytest.mark.parametrize("array", [np.zeros((4, 2)), np.zeros(3), np.array([["a", "b", "c"]]), np.zeros((2, 3, 3))])
-def test_arrays_of_another_shape_or_type_are_refused(array):
-    with pytest.raises(InvalidPointCloudError):
-        clouds.load(array)
+@pytest.mark.parametrize(("given", "said"), [
+    *[(points, "shape") for points in (np.zeros((4, 2)), np.zeros(3))],
+    (np.zeros((2, 3, 3)), "none finite"), (np.array([["a", "b", "c"]]), "expected"),
+    *[(rows, "shape") for rows in (
+        [[1.0, 2.0, 3.0], [1.0, 2.0]], [[1.0, 2.0, 3.0], 4.0], [np.zeros((2, 3)), [1.0]],
+    )],
+    *[(Surface(points), r"\(N, 3\)") for points in (
+        VERTICES.ravel(), VERTICES[:, :2], VERTICES.astype(object), VERTICES * 1j,
+    )],
+    (np.full((5, 3), np.nan), "none finite"),
+    (Surface(np.vstack([VERTICES, [0.0, 9e3, 0.0]]), FACES), "1 of its 5 points metres from the others; take"),
+    (Surface([*VERTICES.tolist(), [np.nan, 0, 0]], None, [[0, 0, 1]] * 4),
+     "a normal for each point; got 4 normals of 5 points; leave"),
+])  # fmt: skip
+def test_points_that_cannot_be_are_refused(given, said):
+    with pytest.raises(InvalidPointCloudError, match=said):
+        clouds.load(given)
 
 
 @pytest.mark.parametrize(
@@ -319,27 +272,15 @@ def test_what_is_no_array_is_answered_with_how_to_make_one(given, how):
         as_points(given)
 
 
-def test_rows_that_are_not_finite_are_dropped_with_a_warning_but_not_all_of_them(caplog):
+def test_rows_that_are_not_finite_are_dropped_with_a_warning(caplog):
     dirty = np.vstack([VERTICES, [[np.nan, 0, 0], [np.inf, 0, 0]]])
     assert len(clouds.load(dirty).points) == 4
     assert "array: 2 of 6 points are not finite: left out" in caplog.text
-    with pytest.raises(InvalidPointCloudError, match="none finite"):
-        clouds.load(np.full((5, 3), np.nan))
 
 
-def test_normals_of_a_surface_may_be_a_list_and_are_as_many_as_its_points():
-    """A list of them with a point that is not finite was a TypeError."""
-    dirty = Surface([*VERTICES.tolist(), [np.nan, 0, 0]], None, [[0, 0, 1]] * 5)
-    surface = clouds.load(dirty)
+def test_normals_of_a_surface_may_be_a_list():
+    surface = clouds.load(Surface([*VERTICES.tolist(), [np.nan, 0, 0]], None, [[0, 0, 1]] * 5))
     assert len(surface.points) == 4 and np.array_equal(surface.normals, [[0, 0, 1]] * 4)
-    with pytest.raises(InvalidPointCloudError, match="a normal for each point; got 4 normals of 5 points; leave"):
-        clouds.load(replace(dirty, normals=[[0, 0, 1]] * 4))
-
-
-@pytest.mark.parametrize("ragged", [[[1.0, 2.0, 3.0], [1.0, 2.0]], [[1.0, 2.0, 3.0], 4.0], [np.zeros((2, 3)), [1.0]]])
-def test_rows_of_several_lengths_are_refused(ragged):
-    with pytest.raises(InvalidPointCloudError, match="shape"):
-        clouds.load(ragged)
 
 
 def test_masked_rows_are_missing():
@@ -369,8 +310,16 @@ def test_points_are_drawn_uniformly_in_area_on_the_faces():
 def test_a_mesh_goes_to_open3d_and_comes_back():
     again = Surface.from_open3d(Surface(VERTICES, FACES).to_open3d())
     assert np.array_equal(again.points, VERTICES) and np.array_equal(again.faces, FACES)
-    with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
-        Surface(VERTICES).to_open3d()
+
+
+@pytest.mark.parametrize(("call", "surface", "said"), [
+    (Surface.to_open3d, Surface(VERTICES), "triangle mesh"), (Surface.mirrored, Surface(VERTICES), "triangle mesh"),
+    (lambda mesh: mesh.sample(5, np.random.default_rng(0)), Surface(VERTICES), "triangle mesh"),
+    (lambda mesh: mesh.sample(5, np.random.default_rng(0)), Surface(np.zeros((3, 3)), np.array([[0, 1, 2]])), "area"),
+])  # fmt: skip
+def test_a_surface_without_faces_or_area_is_no_mesh(call, surface, said):
+    with pytest.raises(InvalidPointCloudError, match=said):
+        call(surface)
 
 
 def test_a_mirrored_mesh_is_still_wound_outward():
@@ -380,25 +329,12 @@ def test_a_mirrored_mesh_is_still_wound_outward():
     assert volume_mm3(mesh.mirrored()) == pytest.approx(volume_mm3(mesh)) and volume_mm3(mesh) > 0.0
     assert np.array_equal(mesh.mirrored().points, VERTICES * [-1.0, 1.0, 1.0])
     assert np.array_equal(mesh.mirrored().normals, mesh.mirrored().points)
-    with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
-        Surface(VERTICES).mirrored()
-
-
-def test_a_cloud_has_no_faces_to_draw_from():
-    with pytest.raises(InvalidPointCloudError, match="triangle mesh"):
-        Surface(VERTICES).sample(5, np.random.default_rng(0))
 
 
 def test_lists_in_a_surface_are_taken_as_arrays():
     loaded = clouds.load(Surface((30.0 * VERTICES).tolist(), FACES.tolist()))
     np.testing.assert_array_equal(loaded.points, 30.0 * VERTICES)
     np.testing.assert_array_equal(loaded.triangles, FACES)
-
-
-@pytest.mark.parametrize("points", [VERTICES.ravel(), VERTICES[:, :2], VERTICES.astype(object), VERTICES * 1j])
-def test_points_of_a_surface_that_are_none_are_refused(points):
-    with pytest.raises(InvalidPointCloudError, match=r"\(N, 3\)"):
-        clouds.load(Surface(points))
 
 
 @pytest.mark.parametrize(("faces", "text"), [
@@ -445,9 +381,3 @@ def test_samples_of_a_mesh_are_those_of_a_choice_by_area_bit_by_bit():
         points, normals = surface.sample(count, np.random.default_rng(count))
         assert (points == a + u * (b - a) + v * (c - a)).all()
         np.testing.assert_allclose(normals, crosses[face] / areas[face, None], atol=1e-12)
-
-
-def test_a_mesh_whose_faces_have_no_area_cannot_be_sampled():
-    flat = Surface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
-    with pytest.raises(InvalidPointCloudError, match="area"):
-        flat.sample(5, np.random.default_rng(0))

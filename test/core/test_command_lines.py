@@ -222,7 +222,6 @@ def test_a_missing_library_names_the_extra_that_installs_it(capsys, monkeypatch)
     ("distributed", "train", "distributed"),
 ])  # fmt: skip
 def test_the_extra_of_a_command_has_all_that_it_needs(library, command, install):
-    """`gapr demo` named one extra after the other, and at last a package that no index has."""
     assert cli._which_extra(ModuleNotFoundError(name=library), command).endswith(f"pip install {install}")
 
 
@@ -312,7 +311,6 @@ def test_a_source_that_looks_like_the_target_is_said(folder, caplog):
 
 
 def test_a_method_whose_module_is_not_found_is_answered_with_where_to_put_it(folder, capsys):
-    """`gapr` does not look into the working folder, as `python -m` does: the name was right."""
     words = ["register", "--source", "cloud.npy", "--target", "cloud.npy", "--method", "mine_alone:make"]
     assert cli.main(words) == cli.BAD_INPUT
     assert "put the folder of its file on PYTHONPATH" in capsys.readouterr().err

@@ -8,7 +8,6 @@ def test_a_markdown_table_has_a_head_a_rule_and_a_line_for_each_row():
 
 
 def test_a_bar_in_a_cell_is_escaped():
-    """A bone of that name split its row."""
     assert markdown.row(["fe|mur", 1]) == r"| fe\|mur | 1 |"
 
 

@@ -202,7 +202,6 @@ def test_landmarks_that_are_exchanged_are_warned_of(folder, caplog, line, at_mm,
 
 
 def test_what_bad_input_leaves_of_an_earlier_run_is_named(folder, capsys):
-    """A script that looks at no exit code took the pose of the run before."""
     line = "--out p.tfm --residuals r.json --slicer scene"
     assert register(line, source="none.npy") == 1 and not capsys.readouterr().out
     assert register(line, "lps.ply", "lps.ply") == 0
@@ -215,7 +214,6 @@ def test_what_bad_input_leaves_of_an_earlier_run_is_named(folder, capsys):
 
 @pytest.mark.parametrize("option", ["--residuals r.json", "--residuals r.ply", "--slicer scene", ""])
 def test_distances_of_fewer_points_than_the_source_has_are_said_to_be_so(folder, capsys, option):
-    """Of a million points 5924 had one, and the page said that every point had."""
     np.save("more.npy", np.vstack([POINTS, POINTS]))
     for source, is_said in (("s.npy", False), ("more.npy", bool(option))):
         assert register(option, "lps.ply", source) == 0
@@ -229,7 +227,6 @@ def test_one_file_for_source_and_target_is_warned_of(folder, caplog):
 
 
 def test_landmarks_that_fit_no_pose_are_warned_of(folder, caplog):
-    """In another order they lay 150 mm apart, which stood in a line without a word of what it means."""
     names = ("a", "b", "c", "d")
     save(folder / "other.mrk.json", Markups(POINTS[[1, 0, 3, 2]], names))
     save(folder / "near.mrk.json", Markups(POINTS[:4] + [[0, 5, 0], [5, 0, 0], [0, 0, 5], [-5, 0, 0]], names))

@@ -101,7 +101,6 @@ def test_a_pose_reaches_slicer_in_ras_and_a_refusal_as_a_status_alone(bridge, li
 
 
 def test_points_that_cannot_be_of_one_bone_are_a_status_and_the_bridge_goes_on(bridge, linked):
-    """A tip metres away ended it with a traceback."""
     tracker, client, server, slicer = linked
     good = RegistrationResult(RegistrationStatus.OK, T, np.eye(6), 0.99)
     real, target = Accumulator(Registrar(RegistrarConfig(num_threads=1)), most=bridge.GROUPS), None
@@ -122,7 +121,6 @@ def test_points_that_cannot_be_of_one_bone_are_a_status_and_the_bridge_goes_on(b
 
 
 def test_the_codes_of_a_status_are_those_of_openigtlink(bridge):
-    """A client took a refusal for `Access denied`."""
     assert (bridge.OK, bridge.NOT_FOUND) == (1, 4)  # igtlStatusMessage.h: STATUS_OK, STATUS_NOT_FOUND
 
 

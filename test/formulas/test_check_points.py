@@ -189,7 +189,6 @@ def test_a_pose_that_is_shown_to_be_off_does_not_hold_however_vague_it_is(shown_
 
 
 def test_a_vague_pose_is_contradicted_by_an_error_that_matters_alone():
-    """Of eight points with a bound of 7.9 mm one pose was 4.7 mm off over the bone: it held."""
     target, points = ellipsoid(count=4000), on_ellipsoid(40, 5)
     shifted = answer(se3.exp(np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.zeros(3)), 400.0 * SMALL)
     found, right = (check(points, target, each, EXACT, 2.5) for each in (shifted, answer(covariance=400.0 * SMALL)))
@@ -245,7 +244,6 @@ def test_rows_that_are_not_finite_are_dropped_and_nothing_to_check_is_an_error()
 
 
 def test_more_points_than_are_touched_are_refused_before_the_work():
-    """Of 100 000 poses the node would have made a matrix of 80 GB."""
     points = np.zeros((module.MOST_POINTS + 1, 3))
     with pytest.raises(InvalidPointCloudError, match="at most 1000 check points; got 1001"):
         check(points, plane(), answer(), EXACT)

@@ -111,7 +111,6 @@ def test_a_look_takes_the_place_of_one_from_nearly_the_same_direction(target, de
 
 @pytest.mark.parametrize("step", [1.0, 3.0, 7.0])
 def test_of_a_camera_that_moves_on_slowly_some_looks_stay(target, step):
-    """Each took the place of the one before, and a whole circle left one look."""
     looks, _ = looks_of(OK)
     for number in range(int(57.0 / step)):
         looks.register(points(number), target, viewpoint=eye(step * number))
@@ -163,7 +162,6 @@ RIGHT = replace(OK, confidence=0.8)
     ([RIGHT, WRONG, WRONG, RIGHT, WRONG, WRONG, WRONG], [1, 0, 0, 1, 0, 0, 0]),
 ])  # fmt: skip
 def test_a_pose_that_contradicts_the_last_is_no_doubt_of_what_comes(target, answers, accepted):
-    """Newest looks that have no pose alone: one contradiction refused all that came after it."""
     looks, asked = looks_of(*answers)
     asked.alone = REFUSED
     found = [looks.register(points(n), target, viewpoint=eye(20.0 * n)).ok for n in range(len(answers))]
@@ -177,7 +175,6 @@ def test_each_by_itself_is_not_compared_with_the_last(target):
 
 @pytest.mark.parametrize(("deg", "is_confirmed"), [(0.2, False), (7.9, False), (8.1, True)])
 def test_a_look_confirms_nothing_that_was_taken_from_where_the_newest_was(target, deg, is_confirmed):
-    """A camera that moved on by 8 deg in all kept two looks that were .2 deg apart, and was sure of another pose."""
     sure, moved = (replace(each, confidence=0.99) for each in (OK, MOVED))
     looks, asked = looks_of(sure, sure, moved)
     looks.register(points(0), target, viewpoint=eye(0.0))

@@ -54,7 +54,6 @@ def test_merging_into_one_of_the_folders_keeps_its_records(pairs, fakes, tmp_pat
 
 
 def test_others_are_compared_with_a_method_that_has_run(pairs, fakes, tmp_path, in_process):
-    """With a misspelt one the table said that no other method beats it."""
     methods = fakes("good", "turned")
     with pytest.raises(ConfigError, match="--ours with one of fakes:good, fakes:turned; got fakes:god"):
         benchmark.benchmark(pairs, methods, tmp_path / "out", ours="fakes:god")
@@ -150,7 +149,6 @@ def test_results_of_other_pairs_of_the_same_name_are_refused(pairs, fakes, tmp_p
 
 
 def test_results_of_pairs_of_other_names_are_refused(pairs, fakes, tmp_path, in_process):
-    """Two folders of pairs went into one table."""
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
     more = shutil.copytree(pairs, tmp_path / "more")
     save_pair(more / "extra.npz", make_pair(9))
@@ -248,7 +246,6 @@ def test_results_of_two_commits_are_said_to_be_so(pairs, fakes, tmp_path, in_pro
 def test_a_table_names_what_its_records_ran_on_whatever_asked_for_it_last(
     pairs, fakes, tmp_path, in_process, monkeypatch
 ):
-    """A finished run that was asked for again named the new commit, machine and threads for the old times."""
     ran = {"commit": "c0ffee", "machine": "an old one", "threads": 4}
     monkeypatch.setattr(benchmark, "_commit", lambda: "c0ffee")
     monkeypatch.setattr(runner.origin, "machine", lambda: "an old one")
@@ -317,7 +314,6 @@ def test_what_a_method_is_made_of(tmp_path, fakes):
     {"metadata": {"noise_mm": 0.3, "overlap": 0.15, "landmark_a": np.zeros(3)}},
 ])  # fmt: skip
 def test_records_of_a_pair_whose_file_says_something_else_now_are_refused(change, pairs, fakes, tmp_path, in_process):
-    """The table named the old protocol, and answers without the camera's place counted as those with it."""
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
     path = pairs / "L1_femur_0001.npz"
     save_pair(path, load_pair(path))

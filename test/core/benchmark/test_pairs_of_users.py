@@ -91,7 +91,6 @@ def test_a_transform_with_few_digits_and_one_without_truth_are_taken(tmp_path):
 def test_a_truth_that_is_written_in_another_way_is_warned_of(
     pairs, fakes, tmp_path, in_process, caplog, transform, said
 ):
-    """Right answers were counted as false accepts in silence."""
     for old in pairs.glob("*"):
         old.unlink()
     matrix = np.eye(4)

@@ -58,7 +58,6 @@ def test_recall_against_overlap_has_one_dot_per_value_and_none_without_variation
 
 
 def test_values_that_round_up_stay_in_a_bin_of_their_own():
-    """Two thirds fell into the bin of one third."""
     found = [record(pair, ok(shifted(pair, 1.0 if k < 4 else 90.0))) for k, pair in enumerate(map(make_pair, range(8)))]
     found = [replace(r, noise_mm=(1 if k < 4 else 2) / 3) for k, r in enumerate(found)]
     x, y = curve(plots.recall_against(found, ["m"], "noise_mm", "noise"), "m")
@@ -105,7 +104,6 @@ def test_errors_are_drawn_along_the_axes_of_the_bone_with_their_mean_in_the_elli
 
 
 def test_lines_that_lie_on_each_other_have_other_dashes():
-    """Two methods without a right answer were one line."""
     records = some_records()
     lines = plots.recall_against_threshold(records, ["a", "b"]).axes[0].lines
     assert len({line.get_linestyle() for line in lines if line.get_label() in ("a", "b")}) == 2
@@ -146,7 +144,6 @@ def report(tmp_path_factory):
 
 
 def test_every_plot_of_the_report_has_its_caption(report):
-    """Nothing said what a large dot or a grey line is."""
     text = re.sub(r"data:image/png;base64,[^\"]*", "", (report / "report.html").read_text(encoding="utf-8"))
     plots_of_it = re.findall(r'<figure><img alt="(?:recall|reliab|risk|error)[^>]*><figcaption>([^<]*)<', text)
     assert len(plots_of_it) > 2 and all(plots_of_it)

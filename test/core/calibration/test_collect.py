@@ -236,7 +236,6 @@ def test_records_of_other_bones_or_settings_are_made_again(tmp_path, monkeypatch
 
 
 def test_records_change_with_bones_and_network_and_those_of_streams_with_every_model(tmp_path, monkeypatch):
-    """Those of the old network counted as done, and went into the fit of the new one."""
     weights = tmp_path / "weights"
     weights.mkdir()
     bones = tmp_path / "bones"

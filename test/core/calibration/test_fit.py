@@ -141,7 +141,6 @@ def test_records_become_the_answers_of_a_kind():
 
 @pytest.mark.parametrize("judged_by", [fits.of_unseen_people, fits.of_unseen_families])
 def test_too_few_pairs_for_a_fit_are_one_sentence(answers, judged_by):
-    """A first try with --count 2 ended with an IndexError."""
     of_one = answers.of(np.arange(len(answers)) == 0)
     with pytest.raises(ConfigError, match="answers of other subjects and sensors.*--count"):
         judged_by(of_one)
@@ -155,7 +154,6 @@ def test_a_calibration_without_pairs_is_one_sentence(tmp_path, line):
 
 @pytest.mark.parametrize("split", ["test", "all", "trian"])
 def test_nothing_is_fitted_to_test_subjects(tmp_path, capsys, split):
-    """`--split test` learned from those that the results are counted on, without a word."""
     with pytest.raises(SystemExit):
         calibration.main(["--anatomy", str(tmp_path), "--out", str(tmp_path / "out"), "--split", split])
     assert "train" in capsys.readouterr().err and not (tmp_path / "out").exists()

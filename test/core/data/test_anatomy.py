@@ -84,7 +84,6 @@ def test_damaged_meshes_are_named(tmp_path):
 
 
 def test_a_mesh_that_is_no_bone_in_mm_is_refused_where_it_is_used_and_nowhere_else(tmp_path):
-    """The training went on with a bone of half a millimetre, and ended with "SVD did not converge" for NaN."""
     write_set(tmp_path, "femur", "one", ["a", "b"])
     write_splits(tmp_path, train=["a"], test=["b"])
     with np.load(tmp_path / "femur_one.npz") as data:
@@ -161,7 +160,6 @@ def test_a_ct_femur_is_of_the_same_person_as_the_fitted_one(anatomy_folder):
 
 
 def test_meshes_of_one_bone_lie_in_a_folder_and_those_of_several_in_folders_of_it(tmp_path):
-    """A femur next to a folder of tibiae was the only tibia, and one folder of femora all bones that were asked for."""
     for name in ("tibia/a", "tibia/b", "femur"):
         path = tmp_path / f"{name}.npz"
         path.parent.mkdir(exist_ok=True)

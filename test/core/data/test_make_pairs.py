@@ -198,7 +198,6 @@ def test_meshes_in_other_units_give_the_pairs_of_the_same_meshes_in_millimetres(
 
 
 def test_meshes_in_one_folder_are_of_one_bone(tmp_path, capsys):
-    """They were femur and tibia by turns: source and target of a wrong pair were the same mesh."""
     write_meshes(tmp_path / "bones", 2)
     words = ["make-pairs", "--split", "all", "--protocol", "wrong", "--count", "1", "--meshes", str(tmp_path / "bones")]
     assert main([*words, "--bones", "femur,tibia", "--out", str(tmp_path / "out")]) == 1

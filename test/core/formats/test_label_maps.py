@@ -164,7 +164,6 @@ def test_versions_of_totalsegmentator_are_named_where_the_file_has_no_names(tmp_
 
 @pytest.mark.parametrize("numbers", [(1,), (1, 2), (5,)])
 def test_a_mask_without_names_is_not_taken_for_one_of_totalsegmentators(tmp_path, caplog, numbers):
-    """Every binary mask was called a patella."""
     affine, size = affine_of((3.0, 3.0, 3.0))
     voxels = numbers[0] * voxels_of(affine, size).astype(np.uint8)
     voxels[0, 0, 0] = numbers[-1]
@@ -179,7 +178,6 @@ def test_a_superscript_is_a_name_and_no_number(tmp_path):
 
 @pytest.mark.parametrize("key", ["Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"])
 def test_a_fractional_segmentation_is_refused_with_the_way_out_in_slicer(tmp_path, key):
-    """It was read as hundreds of labels."""
     path = two_bones(tmp_path, "seg.nrrd", **{key: "Binary labelmap"})
     assert len(clouds.load(path, options=options("75")).points) > 100
     path = two_bones(tmp_path, "seg.nrrd", **{key: "Fractional labelmap"})
@@ -253,7 +251,6 @@ def test_names_that_share_their_voxels_are_no_choice(tmp_path):
 
 
 def test_digits_that_are_the_name_of_one_segment_and_the_number_of_another_are_no_choice():
-    """The segment of that number was taken, another bone."""
     two = [Segment("2", 1), Segment("1", 2)]
     for label in "12":
         with pytest.raises(InvalidPointCloudError, match=f"one segment {label}; got the name of the segment of number"):
@@ -596,7 +593,6 @@ def test_a_label_map_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(t
 
 @pytest.mark.parametrize("labels", ["12", 12, np.int64(12), ["12"], (12,), [np.uint8(12)]])
 def test_a_label_by_itself_and_a_number_are_labels(labels):
-    """Of a name by itself each letter was looked for, and of a number the file was to be exported again."""
     assert ReadOptions(labels=labels) == ReadOptions(labels=("12",))
 
 
@@ -613,7 +609,6 @@ def test_options_in_a_dict_are_refused():
 
 @pytest.mark.parametrize("ending", [".nii.gz", ".nrrd", ".mha"])
 def test_a_label_map_counts_as_many_bytes_as_it_unpacks_to(tmp_path, monkeypatch, ending):
-    """Eight for each voxel, whatever its type, refused the whole leg of a CT: 512 x 512 x 1100 voxels of one byte."""
     affine, size = affine_of((1.5, 1.5, 1.5))
     voxels = voxels_of(affine, size).astype(np.uint8)
     path = write(tmp_path / f"a{ending}", voxels, affine)

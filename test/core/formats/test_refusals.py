@@ -113,7 +113,6 @@ def test_a_bag_is_turned_by_the_axes_that_are_named(tmp_path, bags):
 
 @pytest.mark.parametrize("name", ["bone.stl", "seg.nii", "a.xyz", "p.mrk.json", "folder"])
 def test_a_file_of_another_kind_is_no_recording_for_a_pivot(tmp_path, name):
-    """A mesh was said to be cut."""
     (tmp_path / "folder").mkdir()
     if name != "folder":
         (tmp_path / name).write_bytes(b"solid a\n")
@@ -175,7 +174,6 @@ def test_rows_and_names_of_an_fcsv_file_have_x_y_z(tmp_path, content, said):
     ],
 )
 def test_a_row_of_an_fcsv_file_with_more_cells_than_names_is_refused(tmp_path, row):
-    """One decimal comma, or one in a description, moved the cells: points were lost or became others."""
     head = b"# CoordinateSystem = LPS\n# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
     good = b"0,10,20,30,0,0,0,1,1,1,0,hip,,node,2,0\n"
     said = refusal(tmp_path / "a.fcsv", head + good + row + b"\n")

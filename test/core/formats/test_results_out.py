@@ -100,7 +100,6 @@ def test_a_start_that_is_no_rigid_motion_is_refused_by_its_name(tmp_path):
 
 
 def test_a_start_as_text_may_begin_with_a_byte_order_mark_and_is_refused_for_its_commas(tmp_path):
-    """Both were said to have other content."""
     np.savetxt(tmp_path / "pose.txt", T, header="source to target")
     content = (tmp_path / "pose.txt").read_text()
     (tmp_path / "mark.txt").write_text("\ufeff" + content, encoding="utf-8")
@@ -251,7 +250,6 @@ def test_landmarks_are_paired_by_name_and_else_in_their_order(tmp_path):
     (("d", "b", "b", "c"), False, "have 3 of 4 names in common"), (("1", "2", "", ""), False, ""),
 ])  # fmt: skip
 def test_landmarks_whose_names_agree_in_part_are_warned_of(tmp_path, caplog, names, is_by_name, said):
-    """Names were compared letter by letter, and one that differs had all paired in their order without a word."""
     points = np.array([[0.0, 0, 0], [50, 0, 0], [0, 30, 0], [0, 0, 20]])
     moved = se3.apply(T, points)
     markups.save(tmp_path / "s.mrk.json", markups.Markups(points, ("a", "b", "c", "d")))
@@ -305,7 +303,6 @@ def test_a_scene_for_slicer_names_files_that_exist_and_nodes_that_refer_to_each_
 
 
 def test_points_without_a_surface_near_are_grey_in_a_scene_and_not_on_the_bone(tmp_path, femur):
-    """They had a distance of 0, which is white: exactly on the bone."""
     scene.write_slicer(tmp_path, replace(result_with(np.eye(6), residuals()), bone=femur))
     shown = (tmp_path / "source.vtk").read_text().split("LOOKUP_TABLE default\n")[1].split()
     assert [float(distance) for distance in shown] == [-3.0, 0.0, 3.0] + [0.0] * 16
@@ -329,7 +326,6 @@ def test_targets_of_an_earlier_run_do_not_stay_in_the_folder_of_a_scene(tmp_path
 
 
 def test_a_scene_that_is_killed_at_any_step_is_of_one_run_alone(tmp_path, femur):
-    """A new bone under an old pose was 100 mm off."""
     moved = replace(femur, points=femur.points + 100.0)
     runs = [(femur, np.eye(4)), (moved, se3.from_rotation_translation(np.eye(3), [100.0, 0.0, 0.0]))]
     made = []

@@ -55,7 +55,6 @@ def test_axes_of_markups_are_never_guessed(tmp_path, said):
 
 
 def test_several_lists_of_a_file_are_joined_with_a_warning(tmp_path, caplog):
-    """The middle of a region of interest was a point on the bone."""
     path = tmp_path / "a.mrk.json"
     markups.save(path, markups.Markups(POINTS, ("a", "b", "c")))
     content = json.loads(path.read_text())
@@ -68,7 +67,6 @@ def test_several_lists_of_a_file_are_joined_with_a_warning(tmp_path, caplog):
 
 
 def test_lists_of_other_axes_in_one_fcsv_file_are_refused(tmp_path):
-    """Files that were joined: the points of the second were read in the axes of the first."""
     first, second = (fcsv(tmp_path / "a.fcsv", f"# CoordinateSystem = {s}\n").read_text() for s in ("LPS", "RAS"))
     (tmp_path / "a.fcsv").write_text(first + first)
     assert len(markups.load(tmp_path / "a.fcsv").points) == 6
@@ -79,7 +77,6 @@ def test_lists_of_other_axes_in_one_fcsv_file_are_refused(tmp_path):
 
 @pytest.mark.parametrize("value", [1e308, np.inf, np.nan, -1e12])
 def test_markups_with_a_number_beyond_any_coordinate_are_refused_by_their_name(tmp_path, value):
-    """A planned target at 1e308 ended a registration with a traceback, and the pose was lost."""
     path = fcsv(tmp_path / "a.fcsv", "# CoordinateSystem = LPS\n", np.vstack([POINTS, [0.0, value, 0.0]]))
     for read in (markups.load, reading.read):
         with pytest.raises(InvalidPointCloudError, match="finite numbers below 1e.12; got a.fcsv with others; place"):
@@ -133,7 +130,6 @@ def test_text_clouds_have_a_point_a_line(tmp_path, name, content):
 
 @pytest.mark.parametrize("between", [" ", "\t", "   ", " \t"])
 def test_words_of_an_obj_file_may_have_tabs_between_them(tmp_path, between):
-    """A line that began with `v` and a tab was no vertex."""
     rows = [("v", *point) for point in POINTS] + [("v", 0, 0, 0)]
     rows += [("f", *corners) for corners in ((1, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4))]
     (tmp_path / "a.obj").write_text("".join(between.join(map(str, row)) + "\n" for row in rows))
@@ -143,7 +139,6 @@ def test_words_of_an_obj_file_may_have_tabs_between_them(tmp_path, between):
 
 
 def test_lines_of_an_obj_file_may_end_with_a_comment_or_go_on_after_a_backslash(tmp_path):
-    """They were refused with the words of Python. A backslash in a comment ends it like any other letter."""
     (tmp_path / "a.obj").write_text(
         "# C:\\bones\\\nv 10 20 30 # C:\\\nv -40 5\\\n60#\nv 7 -8 90\nv 0 \\\n 0 \\\r\n0\n"
         "f 1 3 2#c\nf 1 \\\n2 4 # \\\nf 2 3 4\\\n\nf 3 1 4 # 5\n"
@@ -198,7 +193,6 @@ def test_a_pivot_calibration_finds_the_tip_and_says_how_well(tmp_path):
 
 
 def test_a_recording_may_have_semicolons_and_no_decimal_commas(tmp_path):
-    """It was said to lack columns that it has."""
     commas = ndi_csv(tmp_path / "a.csv", turned_poses())
     text = commas.read_text().replace(",", ";")
     (tmp_path / "b.csv").write_text(text)
@@ -300,7 +294,6 @@ def test_a_transform_that_is_not_finite_is_refused(tmp_path):
 
 @pytest.mark.parametrize("value", [b"nan", b"-inf"])
 def test_a_transform_of_a_frame_that_is_not_valid_may_hold_any_number(tmp_path, value):
-    """As PLUS may write for a tool that was not seen; the whole recording was refused."""
     path = igs(tmp_path / "tool.igs.mha", turned_poses(3), ["OK", "INVALID", "OK"])
     path.write_bytes(re.sub(rb"(Seq_Frame0001_\w+Transform = )\S+", rb"\g<1>" + value, path.read_bytes()))
     points = reading.read(path, ReadOptions(tip_mm=tuple(TIP))).points
@@ -450,7 +443,6 @@ def test_axes_of_a_mesh_come_from_the_caller_or_from_its_comment(tmp_path, title
 
 @pytest.mark.parametrize("axes", ["auto", "lps", "ras"])
 def test_comments_that_contradict_each_other_about_the_axes_are_refused(tmp_path, axes):
-    """The first one was believed, and the points were turned."""
     (tmp_path / "a.csv").write_text("# was SPACE=RAS, now turned: SPACE=LPS\n10,20,30\n")
     with pytest.raises(InvalidPointCloudError, match="one SPACE in all comments; got a.csv: SPACE=LPS and SPACE=RAS; "):
         reading.read(tmp_path / "a.csv", ReadOptions(axes=axes))
@@ -494,7 +486,6 @@ def test_texts_in_a_legacy_vtk_file_are_passed_over(tmp_path, version, is_binary
 @pytest.mark.parametrize("is_binary", [False, True])
 @pytest.mark.parametrize(("said", "factors"), [("LPS", [1, 1, 1]), ("RAS", LPS_RAS), ("SCANNER", [1, 1, 1])])
 def test_axes_of_a_legacy_vtk_file_come_from_its_field_space_as_well(tmp_path, version, is_binary, said, factors):
-    """That of a .vtp file was obeyed, and this one not."""
     from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
 
     writer = vtkPolyDataWriter()
@@ -511,7 +502,6 @@ def test_axes_of_a_legacy_vtk_file_come_from_its_field_space_as_well(tmp_path, v
 def test_axes_of_a_legacy_vtk_file_may_come_after_kilobytes_of_other_fields_with_their_own_information(
     tmp_path, is_binary, name
 ):
-    """Only the first 8192 bytes were searched: half a turn. Of two arrays with named components none was read."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
 
@@ -548,7 +538,6 @@ def test_comments_of_a_ply_file_may_be_in_any_language(tmp_path):
 @pytest.mark.parametrize("comment", ["converted from format ascii", "no end_header here", "end_header", "format ascii"])
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
 def test_comments_of_a_ply_file_may_hold_the_words_of_its_header(tmp_path, comment, ending):
-    """A binary file was taken for a text, and refused as cut; a header ended in its comment."""
     head = f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex 3\n"
     head += "property float x\nproperty float y\nproperty float z\nend_header\n"
     (tmp_path / "a.ply").write_bytes(head.replace("\n", ending).encode() + POINTS.astype("<f4").tobytes())
@@ -561,7 +550,6 @@ def test_comments_of_a_ply_file_may_hold_the_words_of_its_header(tmp_path, comme
     ("solid a", "solid facet normal"), ("solid a\nfacet", "\ufeffsolid a\nfacet"), ("\n", "\r\n"), ("\n", "\n\t"),
 ])  # fmt: skip
 def test_words_of_a_text_stl_file_count_at_the_beginning_of_its_lines(tmp_path, change):
-    """Such files were said to have facets without three vertices each, or millions of them."""
     corners = "".join(f"vertex {x} {y} {z}\n" for x, y, z in POINTS)
     content = f"solid a\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\nendsolid a\n"
     (tmp_path / "a.stl").write_text(content.replace(*change), encoding="utf-8", newline="")
@@ -624,7 +612,6 @@ def test_a_line_of_names_says_which_column_is_which_and_the_others_may_be_text(t
 @pytest.mark.parametrize(("name", "delimiter", "header"), [("a.txt", " ", ""), ("a.csv", ",", ""),
                                                            ("a.xyz", " ", "x y z")])  # fmt: skip
 def test_a_row_for_each_coordinate_is_refused_as_transposed(tmp_path, name, delimiter, header):
-    """It was read as three points, and refused as too few."""
     points = np.random.default_rng(0).normal(size=(40, 3))
     np.savetxt(tmp_path / name, points.T, delimiter=delimiter, header=header)
     with pytest.raises(InvalidPointCloudError, match=f"{name}: 3 rows of 40 numbers; is it transposed.*one point a"):
@@ -668,7 +655,6 @@ def test_names_that_say_something_else_are_refused(tmp_path, names):
     ("x_inch,y_inch,z_inch", "in"),
 ])  # fmt: skip
 def test_a_unit_in_the_names_of_the_coordinates_is_never_passed_over(tmp_path, names, unit):
-    """Points in cm were read as mm, as a tenth of the bone."""
     path, extra = tmp_path / "a.csv", (names.count(",") == 3)
     rows = np.insert(POINTS, 0 if names.startswith("t") else 3, 7.0, axis=1) if extra else POINTS
     path.write_text(names + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))

@@ -34,7 +34,6 @@ def changed(poses, number, how):
 
 @pytest.mark.parametrize("how", CHANGES)
 def test_a_tool_of_a_sequence_is_moved_by_rigid_poses_alone(tmp_path, capsys, how):
-    """Scaled by 0.2, the tip was 30 mm from its marker instead of 150, and nothing said so."""
     path = igs(tmp_path / "a.igs.mha", changed(turned_poses(12), 3, how), ["OK"] * 12)
     said = f"rigid poses.*; got .*a.igs.mha with ProbeToTracker of frame 3, whose .*{CHANGES[how][1]}.*--tool"
     with pytest.raises(InvalidPointCloudError, match=said):
@@ -78,7 +77,6 @@ def test_poses_of_a_sequence_with_few_digits_are_read_and_made_rigid(tmp_path):
 
 
 def test_a_transform_that_leads_from_the_tracker_is_no_pose_of_a_tool(tmp_path):
-    """Its tips were those of the inverse: another cloud, and nothing said so."""
     path = igs(tmp_path / "a.igs.mha", turned_poses(4), ["OK"] * 4)
     path.write_bytes(path.read_bytes().replace(b"ProbeToTracker", b"TrackerToProbe"))
     with pytest.raises(InvalidPointCloudError, match="in the frame of the tracker; got .*TrackerToProbe of a.igs.mha"):
@@ -110,7 +108,6 @@ def test_an_empty_sequence_is_called_empty_before_a_tip_is_asked_for(tmp_path):
 
 
 def test_slices_in_metres_are_refused_and_poses_in_metres_warned_of(tmp_path, caplog):
-    """Each slice was one point at its pose: a wrong pose of the bone was accepted at .53."""
     poses = np.array(turned_poses(3))
     poses[:, :3, 3] += np.arange(3)[:, None] * 20.0
     folder = slices_with_poses(tmp_path / "a", poses)

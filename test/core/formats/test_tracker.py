@@ -31,7 +31,6 @@ def damaged(path, column, value, lost=()):
 @pytest.mark.parametrize("column", ["Tx", "Tz", "Q0", "Qz"])
 @pytest.mark.parametrize("value", NO_NUMBERS)
 def test_a_number_that_is_none_in_a_recording_is_named_with_its_row(tmp_path, capsys, column, value):
-    """`gapr pivot` ended with a traceback."""
     path = damaged(tmp_path / "a.csv", column, value)
     assert main(["pivot", str(path)]) == 1
     said = capsys.readouterr().err

@@ -221,7 +221,6 @@ def test_one_viewpoint_for_clouds_of_many_views_is_refused(quick, frames, prepar
 
 
 def test_a_source_that_cannot_be_registered_costs_no_older_one(quick, frames, prepared, monkeypatch):
-    """Where the collection is full the oldest had gone for it, and did not come back."""
     accumulator = Accumulator(quick, most=2)
     for frame in frames[:2]:
         accumulator.collect(frame.source)
@@ -258,7 +257,6 @@ def test_a_reset_reaches_the_tracker_of_the_collection(quick):
 
 
 def test_a_tracker_given_to_a_collection_goes_on_with_its_own_stream(quick, frames, prepared):
-    """It took its sources for one source from then on, and the poses of the collection for its own."""
     alone, used = Tracker(quick), Tracker(quick)
     for tracker in (alone, used):
         tracker.register(frames[0].source, prepared)

@@ -61,7 +61,6 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
 
 
 def test_a_pipe_or_a_device_is_written_to_and_never_replaced(tmp_path):
-    """As root, a file took the place of /dev/null."""
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
     read = []
@@ -75,7 +74,6 @@ def test_a_pipe_or_a_device_is_written_to_and_never_replaced(tmp_path):
 
 
 def test_threads_that_write_one_file_each_leave_a_whole_one(tmp_path):
-    """One scratch name for the whole process: the first to end took the others' file away."""
     together, failed = threading.Barrier(4), []
 
     def write(number):

@@ -25,7 +25,6 @@ def test_the_commit_is_that_of_the_source_tree():
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="it makes a repository with a tag: apt install git")
 def test_a_tag_does_not_hide_the_commit(tmp_path, monkeypatch):
-    """In a clone whose commit has an annotated tag, results named the tag, which may be moved."""
 
     def git(*words):
         named = ["-c", "user.name=a", "-c", "user.email=a@b.c"]

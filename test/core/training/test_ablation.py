@@ -168,7 +168,6 @@ def test_the_plan_that_ships_holds_the_papers_tables():
 
 
 def test_without_the_plan_that_ships_every_command_is_answered_with_how_to_install_it(tmp_path, monkeypatch):
-    """`gapr paper` was referred to an option that it has not."""
     monkeypatch.setattr(training_config, "__file__", str(tmp_path / "a" / "b" / "c.py"))
     monkeypatch.setattr(training_config.sysconfig, "get_path", lambda name: str(tmp_path))
     with pytest.raises(ConfigError, match="got none installed; install gapr_ros again, with its data; gapr ablate ta"):
@@ -176,7 +175,6 @@ def test_without_the_plan_that_ships_every_command_is_answered_with_how_to_insta
 
 
 def test_a_table_that_cannot_be_written_leaves_the_one_before_as_it_is(plan, tmp_path, monkeypatch):
-    """table.csv was cut."""
     ablation_table.write(tmp_path, read_plan(plan), BUDGET, EXAM, seeds=1)
     before = (tmp_path / "table.csv").read_bytes()
 

@@ -152,7 +152,6 @@ def test_a_run_begun_before_a_setting_existed_goes_on_and_another_one_is_refused
 
 
 def test_a_refusal_of_other_settings_names_them(tmp_path):
-    """It said that some were others, of sixty."""
     (tmp_path / "config.json").write_text(
         json.dumps({"train": TrainConfig().to_dict(), "model": ModelConfig().to_dict()})
     )
@@ -163,7 +162,6 @@ def test_a_refusal_of_other_settings_names_them(tmp_path):
 
 
 def test_a_run_goes_on_with_the_bones_and_subjects_that_it_was_begun_with(tmp_path):
-    """Without --anatomy it went on with parametric bones; a test subject that had moved to train was learned from."""
 
     def anatomy(name, people, mesh=b"mesh"):
         (tmp_path / name).mkdir()
@@ -185,7 +183,6 @@ def test_a_run_goes_on_with_the_bones_and_subjects_that_it_was_begun_with(tmp_pa
 
 @pytest.mark.parametrize("content", ["{", "", "{}", "[1]"])
 def test_settings_of_a_run_that_are_damaged_are_refused_by_their_name(tmp_path, content):
-    """They ended `gapr train` with a traceback."""
     (tmp_path / "config.json").write_text(content)
     with pytest.raises(ConfigError, match="the settings of a training run; got .*config.json .*; restore it"):
         run_folder.check(tmp_path, TrainConfig(), ModelConfig())
@@ -232,7 +229,6 @@ def test_a_checkpoint_on_a_full_disk_is_one_sentence_and_the_one_before_stays(to
 
 
 def test_what_a_yaml_names_is_found_from_any_working_folder(tmp_path, monkeypatch):
-    """`gapr train --config /a/checkout/config/train_paper.yaml` knew its network in the checkout alone."""
     root = Path(__file__).parents[3]
     monkeypatch.chdir(tmp_path)
     paper = read_config(root / "config" / "train_paper.yaml")
@@ -242,7 +238,6 @@ def test_what_a_yaml_names_is_found_from_any_working_folder(tmp_path, monkeypatc
 
 
 def test_the_card_of_an_export_states_no_licence_of_data_that_the_run_did_not_have(tmp_path):
-    """Every export named the data behind the shipped weights, whatever it was trained on."""
 
     def of(people):
         return {"provenance": [{"data": {"train_people": people}}]}
@@ -255,7 +250,6 @@ def test_the_card_of_an_export_states_no_licence_of_data_that_the_run_did_not_ha
 
 
 def test_a_device_that_is_not_there_is_named(monkeypatch):
-    """`device: cuda` without a GPU ended with a traceback, `device: gpu` trained on the CPU."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="a GPU that torch can use; got none, with torch .*; set device to auto"):
         distributed.start("cuda")

@@ -54,7 +54,6 @@ def test_a_validation_on_test_subjects_ends_with_an_error_that_names_them(settin
 
 
 def test_meshes_of_nobody_in_the_split_train_are_no_reason_to_train_on_parametric_bones(anatomy, tmp_path):
-    """One misspelt name after the other in splits.json, and the run had no real bone, without a word."""
     (tmp_path / "femur_toy.npz").write_bytes((anatomy / "femur_toy.npz").read_bytes())
     (tmp_path / "splits.json").write_text('{"train": ["P0", "P1"], "val": ["p5"], "test": []}')
     with pytest.raises(ConfigError, match=r"train with a femur; got meshes of p0, p1, p2 \.\.\. in .*splits.json"):

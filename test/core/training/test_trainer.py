@@ -154,7 +154,6 @@ def only(folder, **people):
 
 
 def test_a_bone_without_a_subject_of_val_is_left_out_of_the_validation(settings, anatomy, tmp_path):
-    """It was a division by zero, after hours where no femur was held out."""
     own = only(tmp_path / "own", train=[f"p{i}" for i in range(9)])
     shutil.copy(anatomy / "femur_toy.npz", own)
     model, train = ModelConfig.from_yaml(settings.model), replace(settings, mix={"L1": 1.0}, validation_pairs=2)
@@ -177,13 +176,11 @@ def test_a_run_that_was_refused_leaves_its_folder_to_the_next_one(settings, anat
 
 
 def test_a_run_that_another_process_trains_is_refused(settings, anatomy, tmp_path):
-    """`nohup gapr train &` twice: both wrote the checkpoint, and the lines of the log were of either."""
     with files.alone_in(tmp_path / "run"), pytest.raises(ConfigError, match="another process"):
         trainer.train(settings, tmp_path / "run", anatomy)
 
 
 def test_a_run_of_less_than_one_step_is_refused(settings, anatomy, tmp_path):
-    """It ended well and named weights that it had not written."""
     with pytest.raises(ConfigError, match="a batch of 4 or more; got 3 pairs; raise --pairs"):
         trainer.train(replace(settings, pairs=3), tmp_path / "run", anatomy)
     assert not (tmp_path / "run").exists()
@@ -399,7 +396,6 @@ def test_a_bone_from_the_shared_folder_gives_the_same_pairs_bit_by_bit(settings,
 def test_other_meshes_and_other_parametric_bones_have_a_shared_folder_of_their_own(
     settings, anatomy, tmp_path, monkeypatch
 ):
-    """A run that was stopped and begun again with another anatomy learned from the bones of the first one."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     other = shutil.copytree(anatomy, tmp_path / "other")
     first = batches.bones_folder(tmp_path / "run", settings, anatomy)

@@ -1,15 +1,11 @@
 """What every test needs: few threads, and ROS graphs that do not see each other or anything outside."""
 
 import os
-import sys
-from pathlib import Path
 
+import domain
 import numpy as np
 import pytest
 from hypothesis import settings
-
-sys.path.insert(0, str(Path(__file__).parent / "ros"))
-import domain  # noqa: E402
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")

@@ -11,7 +11,7 @@ import numpy as np
 from mesh_samples import body
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "core" / "formats"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 SPACING = (4.0, 4.0, 5.0)
 
@@ -60,7 +60,7 @@ def _recordings(points):
 
 def _label_maps():
     import SimpleITK
-    from test_label_maps import affine_of, image_of, voxels_of
+    from label_map_files import affine_of, image_of, voxels_of
 
     affine, size = affine_of(SPACING, turn=(0.1, 0.2, 0.3))
     image, made = image_of(voxels_of(affine, size), affine), {}
@@ -75,7 +75,7 @@ def _label_maps():
 
 
 def _dicom():
-    from test_label_maps import dicom_seg
+    from label_map_files import dicom_seg
 
     with tempfile.TemporaryDirectory() as folder:
         return {"one.dcm": dicom_seg(Path(folder), SPACING, ("femur",)).read_bytes()}

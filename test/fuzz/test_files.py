@@ -1,16 +1,12 @@
 """A small share of `files.py` in the default suite, and every case that was ever found."""
 
-import sys
 from pathlib import Path
-
-import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 import files
 import packed
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from mesh_samples import samples
 from mutations import mutated
 from patient_samples import native_samples, text_samples

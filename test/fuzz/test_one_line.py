@@ -1,14 +1,10 @@
 """Every command that meets a damaged, empty or wrong-unit file of each format says so in one line, with exit code 1."""
 
-import sys
 from pathlib import Path
 
+import mesh_samples
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import mesh_samples
 from patient_samples import native_samples, text_samples
 
 from gapr_core.cli import main

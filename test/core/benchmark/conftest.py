@@ -1,16 +1,12 @@
 """Pairs on disk and methods that worker processes can import."""
 
 import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # for benchmark_cases
-
-from benchmark_cases import FAKES, make_pair  # noqa: E402
+from benchmark_cases import FAKES, make_pair
 
 from gapr_core.benchmark import runner
-from gapr_core.data.pair_files import save_pair  # noqa: E402
+from gapr_core.data.pair_files import save_pair
 from gapr_core.pages import benchmark_report
 
 

@@ -125,27 +125,15 @@ def test_a_method_that_ends_its_process_or_says_several_lines_fails_on_that_pair
     assert found == {"SystemExit: 4", "ValueError: oops line | two", "RuntimeError: no luck"}
 
 
-def test_a_missing_library_stops_the_run_with_its_install_line(pairs, fakes, tmp_path, in_process):
-    with pytest.raises(MethodUnavailableError, match="pip install nope"):
-        benchmark.benchmark(pairs, fakes("missing"), tmp_path / "out")
-
-
-@pytest.mark.parametrize("name", ["fakes:nobody", "no_such_module:good", "fakes:nothing", "ipc"])
-def test_a_method_that_does_not_exist_stops_the_run(name, pairs, fakes, tmp_path, in_process):
-    with pytest.raises(ConfigError):
+@pytest.mark.parametrize(("name", "error", "said"), [
+    ("fakes:missing", MethodUnavailableError, "pip install nope"),
+    *[(name, ConfigError, "expected") for name in ("fakes:nobody", "no_such_module:good", "fakes:nothing", "ipc")],
+])  # fmt: skip
+def test_a_method_that_cannot_be_made_stops_the_run(name, error, said, pairs, fakes, tmp_path, in_process):
+    with pytest.raises(error, match=said):
         benchmark.benchmark(pairs, [name], tmp_path / "out")
-
-
-def test_results_of_other_pairs_of_the_same_name_are_refused(pairs, fakes, tmp_path, in_process):
-    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
-    other = make_pair(9)
-    save_pair(pairs / "L1_femur_0001.npz", other)
-    with pytest.raises(ConfigError, match="L1_femur_0001"):
-        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
-    shutil.copytree(tmp_path / "out", tmp_path / "old")
-    benchmark.benchmark(pairs, fakes("good"), tmp_path / "new")
-    with pytest.raises(ConfigError, match="other clouds"):
-        benchmark.merge([tmp_path / "old", tmp_path / "new"], tmp_path / "merged")
+    with pytest.raises(ConfigError, match="gapr_search"):  # settings without a method that has some
+        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", config=RegistrarConfig(seed=1))
 
 
 def test_results_of_pairs_of_other_names_are_refused(pairs, fakes, tmp_path, in_process):
@@ -278,14 +266,26 @@ def test_a_method_that_is_added_changes_neither_the_order_nor_what_the_others_ar
     assert records.read_plan(tmp_path / "out").ours == turned
 
 
-def test_records_of_a_method_that_has_changed_are_refused(pairs, fakes, tmp_path, in_process):
-    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
-    module = tmp_path / "modules" / "fakes.py"
+def other_pair(pairs, folder):
+    save_pair(pairs / "L1_femur_0001.npz", make_pair(9))
+
+
+def other_code(pairs, folder):
+    module = folder / "modules" / "fakes.py"
     module.write_text(module.read_text() + "# changed\n")
-    with pytest.raises(ConfigError, match="fakes:good as it is now; got some of other weights, or other code"):
+
+
+@pytest.mark.parametrize(("change", "said", "merged"), [
+    (other_pair, "L1_femur_0001", "other clouds"),
+    (other_code, "fakes:good as it is now; got some of other weights, or other code", "fakes:good as it is now"),
+])  # fmt: skip
+def test_records_of_other_pairs_or_code_are_refused(pairs, fakes, tmp_path, in_process, change, said, merged):
+    benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
+    change(pairs, tmp_path)
+    with pytest.raises(ConfigError, match=said):
         benchmark.benchmark(pairs, fakes("good"), tmp_path / "out")
     benchmark.benchmark(pairs, fakes("good"), tmp_path / "new")
-    with pytest.raises(ConfigError, match="fakes:good as it is now"):
+    with pytest.raises(ConfigError, match=merged):
         benchmark.merge([tmp_path / "out", tmp_path / "new"], tmp_path / "merged")
 
 
@@ -403,11 +403,6 @@ def test_records_of_other_settings_do_not_pass_for_new_ones(pairs, fakes, ours, 
     benchmark.benchmark(pairs, ["mine"], tmp_path / "new", config=other)
     with pytest.raises(ConfigError, match="settings"):
         benchmark.merge([tmp_path / "old", tmp_path / "new"], tmp_path / "merged")
-
-
-def test_settings_without_a_method_that_has_some_are_refused(pairs, fakes, tmp_path, in_process):
-    with pytest.raises(ConfigError, match="gapr_search"):
-        benchmark.benchmark(pairs, fakes("good"), tmp_path / "out", config=RegistrarConfig(seed=1))
 
 
 def listed(pairs, monkeypatch):

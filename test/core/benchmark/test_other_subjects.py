@@ -1,24 +1,19 @@
 """`benchmarks/other_subjects.py`: which pairs it makes, and how it counts."""
 
-import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+import other_subjects
 import pytest
 from benchmark_cases import ok, record
+from other_subjects import MIRRORED, SIDE, SIMILAR, SUBJECT, Case
 
 from gapr_core.benchmark import records
 from gapr_core.data import anatomy
 from gapr_core.data.pool import parametric_specimen
 from gapr_core.geometry import se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-
-sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
-
-import other_subjects  # noqa: E402
-from other_subjects import MIRRORED, SIDE, SIMILAR, SUBJECT, Case  # noqa: E402
 
 
 @pytest.fixture(scope="module")

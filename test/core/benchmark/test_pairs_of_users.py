@@ -1,10 +1,12 @@
 """Pairs and methods that users bring: what cannot be is refused before the first registration, or is a failure."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
+import proposals
 import pytest
+import uncertainty
+import viewpoint
 from benchmark_cases import make_pair
 
 from gapr_core import cli
@@ -13,12 +15,6 @@ from gapr_core.commands import benchmark
 from gapr_core.data.pair_files import load_facts, load_pair
 from gapr_core.errors import ConfigError, InvalidPointCloudError
 from gapr_core.geometry import se3
-
-sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
-
-import proposals  # noqa: E402
-import uncertainty  # noqa: E402
-import viewpoint  # noqa: E402
 
 PAIR = make_pair(0)
 TRUE = PAIR.T_target_source

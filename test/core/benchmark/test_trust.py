@@ -2,20 +2,16 @@
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import trust
 from benchmark_cases import make_pair, ok, record, shifted
 from scipy.stats import chi2
 
 from gapr_core.benchmark import records
 from gapr_core.errors import ConfigError
 from gapr_core.results import Hypothesis, RegistrationResult, RegistrationStatus
-
-sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
-
-import trust  # noqa: E402
 
 
 def answered(seed, off_mm, confidence, bound_mm, accepted=True, protocol="L1", settings=""):

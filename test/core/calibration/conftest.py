@@ -1,9 +1,4 @@
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # for answer_cases
 
 from gapr_core.calibration import pairs
 from gapr_core.data.pool import parametric_specimen

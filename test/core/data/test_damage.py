@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import damage as of_damage
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -18,10 +17,6 @@ from gapr_core.data.pool import parametric_specimen
 from gapr_core.data.protocols import make_pair
 from gapr_core.geometry import extent, se3
 from gapr_core.results import RegistrationResult, RegistrationStatus
-
-sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
-
-import damage as of_damage  # noqa: E402
 
 
 @pytest.fixture(scope="module")

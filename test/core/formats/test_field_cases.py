@@ -2,16 +2,11 @@
 
 import logging
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "fuzz"))
-
 from mesh_samples import body, samples
+from scipy.spatial.transform import Rotation
 
 from gapr_core import clouds
 from gapr_core.errors import InvalidPointCloudError

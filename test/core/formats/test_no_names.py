@@ -1,19 +1,15 @@
 """What a file says of its patient reaches no output: every file of a run is searched for it."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from label_map_files import dicom_seg
 
 from gapr_core.cli import main
 from gapr_core.data.masks import mask_of
 from gapr_core.formats import markups
 from gapr_core.geometry import se3
-
-sys.path.insert(0, str(Path(__file__).parent))
-from test_label_maps import dicom_seg  # noqa: E402
 
 sitk = pytest.importorskip("SimpleITK", reason="it writes the label map: pip install SimpleITK")
 

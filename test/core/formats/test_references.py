@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from recordings import T_REFERENCE_BONE, csv_of, igs_of, motions
 
 from gapr_core.cli import main
 from gapr_core.errors import ConfigError, InvalidPointCloudError
@@ -16,13 +16,6 @@ from gapr_core.geometry import se3
 
 TIP = (3.0, -5.0, 150.0)
 NAMES = ["two.csv", "two.igs.mha"]
-T_REFERENCE_BONE = se3.from_rotation_translation(Rotation.from_rotvec([0.2, -0.5, 0.9]).as_matrix(), [20.0, 5.0, -40.0])
-
-
-def motions(count, seed, turn=0.4, shift_mm=60.0):
-    rng = np.random.default_rng(seed)
-    turns = Rotation.from_rotvec(rng.normal(0.0, turn, (count, 3))).as_matrix()
-    return se3.from_rotation_translation(turns, rng.normal(0.0, shift_mm, (count, 3)))
 
 
 def recorded(path, points, reference_lost=(), pointer_lost=()):
@@ -30,34 +23,8 @@ def recorded(path, points, reference_lost=(), pointer_lost=()):
     references, pointers = motions(len(points), 0), motions(len(points), 1)
     touched = np.einsum("nij,nj->ni", references[:, :3, :3], points) + references[:, :3, 3]
     pointers[:, :3, 3] = touched - pointers[:, :3, :3] @ TIP
-    (igs if path.suffix == ".mha" else csv)(path, (references, reference_lost), (pointers, pointer_lost))
+    (igs_of if path.suffix == ".mha" else csv_of)(path, (references, reference_lost), (pointers, pointer_lost))
     return path
-
-
-def csv(path, *tools):
-    lines = [",".join(["Tools,Port,Frame,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz"] * len(tools))]
-    for i in range(len(tools[0][0])):
-        words = []
-        for poses, lost in tools:
-            values = [*np.roll(Rotation.from_matrix(poses[i, :3, :3]).as_quat(), 1), *poses[i, :3, 3]]
-            words += [
-                "1",
-                "A",
-                str(i),
-                "Missing" if i in lost else "OK",
-                *(map(str, [0.0] * 7 if i in lost else values)),
-            ]
-        lines.append(",".join(words))
-    path.write_text("\n".join(lines) + "\n")
-
-
-def igs(path, *tools):
-    head = "ObjectType = Image\nNDims = 3\nDimSize = 1 1 2\n"
-    for name, (poses, lost) in zip(("ReferenceToTracker", "StylusToTracker"), tools, strict=True):
-        for i, T in enumerate(poses):
-            head += f"Seq_Frame{i:04d}_{name}Transform = {' '.join(map(str, T.ravel()))}\n"
-            head += f"Seq_Frame{i:04d}_{name}TransformStatus = {'INVALID' if i in lost else 'OK'}\n"
-    path.write_bytes(head.encode() + b"ElementDataFile = LOCAL\n\x00\x00")
 
 
 POINTS = np.random.default_rng(5).uniform(-50.0, 50.0, (12, 3))

@@ -1,10 +1,8 @@
 """Transforms of a sequence and of slices are rigid, and axes turn a folder of slices once."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from recordings import LPS_RAS, POINTS, T_REFERENCE_BONE, TIP, igs, igs_of, motions, slices_with_poses, turned_poses
 
 from gapr_core.cli import main
 from gapr_core.errors import InvalidPointCloudError
@@ -12,11 +10,6 @@ from gapr_core.formats import reading
 from gapr_core.formats.options import ReadOptions
 from gapr_core.formats.poses import poses_in
 from gapr_core.geometry import se3
-
-sys.path.insert(0, str(Path(__file__).parent))
-from test_references import T_REFERENCE_BONE, motions  # noqa: E402
-from test_references import igs as igs_of_two  # noqa: E402
-from test_sources import LPS_RAS, POINTS, TIP, igs, slices_with_poses, turned_poses  # noqa: E402
 
 CHANGES = {
     "scaled": (np.diag([0.2, 0.2, 0.2, 1.0]), "determinant 0.008"),
@@ -48,11 +41,11 @@ def test_a_tool_of_a_sequence_is_moved_by_rigid_poses_alone(tmp_path, capsys, ho
 @pytest.mark.parametrize("how", CHANGES)
 def test_the_reference_of_a_tool_is_rigid_too(tmp_path, how):
     path, rest = tmp_path / "two.igs.mha", motions(4, 0)
-    igs_of_two(path, (changed(rest, 2, how), ()), (motions(4, 1), ()))
+    igs_of(path, (changed(rest, 2, how), ()), (motions(4, 1), ()))
     with pytest.raises(InvalidPointCloudError, match="with ReferenceToTracker of frame 2, whose"):
         poses_in(path, 1, 0)
     assert len(poses_in(path, 1)) == 4
-    igs_of_two(path, (changed(rest, 2, how), {2}), (motions(4, 1), ()))
+    igs_of(path, (changed(rest, 2, how), {2}), (motions(4, 1), ()))
     assert len(poses_in(path, 1, 0)) == 3  # a frame that is not valid is not looked at
 
 

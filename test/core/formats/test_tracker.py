@@ -1,10 +1,8 @@
 """Numbers that are none in a recording are named, and no command ends with a traceback."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from recordings import TIP, igs, ndi_csv, turned_poses
 
 from gapr_core import clouds
 from gapr_core.cli import main
@@ -12,9 +10,6 @@ from gapr_core.errors import InvalidPointCloudError
 from gapr_core.formats import reading, tracker
 from gapr_core.formats.options import ReadOptions
 from gapr_core.formats.poses import poses_in
-
-sys.path.insert(0, str(Path(__file__).parent))
-from test_sources import TIP, igs, ndi_csv, turned_poses  # noqa: E402
 
 NO_NUMBERS = ["nan", "1e400", "-inf", "1e300", "-3.697314E+028"]
 

@@ -1,16 +1,11 @@
 """Voxels that are damaged, cut or elsewhere never become a bone."""
 
 import os
-import sys
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from test_label_maps import affine_of, dicom_seg, image_of, voxels_of
+from label_map_files import affine_of, dicom_seg, image_of, voxels_of
 
 from gapr_core import clouds
 from gapr_core.errors import InvalidPointCloudError

@@ -1,24 +1,17 @@
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-_spec = importlib.util.spec_from_file_location("toy_clouds", Path(__file__).parents[1] / "model" / "conftest.py")
-_toys = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_toys)
-toy, config = _toys.toy, _toys.config
+from toy_clouds import bone, config, toy  # noqa: F401
 
 
 @pytest.fixture(scope="module")
-def anatomy(tmp_path_factory, toy):
+def anatomy(tmp_path_factory):
     """Nine people with one made-up bone in vertex correspondence, in the layout of the anatomy folder."""
     from scipy.spatial import ConvexHull
 
     folder = tmp_path_factory.mktemp("anatomy")
-    points = toy.bone(400)
+    points = bone(400)
     faces = ConvexHull(points).simplices
     rng = np.random.default_rng(0)
     people = np.stack([points * rng.uniform(0.8, 1.2, 3) for _ in range(9)]).astype(np.float32)

@@ -63,21 +63,23 @@ def save_scene_poster(
         target: the bone, mm.
         views: every image, in the order of time.
         points: (N, 3) mm in the target's frame, laid on it.
-        distances_mm: (N,) their signed distances from the surface.
+        distances_mm: (N,) their signed distances from the surface; NaN for points not taken for bone.
         title: the line above.
         charts: name to (values, limit); not finite where there is no value.
         facing: (3,) direction in the target's frame to the camera; from the front where it is None.
     """
-    figure = _figure(11.0, 8.6)
+    figure = _figure(11.0, 7.2)
     figure.suptitle(title, fontsize=13)
-    above, bone, below = figure.subfigures(3, 1, height_ratios=[1.0, 1.25, 0.85])
+    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.7])
+    bone, right = below.subfigures(1, 2)
     count = min(POSTER_VIEWS, len(views))
     chosen = np.linspace(0, len(views) - 1, count).round().astype(int)
     _draw_views(above, [views[k] for k in chosen], 1, count)
     above.supxlabel(KEY, fontsize=9)
-    draw_bone(bone, target, points, distances_mm, facing)
-    all_axes = np.ravel(below.subplots(1, len(charts)))
-    for axes, (name, (values, limit)) in zip(all_axes, charts.items(), strict=True):
+    is_taken = np.isfinite(distances_mm)
+    draw_bone(bone, target, points[is_taken], distances_mm[is_taken], facing)
+    all_axes = np.ravel(right.subplots(-(-len(charts) // 2), 2))
+    for axes, (name, (values, limit)) in zip(all_axes, charts.items(), strict=False):
         draw_chart(axes, name, values, limit, "frame")
     figure.savefig(path)  # in all colours: few of them would leave steps in the bar
 

@@ -56,7 +56,7 @@ def draw_bone(figure: Any, target: Surface, points: Array, distances_mm: Array, 
     on = OnBone(target, points, distances_mm, NOWHERE)
     axes = figure.subplots()
     dots = views.paint(axes, on, views.picture_of(on, on.side_facing(facing)))
-    figure.colorbar(dots, ax=axes, label="distance to the bone, mm", shrink=0.8)
+    figure.colorbar(dots, ax=axes, label="distance to the bone, mm", shrink=0.8, panchor=False)
 
 
 def charts_as_png(charts: Mapping[str, tuple[Sequence[float], float | None]], x_title: str) -> bytes:
@@ -73,7 +73,8 @@ def draw_chart(axes: Any, name: str, values: Sequence[float], limit: float | Non
     axes.plot(np.arange(1, len(values) + 1), values, "o-", color=palette.FIRST, markersize=4, linewidth=1.2)
     if limit is not None:
         axes.axhline(limit, color="0.5", linestyle="--", linewidth=1.0)
-    axes.set(title=name, xlabel=x_title, xlim=(0.5, len(values) + 0.5))
+    axes.set_title(name, fontsize=10)
+    axes.set(xlabel=x_title, xlim=(0.5, len(values) + 0.5))
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.25)

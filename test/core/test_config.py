@@ -6,13 +6,7 @@ from dataclasses import dataclass, fields, is_dataclass
 import numpy as np
 import pytest
 
-from gapr_core.config import (
-    ClutterConfig,
-    RefinementConfig,
-    RegistrarConfig,
-    SensorConfig,
-    VerificationConfig,
-)
+from gapr_core.config import ClutterConfig, RefinementConfig, RegistrarConfig, SensorConfig, VerificationConfig
 from gapr_core.errors import ConfigError
 from gapr_core.runtime import settings
 from gapr_core.runtime.settings import Settings, from_dict, setting

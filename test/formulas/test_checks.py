@@ -16,8 +16,7 @@ from gapr_core.registration.fit.alternatives import Trial
 from gapr_core.results import Effect, RegistrationStatus
 
 CONFIG = RegistrarConfig(
-    num_threads=1,
-    verification=VerificationConfig(middle_points=60, middle_limits_mm=(5.0, 4.0, 5), same_pose_mm=2.0),
+    num_threads=1, verification=VerificationConfig(middle_points=60, middle_limits_mm=(5.0, 4.0, 5), same_pose_mm=2.0)
 )
 
 

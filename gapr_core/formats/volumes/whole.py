@@ -76,6 +76,16 @@ def check_voxels(path: Path, count: int, size_bytes: int) -> None:
         else:
             given = len(file.read().split()) * size_bytes
     check_length(given, count * size_bytes)
+    if encoding == ZLIB:  # ITK takes the length of the stream from the header, and makes noise of it if that is wrong
+        check_packed_length(fields.get("CompressedDataSize"), path.stat().st_size - start)
+
+
+def check_packed_length(announced: str | None, given: int) -> None:
+    """Raise `ValueError` unless the header announces as many compressed bytes as there are."""
+    if announced is None:
+        raise ValueError("no CompressedDataSize in its header")
+    if announced != str(given):
+        raise ValueError(f"{given} compressed bytes where its header announces {announced}")
 
 
 def check_length(given: int, announced: int) -> None:

@@ -1,6 +1,7 @@
 """Voxels that are damaged, cut or elsewhere never become a bone."""
 
 import os
+import re
 import zlib
 
 import numpy as np
@@ -57,9 +58,18 @@ def packed_by_bzip2(data, start):
     return data.replace(b"encoding: gzip", b"encoding: bzip2")
 
 
+def without_packed_size(data, start):
+    return re.sub(rb"CompressedDataSize = \d+\n", b"", data)
+
+
+def of_another_packed_size(data, start):
+    return re.sub(rb"(CompressedDataSize = )\d+", rb"\g<1>10", data)
+
+
 CASES = [
     *[(name, how, None) for name in ("a.mha", "a.nrrd", "a.nii.gz") for how in (cut, flipped, without_checksum)],
     *[(name, how, None) for name in ("a.mha", "a.nrrd") for how in (of_another_size, without_size)],
+    ("a.mha", without_packed_size, "no CompressedDataSize"), ("a.mha", of_another_packed_size, "announces 10"),
     ("a.mha", with_more, "data behind the end"), ("a.nrrd", with_more, "data behind the end"),
     ("a.nii.gz", with_more, None), ("a.nrrd", packed_by_bzip2, "encoding of raw, gzip, hex or text; got a.nrrd: bzip2"),
     *[(name, how, "bytes of voxels where") for name in ("raw.mha", "raw.nrrd", "raw.nii") for how in (cut, with_more)],

@@ -111,6 +111,14 @@ def test_a_unit_is_asked_for_where_the_cloud_would_have_the_size_of_the_bone_in_
         assert found.effect is Effect.ASK
 
 
+def test_no_unit_is_asked_for_where_the_cloud_would_be_too_wide_for_the_bone_in_it():
+    """The first cloud of a probe on a femur's head: 45 mm across, as the whole femur in cm, but as wide as long."""
+    rng = np.random.default_rng(0)
+    femur, ball = rng.uniform(-1.0, 1.0, (2, 500, 3))
+    thin = unit_question(femur * [4.0, 3.0, 20.0], femur * [40.0, 30.0, 200.0])
+    assert thin is not None and unit_question(ball * 13.0, femur * [40.0, 30.0, 200.0]) is None
+
+
 @pytest.fixture(scope="module")
 def lifted():
     """A hundred points of an egg, 1.5 mm outside of it, with .2 mm of noise."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gapr_core.clouds import MM_PER_UNIT, PLAUSIBLE
 from gapr_core.config import RegistrarConfig
+from gapr_core.geometry import extent
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.table import refuse, trial_of
 from gapr_core.registration.confidence import feature_labels
@@ -23,6 +24,7 @@ from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
+ROOM = 1.2  # a piece of a bone is at most that much longer, wider and thicker than the bone
 OTHER_UNITS = {unit: mm for unit, mm in MM_PER_UNIT.items() if unit in ("m", "cm")}  # units that may be mistaken for mm
 STANDOFF_BETTER = 0.15  # log of mean squares: refused sources without a stand-off hardly fit better by more
 
@@ -112,7 +114,7 @@ def questions(a: Assessment, refusal: Finding, config: RegistrarConfig) -> Seque
 def unit_question(source: Array, target: Array) -> Finding | None:
     """Ask for the unit where the cloud would have the bone's size in another one.
 
-    A short scan of a long bone is as small as a whole one in cm taken for mm: no check can distinguish them.
+    A short scan of a long bone is as small as a whole one in cm taken for mm; one too round for the bone is neither.
 
     Args:
         source, target: (N, 3) and (M, 3), read as mm.
@@ -121,10 +123,16 @@ def unit_question(source: Array, target: Array) -> Finding | None:
     extent_mm, target_mm = Surface(source).extent_mm, Surface(target).extent_mm
     for unit, mm in OTHER_UNITS.items():
         share = extent_mm * mm / target_mm
-        if low <= share <= high:
+        if low <= share <= high and (mm * _sides(source, (2, 98)) <= ROOM * _sides(target, (0, 100)) + 1.0).all():
             text = f"the cloud is {extent_mm:.3g} mm across, the bone {target_mm:.3g} mm: is the cloud in {unit}?"
             return Finding("unit", Effect.ASK, share, low, RegistrationStatus.OK, text)
     return None
+
+
+def _sides(points: Array, percentiles: tuple[float, float]) -> Array:
+    """Measure (N, 3) points along their principal axes, longest first, mm."""
+    along = (points - points.mean(axis=0)) @ extent.principal(points).axes.T
+    return np.sort(np.ptp(np.percentile(along, percentiles, axis=0), axis=0))[::-1]
 
 
 def standoff_question(a: Assessment, config: RegistrarConfig) -> Finding | None:

@@ -22,7 +22,7 @@ from gapr_core.pages import palette, report, views
 from gapr_core.pages.report import Image
 from gapr_core.registration.caveats import loosest_turn
 from gapr_core.registration.confidence.feature_labels import FEATURE_LABELS
-from gapr_core.results import RegistrationResult, RegistrationStatus, Residuals, confidence_text
+from gapr_core.results import Effect, RegistrationResult, RegistrationStatus, Residuals, confidence_text
 from gapr_core.runtime import origin
 
 Array = NDArray[np.float64]
@@ -64,6 +64,7 @@ def _answer(result: RegistrationResult, name: str) -> dict[str, Any]:
         "lines": _lines(result),
         "next": _next(result),
         "about": " · ".join(filter(None, (name, f"{datetime.now():%Y-%m-%d %H:%M}", by))),
+        "has_rivals": any(spot.rivals_excluded >= 0.005 for spot in spots),
         "spots": [_spot(number, spot, result) for number, spot in enumerate(spots, 1)],
         "gain_views": _sides(views.of_result(result, with_gain=True)) if spots and result.bone is not None else [],
         "errors": _errors(result),
@@ -83,7 +84,8 @@ def _headline(result: RegistrationResult) -> str:
 def _lines(result: RegistrationResult) -> list[str]:
     """Say in words what may be trusted, or why there is no pose."""
     if not result.ok:
-        return [_sentence(result.reason or str(result.status).replace("_", " ").lower())]
+        said = [finding.text for finding in result.findings if finding.effect is not Effect.WIDEN]
+        return [_sentence(text) for text in said or [result.reason or str(result.status).replace("_", " ").lower()]]
     within = f"{se3.RIGHT_MM:g} mm and {se3.RIGHT_DEG:g} degrees"
     lines = [f"Where the points are: right within {within} with a probability of {confidence_text(result.confidence)}."]
     if result.tre_mm is not None and result.tre95_mm is not None:
@@ -101,7 +103,7 @@ def _next(result: RegistrationResult) -> list[str]:
     if result.ok:
         return []
     advised = [finding.advice for finding in result.findings if finding.advice]
-    return advised[:1] or [NEXT[result.status]]
+    return [_sentence(advice) for advice in advised[:1] or [NEXT[result.status]]]
 
 
 def _spot(number: int, spot: Any, result: RegistrationResult) -> tuple[str, ...]:
@@ -144,15 +146,17 @@ def _details(result: RegistrationResult) -> dict[str, Any]:
 
 
 def _why(result: RegistrationResult) -> list[str]:
-    """List the reasons of the verdict, one sentence each."""
-    lines = [_sentence(str(finding)) for finding in result.findings]
+    """List the reasons of the verdict that it does not hold itself, one sentence each."""
+    lines = [_sentence(str(finding)) for finding in result.findings if result.ok or finding.effect is Effect.WIDEN]
+    if not result.ok and result.status is not RegistrationStatus.LOW_CONFIDENCE:
+        return lines  # refused for what was found, however probable the pose
     if result.pose_probability is not None:
         lines.append(f"If this is the right bone, the pose is right with a probability of "
                      f"{confidence_text(result.pose_probability)}.")  # fmt: skip
     if result.bone_evidence is not None:
-        times = 10.0 ** abs(result.bone_evidence)
+        times = float(f"{10.0 ** abs(result.bone_evidence):.2g}")
         than = "likelier" if result.bone_evidence >= 0.0 else "less likely"
-        lines.append(f"The points are {times:.3g} times {than} on this bone than on another subject's.")
+        lines.append(f"The points are {times:,g} times {than} on this bone than on another subject's.")
     if result.ok:
         lines.append(f"{100.0 * result.inlier_ratio:.0f} % of the points fit.")
         if result.residuals is not None and np.isfinite(result.residuals.distance_mm).any():
@@ -160,7 +164,6 @@ def _why(result: RegistrationResult) -> list[str]:
         if result.bone is not None and (turn := loosest_turn(result, result.bone.points)):
             lines.append(f"It may still turn about {turn[0]} by {turn[1]:.1f} degrees (95 %).")
         return lines
-    lines.append(f"The best pose that was found is right with a probability of {confidence_text(result.confidence)}.")
     against = sorted((adds, name) for name, adds in result.contributions.items() if adds <= -STRENGTHS[1][0])
     lines += [
         f"{_sentence(FEATURE_LABELS.get(name, name))[:-1]} speaks {_strength(adds)} against it."

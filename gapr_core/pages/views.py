@@ -31,7 +31,7 @@ NAMES = {"anterior": "from the front", "posterior": "from behind", "left": "from
          "superior": "from above", "inferior": "from below"}  # fmt: skip
 PIXELS, SHOWN, DPI = 900, 3, 110
 LONG = 2.0  # times as high as wide
-LYING_PT, STANDING_PT = 11.0, 19.0  # letters and numbers: of those that stand, three share the width of a page
+LYING_PT, STANDING_PT = 17.0, 19.0  # letters and numbers: of those that stand, three share the width of a page
 MOST_POINTS = 3000  # drawn of a cloud
 
 

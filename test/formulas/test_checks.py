@@ -54,9 +54,9 @@ TURN, SHIFT, RIVAL, IMAGE = "unobserved turn", "unobserved shift", "equal rival"
     [
         (loose(), None, None, ""),
         (loose(4.99, 5.99), None, None, ""),
-        (loose(turn_deg=6.01), TURN, DEGENERATE, "could still be turned about its short axis by 6 degrees; shifted"),
+        (loose(turn_deg=6.01), TURN, DEGENERATE, "could still be turned about its short axis by 6 degrees"),
         (loose(turn_deg=200.0), TURN, DEGENERATE, "about its short axis freely"),
-        (loose(shift_mm=5.01), SHIFT, DEGENERATE, "shifted along its long axis by 5 mm"),
+        (loose(shift_mm=5.01), SHIFT, DEGENERATE, "the bone could still be shifted along its long axis by 5 mm"),
         (loose(shift_mm=1001.0), SHIFT, DEGENERATE, "shifted along its long axis freely"),
         (rivalled(1.0), None, None, ""),
         (rivalled(4.0, 4.0624), RIVAL, AMBIGUOUS, "another pose, 30 mm and 0 deg away"),

@@ -36,10 +36,11 @@ def trial_of(assessment: Assessment, config: RegistrarConfig) -> Trial:
 def unobserved_motion(a: Assessment, config: RegistrarConfig) -> Assessment:
     """Refuse a pose with a motion that the points do not determine: a spin about a shaft, a slide along it."""
     turn_deg, shift_mm = a.uncertainty.largest_turn_deg, a.uncertainty.largest_shift_mm
-    text = f"{turn_text(a)}; {shift_text(a)}"
-    if turn_deg > LARGEST_TURN_DEG:
+    turns, slides = turn_deg > LARGEST_TURN_DEG, shift_mm > LARGEST_SHIFT_MM
+    text = f"the bone could still be {' and '.join([turn_text(a)] * turns + [shift_text(a)] * slides)}"
+    if turns:
         return a.with_finding(refuse("unobserved turn", turn_deg, LARGEST_TURN_DEG, DEGENERATE, text))
-    if shift_mm > LARGEST_SHIFT_MM:
+    if slides:
         return a.with_finding(refuse("unobserved shift", shift_mm, LARGEST_SHIFT_MM, DEGENERATE, text))
     return a
 
@@ -94,7 +95,7 @@ def turn_text(a: Assessment) -> str:
     turn_deg = a.uncertainty.largest_turn_deg
     axis = axis_name(a.uncertainty.weakest_turn, a)
     how = f"by {turn_deg:.0f} degrees" if turn_deg <= 180.0 else "freely"
-    return f"the bone could still be turned about {axis} {how}"
+    return f"turned about {axis} {how}"
 
 
 def shift_text(a: Assessment) -> str:

@@ -23,7 +23,7 @@ FEATURE_LABELS = {
     "extent": "size of the source against the bone",
     "scale_z": "evidence that another size fits better",
     "scale_off": "size with which the source fits best",
-    "log_scale_sd": "uncertainty of that size",
+    "log_scale_sd": "uncertainty of the size that fits best",
     "size_margin": "fit of a source of another size",
     "near_size_margin": "fit of a source grown or shrunk a little",
     "mirror_margin": "fit of the mirrored source",

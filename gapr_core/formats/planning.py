@@ -26,10 +26,12 @@ DRAWS = 4096
 FAR_MM = 30.0  # planned targets are in a bone, on it, or in the tissue around it
 MUCH_NEARER = 0.3  # share of the distance that is left once a mistake is undone
 FLIPPED = np.array([-1.0, -1.0, 1.0])
+IN_METRES = "Times 1000 it is near: correct the unit of the plan, which is in m."
 MISTAKES = {  # of a plan: what undoes it, and what to do
     "With x and y negated it is near: correct which of plan and bone is RAS and which LPS.": FLIPPED,
-    "Times 1000 it is near: correct the unit of the plan, which is in m.": np.full(3, 1000.0),
+    IN_METRES: np.full(3, 1000.0),
 }
+AT_ORIGIN_MM = 1.0  # a plan in m, taken for mm, is as close to the origin as that
 
 
 def start_of(source: Path, target: Path) -> LandmarkPose:
@@ -94,10 +96,16 @@ def distances_mm(points: Array, bone: Surface) -> Array:
 
 
 def _far_targets(points: Array, apart_mm: Array, result: RegistrationResult) -> tuple[ResultWarning, ...]:
-    """Warn of planned targets (N, 3) far from the bone, with the likely mistake."""
+    """Warn of planned targets (N, 3) far from the bone, or all at its frame's origin, with the likely mistake."""
     far = apart_mm > FAR_MM
-    if result.bone is None or not far.any():
+    if result.bone is None:
         return ()
+    if not far.any():
+        size_mm = float(np.abs(points).max())
+        if not FAR_MM / 1000.0 < size_mm < AT_ORIGIN_MM or (distances_mm(1000.0 * points, result.bone) > FAR_MM).any():
+            return ()
+        text = f"The planned targets are within {AT_ORIGIN_MM:g} mm of the origin."
+        return (ResultWarning("target_far", text, IN_METRES),)
     text = f"{far.sum()} of {len(points)} planned targets {'is' if far.sum() == 1 else 'are'} far from the bone"
     return (ResultWarning("target_far", f"{text}, up to {apart_mm.max():.0f} mm.", _mistake(points[far], result)),)
 

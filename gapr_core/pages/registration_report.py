@@ -148,12 +148,11 @@ def _details(result: RegistrationResult) -> dict[str, Any]:
 def _why(result: RegistrationResult) -> list[str]:
     """List the reasons of the verdict that it does not hold itself, one sentence each."""
     lines = [_sentence(str(finding)) for finding in result.findings if result.ok or finding.effect is Effect.WIDEN]
-    if not result.ok and result.status is not RegistrationStatus.LOW_CONFIDENCE:
-        return lines  # refused for what was found, however probable the pose
-    if result.pose_probability is not None:
+    matters = result.ok or result.status is RegistrationStatus.LOW_CONFIDENCE  # others are refused however probable
+    if matters and result.pose_probability is not None:
         lines.append(f"If this is the right bone, the pose is right with a probability of "
                      f"{confidence_text(result.pose_probability)}.")  # fmt: skip
-    if result.bone_evidence is not None:
+    if matters and result.bone_evidence is not None:
         times = float(f"{10.0 ** abs(result.bone_evidence):.2g}")
         than = "likelier" if result.bone_evidence >= 0.0 else "less likely"
         lines.append(f"The points are {times:,g} times {than} on this bone than on another subject's.")

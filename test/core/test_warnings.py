@@ -152,7 +152,8 @@ def test_a_finding_is_in_the_terminal_on_the_page_and_in_the_json(register, caps
     ([[60.0, -70.0, 100.0]], "", "50 mm from the bone"),  # 30 in x, 40 in y
     ([[-130.0, 25.0, 100.0], [-128.0, 25.0, 90.0]], "", "100 mm from the bone"),
     ([[70.0, 0.0, 0.0]], "Check that the plan is of this bone", "40 mm from the bone"),
-    ([[0.0, 0.0, 0.1], [0.0, 0.0, 0.05]], None, "30 mm inside the bone"),
+    ([[0.0, 0.0, 0.1], [0.0, 0.0, 0.05]], "Times 1000 it is near", "30 mm inside the bone"),
+    ([[0.0, 0.0, 0.02], [0.0, 0.0, 0.0]], None, "30 mm inside the bone"),
     ([[0.0, 10.0, 100.0]], None, "20 mm inside the bone"),
     ([[30.0, 0.0, 0.0]], None, "on the bone"),
 ])  # fmt: skip

@@ -88,7 +88,7 @@ SEEN                      := scenes scene_stereo scene_joint scene_table
 made_by_viewpoint         = viewpoint.py --pairs $(SEEN:%=$(OUT)/pairs/%) --every 3
 WRONG                     := scene_wrong scene_wrong_stereo
 made_by_viewpoint_wrong   = viewpoint.py --pairs $(WRONG:%=$(OUT)/pairs/%) --ways inferred
-made_by_mix               = trust.py $(MIX:%=$(OUT)/bench/%) --plot $(OUT)/figures/reliability.png
+made_by_mix               = trust.py $(MIX:%=$(OUT)/bench/%)
 made_by_mix_fresh         = trust.py $(OUT)/bench/fresh
 made_by_tracing           = trust.py $(TRACED:%=$(OUT)/bench/%)
 made_by_few               = trust.py $(FEW:%=$(OUT)/bench/%)

@@ -1,6 +1,6 @@
 """Can the confidence, the bound and the covariance be believed, over a mix of pairs?
 
-    python benchmarks/trust.py OUT [OUT ...] [--method gapr] [--plot FILE.png]
+    python benchmarks/trust.py OUT [OUT ...] [--method gapr]
 
 OUT are output folders of `gapr benchmark`; all their records together are the mix, so that the caller decides how much
 there is of what. Three tables: of the confidence, which judges the best pose of every pair, refused or not; of
@@ -22,7 +22,6 @@ from gapr_core.benchmark.record import Record
 from gapr_core.benchmark.table import ALL, people, summary
 from gapr_core.errors import ConfigError
 from gapr_core.pages import markdown
-from gapr_core.pages.plots import reliability_diagram
 from gapr_core.runtime.console import say
 
 Groups = dict[str, list[Record]]
@@ -33,13 +32,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, metavar="OUT", help="output folder of gapr benchmark")
     parser.add_argument("--method", default="gapr", help="whose answers")
-    parser.add_argument("--plot", type=Path, help="picture of confidence against the share of right poses")
     args = parser.parse_args()
     mix = read(args.folders, args.method)
     groups = by_family(mix)
     say("\n\n".join((of_confidence(groups), of_bound(groups), of_covariance(groups))))
-    if args.plot:
-        reliability_diagram(mix, [args.method]).savefig(args.plot, dpi=150)
     return 0
 
 

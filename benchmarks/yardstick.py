@@ -1,7 +1,7 @@
 """Freeze the answers to fixed lists of sources, and compare the answers of today with them.
 
     python benchmarks/yardstick.py --anatomy DIR [--split val] [--lists L2,L3] [--jobs 1] --out FILE.jsonl
-    python benchmarks/yardstick.py --out FILE.jsonl --against FROZEN.jsonl
+    python benchmarks/yardstick.py --out FILE.jsonl --against FROZEN.jsonl [--plot FILE.png]
 
 Lists are drawn by seed from subjects of one split: clean views, L2, L3, sweeps, each sensor family, damage, few points,
 wounds with and without a viewpoint, streams of the three classes, mirrored and scaled bones, other subjects. Finished
@@ -20,6 +20,7 @@ from dataclasses import replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import damage
@@ -38,6 +39,7 @@ from gapr_core.data.scenes.stream import SceneMotion
 from gapr_core.data.scenes.stream import simulate as simulate_scenes
 from gapr_core.data.stream import Motion, simulate
 from gapr_core.pages import markdown
+from gapr_core.pages.plots import reliability_diagram
 from gapr_core.runtime.console import say
 
 Row = dict[str, Any]
@@ -96,6 +98,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, required=True, help="answers, one JSON object a line (.gz is read, too)")
     parser.add_argument("--against", type=Path, help="frozen answers to compare with")
+    parser.add_argument("--plot", type=Path, help="picture of confidence against the share of right poses, own bones")
     parser.add_argument("--jitter", type=Path, metavar="DIR", help="folder of the bones: move points by 1e-4 mm")
     args = parser.parse_args()
     if args.jitter is not None:
@@ -107,6 +110,8 @@ def main() -> int:
     now = read(args.out)
     say(table(now) if args.against is None else comparison(read(args.against), now))
     say("\n" + of_checks(now) + "\n\n" + of_evidence(now))
+    if args.plot is not None:
+        plot({"now": now} if args.against is None else {"before": read(args.against), "now": now}, args.plot)
     return 0
 
 
@@ -346,6 +351,13 @@ def of_evidence(rows: Sequence[Row]) -> str:
         low, high = metrics.share_interval(doubted.tolist(), [key[1] for key in pairs_of])
         lines.append((f"{share:.0%}", f"{doubted.mean():.3f} [{low:.3f}-{high:.3f}]", len(means), len(own)))
     return markdown.table(("own bones doubted", "pairs of subjects doubted", "pairs", "own"), lines)
+
+
+def plot(answers: dict[str, Sequence[Row]], path: Path) -> None:
+    """Draw the share of right poses over the confidence, one line for each file of answers."""
+    records: Any = [SimpleNamespace(method=name, confidence=row["confidence"], best_right=row["right"])
+                    for name, rows in answers.items() for row in rows if row["truth"]]  # fmt: skip
+    reliability_diagram(records, list(answers)).savefig(path, dpi=150)
 
 
 def jitter(folder: str, split: str, sources: int = 50, draws: int = 8) -> str:

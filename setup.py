@@ -12,7 +12,7 @@ from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
 
 PACKAGE = "gapr_ros"
-HOME = "https://gapr.invalid/gapr"
+URL = "https://gapr.invalid/gapr"
 HERE = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file, elsewhere
 
 CORE = [
@@ -61,7 +61,7 @@ def files(folder, *patterns):
 
 def readme():
     """The README with links that hold outside of the repository."""
-    return re.sub(r"\]\((?!\w+:|#)", f"]({HOME}/blob/main/", (HERE / "README.md").read_text(encoding="utf-8"))
+    return re.sub(r"\]\((?!\w+:|#)", f"]({URL}/blob/main/", (HERE / "README.md").read_text(encoding="utf-8"))
 
 
 class BuildCompiled(build_py):
@@ -105,8 +105,8 @@ setup(
     license="Apache-2.0",
     maintainer="GAPR maintainers",
     maintainer_email="maintainers@gapr.invalid",
-    url=HOME,
-    project_urls={"Source": f"{HOME}.git", "Issues": f"{HOME}/issues", "Changelog": f"{HOME}/blob/main/CHANGELOG.rst"},
+    url=URL,
+    project_urls={"Source": f"{URL}.git", "Issues": f"{URL}/issues", "Changelog": f"{URL}/blob/main/CHANGELOG.rst"},
     classifiers=[
         "Development Status :: 4 - Beta",
         "Intended Audience :: Healthcare Industry",

@@ -7,7 +7,8 @@ import subprocess
 import sys
 import tarfile
 import xml.etree.ElementTree as ElementTree
-from importlib.metadata import entry_points
+import zipfile
+from importlib.metadata import PathDistribution, entry_points
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 
 
 def setup_py(field):
-    return re.search(rf'{field}="([^"]+)"', (ROOT / "setup.py").read_text())[1]
+    return re.search(rf'(?i)\b{field} ?= ?"([^"]+)"', (ROOT / "setup.py").read_text())[1]
 
 
 @pytest.mark.parametrize("field", ["version", "license", "maintainer", "url"])
@@ -142,6 +143,24 @@ def test_what_an_earlier_build_compiled_is_thrown_away(tmp_path):
     command = [sys.executable, "setup.py", "-q", "build_py", "--build-lib", str(tmp_path / "built")]
     subprocess.run(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, check=True)
     assert not stale.exists()
+
+
+@pytest.mark.parametrize(("compiled", "tag"), [
+    ("no", "py3-none-any"),
+    pytest.param("yes", f"cp3{sys.version_info.minor}-none-linux_x86_64", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_tag_of_a_wheel_tells_whether_it_holds_compiled_loops(tmp_path, compiled, tag):
+    command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path), "build", "--build-base",
+               str(tmp_path / "build"), "bdist_wheel", "-d", str(tmp_path)]  # fmt: skip
+    environment = os.environ | {"GAPR_COMPILED": compiled}
+    subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.endswith(f"-{tag}.whl")
+    folder = zipfile.Path(wheel)
+    assert any(name.endswith(".nbc") for name in folder.root.namelist()) is (compiled == "yes")
+    (information,) = (each for each in folder.iterdir() if each.name.endswith(".dist-info"))
+    metadata = PathDistribution(information).metadata
+    assert metadata["Version"] in metadata.as_string() and "](docs/" not in metadata.as_string()
 
 
 def test_a_source_archive_holds_what_builds_it(tmp_path):

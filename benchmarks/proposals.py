@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from gapr_core import Registrar, RegistrarConfig, metrics
+from gapr_core.benchmark.ransac import ransac
 from gapr_core.data.pair import Pair
 from gapr_core.data.pair_files import load_pair, pair_paths
 from gapr_core.geometry import se3
@@ -28,6 +30,7 @@ from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposer
+from gapr_core.registration.proposals.consensus import Correspondences
 from gapr_core.registration.proposals.network import NetworkProposer
 from gapr_core.runtime.console import say
 
@@ -50,13 +53,18 @@ def main() -> int:
     methods = {
         "network": registrar.proposers[0],
         "search": registrar.proposers[1],
-        "ransac": NetworkProposer.from_weights(method="ransac"),
+        "ransac": NetworkProposer.from_weights(consensus=by_ransac),
     }
     rows = [measure(pair, registrar, methods) for pair in tqdm(chosen(args.pairs, args.limit), unit="pair")]
     if args.out:
         args.out.write_text(json.dumps(rows, indent=1) + "\n")
     say(table(rows))
     return 0
+
+
+def by_ransac(found: Correspondences, radius_mm: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses and scores as the paper finds them."""
+    return ransac(found, radius_mm, np.random.default_rng(0), count=count)
 
 
 def chosen(folder: Path, limit: int | None) -> list[Pair]:

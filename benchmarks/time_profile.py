@@ -95,7 +95,7 @@ def cases_of(bone: Specimen, registrar: Registrar, threads: int, folder: Path) -
     """What is timed, by name; `folder` is for a mesh."""
     pairs, scene = {protocol: make_pair(protocol, bone, 5) for protocol in FULL}, make_pair("scene-C2", bone, 5)
     clean, target, of_scene = pairs["paper"], registrar.prepare(pairs["paper"].target), registrar.prepare(scene.target)
-    twice = Registrar.from_pretrained(RegistrarConfig(num_threads=threads, searched_below=2.0, sure=2.0))
+    twice = Registrar.from_pretrained(RegistrarConfig(num_threads=threads, sure=2.0))
     kiss = make("kiss_matcher+point_to_plane")
     targets = {protocol: (registrar.prepare(pair.target), kiss.prepare(pair.target, "mm"))
                for protocol, pair in pairs.items()}  # fmt: skip

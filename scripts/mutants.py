@@ -58,6 +58,7 @@ TESTS = {
     REGISTRATION + "fit/alternatives.py": [f"{FORMULAS}/test_alternatives.py", f"{FORMULAS}/test_checks.py"],
     REGISTRATION + "checks/table.py": [f"{FORMULAS}/test_checks.py"],
     REGISTRATION + "checks/conclude.py": [f"{FORMULAS}/test_conclude.py"],
+    REGISTRATION + "checks/image.py": [f"{FORMULAS}/test_image.py"],
     REGISTRATION + "checks/assessment.py": [f"{FORMULAS}/test_assessment.py"],
     REGISTRATION + "checks/assess.py": [
         f"{FORMULAS}/test_assessment.py",

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.baselines.base import Baseline, BaselineTarget, NoPose
+from gapr_core.benchmark.ransac import ransac, sharpened
 from gapr_core.errors import InvalidPointCloudError
-from gapr_core.registration.proposals.consensus import Correspondences, ransac, sharpened
+from gapr_core.registration.proposals.consensus import Correspondences
 from gapr_core.registration.proposals.network import SHIPPED, correspondences_mm
 
 if TYPE_CHECKING:

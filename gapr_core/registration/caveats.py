@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,14 +24,6 @@ Array = NDArray[np.float64]
 Source = str | Path | ArrayLike | Surface
 
 
-class Register(Protocol):
-    """`register` as its users see it."""
-
-    def __call__(
-        self, source: Source, target: PreparedTarget, initial: ArrayLike | None = None, viewpoint: Any = None
-    ) -> RegistrationResult: ...
-
-
 LOOSE_DEG = 5.0  # a turn that may be larger than what counts as right
 WITHIN_95 = float(norm.ppf(0.975))
 SENSOR_UNKNOWN = ResultWarning(
@@ -46,7 +38,7 @@ TRACKING_UNKNOWN = ResultWarning(
 )
 
 
-def answering(register: Callable[..., RegistrationResult]) -> Register:
+def answering(register: Callable[..., RegistrationResult]) -> Callable[..., RegistrationResult]:
     """Let a `register` take a path, an array or a `Surface`, and complete its result with what a reader needs."""
 
     @wraps(register)
@@ -58,7 +50,7 @@ def answering(register: Callable[..., RegistrationResult]) -> Register:
         result = replace(result, warnings=_warnings(result, target, self.config))
         return completed(result, target.surface, clouds.finite_points(points))
 
-    return call  # type: ignore[return-value]  # as a method it is bound
+    return call
 
 
 def completed(result: RegistrationResult, bone: Surface, source: Array) -> RegistrationResult:
@@ -92,27 +84,15 @@ def _warnings(result: RegistrationResult, target: PreparedTarget, config: Regist
         place = "{:.0f}, {:.0f}, {:.0f}".format(*result.inferred_viewpoint)
         text = f"The cloud is taken for what a camera at {place} mm saw: as bone alone it gave no pose."
         found.append(ResultWarning("viewpoint_inferred", text, "Give the camera's place as the viewpoint."))
-    if loose := _loose_turn(result, target):
-        found.append(loose)
+    turn = loosest_turn(result, target.points)
+    if turn is not None and turn[1] > LOOSE_DEG:
+        text = f"The bone may still turn about {turn[0]} by {turn[1]:.0f} degrees."
+        found.append(ResultWarning("turn_loose", text, "Measure places away from that axis."))
     return (*result.warnings, *found)
 
 
-def _loose_turn(result: RegistrationResult, target: PreparedTarget) -> ResultWarning | None:
-    """Warn of a turn that may be larger than a right pose allows."""
-    found = loosest_turn(result, target.points)
-    if found is None or found[1] <= LOOSE_DEG:
-        return None
-    text = f"The bone may still turn about {found[0]} by {found[1]:.0f} degrees."
-    return ResultWarning("turn_loose", text, "Measure places away from that axis.")
-
-
 def loosest_turn(result: RegistrationResult, bone: Array) -> tuple[str, float] | None:
-    """Name the axis about which a pose is known worst, and the 95 % bound of that turn, deg.
-
-    Args:
-        result: of registering to the bone.
-        bone: (N, 3) its points, mm.
-    """
+    """Name the axis of the bone (N, 3), mm, with the loosest turn, and its 95 % bound, deg."""
     if result.covariance is None:
         return None
     variances, axes = np.linalg.eigh(result.covariance[3:, 3:])

@@ -3,12 +3,9 @@
 Under a right pose with covariance C, the signed distances d of n points from the bone's surface are normal with
 covariance S = J C J^T + R. J is their derivative by the error of the pose; R is the covariance of sensor and model.
 Then d^T S^-1 d is chi-square with n degrees of freedom. Small distances confirm a pose only if an error would have
-shown: points on one side of a shaft never show a slide along it. So the answer has the error over the bone that the
-points alone leave open, by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P. It also has the point that would
-lower this error most (`precision` for errors over the bone).
-
-A pose with a wide covariance allows large distances, which still show its error. Registration and points together put
-it at C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. The test takes its size over the bone.
+shown. So the answer has the error over the bone that the points alone leave open, and the point that would lower it
+most: by C_alone = (P^-1 + J^T R^-1 J)^-1 with a loose prior P. Registration and points together put the error of the
+pose at C' J^T R^-1 d with covariance C' = (C^-1 + J^T R^-1 J)^-1. The test takes its size over the bone.
 """
 
 from __future__ import annotations
@@ -36,7 +33,7 @@ from gapr_core.results import PointCheck, RegistrationResult, Verdict
 Array = NDArray[np.float64]
 
 SURPRISING = 0.01  # rate at which right poses are contradicted
-LOOSE_MM, LOOSE_DEG = 20.0, 20.0  # standard deviations of a pose known from check points alone
+LOOSE = np.diag([20.0**2] * 3 + [np.radians(20.0) ** 2] * 3)  # covariance of a pose before any check point, mm, rad
 MOST_POINTS = 1000  # every pair of points is compared
 CANDIDATES = 500  # places of the bone compared for the next point
 SAME_MM = 1e-3  # a check point this near to a source point is that point, not another contact
@@ -89,7 +86,7 @@ def check_points(
     probability = _probability(distance_mm[near], S) if near.all() else 0.0
     weighted = np.linalg.solve(R, J)
     information = J.T @ weighted
-    alone = np.linalg.inv(np.linalg.inv(_loose()) + information)
+    alone = np.linalg.inv(np.linalg.inv(LOOSE) + information)
     unseen_mm = precision.bound_mm(alone, target.points, centre)
     together = np.linalg.inv(np.linalg.inv(covariance) + information)
     error = together @ weighted.T @ distance_mm[near]
@@ -103,10 +100,7 @@ def check_points(
 
 
 def _accepted(result: RegistrationResult) -> tuple[Array, Array, Array]:
-    """Return the pose (4, 4), the covariance (6, 6) and its centre (3,) of an answer.
-
-    The covariance is widened as its bound was: 95 % of errors of known size stay below that.
-    """
+    """Return the pose (4, 4), the covariance (6, 6), widened as the bound, and its centre (3,)."""
     if not isinstance(result, RegistrationResult):
         raise InvalidPointCloudError("a result", type(result).__name__, "pass what `register` returned")
     T, covariance, centre = result.T_target_source, result.covariance, result.centre_mm
@@ -133,11 +127,7 @@ def _check_new(points: Array, result: RegistrationResult) -> None:
 
 
 def _distances(T: Array, points: Array, target: PreparedTarget) -> tuple[Array, Array]:
-    """Measure signed distances (N,), mm, of points (N, 3) to the surface under a pose, and its normals.
-
-    They are exact where the target is a mesh, and NaN where no surface is near. Past the edge of a cut model the
-    distance to it counts as well.
-    """
+    """Measure signed distances (N,), mm, of points (N, 3) to the surface under a pose, and normals."""
     if exact := target.mesh_distances(se3.apply(T, points)):
         return exact
     signed, normals, aside, _ = kernels.residuals_at(T, points, *target.kernel_view, 0.0)
@@ -176,11 +166,6 @@ def _verdict(probability: float, shown_mm: float, open_mm: float, within_mm: flo
     if probability < SURPRISING or shown_mm > within_mm:
         return Verdict.CONTRADICTED
     return Verdict.HOLDS if open_mm <= within_mm else Verdict.SAYS_LITTLE
-
-
-def _loose() -> Array:
-    """Return the (6, 6) covariance of a pose that is only known to be near, mm and rad."""
-    return np.diag([LOOSE_MM**2] * 3 + [np.radians(LOOSE_DEG) ** 2] * 3)
 
 
 def _next(covariance: Array, target: PreparedTarget, centre: Array, variance_mm2: float) -> int:

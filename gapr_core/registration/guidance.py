@@ -9,7 +9,6 @@ remains. Every rival pose that the look would not exclude adds its own distance,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from gapr_core.registration.uncertainty import target_error as precision
 from gapr_core.results import Guidance, Hypothesis, Patch
 
 Array = NDArray[np.float64]
+Patches = dict[int, NDArray[np.int64]]  # indices of a patch's target points, by that of its centre
 
 PATCH_MM, PATCHES = 30.0, 250  # diameter of a patch, and number of patches
 LOOK_POINTS, NOISE_MM, BIAS_MM = 60, 0.5, 0.7  # of a look: points, least white noise, least shared bias
@@ -33,29 +33,12 @@ FACING_COS = 0.3  # least cosine between the normals of a patch and of its centr
 SEEN_SHARE = 0.5  # of a patch, from which it counts as seen
 
 
-@dataclass(frozen=True, eq=False)
-class Patches:
-    """Candidate patches of a target.
-
-    Attributes:
-        centres: (K,) indices of target points.
-        members: for each patch the indices of its target points.
-    """
-
-    centres: NDArray[np.int64]
-    members: list[NDArray[np.int64]]
-
-
 def guide(assessment: Assessment) -> Guidance | None:
-    """Rank patches of the target by the gain of a look there; None where the source covers the whole bone.
-
-    Args:
-        assessment: the best pose so far, its covariance and its rivals.
-    """
+    """Rank patches of the target by the gain of a look there; None where the source covers the whole bone."""
     target = assessment.target
     rivals = sorted(assessment.hypotheses[1:], key=lambda rival: -rival.probability)[:MOST_RIVALS]
     patches = _unseen(_patches(target), assessment)
-    if not len(patches.centres):
+    if not patches:
         return None
     noise_mm = max(assessment.fit.sigma_mm, NOISE_MM)
     bias_mm = max(assessment.uncertainty.bias_mm, BIAS_MM)
@@ -64,7 +47,7 @@ def guide(assessment: Assessment) -> Guidance | None:
     now_mm = float(np.sqrt(assessment.tre95_mm**2 + now_mm2))
     after_mm = np.sqrt(bounds**2 + left_mm2)
     order = np.argsort(after_mm, kind="stable")
-    points, normals = target.points[patches.centres], target.normals[patches.centres]  # copies
+    points, normals = target.points[list(patches)], target.normals[list(patches)]  # copies
     ranked = tuple(
         Patch(points[k], normals[k], float(bounds[k]), float(share[k]), now_mm - float(after_mm[k])) for k in order
     )
@@ -91,9 +74,9 @@ def _patches(target: PreparedTarget) -> Patches:
     """Cut balls around evenly spread points, without points that face away from the centre's normal."""
     centres = sampling.thin(target.points, PATCHES)
     balls = target.tree.query_ball_point(target.points[centres], PATCH_MM / 2.0)
-    members = [np.array(ball)[target.normals[ball] @ target.normals[i] > FACING_COS]
-               for i, ball in zip(centres, balls, strict=True)]  # fmt: skip
-    return Patches(centres, members)
+    facing = (np.array(ball)[target.normals[ball] @ target.normals[i] > FACING_COS]
+              for i, ball in zip(centres, balls, strict=True))  # fmt: skip
+    return dict(zip(centres.tolist(), facing, strict=True))
 
 
 def _unseen(patches: Patches, assessment: Assessment) -> Patches:
@@ -104,8 +87,7 @@ def _unseen(patches: Patches, assessment: Assessment) -> Patches:
         return patches
     surface = assessment.target.elements[:, :3]  # farther out by the stand-off
     near = cKDTree(seen).query(surface)[0] < SEEN_MM
-    kept = [k for k, members in enumerate(patches.members) if near[members].mean() < SEEN_SHARE]
-    return Patches(patches.centres[kept], [patches.members[k] for k in kept])
+    return {centre: members for centre, members in patches.items() if near[members].mean() < SEEN_SHARE}
 
 
 def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: float, bias_mm: float) -> Array:
@@ -114,7 +96,7 @@ def _bounds_mm(assessment: Assessment, patches: Patches, points: int, noise_mm: 
     known, anchors = np.linalg.inv(assessment.uncertainty.covariance), target.points[target.anchors]
     over_all = assessment.tre95_mm / assessment.bound_mm(anchors)  # the anchors represent the bone
     bounds = []
-    for members in patches.members:
+    for members in patches.values():
         J = distance_jacobian(target.points[members], target.normals[members], centre)
         covariance = np.asarray(np.linalg.inv(known + information(J, points, noise_mm, bias_mm)), np.float64)
         bounds.append(over_all * assessment.factor95 * precision.bound_mm(covariance, anchors, centre))
@@ -126,14 +108,14 @@ def _of_rivals(
 ) -> tuple[float, Array, Array]:
     """Compute the rivals' part of the squared bound, mm^2, now and (K,) after each look; (K,) excluded shares."""
     if not rivals:
-        return 0.0, np.zeros(len(patches.centres)), np.ones(len(patches.centres))
+        return 0.0, np.zeros(len(patches)), np.ones(len(patches))
     target, best = assessment.target, assessment.hypotheses[0]
     seen_at = target.elements[:, :3]  # farther out by the stand-off, as in `distances_mm`
     in_source = se3.apply(se3.inverse(best.T_target_source), seen_at)
     distances = np.array([_apart_mm(best, rival, target) for rival in rivals])
     weights = np.array([rival.probability for rival in rivals])
     variance = noise_mm**2 + bias_mm**2
-    excluded = np.array([_excluded(in_source[members], rivals, target, variance) for members in patches.members])
+    excluded = np.array([_excluded(in_source[members], rivals, target, variance) for members in patches.values()])
     left_mm2 = (weights * distances**2) @ (1.0 - excluded).T
     return float(weights @ distances**2), left_mm2, excluded @ weights / max(float(weights.sum()), 1e-12)
 
@@ -156,7 +138,7 @@ def _excluded(patch: Array, rivals: Sequence[Hypothesis], target: PreparedTarget
 
 def _spread(target: PreparedTarget, patches: Patches, gain: Array) -> Array:
     """Spread the gain to every target point (M,): that of the nearest patch; 0 outside of all patches."""
-    distance, nearest = cKDTree(target.points[patches.centres]).query(target.points)
+    distance, nearest = cKDTree(target.points[list(patches)]).query(target.points)
     inside = np.zeros(len(target.points), dtype=bool)
-    inside[np.concatenate(patches.members)] = True
+    inside[np.concatenate(list(patches.values()))] = True
     return np.where(inside, np.maximum(gain[nearest], 0.0), 0.0)

@@ -4,7 +4,7 @@
 |---|---|
 | clean and thin the source | `problem.source` |
 | propose poses, keep the best distinct ones, refine the best, compute its two numbers | `_in_rounds` |
-| the same for a camera's cloud, most of which may not be bone | `scenes.rounds` |
+| the same for a camera's cloud, most of which may not be bone | `_in_scene` |
 | apply the costly checks, correct pose and covariance | `_checked` |
 | weigh the sources before it | `streams.evidence`, of a stream only |
 | fold numbers and findings into the answer | `checks.conclude` |
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from copy import copy, deepcopy
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -26,8 +26,8 @@ from gapr_core.clouds import finite_points
 from gapr_core.config import RegistrarConfig
 from gapr_core.errors import ConfigError, InvalidPointCloudError, MethodUnavailableError
 from gapr_core.registration.caveats import answering
-from gapr_core.registration.checks import cortices, image, table
-from gapr_core.registration.checks.assess import assess_fit, bias_corrected
+from gapr_core.registration.checks import image, table
+from gapr_core.registration.checks.assess import assess_fit, bias_corrected, follows_both_cortices
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.conclude import conclude, unit_question
 from gapr_core.registration.confidence.classifier import Classifier
@@ -40,9 +40,10 @@ from gapr_core.registration.problem import target as targets
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
+from gapr_core.registration.proposals import regions
 from gapr_core.registration.proposals.base import Proposer
 from gapr_core.registration.proposals.search import NormalAlignedSearch
-from gapr_core.registration.scenes import clutter, look_agreement, rounds, scene_fit
+from gapr_core.registration.scenes import clutter, look_agreement, scene_fit
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes.scene import Look, Scene, Viewpoint
 from gapr_core.registration.uncertainty.error_calibration import Precision
@@ -60,6 +61,7 @@ Enough = Callable[[Assessment], bool]  # True for an unsure answer that needs no
 
 NO_POSES = np.empty((0, 4, 4))
 NO_POSE = Refusal(RegistrationStatus.LOW_CONFIDENCE, "no pose to begin with was found: expose more bone")
+MOST_HOPELESS = 2  # rounds in a row of a cloud that may be no scene: later ones hardly ever have an accepted pose
 WITHIN_MM = 15.0  # root mean square over the source from which refinement reaches the same pose
 
 
@@ -129,7 +131,7 @@ class Registrar:
         return cls(config, (pretrained_network(device, weights), _search(config)))
 
     def of_bone_alone(self: Own) -> Own:
-        """Copy the registrar for sources that are all bone: those seen from several places."""
+        """Copy the registrar for sources that are all bone, such as those seen from several places."""
         twin = copy(self)
         twin.config = replace(self.config, clutter=replace(self.config.clutter, infer_viewpoint=False))
         return twin
@@ -156,21 +158,20 @@ class Registrar:
             source: (N, 3), mm, in its own frame; rows that are not finite are dropped. Also a path or a `Surface`.
             target: from `prepare`.
             initial: (4, 4) T_target_source to try as well, such as the pose of the frame before.
-            viewpoint: (3,) mm, source frame: place of the camera, if there was one; (N, 3) its place for each
-                point, of a camera that moved in a frame in which the bone rests. Without it the cloud is registered as
-                bone, and where that pose is refused, as a camera's cloud (`ClutterConfig.infer_viewpoint`).
+            viewpoint: (3,) mm, source frame: place of the camera; (N, 3) its place for each point, of a camera that
+                moved. Without it the cloud is registered as bone, and where that pose is refused, as a camera's cloud
+                (`ClutterConfig.infer_viewpoint`).
 
         Raises:
-            InvalidPointCloudError: wrong shape or type, or an extent that cannot be a piece of a bone in mm. A target
-                that is not prepared, or an `initial` that is no rigid pose. A `viewpoint` that is neither, or that sees
-                nothing of the cloud; more than 16 places.
+            InvalidPointCloudError: wrong shape, type or extent of the source; a target that is not prepared. An
+                `initial` that is no rigid pose. A `viewpoint` that sees nothing of the cloud, or more than 16 of them.
         """
         clock = Clock()
         return self.conclude(self.assess(source, target, initial, viewpoint, clock), clock)
 
     @single_threaded_libraries
     def conclude(self, assessment: Assessment | Refusal, clock: Clock) -> RegistrationResult:
-        """Fold an assessment into the answer; the answer shares no array with a stream."""
+        """Fold an assessment into the answer."""
         if isinstance(assessment, Refusal):
             reason = assessment.reason
             return RegistrationResult(assessment.status, reason=reason, method=self.name, stage_ms=clock.stages)
@@ -179,7 +180,7 @@ class Registrar:
         mostly_clutter = None if accepted else scene_fit.mostly_clutter(assessment, self.config)
         result = conclude(assessment, self.config, mostly_clutter)
         clock.lap("assess")
-        return deepcopy(replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages))
+        return replace(result, guidance=guidance, method=self.name, stage_ms=clock.stages)
 
     @single_threaded_libraries
     def assess(
@@ -191,10 +192,7 @@ class Registrar:
         clock: Clock | None = None,
         enough: Enough = never,
     ) -> Assessment | Refusal:
-        """Register up to the thresholds of the user: for streams, calibration and research.
-
-        An answer that is `enough` ends the rounds.
-        """
+        """Register up to the thresholds of the user; an answer that is `enough` ends the rounds."""
         check_call(target, initial)
         start = NO_POSES if initial is None else inputs.rigid(initial, "initial pose")[None]
         return self.assess_from(source, target, start, viewpoint, clock or Clock(), enough)
@@ -208,7 +206,7 @@ class Registrar:
         clock: Clock,
         enough: Enough = never,
     ) -> Assessment | Refusal:
-        """Assess with any number of start poses: (K, 4, 4) T_target_source, mm, each rigid."""
+        """Assess with start poses (K, 4, 4) T_target_source, mm, each rigid."""
         target = offset_surface(target, self.config.sensor)
         if viewpoint is not None:
             return self._as_scene(scenes.split(source, viewpoint), target, start, clock, enough)
@@ -226,9 +224,9 @@ class Registrar:
     def _as_bone(
         self, source: PreparedSource, target: PreparedTarget, poses: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """Register a source of which all points may be bone; to both cortices where it follows both."""
+        """Register a source of which all points may be bone, to both cortices where it follows both."""
         assessment = self._in_rounds(source, target, poses, clock, enough)
-        if assessment is None or not cortices.follows_both(assessment, self.config):
+        if assessment is None or not follows_both_cortices(assessment, self.config):
             return assessment
         both = assessment.target.both_cortices
         again = None if both is None else self._in_rounds(source, both, assessment.fit.T[None], clock)
@@ -255,18 +253,12 @@ class Registrar:
             assessment = replace(assessment, proposer=proposer.name, rounds=number)
             clock.lap("assess")
             is_known = not given or self._is_near(assessment, poses[given:])
-            if enough(assessment) or (self._needs_no_other_proposer(assessment) and is_known):
+            if enough(assessment) or (assessment.reaches(config.sure_from) and is_known):
                 break
         return assessment
 
-    def _needs_no_other_proposer(self, assessment: Assessment) -> bool:
-        return assessment.reaches(self.config.sure_from)
-
     def _is_near(self, assessment: Assessment, proposed: Array) -> bool:
-        """Return True where a proposer would have reached the best pose without a given one.
-
-        Else its poses are no rivals to the given one: the pose that it missed may be the right one, too.
-        """
+        """Return True where a proposer reached the best pose, too: else its poses are no rivals to a given one."""
         count, T = self.config.verification.markers, assessment.fit.T[None]
         return bool(support(T, proposed, assessment.source, count, WITHIN_MM)[0] > 0.0)
 
@@ -317,7 +309,8 @@ class Registrar:
             return None if found is None else self._checked(found, clock, never)
 
         def mirrored() -> Assessment | None:
-            flipped = scenes.prepared(image.flipped_looks(seen), self.config)
+            looks = [Look(image.flipped(look.points), image.flipped(look.viewpoint)) for look in seen]
+            flipped = scenes.prepared(looks, self.config)
             return None if isinstance(flipped, Refusal) else self._in_scene(flipped, target, NO_POSES, clock, 1)
 
         agreed = look_agreement.unless_apart(assessment, scene, target, alone, self.config)
@@ -333,12 +326,41 @@ class Registrar:
     def _in_scene(
         self, seen: Scene, target: PreparedTarget, poses: Array, clock: Clock, most_rounds: int | None = None
     ) -> Assessment | None:
-        """Register a scene; see `scenes.rounds.register`."""
-        return rounds.register(seen, target, poses, self.classifier, self.config, clock, most_rounds)
+        """Register a view with the regions of round after round, until an answer is sure.
+
+        A cloud that may be no scene has `most_rounds`, and stops after some hopeless ones in a row.
+        """
+        config, settings, threads = self.config, self.config.clutter, self.config.num_threads
+        assessment, hopeless = None, 0
+        rounds = regions.rounds(seen.source, replace(settings, rounds=most_rounds or settings.rounds))
+        for number, found in enumerate(rounds, 1):
+            scene = replace(seen, regions=found)
+            pool = clutter.propose(scene, target, poses, settings, threads)
+            clock.lap("propose")
+            if (pool.region == clutter.GIVEN).all():
+                continue  # a given pose needs a rival
+            start = poses if assessment is None else None
+            candidates = clutter.verify(pool, scene, target, settings, threads, start)
+            poses = candidates.poses
+            clock.lap("verify")
+            assessment = self._assessed_part(candidates, scene, target, clock)
+            assessment = replace(assessment, proposer=clutter.NAME, rounds=number)
+            hopeless = hopeless + 1 if assessment.confidence < settings.hopeless else 0
+            if assessment.reaches(config.sure_from) or (most_rounds is not None and hopeless == MOST_HOPELESS):
+                break
+        return assessment
+
+    def _assessed_part(self, candidates: Candidates, scene: Scene, target: PreparedTarget, clock: Clock) -> Assessment:
+        """Refine the first of the candidates on the part of a scene that it explains, and assess it."""
+        part = scene_fit.refine(candidates.poses[0], scene, target, self.config)
+        clock.lap("refine")
+        assessment = scene_fit.assess_part(part, candidates, scene, target, self.classifier, self.config)
+        clock.lap("assess")
+        return assessment
 
     def _of_one_view(self, source: ArrayLike, target: PreparedTarget, poses: Array, clock: Clock) -> Assessment | None:
         """Register a source that is refused as bone as a camera's cloud; None where that is refused, too."""
-        scene = rounds.of_unknown(source, self.config)
+        scene = clutter.possible_view(source, self.config)
         if scene is None:
             return None
         places, unsure = self._places_of(scene), []
@@ -374,12 +396,7 @@ def as_config(config: object) -> RegistrarConfig:
 
 
 def pretrained_network(device: str = "cpu", weights: str | Path | None = None) -> Proposer:
-    """Load GAPR-Net with weights of one's own, or with the shipped ones.
-
-    Raises:
-        MethodUnavailableError: torch or safetensors is not installed.
-        ConfigError: no such device.
-    """
+    """Load GAPR-Net with weights of one's own, or with the shipped ones; raises as `Registrar.from_pretrained`."""
     try:
         from gapr_core.registration.proposals.network import SHIPPED, NetworkProposer
     except ImportError as error:
@@ -389,11 +406,7 @@ def pretrained_network(device: str = "cpu", weights: str | Path | None = None) -
 
 
 def check_call(target: object, initial: ArrayLike | None) -> None:
-    """Refuse a target that is not prepared, or an `initial` that is no rigid pose, before any change of state.
-
-    Raises:
-        InvalidPointCloudError: as `Registrar.register`.
-    """
+    """Raise for a target that is not prepared, or an `initial` that is no rigid pose."""
     if not isinstance(target, PreparedTarget):
         how = "pass what `prepare` returns for it"
         raise InvalidPointCloudError("a prepared target", type(target).__name__, how)

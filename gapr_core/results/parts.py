@@ -39,12 +39,10 @@ class Refusal:
     Attributes:
         status: every one but `OK`.
         reason: one sentence for users.
-        asks_standoff: the reason asks for the sensor's stand-off already.
     """
 
     status: RegistrationStatus
     reason: str
-    asks_standoff: bool = False
 
 
 class Effect(str, Enum):

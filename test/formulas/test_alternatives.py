@@ -40,7 +40,8 @@ def trial(target, noise_mm=0.05, size=1.0, lift_mm=0.0):
     some = rng.permutation(len(target.points))[:150]
     on = target.points[some] + lift_mm * target.normals[some] + rng.normal(0.0, noise_mm, (150, 3))
     on = on.mean(axis=0) + size * (on - on.mean(axis=0))
-    return Trial.of(T, tiny.assessed(se3.apply(se3.inverse(T), on), target, T).source, target, CONFIG)
+    source = tiny.assessed(se3.apply(se3.inverse(T), on), target, T).source
+    return Trial(T, source.subset(CONFIG.verification.middle_points), target, CONFIG)
 
 
 class Scripted(Trial):

@@ -107,9 +107,10 @@ def test_only_a_pose_that_may_be_accepted_is_pushed(plate, least, probability, i
 def test_only_a_pose_that_rests_elsewhere_and_fits_as_well_is_a_valley(plate, egg, same_mm, rests):
     """On a plate of 20 mm a push by 1.5 times 30 mm leaves it, and is no rest at all."""
     config = replace(CONFIG, verification=replace(CONFIG.verification, same_pose_mm=same_mm))
-    pushed_mm2 = alternatives.pushed(table.trial_of(plate, config), plate.fit)
-    assert (pushed_mm2 < table.as_good_as(table.trial_of(plate, config).own_mm2)) is rests
-    assert alternatives.pushed(table.trial_of(egg, CONFIG), egg.fit) > table.as_good_as(1.0)
+    trial = alternatives.trial_of(plate.fit, plate.source, plate.target, config)
+    assert (alternatives.pushed(trial, plate.fit) < table.as_good_as(trial.own_mm2)) is rests
+    trial = alternatives.trial_of(egg.fit, egg.source, egg.target, CONFIG)
+    assert alternatives.pushed(trial, egg.fit) > table.as_good_as(1.0)
 
 
 def test_a_push_goes_both_ways_along_the_weakest_motions_by_its_length(plate):

@@ -10,7 +10,7 @@ from gapr_core.config import RegistrarConfig, SourceConfig
 from gapr_core.geometry import se3
 from gapr_core.registration.checks.deformation import with_looks
 from gapr_core.registration.confidence.classifier import Classifier
-from gapr_core.registration.confidence.features import FEATURES_OF, SCENE, of_the_fit
+from gapr_core.registration.confidence.features import FEATURES_OF, SCENE, measure
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes import scene_fit as explained
 from gapr_core.registration.scenes.free_space import Visible
@@ -118,12 +118,13 @@ def test_every_feature_of_a_scene_says_what_its_name_says(plane, scene, monkeypa
     """Of lines of sight by hand; of the fit as of any source, with the flatness of the whole cloud."""
     found = explained.refine(np.eye(4), scene, plane, CONFIG)
     monkeypatch.setattr(explained.clutter, "seen_of", lambda *words: seen_as())
-    known, candidates = tiny.uncertainty(2.0, 1.0), tiny.candidates(2.0, 3.0)
-    values = explained.measure(found, candidates, known, scene, plane, CONFIG)
-    flatness_mm = scene.source.flatness_mm[found.members]
-    shared = of_the_fit(found.fit, candidates, known, found.source, flatness_mm, plane, CONFIG)
+    candidates = tiny.candidates(2.0, 3.0)
+    a = explained.assess_part(found, candidates, scene, plane, Classifier.load(), CONFIG)
+    np.testing.assert_array_equal(found.source.flatness_mm, scene.source.flatness_mm[found.members])
+    shared = measure(found.fit, candidates, a.uncertainty, found.source, plane, CONFIG)
+    values = dict(a.features)
     assert tuple(values) == FEATURES_OF[SCENE]
-    expected = shared | {
+    expected = {name: value for name, value in shared.items() if name in values} | {
         "inlier_ratio": found.share,
         "free_space_score": 0.2 - 0.2 * 0.2 - 2.0 * 0.05,
         "log_explained_mm2": np.log(1.0 + 0.2 * len(plane.points) * plane.spacing_mm**2),
@@ -136,6 +137,6 @@ def test_every_feature_of_a_scene_says_what_its_name_says(plane, scene, monkeypa
 
 @pytest.mark.parametrize(("scores", "margin"), [((1.0, 100.0), 3.0), ((1.0, 1e-9), -3.0), ((2.0,), 0.0)])
 def test_the_margin_has_ends_and_a_pose_without_a_rival_has_none(plane, scores, margin):
-    found = explained._visible_features(seen_as(0.2, 3.0, 0.0), tiny.candidates(*scores), plane)
+    found = explained.features_of_view(seen_as(0.2, 3.0, 0.0), tiny.candidates(*scores), plane)
     assert found["rival_margin"] == margin and found["violating_of_compared"] == 1.0
     assert found["explained_of_compared"] == pytest.approx(0.2e6)  # nothing was compared: no division by 0

@@ -10,7 +10,6 @@ from gapr_core.geometry.sampling import fibonacci_directions
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.confidence.classifier import Judgement
 from gapr_core.registration.fit import refinement
-from gapr_core.registration.fit.surface_kernels import padded
 from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.target import PreparedTarget
@@ -74,11 +73,6 @@ def on_ellipsoid(count, seed=0, axes_mm=(30.0, 20.0, 12.0)):
     """Random surface points."""
     directions = np.random.default_rng(seed).normal(size=(count, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True) * axes_mm
-
-
-def rows(points) -> np.ndarray:
-    """Room for the rows that the normal equations of points (N, 3) are summed from, full of what must not count."""
-    return np.full((7, padded(len(points))), 7.0)
 
 
 def uncertainty(shift_mm=0.1, turn_deg=0.1) -> PoseUncertainty:

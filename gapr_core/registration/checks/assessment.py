@@ -1,8 +1,4 @@
-"""The assessment of a pose: the best pose of a source on a target and everything known of it.
-
-Two steps change an assessment after the fit: `judge` sets its two numbers, and `with_finding` adds the finding of a
-check. `conclude` folds both into the answer.
-"""
+"""The assessment of a pose: its fit, its two numbers, and the findings of the checks; `conclude` folds them."""
 
 from __future__ import annotations
 
@@ -143,15 +139,14 @@ class Assessment:
 
 
 def shared_probability(best: float, scores: Array, independent_points: float = INDEPENDENT_POINTS) -> tuple[float, ...]:
-    """Share the probability among ranked hypotheses.
+    """Share the remainder of the best hypothesis's probability among its rivals, by their likelihoods.
 
     A rival's likelihood relative to the best is exp(-n / 2 (s / s_best - 1)): that of n independent residuals whose
-    variance is the best one's mean square. The remainder of the best's probability to 1 is shared in these proportions.
-    No rival gets more than its likelihood times the best one's probability.
+    variance is the best one's mean square. No rival gets more than its likelihood times the best one's probability.
 
     Args:
         best: probability of the best, 0 to 1.
-        scores: (K,) mean squares of the residuals, mm^2, best first.
+        scores: (K,) mean squares s of the residuals, mm^2, best first.
         independent_points: n, 0 or more.
     """
     likelihood = np.exp(-0.5 * independent_points * np.maximum(scores[1:] / scores[0] - 1.0, 0.0))

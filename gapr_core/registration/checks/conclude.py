@@ -16,7 +16,7 @@ from gapr_core.clouds import MM_PER_UNIT, PLAUSIBLE
 from gapr_core.config import RegistrarConfig
 from gapr_core.geometry import extent
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.table import refuse, trial_of
+from gapr_core.registration.checks.table import refuse
 from gapr_core.registration.confidence import feature_labels
 from gapr_core.registration.fit import alternatives
 from gapr_core.results import Effect, Finding, RegistrationResult, RegistrationStatus, confidence_text
@@ -37,23 +37,24 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
         config: thresholds of the user.
         clutter: name of the refusal where most of the cloud is not this bone.
     """
-    a, tre95_mm = assessment, assessment.tre95_mm
-    refusal = a.refusal or below_thresholds(a, tre95_mm, config)
+    a, tre95_mm, judged = assessment, assessment.tre95_mm, assessment.judgement
+    against = feature_labels.against(judged.contributions)
+    refusal = a.refusal or by_threshold(a.confidence, judged.pose_probability, tre95_mm, config, against)
     if refusal is not None and clutter is not None:
         refusal = replace(clutter, text=f"{clutter.text}; {refusal.text}")
     findings = a.findings if refusal is None or refusal in a.findings else (*a.findings, refusal)
     common = RegistrationResult(
         status=RegistrationStatus.LOW_CONFIDENCE,
         confidence=a.confidence,
-        pose_probability=a.judgement.pose_probability,
-        bone_evidence=a.judgement.bone_evidence,
+        pose_probability=judged.pose_probability,
+        bone_evidence=judged.bone_evidence,
         findings=findings,
         inlier_ratio=a.features["inlier_ratio"],
         hypotheses=a.hypotheses,
         proposer=a.proposer,
         rounds=a.rounds,
         features=a.features,
-        contributions=a.judgement.contributions,
+        contributions=judged.contributions,
         residuals=a.residuals,
         inferred_viewpoint=a.inferred_viewpoint,
         looks=a.looks,
@@ -74,17 +75,10 @@ def conclude(assessment: Assessment, config: RegistrarConfig, clutter: Finding |
     return replace(common, status=refusal.status, reason=reason, findings=(*findings, *asked))
 
 
-def below_thresholds(a: Assessment, tre95_mm: float, config: RegistrarConfig) -> Finding | None:
-    """Find that a pose misses the user's thresholds; a confidence of NaN misses them."""
-    return by_threshold(
-        a.confidence, a.judgement.pose_probability, tre95_mm, config, feature_labels.against(a.judgement.contributions)
-    )
-
-
 def by_threshold(
     confidence: float, pose_probability: float, tre95_mm: float, config: RegistrarConfig, against: str = ""
 ) -> Finding | None:
-    """Find that numbers miss the user's thresholds; None where they meet them."""
+    """Find that numbers miss the user's thresholds, as a confidence of NaN does; None where they meet them."""
     least, most_mm = config.min_confidence, config.max_tre_mm
     if not confidence >= least:
         status = RegistrationStatus.LOW_CONFIDENCE
@@ -112,12 +106,9 @@ def questions(a: Assessment, refusal: Finding, config: RegistrarConfig) -> Seque
 
 
 def unit_question(source: Array, target: Array) -> Finding | None:
-    """Ask for the unit where the cloud would have the bone's size in another one.
+    """Ask for the unit where the source, read as mm, would have the target's size in another one.
 
     A short scan of a long bone is as small as a whole one in cm taken for mm; one too round for the bone is neither.
-
-    Args:
-        source, target: (N, 3) and (M, 3), read as mm.
     """
     low, high = PLAUSIBLE
     extent_mm, target_mm = Surface(source).extent_mm, Surface(target).extent_mm
@@ -137,7 +128,7 @@ def _sides(points: Array, percentiles: tuple[float, float]) -> Array:
 
 def standoff_question(a: Assessment, config: RegistrarConfig) -> Finding | None:
     """Ask for the stand-off with which the source would fit clearly better, refined from the pose."""
-    best_mm, log_ratio = alternatives.standoff(trial_of(a, config))
+    best_mm, log_ratio = alternatives.standoff(alternatives.trial_of(a.fit, a.source, a.target, config))
     if not log_ratio < -STANDOFF_BETTER:
         return None
     off_mm, stated_mm = a.target.offset_mm + best_mm, config.sensor.standoff_mm

@@ -1,8 +1,7 @@
-"""Deformations of the source: strains, halves, layers and looks that err widen the covariance.
+"""Deformations of the source widen the covariance; each is a test of the residuals (`unknowns`).
 
-A scan that drifts, or slices that lie too far apart, strain the source. In a scan of two that do not fit, or of a bone
-that is bent or broken, one half lies in another pose. Under tissue that grows thicker the distance from the bone
-changes. The looks of a tracked camera err against each other. Each is a test of the residuals (`unknowns`).
+A scan that drifts strains the source. Of a broken bone one half lies in another pose. Under tissue that grows thicker
+the distance from the bone changes. The looks of a tracked camera err against each other.
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ class Deformation(NamedTuple):
 
 
 def deformation(fit: Fit) -> tuple[Finding, Array] | None:
-    """Find deformations of a source, and the covariance (6, 6) that they add to that of its pose.
-
-    Several may be found at once: a bent source is strained, too. The finding names the surest.
-    """
+    """Find deformations of a source, and the covariance (6, 6) that all of them add; the finding names the surest."""
     detected = {name: each for name, each in of_deformations(fit.full_fit).items() if each.shown.log_ratio > each.limit}
     if not detected:
         return None
@@ -97,8 +93,7 @@ def halves(fit: Fit) -> list[Array]:
 def a_layer(fit: Fit) -> Array:
     """Compute (n, 4) derivatives by a layer on the bone: its growth along x, y and z, and its mean.
 
-    No residual shows the mean. A layer that grows evenly from nothing has a mean of root 3 times its standard
-    deviation.
+    A layer that grows evenly from nothing has a mean of root 3 times its standard deviation.
     """
     feet = fit.feet[fit.counts]
     away = (feet - feet.mean(axis=0)) / extent.radius_mm(feet)
@@ -106,13 +101,7 @@ def a_layer(fit: Fit) -> Array:
 
 
 def with_looks(uncertainty: PoseUncertainty, fit: Fit, look: NDArray[np.int64] | None) -> PoseUncertainty:
-    """Add the errors of looks against each other, each a motion of its own, to an uncertainty.
-
-    Args:
-        uncertainty: covariance of the common pose of all looks.
-        fit: the common pose.
-        look: (N,) number of each point's look; None of a single one.
-    """
+    """Add the errors of looks (N,), if there are several, to the uncertainty of their common pose."""
     looks = None if look is None else of_looks(fit, look)
     if looks is None or not looks.shown.log_ratio > looks.limit:
         return uncertainty

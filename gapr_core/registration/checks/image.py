@@ -6,13 +6,13 @@ that is not sure, or of few points, takes the best pose that the first proposer 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from gapr_core.config import RegistrarConfig
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.table import MIRRORED_BETTER, trial_of
+from gapr_core.registration.checks.table import MIRRORED_BETTER
 from gapr_core.registration.fit import alternatives
 from gapr_core.registration.fit.alternatives import flipped
 from gapr_core.registration.fit.refinement import evaluate
@@ -20,7 +20,6 @@ from gapr_core.registration.fit.verification import Candidates, mean_square_mm2
 from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
-from gapr_core.registration.scenes.scene import Look
 from gapr_core.results import Refusal
 from gapr_core.runtime.clock import Clock
 
@@ -46,9 +45,10 @@ def log_ratio(
         believed: the answer is sure.
         propose: finds poses of the mirror image.
         scene: registers the mirror image of a camera's whole view; None without a given place of a camera.
-        clock: stage times of the call.
+        clock: stage times.
     """
-    trial, count = trial_of(assessment, config), len(assessment.source.points)
+    trial = alternatives.trial_of(assessment.fit, assessment.source, assessment.target, config)
+    count = len(assessment.source.points)
     if alternatives.is_symmetric(trial):
         return np.inf
     found = alternatives.on_own_image(trial)
@@ -56,17 +56,15 @@ def log_ratio(
     if not by_chance or found < -MIRRORED_BETTER:
         return found
     if scene is not None:
-        return _of_scene(assessment, scene())
+        image = scene()
+        if image is None or not image.confidence > assessment.confidence:  # a poor one may score slightly better
+            return np.inf
+        return float(np.log(image.candidates.scores[0] / assessment.candidates.scores[0]))
     mirrored = sources.prepare(flipped(assessment.source.whole), config.source, config.num_threads)
     found_poses = None if isinstance(mirrored, Refusal) else propose(mirrored, assessment.target, clock)
     if found_poses is None or isinstance(mirrored, Refusal):
         return np.inf
     return _of_bone(assessment, mirrored, found_poses, config)
-
-
-def flipped_looks(seen: Sequence[Look]) -> list[Look]:
-    """Mirror the looks of a camera."""
-    return [Look(flipped(look.points), flipped(look.viewpoint)) for look in seen]
 
 
 def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config: RegistrarConfig) -> float:
@@ -79,13 +77,3 @@ def _of_bone(a: Assessment, mirrored: PreparedSource, image: Candidates, config:
         alternatives.log_ratio(float(image.scores[0]), own),
         alternatives.log_ratio(sigma_mm**2, a.fit.sigma_mm**2),
     )
-
-
-def _of_scene(assessment: Assessment, image: Assessment | None) -> float:
-    """Compute the log ratio of scores of lines of sight, 1 / score each; infinite where the image is no surer.
-
-    A poor image may score slightly better mirrored. On the bone of the other side the mirrored one is sure (.999).
-    """
-    if image is None or not image.confidence > assessment.confidence:
-        return np.inf
-    return float(np.log(image.candidates.scores[0] / assessment.candidates.scores[0]))

@@ -15,22 +15,14 @@ from gapr_core.geometry import se3
 from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.checks.deformation import deformation
 from gapr_core.registration.fit import alternatives
-from gapr_core.registration.fit.alternatives import Trial
-from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.results import Effect, Finding, RegistrationStatus
 
 Check = Callable[[Assessment, RegistrarConfig], Assessment]
-Register = Callable[[PreparedSource], Assessment | None]
 
 LARGEST_TURN_DEG, LARGEST_SHIFT_MM = 6.0, 5.0  # standard deviations of a motion that is not observed
 EQUAL_SHARE, EQUAL_MM = 0.015, 0.25  # mean square of a rival as good over the best's, less 1; the same as a length
 MIRRORED_BETTER = 0.01  # log of mean squares by which the mirror image may fit better
 MORE_BONE = "measure another side or an end of the bone"
-
-
-def trial_of(assessment: Assessment, config: RegistrarConfig) -> Trial:
-    """Try changes of an assessed pose."""
-    return Trial.of(assessment.fit.T, assessment.source, assessment.target, config)
 
 
 def unobserved_motion(a: Assessment, config: RegistrarConfig) -> Assessment:
@@ -57,7 +49,7 @@ def equal_rival(a: Assessment, config: RegistrarConfig) -> Assessment:
 
 def flat_valley(a: Assessment, config: RegistrarConfig) -> Assessment:
     """Refuse a pose that, pushed along its weakest motions, rests elsewhere and explains the source as well."""
-    trial = trial_of(a, config)
+    trial = alternatives.trial_of(a.fit, a.source, a.target, config)
     pushed_mm2, limit_mm2 = alternatives.pushed(trial, a.fit), as_good_as(trial.own_mm2)
     if not pushed_mm2 < limit_mm2:
         return a

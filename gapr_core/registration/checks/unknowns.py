@@ -69,7 +69,7 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64]) -
 
     Args:
         fit: the residuals.
-        free: (n, j) derivatives of the inliers' residuals by the nuisance unknowns.
+        free: (n, j) their derivatives by the nuisance unknowns.
         more: m times (n, k), the same by the further unknowns; k may differ.
         group: (n,) number of a group; a block holds points of one.
     """
@@ -89,10 +89,7 @@ def blocks(fit: Fit, free: Array, more: list[Array], group: NDArray[np.int64]) -
 
 
 def motions(fit: Fit) -> Array:
-    """Compute (n, 6) changes of the inliers' residuals by shifts and by turns about their middle, of 1 mm each.
-
-    A turn of 1 mm is one by 1 mm over their root mean square distance from the middle.
-    """
+    """Compute (n, 6) changes of the inliers' residuals by shifts and turns about their middle, of 1 mm rms each."""
     inlier = fit.counts
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
     return distance_jacobian(moved, normals, moved.mean(axis=0)) / np.repeat([1.0, extent.radius_mm(moved)], 3)

@@ -7,10 +7,10 @@ outside the fitted range counts as its edge.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gapr_core.errors import WeightsError
 
 Array = NDArray[np.float64]
+Model = TypeVar("Model")
 FORMAT = 3
 FIT_AGAIN = "fit it again: python -m gapr_core.calibration --anatomy DIR --out DIR"
 
@@ -75,11 +76,7 @@ def as_dict(model: Additive) -> dict[str, Any]:
 
 
 def from_dict(data: Mapping[str, Any]) -> Additive:
-    """Build the model that `as_dict` wrote.
-
-    Raises:
-        ValueError: knots that do not ascend, another number of additions than of knots, or values that are not finite.
-    """
+    """Build the model that `as_dict` wrote; raises ValueError for damaged curves."""
     curves = tuple(Curve(str(c["feature"]), np.array(c["knots"], float), np.array(c["adds"], float))
                    for c in data["curves"])  # fmt: skip
     for curve in curves:
@@ -94,11 +91,7 @@ def from_dict(data: Mapping[str, Any]) -> Additive:
 
 
 def read(path: Path, kind: str) -> dict[str, Any]:
-    """Read the content of a model's file.
-
-    Args:
-        path: a JSON file.
-        kind: required kind in the file, for example "confidence".
+    """Read the content of a model's JSON file of a kind, for example "confidence".
 
     Raises:
         WeightsError: no such file, a damaged one, or one of another format or kind.
@@ -113,3 +106,12 @@ def read(path: Path, kind: str) -> dict[str, Any]:
     if given != (FORMAT, kind):
         raise WeightsError(f"a {kind} model of format {FORMAT}", f"{path}: {given[1]} of {given[0]}", FIT_AGAIN)
     return dict(data)
+
+
+def load(path: str | Path, kind: str, build: Callable[[dict[str, Any]], Model]) -> Model:
+    """Read a model's file and build the model; raises WeightsError, as `read`, where the content is damaged."""
+    data = read(Path(path), kind)
+    try:
+        return build(data)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise WeightsError(f"a whole {kind} model", f"{path}: {error!r}", FIT_AGAIN) from error

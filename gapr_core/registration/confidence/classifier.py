@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.special import expit
 
 from gapr_core.errors import WeightsError
-from gapr_core.registration.confidence.additive import FIT_AGAIN, Additive, from_dict, read
+from gapr_core.registration.confidence.additive import FIT_AGAIN, Additive, from_dict, load
 from gapr_core.registration.confidence.features import FEATURES_OF
 
 SHIPPED = Path(__file__).parents[2] / "weights" / "confidence.json"
@@ -45,12 +46,7 @@ class Judgement:
 
 
 def joint(judgement: Judgement, other_bone_prior: float) -> float:
-    """Compute P(pose | this bone) x P(this bone).
-
-    Args:
-        judgement: the two numbers.
-        other_bone_prior: probability, before the data, of another subject's bone; 0 to 1.
-    """
+    """Compute P(pose | this bone) x P(this bone), with a prior probability, 0 to 1, of another subject's bone."""
     return judgement.pose_probability * bone_probability(judgement.bone_evidence, other_bone_prior)
 
 
@@ -85,28 +81,21 @@ class Classifier:
         Raises:
             WeightsError: no such file, another format, other features, or a damaged file.
         """
-        path = Path(path)
-        data = read(path, "confidence")
-        try:
-            pose = {kind: from_dict(model) for kind, model in data["pose"].items()}
-            bone = {kind: from_dict(model) for kind, model in data["bone"].items()}
-            found = Classifier(pose, bone, float(data["rho_pose"]), float(data["rho_bone"]), dict(data["card"]))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise WeightsError("a whole confidence model", f"{path}: {error!r}", FIT_AGAIN) from error
+
+        def build(data: dict[str, Any]) -> Classifier:
+            pose, bone = ({kind: from_dict(model) for kind, model in data[name].items()} for name in ("pose", "bone"))
+            return Classifier(pose, bone, float(data["rho_pose"]), float(data["rho_bone"]), dict(data["card"]))
+
+        found = load(path, "confidence", build)
         for kind, names in FEATURES_OF.items():
-            for models in (pose, bone):
+            for models in (found.pose, found.bone):
                 if kind not in models or not set(models[kind].features) <= set(names):
                     expected = f"models of {kind!r} with features among {names}"
                     raise WeightsError(expected, f"{path}: {models.get(kind)}", FIT_AGAIN)
         return found
 
     def judge(self, kind: str, features: Mapping[str, float]) -> Judgement:
-        """Compute the two numbers of an answer.
-
-        Args:
-            kind: a key of `features.FEATURES_OF`.
-            features: measurements of the answer, at least those of the models.
-        """
+        """Compute the two numbers of an answer of a kind (`features.FEATURES_OF`) from its features."""
         log_odds = np.clip(self.pose[kind].value(features), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
         evidence = np.clip(self.bone[kind].value(features) / np.log(10.0), -LARGEST_EVIDENCE, LARGEST_EVIDENCE)
         return Judgement(float(log_odds), float(evidence), self.pose[kind].contributions(features))

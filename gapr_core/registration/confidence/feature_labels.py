@@ -37,10 +37,6 @@ FEATURE_LABELS = {
 
 
 def against(contributions: Mapping[str, float]) -> str:
-    """Name the features with the most negative log odds; "" where none is below `WORTH_NAMING`.
-
-    Returns:
-        Such as "fit of the mirrored source, size of the residuals".
-    """
+    """Name the features with the most negative log odds; "" where none is below `WORTH_NAMING`."""
     named = sorted((adds, name) for name, adds in contributions.items() if adds <= WORTH_NAMING)[:MOST_NAMED]
     return ", ".join(FEATURE_LABELS.get(name, name) for _, name in named)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,6 @@ from gapr_core.geometry.extent import half_extent_mm
 from gapr_core.geometry.planes import fit_planes
 from gapr_core.registration.confidence.roughness import SURE_SIGMAS, rough_misfit_mm
 from gapr_core.registration.fit import alternatives
-from gapr_core.registration.fit.alternatives import Trial
 from gapr_core.registration.fit.refinement import SD_OF_MEDIAN, Fit
 from gapr_core.registration.fit.verification import Candidates
 from gapr_core.registration.problem import sensor
@@ -62,42 +63,23 @@ def measure(
     source: PreparedSource,
     target: PreparedTarget,
     config: RegistrarConfig,
+    of_view: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Measure the features of a source that is bone alone; every one is finite.
+    """Measure the features of an answer; every one is finite.
 
     Args:
-        fit: the refined pose and its residuals.
-        candidates: the distinct poses, best first.
-        uncertainty: covariance of the pose.
+        fit, candidates, uncertainty: the refined pose, the distinct poses, best first, and the pose's covariance.
         source: the registered source.
         target: the bone.
         config: settings of the refinement of changed sources, and the sensor.
+        of_view: features of a camera's view (`scene_fit.features_of_view`); None of a source that is bone alone.
     """
-    second = candidates.scores[1] if len(candidates.scores) > 1 else RIVAL_IF_ALONE * candidates.scores[0]
-    values = of_the_fit(fit, candidates, uncertainty, source, source.flatness_mm, target, config) | {
-        "inlier_ratio": float(fit.counts.mean()),
-        "residual": float(np.sqrt(candidates.scores[0])),
-        "margin": float(np.log(max(second / candidates.scores[0], 1.0) - 1.0 + LEAST_MARGIN)),
-        "log_hypotheses": float(np.log(candidates.hypotheses)),
-    }
-    return {name: values[name] for name in FEATURES_OF[BONE]}
-
-
-def of_the_fit(
-    fit: Fit,
-    candidates: Candidates,
-    uncertainty: PoseUncertainty,
-    source: PreparedSource,
-    flatness_mm: Array,
-    target: PreparedTarget,
-    config: RegistrarConfig,
-) -> dict[str, float]:
-    """Measure the features that both kinds share; `flatness_mm` (N,) is of the whole cloud, `source` was fitted."""
-    inlier = fit.counts
+    inlier, kind = fit.counts, BONE if of_view is None else SCENE
     agreement = np.abs(np.einsum("ni,ni->n", source.normals @ fit.T[:3, :3].T, fit.gradients))
-    return {
+    noise_mm = max(noise_of(source.flatness_mm, source, fit), LEAST_NOISE_MM)
+    values = {
         "log_sigma": float(np.log(fit.sigma_mm)),
-        "log_excess": float(np.log(fit.sigma_mm / max(noise_of(flatness_mm, source, fit), LEAST_NOISE_MM))),
+        "log_excess": float(np.log(fit.sigma_mm / noise_mm)),
         "smooth_misfit": uncertainty.smooth_mm,
         "short_misfit": uncertainty.short_mm,
         "support": float(candidates.support[0]),
@@ -107,14 +89,27 @@ def of_the_fit(
         "log_points": float(np.log(len(source.points))),
         "extent": half_extent_mm(source.points) / target.half_extent_mm,
         **of_another_bone(fit, source, target, config),
+        **(of_bone_alone(fit, candidates) if of_view is None else of_view),
+    }
+    return {name: values[name] for name in FEATURES_OF[kind]}
+
+
+def of_bone_alone(fit: Fit, candidates: Candidates) -> dict[str, float]:
+    """Measure the features that only a source of bone alone has."""
+    best = candidates.scores[0]
+    second = candidates.scores[1] if len(candidates.scores) > 1 else RIVAL_IF_ALONE * best
+    return {
+        "inlier_ratio": float(fit.counts.mean()),
+        "residual": float(np.sqrt(best)),
+        "margin": float(np.log(max(second / best, 1.0) - 1.0 + LEAST_MARGIN)),
+        "log_hypotheses": float(np.log(candidates.hypotheses)),
     }
 
 
 def noise_of(flatness_mm: Array, source: PreparedSource, fit: Fit) -> float:
     """Estimate the noise of a point, mm, from its neighbours: the upper end of its likely range.
 
-    Noise and the curvature of the bone take neighbours off their plane. Their foot points show the curvature alone, and
-    variances add up. The median of the remainder has the standard error of one of as many independent patches.
+    Noise and the curvature of the bone take neighbours off their plane; their foot points show the curvature alone.
     """
     curved_mm = fit_planes(fit.full_fit.feet, source.patches)[1]
     left_mm2 = flatness_mm**2 - curved_mm**2
@@ -129,7 +124,7 @@ def of_another_bone(
     fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig
 ) -> dict[str, float]:
     """Measure the fit of sources of another size, side of the body or subject."""
-    trial = Trial.of(fit.T, source, target, config)
+    trial = alternatives.trial_of(fit, source, target, config)
     scale, scale_sd = scale_of(fit)
     usual = max(SURE_SIZE, sensor.errors(config.sensor, len(source.points)).scale)
     return {
@@ -144,14 +139,10 @@ def of_another_bone(
 
 
 def scale_of(fit: Fit) -> tuple[float, float]:
-    """Estimate the growth with which the source fits best, and its standard deviation.
+    """Estimate the size less 1 with which the source fits best (0.05: it is 5 % too small), and its deviation.
 
     Generalised least squares with a smooth bias (see `linear_model`), of the pose's six motions, the size, by which a
-    residual grows as n . (q - c) at its foot point q, and a shared stand-off. That looks much like another size on a
-    patch seen from one side. The size of the bias follows from the remaining residuals.
-
-    Returns:
-        The size less 1 (0.05: the source is 5 % too small), and its standard deviation, each at most 1.
+    residual grows as n . (q - c) at its foot point q, and a shared stand-off, which looks much alike from one side.
     """
     fit = fit.full_fit
     if np.count_nonzero(fit.counts) < FEWEST_FOR_SIZE:

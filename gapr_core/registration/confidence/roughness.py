@@ -1,10 +1,9 @@
 """The misfit that changes within centimetres: a sign of another bone, or of a wrong pose.
 
-A sensor errs over whole regions (soft tissue, a warped scan): residuals 12 to 16 mm apart are nearly as alike as those
-of neighbours. Another subject's bone fits here and not there, ridge by ridge. So the covariance of the residuals at
-short range, less that at longer range, tells the two apart (an empirical covariogram; Matheron 1963). Noise takes no
-part: it is independent from point to point. Large residuals are damped: a few of them would decide. The feature is the
-upper end of the likely difference. It stays large if there are too few pairs: unseen misfit is never treated as zero.
+A sensor errs over whole regions; another subject's bone fits here and not there, ridge by ridge. So the covariance of
+the residuals at short range, less that at longer range, tells the two apart (an empirical covariogram; Matheron 1963).
+Independent noise takes no part. The feature is the upper end of the likely difference, which is large of few pairs:
+unseen misfit is never treated as zero.
 """
 
 from __future__ import annotations
@@ -41,23 +40,16 @@ def rough_misfit_mm(fit: Fit) -> float:
         return float(np.sqrt(largest_mm2))
     near_mm2, far_mm2 = total / count
     possible_mm2 = near_mm2 - far_mm2 + SURE_SIGMAS * largest_mm2 * np.sqrt((2.0 / count).sum())
-    return signed_root(min(possible_mm2, largest_mm2))
+    difference_mm2 = min(possible_mm2, largest_mm2)
+    return float(np.sign(difference_mm2) * np.sqrt(abs(difference_mm2)))
 
 
 def on_the_bone(fit: Fit) -> tuple[Array, Array]:
-    """Compute (M, 3) foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm.
-
-    Foot points: noise must not decide which points are near. Rounded: nor must the last bits of a pose.
-    """
+    """Compute (M, 3) rounded foot points of the inliers and their (M,) damped residuals r (1 - (r / 4 sigma)^2), mm."""
     inlier = fit.counts
     signed = fit.signed_mm[inlier]
     damped = signed * np.maximum(1.0 - (signed / (LARGEST_SIGMAS * fit.sigma_mm)) ** 2, 0.0)
     return fit.feet[inlier].round(DIGITS), damped
-
-
-def signed_root(difference_mm2: float) -> float:
-    """Compute the root, mm, of the size of a difference of covariances, with its sign."""
-    return float(np.sign(difference_mm2) * np.sqrt(abs(difference_mm2)))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

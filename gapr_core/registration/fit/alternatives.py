@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,11 +50,6 @@ class Trial:
     target: PreparedTarget
     config: RegistrarConfig
 
-    @classmethod
-    def of(cls, T: Array, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig) -> Trial:
-        """Try changes on the middle points of a source."""
-        return cls(T, source.subset(config.verification.middle_points), target, config)
-
     def refined(
         self, poses: Array, points: Array | None = None, target: PreparedTarget | None = None
     ) -> tuple[Array, Array]:
@@ -71,6 +66,12 @@ class Trial:
     def log_ratio(self, changed_mm2: float) -> float:
         """Compute the log of a mean square, mm^2, over that of the own pose."""
         return log_ratio(changed_mm2, self.own_mm2)
+
+
+@lru_cache(maxsize=1)  # features and checks of one fit share it
+def trial_of(fit: Fit, source: PreparedSource, target: PreparedTarget, config: RegistrarConfig) -> Trial:
+    """Try changes of a fit on the middle points of its source."""
+    return Trial(fit.T, source.subset(config.verification.middle_points), target, config)
 
 
 def log_ratio(changed_mm2: float, own_mm2: float) -> float:
@@ -104,7 +105,7 @@ def standoff(trial: Trial, standoffs_mm: Sequence[float] = STANDOFFS_MM) -> tupl
 def pushed(trial: Trial, fit: Fit) -> float:
     """Compute the least mean square, mm^2, of the pose pushed along its weakest motions and at rest elsewhere.
 
-    Infinite where every push comes back. No other hypothesis shows a flat valley, since each stays where it began.
+    Infinite where every push comes back.
     """
     same_mm = trial.config.verification.same_pose_mm
     pushes, centre = _weakest_motions(fit) * PUSH * same_mm, fit.moved.mean(axis=0)

@@ -32,15 +32,21 @@ END = ROWS + 7 * B
 
 
 @numba.njit(**FAST)
-def accumulate(T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g):
-    """Fill the normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle."""
+def accumulate(
+    T, points, trust, middle, elements, nearest, origin, per_cell, spacing, limit, variance, H, g, front=0.0
+):
+    """Fill the normal equations H twist = g, weighted; twist = x y z rx ry rz about the moved middle.
+
+    `limit` is Tukey's, `front` that of points outside of the surface, if it is another one.
+    """
+    front = front if front > 0.0 else limit
     centre = moved(T, middle)
     block, reach = np.empty(END), ELEMENT_RADIUS * spacing
     H[:], g[:] = 0.0, 0.0
     for start in range(0, len(points), B):
         stop = min(start + B, len(points))
         count = gather(T, points, trust, start, stop, elements, nearest, origin, per_cell, block)
-        fill_rows(block, count, centre, reach, limit, variance)
+        fill_rows(block, count, centre, reach, limit, front, variance)
         add_up(block, count, H, g)
     for a in range(6):
         for b in range(a):
@@ -94,7 +100,7 @@ def distance_of(block, c, reach, variance):
 
 
 @numba.njit(**FAST)
-def fill_rows(block, count, centre, reach, limit, variance):
+def fill_rows(block, count, centre, reach, limit, front, variance):
     """Fill the rows: derivatives of the residuals by the twist about `centre` (3), and the residuals.
 
     Both are times root w: w is the trust times Tukey's weight, and the noise's share in the variance if that is given.
@@ -104,7 +110,7 @@ def fill_rows(block, count, centre, reach, limit, variance):
     for c in range(count):
         r, nx, ny, nz, aside = distance_of(block, c, reach, variance)
         total = noise + known * block[VARIANCE + c]
-        root = np.sqrt(block[TRUST + c] * tukey(r * r + aside * aside, limit) * noise / total)
+        root = np.sqrt(block[TRUST + c] * tukey(r * r + aside * aside, front if r > 0.0 else limit) * noise / total)
         nx, ny, nz = root * nx, root * ny, root * nz
         x, y, z = block[X + c] - cx, block[Y + c] - cy, block[Z + c] - cz
         block[ROWS + c], block[ROWS + B + c], block[ROWS + 2 * B + c] = nx, ny, nz

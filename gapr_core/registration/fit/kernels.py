@@ -3,6 +3,7 @@
 A residual is the signed distance of a moved source point to the quadric of the surface near it. Isotropic noise of
 variance s^2 lifts the expected distance to a curved surface by -s^2 tr(shape) / 2 (outwards where it is convex). Given
 that variance, the offset is subtracted. Without it the pose of a one-sided cloud is pushed along the direction of view.
+Means take no fast mathematics: a residual is NaN where no surface is near.
 """
 
 # mypy: ignore-errors
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from gapr_core.geometry.quadric_kernels import EXACT
 from gapr_core.registration.fit.block_kernels import accumulate, mean_square
 from gapr_core.registration.fit.surface_kernels import FAST, element_near, moved, residual
 
@@ -143,3 +145,36 @@ def distinct(moved_points, order, tolerance, most):
             if count == most:
                 break
     return kept[:count]
+
+
+@numba.njit(**EXACT)
+def patch_means(residuals, weights, neighbours):
+    """Compute (N,) weighted means of the residuals of each point's neighbours (N, k) that have a weight."""
+    out = np.empty(len(neighbours))
+    for p in range(len(neighbours)):
+        total, weight = 0.0, 1e-9
+        for q in neighbours[p]:
+            if weights[q] > 0.0:
+                total += weights[q] * residuals[q]
+                weight += weights[q]
+        out[p] = total / weight
+    return out
+
+
+@numba.njit(**EXACT)
+def leading_means(values, counts, neighbours, count):
+    """Average `values` over the first `count` of each point's neighbours (N, k) that count.
+
+    Returns (N,), NaN where too few count; `counts` (N,) marks the points that count.
+    """
+    out = np.full(len(neighbours), np.nan)
+    for p in range(len(neighbours)):
+        total, found = 0.0, 0
+        for q in neighbours[p]:
+            if counts[q]:
+                total += values[q]
+                found += 1
+                if found == count:
+                    out[p] = total / count
+                    break
+    return out

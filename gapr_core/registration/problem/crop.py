@@ -3,44 +3,30 @@
 from __future__ import annotations
 
 from numbers import Real
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from gapr_core.clouds import finite_points
 from gapr_core.errors import ConfigError
 from gapr_core.geometry import se3
 from gapr_core.registration.problem import inputs
+from gapr_core.registration.problem.target import PreparedTarget
 
 Array = NDArray[np.float64]
 
 
-class Findable(Protocol):
-    """A bone with a search tree, such as a `PreparedTarget`."""
-
-    @property
-    def tree(self) -> cKDTree:
-        """K-d tree of its points, mm."""
-        ...
-
-
 def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, highest: ArrayLike) -> Array:
-    """Select the points in a box.
+    """Select the finite points in a box; (K, 3) in the points' own frame.
 
     Args:
         points: (N, 3), mm, in their own frame.
         T_box_points: (4, 4) pose of that frame in the box's frame, mm.
-        lowest: (3,) corner of the box, mm, box frame; included.
-        highest: (3,) opposite corner.
-
-    Returns:
-        (K, 3) in the points' own frame, finite ones only.
+        lowest, highest: (3,) opposite corners of the box, mm, box frame; included.
 
     Raises:
-        ConfigError: when a corner is not (3,) numbers or `lowest` is not below `highest`.
-        InvalidPointCloudError: when the points are not (N, 3) numbers, or the pose is not rigid.
+        ConfigError: a corner is not (3,) numbers, or `lowest` is not below `highest`.
+        InvalidPointCloudError: the points are not (N, 3) numbers, or the pose is not rigid.
     """
     low, high = _corner(lowest), _corner(highest)
     if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
@@ -50,8 +36,8 @@ def crop_box(points: ArrayLike, T_box_points: ArrayLike, lowest: ArrayLike, high
     return np.asarray(points[((placed >= low) & (placed <= high)).all(axis=1)])
 
 
-def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: Findable, margin_mm: float) -> Array:
-    """Select the points within `margin_mm` of the bone under its last pose.
+def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: PreparedTarget, margin_mm: float) -> Array:
+    """Select the finite points within a margin of the bone under its last pose; (K, 3), mm, source frame.
 
     Args:
         points: (N, 3), mm, source frame.
@@ -59,12 +45,9 @@ def crop_to_pose(points: ArrayLike, T_target_source: ArrayLike, target: Findable
         target: from `Registrar.prepare`.
         margin_mm: largest motion of the bone since, and a little more.
 
-    Returns:
-        (K, 3), mm, source frame, finite ones only.
-
     Raises:
-        ConfigError: for a margin that is not positive.
-        InvalidPointCloudError: when the points are not (N, 3) numbers, or the pose is not rigid.
+        ConfigError: a margin that is not positive.
+        InvalidPointCloudError: the points are not (N, 3) numbers, or the pose is not rigid.
     """
     if not isinstance(margin_mm, Real) or not margin_mm > 0.0:
         raise ConfigError("a positive margin in mm", repr(margin_mm), "30 mm suits a bone that moves slowly")

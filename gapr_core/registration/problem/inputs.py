@@ -14,16 +14,10 @@ MOST_SHOWN = 16  # values of an array in a message
 
 
 def numbers(values: ArrayLike, shape: tuple[int, ...], what: str, how: str) -> Array:
-    """Copy the values into a float64 array of a required shape.
-
-    Args:
-        values: a list, an array or a tensor.
-        shape: required shape.
-        what: name of the values in the message.
-        how: advice in the message.
+    """Copy values, a list, an array or a tensor, into a finite float64 array of a required shape.
 
     Raises:
-        InvalidPointCloudError: another shape, or a value that is no finite number.
+        InvalidPointCloudError: another shape, or a value that is no finite number; it names `what` and `how` to fix it.
     """
     array = as_array(values, f"a finite {shape} {what}", how)
     if array.shape != shape or array.dtype.kind not in "fiu" or not np.isfinite(array).all():

@@ -67,8 +67,8 @@ KINDS = {
 def errors(sensor: SensorConfig, points: int) -> Errors:
     """Return the errors to expect of a source of `points` points; stated values replace the usual ones.
 
-    An unnamed sensor with up to 2000 points (`sparse_points`) may have touched the bone: a pointer read at 60 Hz gives
-    as many in half a minute. A denser cloud is a camera's or a laser's, but no surer than a named one.
+    An unnamed sensor with up to `sparse_points` may have touched the bone, as a pointer read for half a minute. A
+    denser cloud is a camera's or a laser's, but no surer than a named one.
     """
     usual = KINDS[sensor.kind]
     if sensor.kind == "unknown":
@@ -84,8 +84,7 @@ def errors(sensor: SensorConfig, points: int) -> Errors:
 def offset_surface(target: PreparedTarget, sensor: SensorConfig) -> PreparedTarget:
     """Move the target's surface elements to where the sensor sees them: farther out by the stand-off.
 
-    The residual of a point becomes its signed distance to the bone less the stand-off. Everything else of the target
-    stays; a stand-off of 0 returns the same object. A target that lies farther out already adds its own offset.
+    A residual becomes the signed distance to the bone less the stand-off. One of 0 returns the same object.
     """
     offset_mm = errors(sensor, 0).offset_mm
     if offset_mm == 0.0:

@@ -63,10 +63,7 @@ class PreparedSource:
         return self.around[:, : self.patches.shape[1]]
 
     def axes(self, chosen: NDArray[np.int64]) -> Array:
-        """Compute (K, 3, 3) local frames of the chosen (K,) points; rows are two tangents and the unit normal.
-
-        The normal's sign is that of `normals` where these are oriented, else arbitrary.
-        """
+        """Compute (K, 3, 3) local frames of the chosen (K,) points; rows are two tangents and the unit normal."""
         axes = quadrics.local_frames(self.whole, self.patches[chosen]).axes
         if not self.oriented:
             return axes
@@ -79,10 +76,7 @@ class PreparedSource:
         return float(np.median(self.flatness_mm))
 
     def facing(self, viewpoint: Array) -> PreparedSource:
-        """Turn the normals to the viewpoint, mm, (3,) or one for each point (N, 3).
-
-        A sensor sees surfaces from outside.
-        """
+        """Turn the normals to the viewpoint, mm, (3,) or one for each point (N, 3)."""
         away = np.einsum("ni,ni->n", self.normals, viewpoint - self.points) < 0.0
         return replace(self, normals=self.normals * np.where(away, -1.0, 1.0)[:, None], oriented=True)
 
@@ -149,21 +143,14 @@ def _some_of(points: Array, config: SourceConfig, num_threads: int) -> PreparedS
 
 
 def _drawn(points: Array, most: int) -> NDArray[np.int64]:
-    """Draw at most `most` of the points (N, 3) at random: the same in every frame; ascending indices.
-
-    The draw is among their distances to the centroid, which no frame changes, and not in the order of coordinates.
-    """
+    """Draw at most `most` of the points (N, 3) at random, ascending: the same in every frame."""
     by_distance = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
     chosen = np.random.default_rng(0).choice(len(points), min(most, len(points)), replace=False)
     return np.asarray(np.sort(by_distance[chosen]))
 
 
 def _too_little(points: Array, config: SourceConfig) -> Refusal | None:
-    """Refuse points (N, 3), mm, that are too few or a line; None for others.
-
-    Raises:
-        InvalidPointCloudError: their extent cannot be that of a piece of a bone in mm.
-    """
+    """Refuse points (N, 3), mm, that are too few or a line; raise for an impossible extent."""
     if len(points) < config.fewest_points:
         return Refusal(
             RegistrationStatus.TOO_FEW_POINTS,
@@ -181,9 +168,7 @@ def _too_little(points: Array, config: SourceConfig) -> Refusal | None:
 def without_isolated(points: Array, config: SourceConfig) -> Array:
     """Remove points that are far from all others (N, 3), mm: far echoes, flying pixels.
 
-    A point is isolated when its sixth nearest neighbour (`companions`) is farther than 12 mm and than five times the
-    typical distance of the cloud: Open3D's `remove_radius_outlier` with a radius that follows the spacing. A sparse
-    cloud, such as a pointer's, stays as it is: every point counts.
+    Open3D's `remove_radius_outlier` with a radius that follows the spacing. A sparse cloud stays as it is.
     """
     if len(points) < config.dense_points:
         return points
@@ -203,10 +188,7 @@ def _has_companions(gaps: Array, config: SourceConfig) -> NDArray[np.bool_]:
 
 
 def _looked_up(points: Array, config: SourceConfig, num_threads: int) -> tuple[Array, Found | None]:
-    """Remove isolated points and keep the neighbours of the others where one look-up gives both, else None.
-
-    A point whose neighbours all stay keeps them.
-    """
+    """Remove isolated points and keep the neighbours of the others where one look-up gives both, else None."""
     count = _around_count(len(points), config)
     if not config.dense_points <= len(points) <= min(config.most_points, config.most_compared):
         return without_isolated(points, config), None
@@ -226,14 +208,7 @@ def _looked_up(points: Array, config: SourceConfig, num_threads: int) -> tuple[A
 
 
 def describe(points: Array, config: SourceConfig, found: Found | None = None, num_threads: int = 1) -> PreparedSource:
-    """Compute normals, neighbours and order of points (N, 3), mm, that are clean and thin already.
-
-    Args:
-        points: (N, 3), mm.
-        config: number of neighbours for a normal.
-        found: distances and indices of the neighbours, where they are known.
-        num_threads: threads of the look-up; 0 for all cores.
-    """
+    """Describe points (N, 3), mm, that are clean and thin already; `found` are their neighbours, where known."""
     gaps, around = found or quadrics.nearest(points, _around_count(len(points), config), num_threads=num_threads)
     patches = np.ascontiguousarray(around[:, : _neighbour_count(len(points), config)])
     return _described(points, around, gaps[:, : patches.shape[1]], points, patches)
@@ -250,7 +225,7 @@ def _described(
 
 
 def _neighbour_count(count: int, config: SourceConfig) -> int:
-    """Choose the number of points for a normal: a quarter of a few points, so that a patch stays local."""
+    """Choose the number of points for a normal: a quarter of few points, so that a patch stays local."""
     return min(config.normal_neighbours, max(count // 4, config.fewest_points), count)
 
 

@@ -81,10 +81,9 @@ class PreparedTarget:
         return self.elements, self.field.nearest, self.field.origin, 1.0 / self.field.cell_mm, self.spacing_mm
 
     def mesh_distances(self, points: Array) -> tuple[Array, Array] | None:
-        """Give exact distances (N,) of points (N, 3) to the mesh, and their gradients (N, 3); None for a cloud.
+        """Measure exact distances (N,), mm, of points (N, 3) to the mesh, and gradients (N, 3); None for a cloud.
 
-        They are signed, mm, positive outside of where a sensor sees the surface (`offset_mm`), and NaN beyond the
-        reach of the field.
+        Positive outside of where a sensor sees the surface (`offset_mm`), NaN beyond the reach of the field.
         """
         if self.faces is None or not len(self.faces):
             return None

@@ -1,4 +1,4 @@
-"""Poses from correspondences: consensus per patch (local to global) and RANSAC, both with several answers."""
+"""Poses from correspondences: consensus per patch (local to global), with several answers."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from gapr_core.geometry import se3
 
 Array = NDArray[np.float64]
 
-SHRINKING = (2.0, 1.5, 1.0, 0.7)  # successive radii of `sharpened`, over `radius_mm`
-ROUNDS = 5  # fits with each radius
 REFITS = 4  # of a pose to the correspondences that agree with it
 APART_MM, APART_DEG = 8.0, 8.0  # poses within both are the same
 
@@ -54,40 +52,10 @@ def local_to_global(found: Correspondences, radius_mm: float, count: int = 32) -
     patches = np.unique(found.patch, return_counts=True)
     large = patches[0][patches[1] >= 3]
     members = (found.patch[None] == large[:, None]) * found.score
-    return _converge(_batched_kabsch(found, members), found, radius_mm, count)
+    return converge(batched_kabsch(found, members), found, radius_mm, count)
 
 
-def ransac(
-    found: Correspondences, radius_mm: float, rng: np.random.Generator, draws: int = 2000, count: int = 32
-) -> tuple[Array, Array]:
-    """Fit poses to random triples of correspondences (Fischler and Bolles 1981), drawn by score, with equal sides.
-
-    Args and returns: as `local_to_global`; `draws` triples are tried.
-    """
-    if len(found.score) < 3:
-        return np.empty((0, 4, 4)), np.empty(0)
-    triples = rng.choice(len(found.score), (draws, 3), p=found.score / found.score.sum())
-    p, q = found.source[triples], found.target[triples]
-    sides_p, sides_q = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
-    rigid = (np.abs(sides_p - sides_q) < 2.0 * radius_mm).all(axis=1) & (sides_p > 2.0 * radius_mm).all(axis=1)
-    return _converge(se3.kabsch(p[rigid], q[rigid]), found, radius_mm, count)
-
-
-def sharpened(pose: Array, found: Correspondences, radius_mm: float) -> Array:
-    """Refit a pose (4, 4) to the correspondences near it by Tukey's weights, within a radius that shrinks.
-
-    A correspondence within `radius_mm` can be that far off. Those of a pose that is nearly right agree better.
-    """
-    for within_mm in radius_mm * np.repeat(SHRINKING, ROUNDS):
-        squared = ((se3.apply(pose, found.source) - found.target) ** 2).sum(axis=1)
-        weights = found.score * np.maximum(1.0 - squared / within_mm**2, 0.0) ** 2
-        if np.count_nonzero(weights) < 3:
-            break
-        pose = _batched_kabsch(found, weights[None])[0]
-    return pose
-
-
-def _converge(poses: Array, found: Correspondences, radius_mm: float, count: int) -> tuple[Array, Array]:
+def converge(poses: Array, found: Correspondences, radius_mm: float, count: int) -> tuple[Array, Array]:
     """Refit the best poses to the correspondences that agree with them, and drop near-copies."""
     if len(poses) == 0:
         return np.empty((0, 4, 4)), np.empty(0)
@@ -97,7 +65,7 @@ def _converge(poses: Array, found: Correspondences, radius_mm: float, count: int
     for _ in range(REFITS):
         weights = _support(poses, found, radius_mm)
         enough = (weights > 0).sum(axis=1) >= 3
-        refitted = _batched_kabsch(found, weights)
+        refitted = batched_kabsch(found, weights)
         poses = np.where(enough[:, None, None], refitted, poses)
     scores = _support(poses, found, radius_mm).sum(axis=1)
     kept = distinct(poses, scores, centroid, count)
@@ -142,7 +110,7 @@ def _agreeing(poses, source, target, score, limit):  # type: ignore[no-untyped-d
     return weights
 
 
-def _batched_kabsch(found: Correspondences, weights: Array) -> Array:
+def batched_kabsch(found: Correspondences, weights: Array) -> Array:
     """Fit poses to all correspondences under each row of weights (K, C), by SVD."""
     total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
     p_mean, q_mean = weights @ found.source / total, weights @ found.target / total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,10 @@ from gapr_core.model.types import Cloud, Features, Matches
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposals
-from gapr_core.registration.proposals.consensus import Correspondences, local_to_global, ransac
+from gapr_core.registration.proposals.consensus import Correspondences, local_to_global
 
 Array = NDArray[np.float64]
-METHODS = ("local_to_global", "ransac")
+Consensus = Callable[[Correspondences, float, int], tuple[Array, Array]]
 RADIUS_VOXELS, SMALLEST_VOXEL_MM = 1.5, 5.0  # radius of agreement of a correspondence, over the first voxel
 SHIPPED = Path(__file__).parents[2] / "weights" / "gapr_net.safetensors"
 
@@ -31,18 +32,16 @@ class NetworkProposer:
 
     Args:
         network: in evaluation mode, on any device.
-        method: `local_to_global`, or `ransac` as in the paper.
         count: most poses for one pair.
         weights_name: key of the target's cached features, with the device, so that networks of the
             same weights share them; without a name they are the network's alone.
+        consensus: finds poses (K, 4, 4), best first, and their scores in correspondences, within a radius, mm.
     """
 
     def __init__(
-        self, network: GAPRNet, method: str = "local_to_global", count: int = 32, weights_name: str = ""
+        self, network: GAPRNet, count: int = 32, weights_name: str = "", consensus: Consensus = local_to_global
     ) -> None:
-        if method not in METHODS:
-            raise ConfigError(f"method one of {', '.join(METHODS)}", repr(method), "choose one of these")
-        self.network, self.method, self.count = network.eval(), method, count
+        self.network, self.count, self.consensus = network.eval(), count, consensus
         self.name = "network"
         self.is_shipped = False  # the shipped confidence was fitted to these weights
         self._key = "network", weights_name or network  # the network itself: an id may recur
@@ -73,7 +72,7 @@ class NetworkProposer:
             return Proposals(np.empty((0, 4, 4)), np.empty(0))
         found = self.match(moving, cloud, features)
         radius_mm = RADIUS_VOXELS * max(SMALLEST_VOXEL_MM, frame.voxel * frame.scale_mm)
-        return Proposals(*consensus(self.method, found, radius_mm, rng, self.count))
+        return Proposals(*self.consensus(found, radius_mm, self.count))
 
     def prepare(self, target: PreparedTarget) -> tuple[Frame, Cloud, Features]:
         """Compute the target's pyramid and features once, and keep them with it."""
@@ -101,22 +100,9 @@ class NetworkProposer:
         return next(self.network.parameters()).device
 
 
-def consensus(
-    method: str, found: Correspondences, radius_mm: float, rng: np.random.Generator | None = None, count: int = 32
-) -> tuple[Array, Array]:
-    """Compute poses (K, 4, 4), best first, and their scores (K,) from correspondences, by a method of `METHODS`."""
-    if method == "ransac":
-        return ransac(found, radius_mm, rng or np.random.default_rng(0), count=count)
-    return local_to_global(found, radius_mm, count=count)
-
-
 @cache
 def _survive_forks() -> None:
-    """Let forked processes run torch in one thread from now on.
-
-    OpenMP's threads do not survive a fork, and a child that waits for them hangs. torch's own data loader does the same
-    in its workers.
-    """
+    """Let forked processes run torch in one thread: OpenMP's threads do not survive a fork, and a child would hang."""
     import torch
 
     os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))

@@ -1,9 +1,8 @@
 """Hypotheses from small regions: where most of a cloud is not bone, a part of it may be bone alone.
 
-The cloud is cut into segments where its surface bends or steps: at the rim of a wound, at the edge of an instrument
-(smoothness constraint: Rabbani, van den Heuvel, Vosselman 2006). The parts of a segment within balls of several sizes
-are sources of their own for the exhaustive search. A region on bone proposes the pose; the whole cloud later decides
-which region that is.
+The cloud is cut into segments where its surface bends or steps, as at the rim of a wound (smoothness constraint:
+Rabbani, van den Heuvel, Vosselman 2006). The parts of a segment within balls of several sizes are sources of their own
+for the exhaustive search.
 """
 
 from __future__ import annotations
@@ -50,10 +49,6 @@ def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Regio
     """Yield the regions of each round, at most `config.seeds` of each radius, without repetition.
 
     There is a first round, even an empty one; the rounds end where nothing more grows.
-
-    Args:
-        source: the scene.
-        config: radii, numbers of regions, and limits of a surface.
     """
     joined, tree = smooth_neighbours(source, config), cKDTree(source.points)
     seeds = _seeds(source, joined, TRIES * max(config.seeds) * config.rounds, config.region_fewest_points)
@@ -67,10 +62,7 @@ def rounds(source: PreparedSource, config: ClutterConfig) -> Iterator[list[Regio
 
 
 def smooth_neighbours(source: PreparedSource, config: ClutterConfig) -> csr_array:
-    """Build the (N, N) adjacency of neighbours with agreeing normals, each near the other's tangent plane.
-
-    The planes are those of so few neighbours that a fold is one: the normals of the source turn more slowly.
-    """
+    """Build the (N, N) adjacency of neighbours with agreeing normals of few points, each near the other's plane."""
     near = np.ascontiguousarray(source.neighbours[:, : config.smooth_neighbours])
     normals, _, _ = fit_planes(source.points, near)
     one, other = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()

@@ -1,9 +1,8 @@
 """The weight-free proposer: every placement of a source normal on a target normal.
 
 A reference point of the source is put on an anchor of the target, normal on normal, and turned about the normal in
-steps. Each pose is scored by the distances of a few probe points of the source in the target's distance field. The sign
-of a source normal is unknown (one-sided clouds look alike from both sides), so both are tried unless the sensor's place
-decides it.
+steps. Each pose is scored by the distances of a few probe points in the target's distance field. Both signs of a normal
+are tried unless the sensor's place decides it.
 """
 
 from __future__ import annotations
@@ -42,7 +41,8 @@ class NormalAlignedSearch:
         """Find the best spin of every (reference, sign, anchor), and return the best `keep` of them all."""
         references = _references(source, self.config.references)
         signs = np.array([1.0] if source.oriented else [1.0, -1.0])
-        anchor_axes = _anchor_axes(target)
+        normals = target.normals[target.anchors]
+        anchor_axes = np.concatenate([quadrics.tangent_basis(normals), normals[:, None]], axis=1)  # (A, 3, 3) rows
         local = np.stack([_probes_in_frame(source, i, sign, self.config) for i in references for sign in signs])
         anchors = target.points[target.anchors].astype(np.float32)
         score, spin = self._score(local, anchors, anchor_axes.astype(np.float32), target.field)
@@ -75,15 +75,10 @@ def _references(source: PreparedSource, count: int) -> NDArray[np.int64]:
     return flat[sampling.farthest_points(source.points[flat], count)]
 
 
-def _anchor_axes(target: PreparedTarget) -> Array:
-    """Compute (A, 3, 3) frames of the anchors: rows are two tangents and the outward normal."""
-    normals = target.normals[target.anchors]
-    return np.concatenate([quadrics.tangent_basis(normals), normals[:, None]], axis=1)
-
-
 def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config: SearchConfig) -> NDArray[np.float32]:
     """Turn the probe points about one reference's normal; (probes, 3, spins) in its frame."""
-    probes = (source.subset(config.probes) - source.points[reference]) @ _signed_axes(source, reference, sign).T
+    axes = source.axes(np.array([reference]))[0] * np.array([1.0, sign, sign])[:, None]
+    probes = (source.subset(config.probes) - source.points[reference]) @ axes.T
     angle = 2.0 * np.pi * np.arange(config.spins) / config.spins
     x, y, z = probes.T[:, :, None]
     turned = [
@@ -92,10 +87,6 @@ def _probes_in_frame(source: PreparedSource, reference: int, sign: float, config
         np.broadcast_to(z, (len(z), len(angle))),
     ]
     return np.stack(turned, axis=1).astype(np.float32)
-
-
-def _signed_axes(source: PreparedSource, reference: int, sign: float) -> Array:
-    return source.axes(np.array([reference]))[0] * np.array([1.0, sign, sign])[:, None]
 
 
 def _poses(

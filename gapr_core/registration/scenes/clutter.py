@@ -1,24 +1,24 @@
-"""Registration of a camera's cloud of a wound, most of which may not be bone.
+"""Registration of a camera's cloud of a wound: regions propose poses as if they were bone, lines of sight decide.
 
-Regions propose, lines of sight decide. Every region of the cloud proposes poses as if it were bone. All poses are
-ranked by the camera's view of the target: first roughly, then, refined on more and more points, at the scale of the
-noise. Soft tissue lies in front of the bone, never inside it: there a point has to be nearer to count.
+Poses are ranked by the camera's view of the target: first roughly, then, refined on more and more points, at the scale
+of the noise. Soft tissue lies in front of the bone, never inside it: there a point has to be nearer to count.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from gapr_core.config import ClutterConfig, RegistrarConfig
+from gapr_core.errors import InvalidPointCloudError
 from gapr_core.geometry import one_view, sampling
 from gapr_core.registration.fit.kernels import distinct
 from gapr_core.registration.fit.verification import Candidates, markers, support
+from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals import regions
@@ -69,11 +69,10 @@ def sees_from_afar(config: RegistrarConfig) -> bool:
 
 
 def inferred_places(source: PreparedSource, config: RegistrarConfig) -> list[tuple[Array, int]]:
-    """Infer the places, (3,) mm, source frame, that a cloud may be seen from, the likeliest first.
+    """Infer places, (3,) mm, source frame, that a cloud may be seen from, likeliest first, with their rounds.
 
     The origin, where the cloud may be in the frame of its camera, and both ends of the line of sight that its surface
-    shows. Each comes with its rounds of regions. None for a cloud that cannot be a camera's: too few points, points
-    grazed from the common place, or a sensor that sees nothing from afar.
+    shows. None of too few points, of points grazed from there, or of a sensor that sees nothing from afar.
     """
     if not sees_from_afar(config) or len(source.points) < config.source.dense_points:
         return []
@@ -88,9 +87,15 @@ def inferred_places(source: PreparedSource, config: RegistrarConfig) -> list[tup
     return places
 
 
-def in_rounds(scene: Scene, config: ClutterConfig) -> Iterator[Scene]:
-    """Yield the scene with the regions of each round; no region comes twice."""
-    return (replace(scene, regions=found) for found in regions.rounds(scene.source, config))
+def possible_view(source: ArrayLike, config: RegistrarConfig) -> PreparedSource | None:
+    """Prepare a source without a viewpoint as a possible view of a camera; None where it cannot be one."""
+    if not sees_from_afar(config):
+        return None
+    try:
+        scene = sources.prepare(source, config.source, config.num_threads, in_scene=True)
+    except InvalidPointCloudError:
+        return None  # some of all points are metres away; the fitted ones are not
+    return scene if isinstance(scene, PreparedSource) else None
 
 
 def propose(scene: Scene, target: PreparedTarget, start: Array, config: ClutterConfig, num_threads: int = 0) -> Pool:
@@ -104,11 +109,6 @@ def propose(scene: Scene, target: PreparedTarget, start: Array, config: ClutterC
     found = in_threads(work, scene.regions, num_threads=num_threads)
     label = np.repeat(np.arange(GIVEN, len(found)), [len(start), *map(len, found)])
     return Pool(np.concatenate([start, *found]), label, np.zeros(len(label)))
-
-
-def has_proposed(pool: Pool) -> bool:
-    """Return True when any of the hypotheses is a region's own: given poses alone have no rival."""
-    return bool((pool.region != GIVEN).any())
 
 
 def verify(
@@ -131,11 +131,7 @@ def verify(
 
 
 def small_is_good(scores: Array) -> Array:
-    """Invert (K,) scores of lines of sight to those of `Candidates`, where small is good: 1 / score.
-
-    Rules and features compare a rival with the best by their ratio. A pose that explains half as much of the bone is a
-    rival of twice the score, just as one of twice the mean square.
-    """
+    """Invert (K,) scores of lines of sight to those of `Candidates`, where small is good and a ratio counts."""
     return np.asarray(1.0 / np.maximum(scores, SMALLEST_SCORE))
 
 
@@ -170,8 +166,7 @@ def refine_on_all(
 ) -> Pool:
     """Refine each pose on all points whose normals agree, and rank at the scale of the noise.
 
-    Twice: on points hardly in front of the bone, which tissue pulls at less, and on both sides alike, which noise does
-    not shift. The score decides.
+    Twice: hardly in front of the bone, where tissue pulls, and on both sides alike, as noise does not shift that.
     """
     some, refined = scene.source.order[: config.final_points], []
     for front_share in (1.0, config.front_share):

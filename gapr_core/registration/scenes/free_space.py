@@ -1,8 +1,7 @@
-"""Lines of sight: a camera's image shows where the bone is and where it cannot be.
+"""Lines of sight: each point of the target is compared with the measured point on its own line of sight.
 
-Between the camera and a measured point there is nothing. A pose that puts bone there is impossible, whatever else it
-explains. Bone behind a measured point may be hidden, and outside the image nothing is known. So each point of the
-target's surface is compared with the measured point on its own line of sight.
+A pose that puts bone between the camera and a measured point is impossible, whatever else it explains. Bone behind a
+measured point may be hidden, and outside the image nothing is known.
 """
 
 from __future__ import annotations
@@ -83,12 +82,7 @@ def average(seen: Sequence[Visible]) -> Visible:
 
 
 def see(points: Array, normals: Array, viewpoint: ArrayLike) -> DepthImage:
-    """Build the image of a cloud.
-
-    Args:
-        points: (N, 3), mm, source frame.
-        normals: (N, 3), unit; the sign does not matter.
-        viewpoint: (3,), mm, source frame.
+    """Build the image of points (N, 3), mm, with normals (N, 3) of any sign, from a viewpoint (3,).
 
     Raises:
         InvalidViewpointError: a viewpoint in the middle of the points, where no camera sees them.

@@ -6,8 +6,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from gapr_core.registration.fit.block_kernels import accumulate
 from gapr_core.registration.fit.kernels import step
-from gapr_core.registration.fit.surface_kernels import FAST, element_near, moved, padded, residual, tukey
+from gapr_core.registration.fit.surface_kernels import FAST, element_near, moved
 
 OFFSET, DEPTH, FRONT = 3, 4, 5  # columns of a pixel after its normal, as in `free_space.DepthImage`
 
@@ -72,72 +73,29 @@ def refine_agreeing(poses, points, normals, signed, elements, nearest, origin, p
     3) agree from the cosine `same`.
     """
     out = poses.copy()
-    surface = elements, nearest, origin, per_cell, spacing
-    rows, H, g = np.empty((7, padded(len(points)))), np.empty((6, 6)), np.empty(6)
+    trust, H, g = np.empty(len(points)), np.empty((6, 6)), np.empty(6)
     middle = np.array([points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()])
     for k in range(len(poses)):
         T = out[k]
         for i in range(len(limits)):
-            weight = accumulate_agreeing(T, points, normals, signed, *surface, limits[i], same, middle, rows, H, g)
+            agreeing(T, points, normals, signed, elements, nearest, origin, per_cell, same, trust)
+            surface = elements, nearest, origin, per_cell, spacing
+            accumulate(T, points, trust, middle, *surface, limits[i, 0], 0.0, H, g, limits[i, 1])
+            weight = H[0, 0] + H[1, 1] + H[2, 2]  # their sum, as gradients have unit length
             if weight > 0.0:
                 step(T, middle, H, g, weight)
     return out
 
 
 @numba.njit(**FAST)
-def accumulate_agreeing(
-    T, points, normals, signed, elements, nearest, origin, per_cell, spacing, limits, same, middle, rows, H, g
-):
-    """Fill the normal equations H twist = g about the moved `middle` (3,); returns the sum of the weights."""
-    middle = moved(T, middle)
-    count, total = 0, 0.0
+def agreeing(T, points, normals, signed, elements, nearest, origin, per_cell, same, trust):
+    """Set `trust` (N,) to 1 where a normal agrees with that of the element near its point, else to 0."""
     for p in range(len(points)):
         x, y, z = moved(T, points[p])
         q = element_near(x, y, z, nearest, origin, per_cell)
-        if q < 0:
-            continue
         n = normals[p]
         ux = T[0, 0] * n[0] + T[0, 1] * n[1] + T[0, 2] * n[2]
         uy = T[1, 0] * n[0] + T[1, 1] * n[1] + T[1, 2] * n[2]
         uz = T[2, 0] * n[0] + T[2, 1] * n[1] + T[2, 2] * n[2]
         cosine = ux * elements[q, 3] + uy * elements[q, 4] + uz * elements[q, 5]
-        if cosine < same and (signed or cosine > -same):
-            continue
-        r, nx, ny, nz, aside = residual(x, y, z, q, elements, spacing, 0.0)
-        w = tukey(r * r + aside * aside, limits[1] if r > 0.0 else limits[0])
-        total += w
-        put_row(rows, count, w, x, y, z, middle, r, nx, ny, nz)
-        count += 1
-    normal_equations(rows, count, H, g)
-    return total
-
-
-@numba.njit(inline="always", **FAST)
-def put_row(rows, i, w, x, y, z, middle, r, nx, ny, nz):
-    """Fill column i of `rows`: derivatives of a residual r by the twist about `middle` (3), and r, times root w."""
-    root = np.sqrt(w)
-    nx, ny, nz = root * nx, root * ny, root * nz
-    x, y, z = x - middle[0], y - middle[1], z - middle[2]
-    rows[0, i], rows[1, i], rows[2, i] = nx, ny, nz
-    rows[3, i], rows[4, i], rows[5, i] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-    rows[6, i] = root * r
-
-
-@numba.njit(**FAST)
-def normal_equations(rows, count, H, g):
-    """Compute the normal equations (6, 6) and (6,) of the first `count` columns of `rows` (7, N), in place.
-
-    One product of whole, padded rows after the other, so that the compiler takes several columns at a time.
-    """
-    columns = padded(count)
-    rows[:, count:columns] = 0.0
-    for a in range(6):
-        total = 0.0
-        for p in range(columns):
-            total -= rows[a, p] * rows[6, p]
-        g[a] = total
-        for b in range(a + 1):
-            total = 0.0
-            for p in range(columns):
-                total += rows[a, p] * rows[b, p]
-            H[a, b] = H[b, a] = total
+        trust[p] = 1.0 if cosine >= same or (not signed and cosine <= -same) else 0.0

@@ -1,10 +1,9 @@
 """Agreement of the looks of a camera: the bone or its reference may move between two of them.
 
-The common pose of all looks then fits only some of them, or none exactly. So each look is laid on the bone by itself,
-from that pose. It may be apart for three reasons: far more of the surface lies on it elsewhere, it looked through the
-bone here, or it agrees far less than the others. A look with an error of its own seems apart, too. It is registered in
-full, and fits where its own pose is accepted and nearly the same. A look that could not have shown the bone here is
-blind: something was in the way, or the bone is far.
+Each look is laid on the bone by itself, from the common pose. It is apart where far more of the surface lies on it
+elsewhere, where it looked through the bone, or where it agrees far less than the others. One that seems apart is
+registered in full, and fits where its own pose is accepted and nearly the same. A look that could not have shown the
+bone is blind.
 """
 
 from __future__ import annotations
@@ -80,8 +79,8 @@ def unless_apart(
         assessment: the common pose of all looks.
         scene: views from one place or from several.
         target: the bone.
-        alone: registers one of the looks in full; used for each that seems to be apart.
-        config: limits of the registration, and least confidence of an accepted pose.
+        alone: registers a look in full that seems to be apart.
+        config: settings of the registration.
     """
     if len(scene.given) < 2:
         return assessment
@@ -92,11 +91,6 @@ def unless_apart(
     answers = tuple(map(LookAnswer, scene.given, fits))
     do_not_fit = LookFit.APART in own_fits or 2 * own_fits.count(LookFit.BLIND) >= len(own_fits)
     return replace(assessment, looks=answers).with_finding(_apart(answers) if do_not_fit else None)
-
-
-def is_refused(assessment: Assessment) -> bool:
-    """Return True where a scene was refused for its looks."""
-    return any(finding.check == CHECK for finding in assessment.findings)
 
 
 def _fits(
@@ -141,9 +135,7 @@ def look_fits(T: Array, scene: Scene, target: PreparedTarget, config: RegistrarC
 def is_apart(look: LookShares, near: float, on: float) -> bool:
     """Return True where a look fits far better elsewhere, saw through the bone, or agrees far less than the best.
 
-    Args:
-        look: shares of the look.
-        near, on: the largest shares of all looks that are not blind.
+    `near` and `on` are the largest shares of all looks that are not blind.
     """
     disagrees = look.share(look.near) < LEAST_NEAR * near or look.share(look.on) < LEAST_ON * on
     return look.fits_elsewhere or look.share(look.seen_through) > SEEN_THROUGH or disagrees

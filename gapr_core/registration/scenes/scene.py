@@ -1,8 +1,4 @@
-"""A scene: a camera's view from one place or from several.
-
-One image shows one side of a wound, with one set of errors. A camera that moves a little shows more bone, the tissue in
-front of it, and other errors. The images are one cloud in one frame in which the bone rests; each keeps its own lines.
-"""
+"""A scene: a camera's view from one place or from several, as one cloud; each image keeps its own lines of sight."""
 
 from __future__ import annotations
 
@@ -96,8 +92,12 @@ class Scene:
         return np.asarray(self.viewpoints.mean(axis=0))
 
     def part(self, members: NDArray[np.bool_], config: RegistrarConfig) -> PreparedSource:
-        """Cut some of its points into a source of their own, with normals towards the camera."""
+        """Cut some of its points into a source of their own, with normals towards the camera.
+
+        Their flatness stays that of the whole cloud: that of the part omits tissue.
+        """
         part = sources.describe(self.source.points[members], config.source)
+        part = replace(part, flatness_mm=self.source.flatness_mm[members])
         return part.facing(self.viewpoints[self.look[members]])
 
     def compare(
@@ -110,9 +110,7 @@ class Scene:
 
 
 def split(source: ArrayLike, viewpoint: Viewpoint) -> list[Look]:
-    """Split a cloud (N, 3), mm, by the place of its camera: one place for all, or one for each point.
-
-    Points that are not finite are dropped, with their viewpoints.
+    """Split the finite points of a cloud (N, 3), mm, by the place of its camera: one for all, or one for each point.
 
     Raises:
         InvalidPointCloudError: a viewpoint of another shape, or one that is not finite; more than `MOST_PLACES` places.
@@ -145,11 +143,7 @@ def _by_place(source: ArrayLike, viewpoint: ArrayLike) -> tuple[Array, Array, ND
 def prepared(looks: Sequence[Look], config: RegistrarConfig) -> Scene | Refusal:
     """Prepare the scene of looks, without those of too few points; the first one's refusal where all have too few.
 
-    With others a look needs the points of a region (`ClutterConfig.region_fewest_points`): an image of a few is all
-    holes.
-
-    Raises:
-        InvalidViewpointError: a viewpoint in the middle of its own points.
+    With others a look needs the points of a region: an image of a few is all holes. Raises as `scene_from`.
     """
     clouds = [sources.prepare(look.points, config.source, config.num_threads, in_scene=True) for look in looks]
     seen = {name: source for name, source in enumerate(clouds) if isinstance(source, PreparedSource)}
@@ -170,8 +164,10 @@ def scene_from(source: PreparedSource, viewpoint: Array, config: RegistrarConfig
     Raises:
         InvalidViewpointError: a viewpoint in the middle of its own points.
     """
-    settings, seen = config.clutter, source.facing(viewpoint)
-    image = free_space.see(_levelled(seen, settings.levelled_by), seen.normals, viewpoint)
+    seen = source.facing(viewpoint)
+    around = seen.points[seen.neighbours[:, : config.clutter.levelled_by]].mean(axis=1) - seen.points
+    heights = np.einsum("ni,ni->n", around, seen.normals)  # of the mean of neighbours: the noise is averaged
+    image = free_space.see(seen.points + seen.normals * heights[:, None], seen.normals, viewpoint)
     return Scene(seen, (image,), viewpoint[None], np.zeros(len(seen.points), dtype=np.int64))
 
 
@@ -186,9 +182,3 @@ def _together(each: Sequence[Scene], config: RegistrarConfig) -> Scene | Refusal
     look = of_point[cKDTree(points).query(together.points)[1]]
     images = tuple(scene.images[0] for scene in each)
     return Scene(together.facing(viewpoints[look]), images, viewpoints, look, each=tuple(each))
-
-
-def _levelled(source: PreparedSource, count: int) -> Array:
-    """Move points (N, 3), mm, along their normals to the mean of `count` neighbours: the noise is averaged."""
-    around = source.points[source.neighbours[:, :count]].mean(axis=1) - source.points
-    return source.points + source.normals * np.einsum("ni,ni->n", around, source.normals)[:, None]

@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapr_core.config import RegistrarConfig
-from gapr_core.registration.checks.assess import checked_geometry
+from gapr_core.registration.checks.assess import assess_fit
 from gapr_core.registration.checks.assessment import Assessment
-from gapr_core.registration.checks.deformation import with_looks
 from gapr_core.registration.confidence.classifier import Classifier
-from gapr_core.registration.confidence.features import FEATURES_OF, SCENE, of_the_fit
 from gapr_core.registration.fit import kernels
 from gapr_core.registration.fit.refinement import Fit, refine_fully
 from gapr_core.registration.fit.verification import Candidates
@@ -21,8 +19,6 @@ from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.scenes import clutter, look_agreement
 from gapr_core.registration.scenes.free_space import Visible
 from gapr_core.registration.scenes.scene import Scene
-from gapr_core.registration.uncertainty import covariance
-from gapr_core.registration.uncertainty.covariance import PoseUncertainty
 from gapr_core.results import Effect, Finding, RegistrationStatus
 
 Array = NDArray[np.float64]
@@ -86,39 +82,23 @@ def assess_part(
     classifier: Classifier,
     config: RegistrarConfig,
 ) -> Assessment:
-    """Assess a pose that explains a part of a scene, as `assess_fit` does a source of bone alone."""
-    fit, part = explained.fit, explained.source
-    eye = covariance.eye_of(fit.T, scene.viewpoint, config.sensor)
-    uncertainty = covariance.estimate(fit, config.covariance, config.sensor, part.around, eye=eye)
-    look = scene.look[explained.members] if len(scene.images) > 1 else None
-    uncertainty = with_looks(uncertainty, fit, look)
-    features = measure(explained, candidates, uncertainty, scene, target, config)
-    assessment = Assessment(
-        fit,
-        candidates,
-        uncertainty,
-        features,
-        classifier.judge(SCENE, features),
-        config.other_bone_prior,
-        part,
-        target,
-        seen=scene.source,
-        members=explained.members,
-        viewpoint=scene.viewpoint,
-        look=look,
-    )
-    return checked_geometry(assessment, config)
+    """Assess a pose that explains a part of a scene; see `assess_fit`."""
+    seen = clutter.seen_of(explained.fit.T[None], scene, target, config.clutter)
+    of_view = features_of_view(seen, candidates, target) | {"inlier_ratio": explained.share}
+    members, look = explained.members, scene.look[explained.members] if len(scene.images) > 1 else None
+    view = {"seen": scene.source, "members": members, "viewpoint": scene.viewpoint, "look": look}
+    return assess_fit(explained.fit, candidates, explained.source, target, classifier, config, of_view, **view)
 
 
 def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding | None:
-    """Find that most of a cloud is not this bone: a reason for its refusal, if it is refused.
+    """Name a refusal of a cloud that is mostly not this bone.
 
     With a viewpoint, by the share that the pose explains; of another dense cloud, by the share that lies on the bone.
     """
     source, in_scene = assessment.source, assessment.seen is not None
     is_believed = in_scene and assessment.confidence >= config.min_confidence  # and refused for another reason
     is_cloud = in_scene or len(source.points) >= config.source.dense_points
-    if is_believed or not is_cloud or look_agreement.is_refused(assessment):
+    if is_believed or not is_cloud or any(finding.check == look_agreement.CHECK for finding in assessment.findings):
         return None
     if in_scene:
         share, limit = assessment.features["inlier_ratio"], MOSTLY_CLUTTER
@@ -133,24 +113,7 @@ def mostly_clutter(assessment: Assessment, config: RegistrarConfig) -> Finding |
     return Finding("clutter", Effect.REFUSE, share, limit, RegistrationStatus.CLUTTER, text, advice)
 
 
-def measure(
-    explained: Explained,
-    candidates: Candidates,
-    uncertainty: PoseUncertainty,
-    scene: Scene,
-    target: PreparedTarget,
-    config: RegistrarConfig,
-) -> dict[str, float]:
-    """Measure the features of a scene (`features.FEATURES_OF`); every one is finite."""
-    seen = clutter.seen_of(explained.fit.T[None], scene, target, config.clutter)
-    visible = _visible_features(seen, candidates, target)
-    flatness_mm = scene.source.flatness_mm[explained.members]  # of the whole: that of the part omits tissue
-    shared = of_the_fit(explained.fit, candidates, uncertainty, explained.source, flatness_mm, target, config)
-    values = visible | shared | {"inlier_ratio": explained.share}
-    return {name: values[name] for name in FEATURES_OF[SCENE]}
-
-
-def _visible_features(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:
+def features_of_view(seen: Visible, candidates: Candidates, target: PreparedTarget) -> dict[str, float]:
     """Measure the lines of sight: shares of the surface, and the margin to the best distinct rival."""
     explained, violating, compared = (float(x[0]) for x in (seen.explained, seen.violating, seen.compared))
     area_mm2 = explained * len(target.points) * target.spacing_mm**2

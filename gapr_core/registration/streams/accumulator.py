@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,13 +19,12 @@ from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.streams import motion_test
-from gapr_core.registration.streams.duplicate_clouds import fingerprint
-from gapr_core.registration.streams.outlier_clouds import MOST_OFF, FarInARow
+from gapr_core.registration.streams.collection import MOST_OFF, Collection, together
+from gapr_core.registration.streams.evidence import fingerprint, is_repeated
 from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.registration.uncertainty import target_error
 from gapr_core.results import RegistrationResult, RegistrationStatus
 from gapr_core.runtime.parallel import single_threaded_libraries
-from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -39,15 +37,13 @@ FEWEST_THAT_MAY = 3  # least sources for a wider bound by motion
 MAY_MOVE, MOVES = 1.0, 6.0  # least log likelihood ratios of a possible and of a certain motion
 
 
-class Accumulator:
+class Accumulator(Collection):
     """Registers each source together with those before it.
 
-    Images of a probe that determine nothing alone determine the pose together. All sources must be in one frame in
-    which the bone rests, such as that of a reference fixed to it. Under an accepted pose each new source is checked by
-    itself, one of few points together with such ones just before it. A source off the bone under this or the last
-    accepted pose is left out, and the answer refused if it is the newest. After three of them in a row the bone or its
-    reference has moved, and only these three are kept. Where all show that the bone moves (see `motion_test`), the
-    answer is refused, and those since a step or the last third are kept.
+    All sources must be in one frame in which the bone rests, such as that of a reference fixed to it. A source off the
+    bone under this or the last accepted pose is left out, and the answer refused if it is the newest. After three in a
+    row the bone or its reference has moved, and only these are kept. Where all show that the bone moves (see
+    `motion_test`), the answer is refused, and those since a step or the last third are kept.
 
     Args:
         method: registers the collected sources; a `Tracker` is not changed but copied to one whose sources count as one
@@ -65,20 +61,18 @@ class Accumulator:
             raise ConfigError("a whole number of sources to keep, at least 1", repr(most), "1 registers each by itself")
         if not (hasattr(method, "register") and hasattr(method, "config")):
             raise ConfigError("a Registrar or a Tracker", repr(method), "pass Registrar.from_pretrained()")
-        self.method, self.most = _of_many_places(method), most
-        self.config = self.method.config
-        self._target: PreparedTarget | None = None
-        self._far_away = FarInARow(MOST_OFF, "source")
-        self.reset()
+        if isinstance(method, Tracker):  # no single camera saw the sources
+            method = method.sharing_points()
+        super().__init__(method.of_bone_alone() if isinstance(method, Registrar) else method, most)
 
     @property
     def collected(self) -> Array:
         """(N, 3) all kept points, mm."""
-        return _together(self._kept + self._new)
+        return together(self._kept + self._new)
 
     def together_with(self, source: ArrayLike) -> Array:
         """Join the last kept sources and a source (n, 3) as `register` would; (N, 3) mm."""
-        return _together([*self._kept, *self._new, np.asarray(source, dtype=np.float64)][-self.most :])
+        return together([*self._kept, *self._new, np.asarray(source, dtype=np.float64)][-self.most :])
 
     def reset(self) -> None:
         """Forget all sources, and the track of a `Tracker`."""
@@ -87,15 +81,13 @@ class Accumulator:
         self._small: list[Array] = []  # the newest of few points, which are looked at together
         self._off_in_a_row: list[Array] = []  # off the bone under an accepted pose, and left out
         self._accepted: RegistrationResult | None = None  # the last answer that was
-        self._far_away.reset()
-        if isinstance(self.method, Tracker):
-            self.method.reset()
+        super().reset()
 
     def collect(self, source: ArrayLike) -> None:
         """Keep a source (N, 3), mm, without registering; beyond `most` the oldest goes.
 
-        An empty source, or a repeated one, changes nothing. One that is metres away from the others cannot be of the
-        same bone in the same frame: it is left out, and the third in a row restarts the collection.
+        An empty source, or a repeated one, changes nothing. The third in a row that is metres away from the others
+        restarts the collection.
 
         Raises:
             InvalidPointCloudError: wrong shape or type, points that are metres apart, or metres away from the others.
@@ -104,14 +96,9 @@ class Accumulator:
         points = points[sampling.thin(points, MOST_POINTS)]
         if not len(points):
             return
-        if self._far_away.restarts_with(points, self.collected):
-            self.reset()
-        if not _was_sent(points, self._kept + self._new):
+        self._unless_far(points)
+        if not any(is_repeated(fingerprint(each), fingerprint(points)) for each in self._kept + self._new):
             self._new = [*self._new, points][-self.most :]
-
-    def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Compute everything static about a target; see `Registrar.prepare`."""
-        return self.method.prepare(target, units)
 
     @answering
     @single_threaded_libraries
@@ -124,8 +111,8 @@ class Accumulator:
     ) -> RegistrationResult:
         """Register all collected sources, this one included, as `Registrar.register`.
 
-        Another target than before starts a new collection. A source that cannot be registered is not kept. One without
-        a finite point is refused: the others show nothing about it.
+        Another target than before starts a new collection. A source that cannot be registered is not kept; one without
+        a finite point is refused.
 
         Raises:
             ConfigError: a viewpoint is given; the collected sources were seen from many.
@@ -137,15 +124,13 @@ class Accumulator:
         if isinstance(self.method, Registrar | Tracker):  # others have targets of their own
             check_call(target, initial)
         points = finite_points(source)
-        if self._target is not None and self._target is not target:
-            self.reset()
-        self._target = target
+        self._begin_with(target)
         if not len(points):
             return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason="the source has no finite point")
         kept, before = self._kept, self._new
         self.collect(source)
         try:
-            result = self.method.register(_together(self._registered_together()), target, initial)
+            result = self.method.register(together(self._registered_together()), target, initial)
         except Exception:
             self._new = before if self._kept is kept else []  # or the collection restarted with this source
             raise
@@ -158,10 +143,7 @@ class Accumulator:
         return (self._kept + self._new)[-self.most :]
 
     def _decide_on_new(self, result: RegistrationResult, target: PreparedTarget) -> RegistrationResult:
-        """Keep the new sources that lie on the bone under the answer's pose; without a pose keep all.
-
-        The answer is refused where the newest source lies off the bone, or so many in a row that the bone has moved.
-        """
+        """Keep the new sources that lie on the bone under the answer's pose, without a pose all; refuse for others."""
         T = result.best if result.status in POSED else None
         if T is None:  # no evidence on any source, nor on a row of those off the bone
             for source in self._new:
@@ -171,8 +153,11 @@ class Accumulator:
         new, off = self._new, self._update_row_off_the_bone(T, target)
         self._kept = [source for source in self._kept + new if not _is_among(source, off)][-self.most :]
         self._new = []
-        if len(self._off_in_a_row) >= MOST_OFF:
-            return self._restart(result)
+        if len(moved := self._off_in_a_row) >= MOST_OFF:
+            self.reset()
+            self._kept = moved[-self.most :]
+            why = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"
+            return _refused(result, why)
         if new and self._off_in_a_row:
             newest = "newest source lies" if _is_among(new[-1], off) else "sources before lie"
             why = f"the {newest} off the bone where the others found it: left out"
@@ -180,17 +165,13 @@ class Accumulator:
         return self._unless_it_moves(result, T, target)
 
     def _unless_it_moves(self, result: RegistrationResult, T: Array, target: PreparedTarget) -> RegistrationResult:
-        """Refuse where the sources show that the bone moves; widen the bound where they hardly exclude it.
-
-        The covariance then includes the possible motion. The sources since a step are kept; of a steady motion the last
-        third.
-        """
+        """Refuse where the sources show that the bone moves; widen the covariance where they hardly exclude it."""
         kept = self._kept
         if len(kept) < FEWEST_THAT_MAY:
             return result
         order = np.repeat(np.arange(len(kept)), list(map(len, kept)))
         some = slice(None, None, 1 + len(order) // MOST_POINTS)
-        points, seen = np.ascontiguousarray(_together(kept)[some]), offset_surface(target, self.config.sensor)
+        points, seen = np.ascontiguousarray(together(kept)[some]), offset_surface(target, self.config.sensor)
         fit = refine_fully(T, points, seen, self.config.refinement)
         motion = motion_test.of_motion(fit, order[some])
         ratio = motion.shown.log_ratio
@@ -207,14 +188,7 @@ class Accumulator:
     def _widened(
         self, result: RegistrationResult, added: Array, about_mm: Array, target: PreparedTarget
     ) -> RegistrationResult:
-        """Add to the covariance of an answer and to its errors; refuse where these become too large.
-
-        Args:
-            result: an answer.
-            added: (6, 6) covariance about a centre of its own.
-            about_mm: (3,) its centre, mm, target frame.
-            target: the bone.
-        """
+        """Add a covariance (6, 6) about a centre (3,), mm, to an answer; refuse too large a bound."""
         if result.covariance is None or result.centre_mm is None:  # as of methods that predict no error
             return result
         covariance = result.covariance + covariance_about(result.centre_mm - about_mm, added)
@@ -226,15 +200,12 @@ class Accumulator:
         return replace(result, covariance=covariance, tre_mm=tre_mm, tre95_mm=tre95_mm)
 
     def _update_row_off_the_bone(self, T: Array, target: PreparedTarget) -> list[Array]:
-        """Find the sources off the bone under a pose (4, 4), mm: new ones, and small ones judged with them.
-
-        Each of them prolongs the row of those off the bone, each other one ends it. One of too few points does neither.
-        """
-        everything, seen = _together(self._registered_together()), offset_surface(target, self.config.sensor)
+        """Find the sources off the bone under a pose (4, 4), mm, and update their row."""
+        everything, seen = together(self._registered_together()), offset_surface(target, self.config.sensor)
         off: list[Array] = []
         for source in self._new:
             judged = self._join_small_ones(source)
-            points = _together(judged)
+            points = together(judged)
             if not judged:
                 continue
             if not (self._lies_off(points, everything, T, seen) or self._contradicts(points, seen)):
@@ -256,29 +227,15 @@ class Accumulator:
             self._small = self._small[1:]
         return self._small if sum(map(len, self._small)) >= fewest else []
 
-    def _restart(self, result: RegistrationResult) -> RegistrationResult:
-        """Refuse, and keep only the row of sources off the bone: they show its place now."""
-        moved = self._off_in_a_row
-        self.reset()
-        self._kept = moved[-self.most :]
-        reason = f"{len(moved)} sources in a row lie off the bone: it has moved, and the collection restarts"
-        return _refused(result, reason)
-
     def _lies_off(self, source: Array, points: Array, T: Array, target: PreparedTarget, least_mm: float = 0.0) -> bool:
-        """Return True when a source (N, 3) lies much farther off the surface than all points (M, 3).
-
-        Its median distance counts; it also exceeds `least_mm`.
-        """
+        """Return True where the median distance of a source (N, 3) is far above that of all points, and `least_mm`."""
         refinement = self.config.refinement
         some = np.ascontiguousarray(points[:: 1 + len(points) // MOST_POINTS])
         own, of_all = (_typical_distance_mm(T, each, target) for each in (source, some))
         return own > max(least_mm, OFF * max(of_all, refinement.smallest_sigma_mm))
 
     def _contradicts(self, source: Array, target: PreparedTarget) -> bool:
-        """Return True when a source (N, 3) lies off the bone under the last accepted pose, beyond its bound there.
-
-        A large source may pull the common pose along, and lie on the bone then.
-        """
+        """Return True where a source (N, 3) lies off the bone under the last accepted pose."""
         before, last = self._registered_together()[: -len(self._new)], self._accepted
         if not before or last is None:
             return False
@@ -286,14 +243,7 @@ class Accumulator:
         if T is None or covariance is None or centre_mm is None:  # as of methods that predict no error
             return False
         least_mm = last.factor95 * target_error.bound_mm(covariance, se3.apply(T, source), centre_mm)
-        return self._lies_off(source, _together(before), T, target, least_mm)
-
-
-def _of_many_places(method: Registrar | Tracker) -> Registrar | Tracker:
-    """Return the method for sources that no single camera saw; other methods are taken as they are."""
-    if isinstance(method, Tracker):
-        return method.sharing_points()
-    return method.of_bone_alone() if isinstance(method, Registrar) else method
+        return self._lies_off(source, together(before), T, target, least_mm)
 
 
 def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> float:
@@ -301,20 +251,10 @@ def _typical_distance_mm(T: Array, points: Array, target: PreparedTarget) -> flo
     return float(np.median(distances_mm(T, points, target)))
 
 
-def _together(sources: list[Array]) -> Array:
-    return np.concatenate([np.empty((0, 3)), *sources])
-
-
 def _is_among(source: Array, others: list[Array]) -> bool:
     return any(np.array_equal(source, other) for other in others)
 
 
-def _was_sent(source: Array, before: list[Array]) -> bool:
-    """Return True where one of those before is the same, in any order of its points."""
-    new = fingerprint(source)
-    return any(len(each) == len(source) and new.is_of_same(fingerprint(each)) for each in before)
-
-
 def _refused(result: RegistrationResult, reason: str) -> RegistrationResult:
-    """Refuse a pose when the bone has moved away from the collected sources."""
+    """Refuse a pose because the bone has moved."""
     return result.refused(RegistrationStatus.LOW_CONFIDENCE, reason)

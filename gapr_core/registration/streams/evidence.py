@@ -12,11 +12,23 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapr_core.registration.confidence.classifier import LARGEST_EVIDENCE, LARGEST_LOG_ODDS, Judgement
 
 MEMORY = 10.0  # frames after which a frame's weight has fallen to about 1/e
 AGREE_MM = 15.0  # largest motion between frames (rms) of a track
+SAME_MM = 1e-4  # rounding to single precision; the noise of a new measurement moves the mean farther
+
+
+def fingerprint(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute (7,) number, mean and standard deviations, mm, of points (N, 3): their order does not matter."""
+    return np.hstack([len(points), points.mean(axis=0), points.std(axis=0)]) if len(points) else np.zeros(7)
+
+
+def is_repeated(cloud: NDArray[np.float64], before: NDArray[np.float64]) -> bool:
+    """Return True where two fingerprints are of the same points, up to rounding: a driver sent the last cloud again."""
+    return bool(np.abs(cloud - before).max() <= SAME_MM)
 
 
 class State(NamedTuple):

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,12 +19,11 @@ from gapr_core.registration.problem import inputs
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.scenes.scene import HOW, MOST_PLACES, Look, Places
-from gapr_core.registration.streams.outlier_clouds import MOST_OFF, FarInARow
+from gapr_core.registration.streams.collection import MOST_OFF, Collection, together
 from gapr_core.registration.streams.tracker import Tracker
 from gapr_core.results import LookFit, RegistrationResult, RegistrationStatus
 from gapr_core.runtime.clock import Clock
 from gapr_core.runtime.parallel import single_threaded_libraries
-from gapr_core.surface import Surface
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -50,7 +48,7 @@ class Newest(Enum):
 
 
 STANDING = (Newest.AGREES, Newest.IS_UNCONFIRMED)  # verdicts under which the pose stands
-ELSEWHERE = (Newest.IS_APART, Newest.DIFFERS)
+ROW_OF = {Newest.IS_APART: "elsewhere", Newest.DIFFERS: "elsewhere", Newest.CONTRADICTS: "another pose"}
 REFUSED_FOR = {
     Newest.DIFFERS: RegistrationStatus.AMBIGUOUS,
     Newest.CONTRADICTS: RegistrationStatus.AMBIGUOUS,
@@ -79,22 +77,18 @@ class KeptLook(Look):
     first: Direction
 
 
-class LookAccumulator:
+class LookAccumulator(Collection):
     """Registers each look of a camera together with those before it.
 
-    A single image of a wound shows little of the bone, with one set of errors. A few from places some ten degrees apart
-    show more of it and its cover. All must be in one frame in which the bone rests, such as that of a reference
-    fixed to it, and the camera's place must be known for each. A look replaces one from nearly the same direction. So
-    those of a video do not push out all others, and some of a moving camera stay.
+    A few images from places some ten degrees apart show more of the bone than one. All must be in one frame in which it
+    rests, such as that of a reference fixed to it, and the camera's place must be known for each. A look replaces one
+    from nearly the same direction, so those of a video do not push out all others. State the errors that all looks
+    share, such as that of a hand-eye calibration, as `tracking_mm` of the sensor (`SensorConfig`).
 
-    Older looks that show the bone elsewhere than the newest and most others are left out, and the others are registered
-    again. The newest is refused where it does not fit the others, shows nothing of the bone there, or alone has another
-    pose. A pose that is not sure and differs from the last is refused, too. After three in a row that show the bone
-    elsewhere it or its reference has moved, and only these three are kept, whatever their directions. The same holds
-    after three poses in a row that differ. After ten refusals from one direction only the last look is kept.
-
-    No look shows the errors that all share, such as that of a hand-eye calibration: state it as `tracking_mm` of the
-    sensor (`SensorConfig`).
+    Older looks that show the bone elsewhere than the newest and most others are left out. The newest is refused where
+    it does not fit the others, shows nothing of the bone there, or alone has another pose. So is an unsure pose that
+    differs from the last. After three such in a row the bone or its reference has moved, and only these are kept. After
+    ten refusals from one direction only the last look is kept.
 
     Args:
         method: registers the collected looks; a `Tracker` is copied to one whose sources count as one.
@@ -107,6 +101,7 @@ class LookAccumulator:
     """
 
     name = "gapr_looks"
+    called = "look"
 
     def __init__(self, method: Registrar | Tracker, most: int = 4, apart_deg: float = 8.0) -> None:
         if not isinstance(most, int | np.integer) or not 1 <= most <= MOST_PLACES:
@@ -116,11 +111,8 @@ class LookAccumulator:
             raise ConfigError("an angle between looks, 0 to 90 deg", repr(apart_deg), "0 keeps all of them")
         if not isinstance(method, Registrar | Tracker):
             raise ConfigError("a Registrar or a Tracker", repr(method), "pass Registrar.from_pretrained()")
-        self.method = method.sharing_points() if isinstance(method, Tracker) else method
-        self.most, self.apart_deg, self.config = most, apart_deg, method.config
-        self._target: PreparedTarget | None = None
-        self._far_away = FarInARow(MOST_OFF, "look")
-        self.reset()
+        super().__init__(method.sharing_points() if isinstance(method, Tracker) else method, most)
+        self.apart_deg = apart_deg
 
     @property
     def collected(self) -> Array:
@@ -135,20 +127,16 @@ class LookAccumulator:
     def reset(self) -> None:
         """Forget all looks, and the track of a `Tracker`."""
         self._looks: list[KeptLook] = []
-        self._off_in_a_row: list[KeptLook] = []  # newest ones that show the bone elsewhere than those before
-        self._another_in_a_row: list[KeptLook] = []  # newest ones with which the pose is another than the last
+        self._rows: dict[str, list[KeptLook]] = {}  # newest ones in a row with a verdict of `ROW_OF`
         self._refused_in_a_row: list[KeptLook] = []  # from nearly one direction, since a pose
         self._last: Array | None = None  # (4, 4) the last pose that was given
-        self._far_away.reset()
-        if isinstance(self.method, Tracker):
-            self.method.reset()
+        super().reset()
 
     def collect(self, source: ArrayLike, viewpoint: ArrayLike | None = None) -> None:
-        """Keep a look (N, 3), mm, and the place of its camera (3,), without registering.
+        """Keep a look (N, 3), mm, and the place of its camera (3,), without registering; beyond `most` the oldest goes.
 
-        It replaces those from nearly the same direction; beyond `most` the oldest goes. A look of fewer points than a
-        pose needs changes nothing. One that is metres away from the others is left out, and the third in a row restarts
-        the collection.
+        A look of fewer points than a pose needs changes nothing. The third in a row that is metres away from the others
+        restarts the collection.
 
         Raises:
             ConfigError: no viewpoint.
@@ -157,10 +145,6 @@ class LookAccumulator:
         newest = _look(source, viewpoint)
         if self._is_enough(newest):
             self._add(newest)
-
-    def prepare(self, target: str | Path | ArrayLike | Surface, units: str = "mm") -> PreparedTarget:
-        """Compute everything static about a target; see `Registrar.prepare`."""
-        return self.method.prepare(target, units)
 
     @answering
     @single_threaded_libraries
@@ -173,17 +157,15 @@ class LookAccumulator:
     ) -> RegistrationResult:
         """Register all kept looks, this one included, as `Registrar.register`.
 
-        Another target than before starts a new collection. A look of fewer points than a pose needs is refused: the
-        others show nothing about it. A look with which the others cannot be registered is not kept.
+        Another target than before starts a new collection. A look of fewer points than a pose needs is refused; one
+        with which the others cannot be registered is not kept.
 
         Raises:
             ConfigError, InvalidPointCloudError: as `collect` and `Registrar.register`.
         """
         check_call(target, initial)
         look = _look(source, viewpoint)
-        if self._target is not None and self._target is not target:
-            self.reset()
-        self._target = target
+        self._begin_with(target)
         if not self._is_enough(look):
             reason = f"the look has {len(look.points)} finite points, a pose needs {self.config.source.fewest_points}"
             return RegistrationResult(RegistrationStatus.TOO_FEW_POINTS, reason=reason, method=self.name)
@@ -231,7 +213,7 @@ class LookAccumulator:
         is_sure = verdict is Newest.AGREES and result.confidence >= self.config.sure_from
         if verdict in STANDING and not is_sure and self._is_another(result):
             return Newest.CONTRADICTS
-        return Newest.IS_DOUBTFUL if verdict is Newest.IS_UNCONFIRMED and self._off_in_a_row else verdict
+        return Newest.IS_DOUBTFUL if verdict is Newest.IS_UNCONFIRMED and "elsewhere" in self._rows else verdict
 
     def _is_another(self, result: RegistrationResult) -> bool:
         """Return True where the pose differs from the last one given since the collection began."""
@@ -240,10 +222,7 @@ class LookAccumulator:
         return not se3.pose_error(result.T_target_source, self._last, self.collected).is_right
 
     def _of_newest_alone(self, asked: list[KeptLook], result: RegistrationResult, target: PreparedTarget) -> Newest:
-        """Judge the common pose by that of the newest look alone: it agrees, differs, or there is none.
-
-        Others from the same direction confirm nothing.
-        """
+        """Judge the common pose by that of the newest look alone; others from the same direction confirm nothing."""
         if len(asked) < 2:
             return Newest.IS_UNCONFIRMED if self.most > 1 else Newest.AGREES
         if result.T_target_source is None:
@@ -267,41 +246,35 @@ class LookAccumulator:
         before: list[KeptLook],
         asked: list[KeptLook],
     ) -> str:
-        """Decide which looks stay after an answer. Returns a text to add to the reason.
+        """Decide which looks stay after an answer; returns a text to add to the reason.
 
         Args:
-            verdict: verdict of the newest look; a pose that stands ends all counts.
+            verdict: of the newest look; a pose that stands ends all counts.
             result: the answer.
             newest: the look, already kept.
             before: the looks before it.
-            asked: looks of the common pose, itself included; after a refusal all others stay, too.
+            asked: looks of the common pose, itself included.
         """
         if verdict in STANDING:
             if len(asked) < len(self._looks):
                 log.warning("%d older looks show the bone elsewhere: left out", len(self._looks) - len(asked))
-            self._looks, self._off_in_a_row, self._another_in_a_row, self._refused_in_a_row = asked, [], [], []
+            self._looks, self._rows, self._refused_in_a_row = asked, {}, []
             self._last = self._last if result.T_target_source is None else result.T_target_source
             return ""
-        if verdict in ELSEWHERE:
-            self._off_in_a_row = [*self._off_in_a_row, newest]
-            return self._update_row_elsewhere(self._off_in_a_row, before)
-        if verdict is Newest.CONTRADICTS:
-            self._another_in_a_row = [*self._another_in_a_row, newest]
-            return self._update_row_elsewhere(self._another_in_a_row, before)
+        if verdict in ROW_OF:
+            row = self._rows.setdefault(ROW_OF[verdict], [])
+            row.append(newest)
+            if len(row) == MOST_OFF:
+                self._restart_with(row)
+                return f"; {len(row)} in a row: the collection restarts with them"
+            self._looks = before
+            return "; left out"
         if verdict is not Newest.IS_REFUSED:
             self._looks = before
         if self._is_stuck(newest) and self._looks and self._looks != [newest]:
             self._restart_with([newest])
             return f"; {STUCK} refusals in a row: the collection restarts with the last look"
         return "" if verdict is Newest.IS_REFUSED else "; left out"
-
-    def _update_row_elsewhere(self, row: list[KeptLook], before: list[KeptLook]) -> str:
-        """Update the looks, as `_update_looks`, after the last of a row that show the bone elsewhere."""
-        if len(row) < MOST_OFF:
-            self._looks = before
-            return "; left out"
-        self._restart_with(row)
-        return f"; {len(row)} in a row: the collection restarts with them"
 
     def _is_stuck(self, newest: KeptLook) -> bool:
         """Count a refusal; true with the last of `STUCK` from nearly the direction of the first of them."""
@@ -322,8 +295,7 @@ class LookAccumulator:
 
     def _add(self, look: Look) -> tuple[KeptLook, list[KeptLook]]:
         """Keep a look, and return it and those before it; none where the collection restarts with it."""
-        if self._far_away.restarts_with(look.points, self.collected):
-            self.reset()
+        self._unless_far(look.points)
         before = self._looks
         newest, self._looks = self._with(look)
         return newest, before
@@ -350,7 +322,7 @@ def _added(stage_ms: Mapping[str, float], more_ms: Mapping[str, float]) -> dict[
 
 
 def _together(looks: Sequence[Look]) -> Array:
-    return np.concatenate([np.empty((0, 3)), *(look.points for look in looks)])
+    return together([look.points for look in looks])
 
 
 def _direction(look: Look) -> Direction:
@@ -358,11 +330,7 @@ def _direction(look: Look) -> Direction:
 
 
 def _apart_deg(first: Direction, second: Direction) -> float:
-    """Measure the difference of two directions: the larger of two angles.
-
-    One is between the cameras, seen from the middle of both views; the other between the views, seen from the middle of
-    both cameras.
-    """
+    """Measure the larger angle between two directions: of the cameras, seen from the views' middle, and vice versa."""
     cameras = np.stack([first.camera, second.camera])
     shown = np.stack([first.middle, second.middle])
     return max(_angle_deg(cameras - shown.mean(axis=0)), _angle_deg(shown - cameras.mean(axis=0)))

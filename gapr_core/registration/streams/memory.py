@@ -16,7 +16,7 @@ from gapr_core.registration.problem.source import PreparedSource
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.proposals.base import Proposals
 from gapr_core.registration.registrar import Enough, Registrar, never
-from gapr_core.registration.scenes import rounds as scene_rounds
+from gapr_core.registration.scenes import clutter
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.scenes.scene import Scene, Viewpoint
 from gapr_core.results import Refusal
@@ -26,9 +26,7 @@ Array = NDArray[np.float64]
 
 
 class PreviousPoses:
-    """Proposes the last pose, and the rivals that the last full registration gave it.
-
-    Without the rivals nothing would compete with the pose, and it would count as sure for being the only one.
+    """Proposes the last pose and its rivals of the last full registration; alone it would count as sure.
 
     Attributes:
         poses: (K, 4, 4) T_target_source of the last assessed source, mm, best first.
@@ -55,10 +53,7 @@ class PreviousPoses:
         self.poses = np.stack(poses)
 
     def follow(self, pose: Array, source: Array) -> None:
-        """Move all poses with the source (N, 3), mm: the nearest one to `pose`, T_before, becomes T_now.
-
-        The others go from R to R inv(T_before) T_now; the nearest one comes first.
-        """
+        """Move all poses with the source (N, 3), mm: the nearest one to `pose` becomes it, and comes first."""
         before = self.poses
         nearest = int(np.argmin([se3.rms_apart_mm(each, pose, source) for each in before]))
         moved = before @ (se3.inverse(before[nearest]) @ pose)
@@ -66,12 +61,7 @@ class PreviousPoses:
 
 
 class TrackingRegistrar(Registrar):
-    """Uses the previous poses first, then the proposers of another registrar.
-
-    Args:
-        memory: poses of the last source.
-        full: registers the mirror image of a source, for which there are no previous poses.
-    """
+    """Uses the previous poses first, then the proposers of a full registrar, which registers mirror images, too."""
 
     def __init__(self, memory: PreviousPoses, full: Registrar) -> None:
         super().__init__(full.config, (memory, *full.proposers), full.classifier, full.precision)
@@ -98,7 +88,7 @@ class TrackingRegistrar(Registrar):
         self, source: ArrayLike, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
         """Assess a source without a viewpoint as the camera's next view; None where the previous poses are not sure."""
-        scene = scene_rounds.of_unknown(source, self.config)
+        scene = clutter.possible_view(source, self.config)
         places = [] if scene is None else self._places_of(scene)
         clock.lap("prepare")
         if scene is None or not places:
@@ -137,13 +127,19 @@ class TrackingRegistrar(Registrar):
     def _remembered(
         self, scene: Scene, target: PreparedTarget, start: Array, clock: Clock, enough: Enough
     ) -> Assessment | None:
-        """Assess the best of the previous poses; None where it is not sure and regions must propose."""
-        poses, how = np.concatenate([start, self._memory.poses]), (self.classifier, self.config, clock)
-        assessment = scene_rounds.of_remembered(scene, target, poses, self._memory.support, *how)
-        if assessment is None:
+        """Assess the best of the previous poses; None where it is not sure, or alone: then regions must propose.
+
+        Of a few remembered hypotheses its own would be a large share: its support is that of the last regions.
+        """
+        poses, config = np.concatenate([start, self._memory.poses]), self.config
+        found = clutter.verify(clutter.given(poses), scene, target, config.clutter, config.num_threads, poses)
+        clock.lap("verify")
+        if len(found.poses) < 2:
             return None
+        found = replace(found, support=np.minimum(found.support, self._memory.support))
+        assessment = self._assessed_part(found, scene, target, clock)
         assessment = replace(assessment, proposer=PreviousPoses.name, rounds=1)
-        return assessment if self._needs_no_other_proposer(assessment) or enough(assessment) else None
+        return assessment if assessment.reaches(self.config.sure_from) or enough(assessment) else None
 
     def _of_image(self, flipped: PreparedSource, target: PreparedTarget, clock: Clock) -> Candidates | None:
         return self._full._of_image(flipped, target, clock)

@@ -33,8 +33,6 @@ class Motion(NamedTuple):
 def of_motion(fit: Fit, order: NDArray[np.int64]) -> Motion:
     """Test whether the bone moved during the collection: steadily, or once between two groups of sources.
 
-    The size of a steady motion is that from the first source to the last.
-
     Args:
         fit: common pose of all points.
         order: (N,) number of each point's source in time: 0, 1, 2 and on.

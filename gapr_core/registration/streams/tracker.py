@@ -18,8 +18,7 @@ from gapr_core.registration.checks.assessment import Assessment
 from gapr_core.registration.problem.target import PreparedTarget
 from gapr_core.registration.registrar import Registrar, check_call
 from gapr_core.registration.scenes.scene import Viewpoint
-from gapr_core.registration.streams.duplicate_clouds import Fingerprint, fingerprint
-from gapr_core.registration.streams.evidence import AGREE_MM, Evidence
+from gapr_core.registration.streams.evidence import AGREE_MM, Evidence, fingerprint, is_repeated
 from gapr_core.registration.streams.memory import PreviousPoses, TrackingRegistrar
 from gapr_core.results import Refusal, RegistrationResult
 from gapr_core.runtime.clock import Clock
@@ -32,26 +31,20 @@ STANDS = 0.8  # after a sure source a tracked answer of this confidence needs no
 
 
 class Last(NamedTuple):
-    """Last source that no finding refused.
-
-    Attributes:
-        T_target_source: (4, 4) its pose, mm.
-        cloud: fingerprint of all its points, source frame.
-        agreed: it continued the one before it.
-    """
+    """Last source that no finding refused: its pose (4, 4), mm, its fingerprint, and whether it continued the track."""
 
     T_target_source: Array
-    cloud: Fingerprint
+    cloud: Array
     agreed: bool
 
 
 class Tracker:
     """Registers a stream of sources in one frame, such as the clouds of a tracked probe.
 
-    The last pose and its rivals are refined on the new source first. Where that answer is sure (`RegistrarConfig.sure`)
-    it stands. In a stream that is sure, so does one near the last pose that reaches `STANDS`. Else the registrar's
-    proposers run as for a single source. So a jump, another frame or a wrong track costs time, not truth. Both numbers
-    of a source also rest on those before it (`Evidence`). Used by one thread at a time.
+    The last pose and its rivals are refined on the new source first. That answer stands where it is sure
+    (`RegistrarConfig.sure`), or, near the last pose of a sure stream, where it reaches `STANDS`. Else all run:
+    a jump or a wrong track costs time, not truth. Both numbers also rest on the sources before (`Evidence`). Used by
+    one thread at a time.
 
     Args:
         registrar: does the full registrations; `Registrar.from_pretrained()` when not given.
@@ -104,10 +97,7 @@ class Tracker:
         return type(self)(self.registrar.of_bone_alone(), self.recheck)
 
     def sharing_points(self) -> Tracker:
-        """Make a tracker for sources that share their points, as those of an `Accumulator` do: many count as one.
-
-        No single camera saw the points of one of them. It begins a stream of its own.
-        """
+        """Make a tracker for sources that share their points, as an `Accumulator`'s do: many count as one."""
         twin = self.of_bone_alone()
         twin._evidence = Evidence(rho_pose=1.0, rho_bone=1.0)
         return twin
@@ -184,25 +174,18 @@ class Tracker:
         was_view, is_view = self._memory.place is not None, assessment.seen is not None
         return was_view and not is_view and not assessment.reaches(self.config.min_confidence)
 
-    def _with_evidence(self, assessment: Assessment, cloud: Fingerprint) -> Assessment:
-        """Combine the numbers of an assessment with those of the frames before it.
-
-        A frame that a finding refuses does not count, nor a camera's view taken for bone. A repeated frame adds
-        nothing.
-        """
+    def _with_evidence(self, assessment: Assessment, cloud: Array) -> Assessment:
+        """Combine its numbers with those of the frames before; refused or repeated ones add nothing."""
         if assessment.refusal is not None or self._is_no_view(assessment):
             return assessment
         last = self._last
-        again = last is not None and cloud.is_of_same(last.cloud)
+        again = last is not None and is_repeated(cloud, last.cloud)
         agrees = self._agrees(assessment) and (last is None or last.agreed or not again)
-        self._last = Last(assessment.fit.T, cloud, agrees)
+        self._last = Last(assessment.fit.T.copy(), cloud, agrees)  # the answer is the user's to change
         return replace(assessment, judgement=self._evidence.observe(assessment.judgement, agrees, again))
 
     def _remember(self, result: RegistrationResult, source: Array) -> None:
-        """Follow an accepted pose; a refusal changes nothing, since the bone may not have moved.
-
-        A refused full registration does not count as one, so another follows.
-        """
+        """Follow an accepted pose; a refusal changes nothing, and another full registration follows a refused one."""
         self._is_sure = result.ok and result.confidence >= self.config.sure_from
         if result.T_target_source is None:
             return

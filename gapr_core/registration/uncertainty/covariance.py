@@ -4,12 +4,10 @@ A least-squares pose reacts to errors e of the residuals by a gain, G e. The noi
 smooth bias has variance b^2 and correlation exp(-d^2 / 2 l^2). All points share a stand-off of variance o^2, and a
 relative error of the size of variance q^2. The covariance is G (s^2 I + b^2 K + o^2 1 1^T + q^2 r r^T) G^T (White 1980;
 Censi 2007 for the noise alone); `sandwich` has all terms. A Hessian alone is over-confident. The size of the bias comes
-from the residuals (`bias_field`), stand-off and scale from the sensor (`sensor`). An error that wraps around the bone
-hardly moves the pose; one seen from one side does. Errors that vary more slowly than the correlation are constant or
-linear in place: in proportion to the bias, all points share an offset and the source is strained. The depths of an
-image are wrong along the beam, where stand-off and scale then act. Slices of a tracked probe share an error each:
-another K, of short reach. Tracking error adds directly to the pose covariance. A weak prior keeps the variance of an
-unobserved motion finite.
+from the residuals (`linear_model`), stand-off and scale from the sensor (`sensor`). Errors that vary more slowly than
+the correlation are constant or linear in place: in proportion to the bias, all points share an offset and the source is
+strained. Slices of a tracked probe share an error each: another K, of short reach. Tracking error adds directly. A weak
+prior keeps the variance of an unobserved motion finite.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from scipy.spatial import cKDTree
 from gapr_core.config import CovarianceConfig, SensorConfig
 from gapr_core.geometry import extent, se3
 from gapr_core.geometry.twists import covariance_about
-from gapr_core.registration.fit import fit_kernels
+from gapr_core.registration.fit import kernels
 from gapr_core.registration.fit.refinement import Fit
 from gapr_core.registration.problem import sensor as sensors
 from gapr_core.registration.problem.sensor import Errors
@@ -105,12 +103,12 @@ def estimate(
     """Estimate the covariance of a fit from its residuals and its sensor; always symmetric and positive definite.
 
     Args:
-        fit: the pose and its residuals; all points of its full fit count, its own points alone for the smooth misfits.
+        fit: the pose and its residuals; all points of its full fit count, its own alone for the smooth misfits.
         config: errors of the bone's model.
         sensor: errors known before the residuals.
         around: (N, k) neighbours of each point, if known (see `smooth_misfits_mm`).
-        misfits_mm: the smooth and the short misfit, if known; else they are measured.
-        eye: (3,) mm, target frame: place of a camera with wrong ranges (`eye_of`); None for an error of size alone.
+        misfits_mm: the smooth and the short misfit, if known.
+        eye: (3,) mm, target frame: place of a camera with wrong ranges (`eye_of`).
     """
     full = fit.full_fit
     count = int(np.count_nonzero(full.weights))
@@ -128,10 +126,7 @@ def estimate(
 
 
 def eye_of(T: Array, viewpoint: Array | None, sensor: SensorConfig) -> Array | None:
-    """Locate the camera of a source under a pose (4, 4), (3,) mm, target frame; None without a stated scale.
-
-    The usual scale of a kind is an error of the size alone: cameras differ by more in the error of their distance.
-    """
+    """Locate the camera of a source under a pose (4, 4), (3,) mm, target frame; None without a stated scale."""
     return None if viewpoint is None or sensor.scale is None else se3.apply(T, viewpoint[None])[0]
 
 
@@ -151,10 +146,7 @@ def _about_middle(fit: Fit, covariance: Array) -> Array:
 
 
 def expected_noise_mm(sigma_mm: float, count: int, known_mm: float, worth: float) -> float:
-    """Estimate the standard deviation of a point from the spread `sigma_mm` of residuals after a fit of 6 unknowns.
-
-    The sensor's own noise counts as `worth` points on top of `count`: a dozen residuals carry little information.
-    """
+    """Estimate the noise of a point from the spread of residuals; the usual noise counts as `worth` points."""
     freedom = max(worth + count - UNKNOWNS, 1.0)
     return float(np.sqrt((worth * known_mm**2 + count * sigma_mm**2) / freedom))
 
@@ -196,11 +188,10 @@ def sandwich(fit: Fit, bias_fields: Array, errors: Errors, config: CovarianceCon
 def directions(fit: Fit, along_beam: bool, one_sided: float, eye: Array | None = None) -> tuple[Array, Array]:
     """Compute the changes of the inliers' residuals (n,) by a stand-off of 1 mm and by an error of size.
 
-    A stand-off moves every point along its normal; an error of the size of 1 moves it by its distance from the
-    centroid. With wrong ranges of a camera at `eye` (3,), mm, target frame, the distance from there counts: the whole
-    cloud is nearer or farther. Where only depths are wrong, both move a point along the beam d: by n . d, and by (n .
-    d) times its depth. The beam is the mean normal. Where that is shorter than `one_sided`, the bone was seen from
-    several sides and no beam is common.
+    A stand-off moves every point along its normal. An error of the size of 1 moves it by its distance from the
+    centroid, or from a camera with wrong ranges at `eye` (3,), mm, target frame. Where only depths are wrong, both move
+    a point along the beam d: by n . d, and by (n . d) times its depth. The beam is the mean normal; where that is
+    shorter than `one_sided`, no beam is common.
     """
     inlier = fit.counts
     moved, normals = fit.moved[inlier], fit.gradients[inlier]
@@ -218,8 +209,8 @@ def strains(fit: Fit) -> Array:
     """Compute (n, 6) changes of the inliers' residuals by independent strains about their centroid.
 
     A symmetric matrix E moves a point p by E (p - c), and its residual by n . E (p - c). The six are orthogonal, and
-    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. The foot stands for p: on a
-    flat piece the distance of p would go with the residual, and look like a strain across the piece.
+    the norm (Frobenius) of each is 1 over the root mean square distance from the centroid. The foot stands for p, whose
+    own distance goes with the residual.
     """
     inlier = fit.counts
     if not inlier.any():
@@ -237,8 +228,7 @@ def _local_fields(fit: Fit, errors: Errors) -> Array:
 
 
 def gain_of(fit: Fit, bias_fields: Array, noise_mm: float) -> tuple[Array, Array]:
-    """Compute the reaction of the pose to errors of the inliers: (6, n) twist per mm, and the prior's (6, 6)
-    covariance.
+    """Compute the reaction of the pose to errors of the inliers, (6, n) twist per mm, and the prior's covariance.
 
     G = (J^T V^-1 J + P)^-1 J^T V^-1 up to its sign, with V = s^2 W^-1 + c^2 F F^T (Aitken 1935). c is the bias that the
     pose is corrected for, 0 for plain least squares. V^-1 by Woodbury's identity. P keeps unobserved motions finite.
@@ -271,7 +261,7 @@ def smooth_misfits_mm(
     known = np.empty((len(inlier), 0), dtype=np.int64) if around is None else around
 
     def misfit_mm(count: int) -> float:
-        averages = fit_kernels.leading_means(fit.signed_mm, inlier, known, count)[inlier]
+        averages = kernels.leading_means(fit.signed_mm, inlier, known, count)[inlier]
         left = np.flatnonzero(np.isnan(averages))
         if len(left):
             averages[left] = signed[cKDTree(points).query(points[left], k=count)[1]].mean(axis=1)

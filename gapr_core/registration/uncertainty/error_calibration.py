@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gapr_core.errors import WeightsError
-from gapr_core.registration.confidence.additive import FIT_AGAIN, Additive, from_dict, read
+from gapr_core.registration.confidence.additive import FIT_AGAIN, Additive, from_dict, load
 
 SHIPPED = Path(__file__).parents[2] / "weights" / "precision.json"
 PRECISION_FEATURES = (
@@ -47,13 +48,13 @@ class Precision:
         Raises:
             WeightsError: no such file, another format, other features, or a damaged file.
         """
-        path = Path(path)
-        data = read(path, "precision")
-        try:
+
+        def build(data: dict[str, Any]) -> Precision:
             at, factors = (tuple(map(float, data[name])) for name in ("confidences", "factors"))
-            precision = Precision(from_dict(data), at, factors, dict(data["card"]))
-        except (ValueError, KeyError, TypeError) as error:
-            raise WeightsError("a whole precision model", f"{path}: {error!r}", FIT_AGAIN) from error
+            return Precision(from_dict(data), at, factors, dict(data["card"]))
+
+        precision = load(path, "precision", build)
+        at, factors = precision.confidences, precision.factors
         if precision.model.features != PRECISION_FEATURES:
             raise WeightsError(f"a model of {PRECISION_FEATURES}", f"{path}: {precision.model.features}", FIT_AGAIN)
         is_usable = len(at) == len(factors) > 0 and list(at) == sorted(at) and all(0.0 < f < np.inf for f in factors)
@@ -63,16 +64,11 @@ class Precision:
 
     @staticmethod
     def unscaled() -> Precision:
-        """Leave predictions as the covariance gives them: only for the records that a model is fitted to."""
+        """Leave predictions as they are: for the records that a model is fitted to."""
         return Precision(Additive(0.0, ()), (0.5,), (1.0,), {})
 
     def scale(self, features: Mapping[str, float], tre_mm: float) -> float:
-        """Compute the scale of a standard deviation of the covariance.
-
-        Args:
-            features: of the answer (`features.FEATURES_OF`).
-            tre_mm: whole-bone error predicted by the covariance, mm.
-        """
+        """Compute the scale of a standard deviation from the features and the predicted whole-bone error, mm."""
         log_scale = self.model.value({**features, "log_tre": float(np.log(max(tre_mm, 1e-6)))})
         return float(np.clip(np.exp(log_scale), *SCALE_LIMITS))
 

@@ -1,10 +1,9 @@
 """A smooth bias as a Gaussian process over the source, and its size by the residuals.
 
-The field has correlation exp(-d^2 / 2 l^2) and is spanned by a few dozen of the inliers (Nystrom). It is a function of
-the foot points: at the points themselves it would change along the normal with their own noise, which then passes for a
-bias. Its size follows from the residuals by restricted maximum likelihood, with the pose integrated out (Patterson and
-Thompson 1971; Rasmussen and Williams 2006, section 2.7). Errors that only near points share, such as the windows of a
-stereo camera, are no such field. They enlarge the noise of sums by a design effect (Kish 1965).
+The field has correlation exp(-d^2 / 2 l^2) and is spanned by a few dozen of the inliers (Nystrom), at their foot
+points. Its size follows from the residuals by restricted maximum likelihood, with the pose integrated out (Patterson
+and Thompson 1971; Rasmussen and Williams 2006, section 2.7). Errors that only near points share enlarge the noise of
+sums by a design effect (Kish 1965).
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ PIVOT = 1e-6  # on the diagonal of the centres' correlation, so that it can be f
 
 @lru_cache(maxsize=4)  # covariance, size and bias of one fit share it
 def fields(fit: Fit, correlation_mm: float, centres: int) -> Array:
-    """Compute (N, m) fields whose products are the correlation of the bias between foot points (Nystrom).
-
-    m of the inliers span them. Read-only: the same fit gets the same array.
-    """
+    """Compute (N, m) fields whose products are the bias's correlation between foot points; m inliers span them."""
     spanned = _spanned(fit.feet, fit.counts, correlation_mm, centres)
     spanned.flags.writeable = False
     return spanned
@@ -96,8 +92,7 @@ class NormalEquations:
     def expected_design_effect(self) -> float:
         """Compute the geometric mean of the design effect under the scores, with a smooth bias of any size.
 
-        A score s of a field with information i varies by k i under errors of design effect k, and by b^2 i^2 more under
-        a bias b. The rough fields, of little information, determine k; the smooth ones determine b.
+        A score s of a field with information i has variance k i + b^2 i^2 under a design effect k and a bias b.
         """
         information, score = self._fields_alone
         determined = information > DETERMINED * max(information[-1], 0.0)
@@ -128,8 +123,8 @@ class NormalEquations:
     def log_likelihood(self, sizes_mm: Array, smallest_share: float) -> Array:
         """Compute the (K,) restricted log likelihood of standard deviations (K,) of the bias; 0 without a bias.
 
-        Only the fields that the points determine best count: those with `smallest_share` of the information of the best
-        one. The others are rough, and misfits of the surface's model at edges would pass for a bias.
+        Only fields with `smallest_share` of the information of the best one count: in rough ones, misfits of the
+        surface's model at edges would pass for a bias.
         """
         information, score = self._fields_alone
         smooth = information > smallest_share * max(information[-1], 0.0)

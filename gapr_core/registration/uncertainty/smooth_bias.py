@@ -1,10 +1,7 @@
 """The pose corrected for a smooth bias: soft tissue, a warped scan, a badly calibrated probe.
 
-Such a bias moves whole regions along their normals. Plain least squares treats their points as independent and lets the
-regions pull the pose along. Here the bias is a nuisance: a Gaussian process over the surface with correlation exp(-d^2
-/ 2 l^2). The pose is that of generalised least squares, which relies on residuals that vary faster than the bias can.
-The residuals determine the size of the bias by restricted maximum likelihood, with the pose integrated out (Patterson
-and Thompson 1971; Rasmussen and Williams 2006, section 2.7).
+Such a bias moves whole regions along their normals, and with least squares the pose. Here it is a nuisance: the field
+of `linear_model`, of a size by the residuals. The pose is that of generalised least squares.
 """
 
 from __future__ import annotations
@@ -38,14 +35,7 @@ def corrected_fit(
 ) -> Fit:
     """Correct a fit by some steps of generalised least squares; `fit` itself where its residuals show no bias.
 
-    All points of its full fit take part: the more, the better they tell noise from bias. A move that the covariance all
-    but rules out is not made: an answer must stay near the assessed pose.
-
-    Args:
-        fit: from `refinement.refine_fully`, or from `rest_on_whole` after it.
-        covariance: (6, 6) of `fit`, as `gapr_core.registration.uncertainty.covariance.estimate` gives it.
-        source, target: the refined source and its target.
-        config: settings with which `fit` was refined.
+    A move that the covariance (6, 6) of `fit` all but rules out is not made: an answer stays near the assessed pose.
     """
     refinement, before = config.refinement, fit.full_fit
     if np.count_nonzero(before.counts) < FEWEST_POINTS:

@@ -21,10 +21,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
 from gapr_core import metrics
+from gapr_core.benchmark.ransac import ransac, sharpened
 from gapr_core.config import RefinementConfig
 from gapr_core.data.anatomy import SPLITS
 from gapr_core.data.make_pairs import MANIFEST, Recipe, read_manifest, write_pairs
@@ -37,8 +39,8 @@ from gapr_core.model.network import GAPRNet
 from gapr_core.model.pyramid import build_cloud, target_frame
 from gapr_core.registration.fit.refinement import refine_fully
 from gapr_core.registration.problem import target
-from gapr_core.registration.proposals.consensus import sharpened
-from gapr_core.registration.proposals.network import METHODS, consensus, correspondences_mm
+from gapr_core.registration.proposals.consensus import local_to_global
+from gapr_core.registration.proposals.network import correspondences_mm
 from gapr_core.runtime import files
 from gapr_core.runtime.arguments import above_zero, at_least_one, names
 from gapr_core.runtime.console import say
@@ -49,6 +51,8 @@ from gapr_core.training.config import TrainConfig, Variant, default_plan, read_p
 from gapr_core.training.targets import training_pair
 from gapr_core.training.trainer import train
 from gapr_core.training.validation import inlier_ratios
+
+METHODS = ("local_to_global", "ransac")
 
 Record = dict[str, Any]
 
@@ -231,10 +235,12 @@ def examine(network: GAPRNet, pair: Pair, pose: str = METHODS[0]) -> Record:
     record["coarse"], record["fine"] = inlier_ratios(output, source, truth)
     radius_mm = float(truth.radius[0]) * float(source.scale_mm[0])
     found = correspondences_mm(output.matches, source, full)
-    poses, _ = consensus(pose, found, 1.5 * radius_mm)
+    agrees_mm = 1.5 * radius_mm
+    by_ransac = pose == "ransac"
+    poses = (ransac(found, agrees_mm, np.random.default_rng(0)) if by_ransac else local_to_global(found, agrees_mm))[0]
     if not len(poses):
         return record | dict.fromkeys([name for name in FIGURES if "rr_" in name], 0.0)
-    best = sharpened(poses[0], found, radius_mm) if pose == "ransac" else poses[0]
+    best = sharpened(poses[0], found, radius_mm) if by_ransac else poses[0]
     refined = refine_fully(best, pair.source, target.prepare(pair.target), RefinementConfig()).T
     return record | _recalled(pair, best, "") | _recalled(pair, refined, "refined_")
 

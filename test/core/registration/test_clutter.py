@@ -19,7 +19,6 @@ from gapr_core.registration.problem import source as sources
 from gapr_core.registration.problem.sensor import offset_surface
 from gapr_core.registration.problem.source import prepare
 from gapr_core.registration.scenes import clutter
-from gapr_core.registration.scenes import rounds as scene_rounds
 from gapr_core.registration.scenes import scene as scenes
 from gapr_core.registration.streams.memory import PreviousPoses, TrackingRegistrar
 from gapr_core.runtime.clock import Clock
@@ -130,7 +129,7 @@ def test_a_pose_that_rests_on_an_inferred_place_is_taken_where_it_is_accepted(ta
 def test_sensors_that_touch_the_bone_or_skin_have_no_lines_of_sight(scene, kind, asked):
     config = RegistrarConfig(sensor=SensorConfig(kind=kind))
     assert len(clutter.inferred_places(prepare(scene[0], in_scene=True), config)) == asked
-    assert (scene_rounds.of_unknown(scene[0], config) is not None) is bool(asked), "nothing is prepared in vain"
+    assert (clutter.possible_view(scene[0], config) is not None) is bool(asked), "nothing is prepared in vain"
 
 
 def test_a_pose_that_a_later_check_refuses_is_none_and_the_first_refusal_stands(target, scene, monkeypatch):
@@ -259,7 +258,8 @@ def test_two_hopeless_rounds_of_what_may_be_no_scene_are_the_last(target, scene,
 
     config = RegistrarConfig(num_threads=1, clutter=ClutterConfig(seeds=(2, 1), middle_poses=50, final_poses=10))
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), config)
-    found = scene_rounds.register(seen, target, np.empty((0, 4, 4)), Scripted({}, {}), config, Clock(), most)
+    registrar = Registrar(config, classifier=Scripted({}, {}))
+    found = registrar._in_scene(seen, target, np.empty((0, 4, 4)), Clock(), most)
     assert found.rounds == asked == len(probabilities) - len(left)
 
 
@@ -325,8 +325,7 @@ def test_a_remembered_pose_has_no_more_support_than_the_last_full_registration_g
     """Of four remembered poses its own is a quarter; of all that regions propose, a right one is a fiftieth."""
     tracker._memory.support = most
     seen = scenes.prepared(scenes.split(scene[0], scene[1]), tracker.config)
-    how = tracker.registrar.classifier, tracker.config, Clock()
-    found = scene_rounds.of_remembered(seen, target, tracker._memory.poses, most, *how)
+    found = tracker._tracking._remembered(seen, target, np.empty((0, 4, 4)), Clock(), lambda answer: True)
     assert found.features["support"] <= most and (found.features["support"] == most or most == 0.5)
 
 

@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gapr_core.benchmark.ransac import ransac, sharpened
 from gapr_core.geometry import se3
 from gapr_core.registration.proposals import consensus
-from gapr_core.registration.proposals.consensus import Correspondences, distinct, local_to_global, ransac, sharpened
+from gapr_core.registration.proposals.consensus import Correspondences, distinct, local_to_global
 
 
 def scene(share_right: float, second_share: float = 0.0, seed: int = 0):
@@ -70,7 +71,7 @@ def test_a_pose_that_two_correspondences_agree_with_is_not_fitted_to_them():
     source = np.array([[0.0, 0, 0], [50.0, 0, 0], [0, 50.0, 0], [0, 0, 50.0]])
     far = np.array([[0.0, 0, 0], [1.0, 0, 0], [900.0, 0, 0], [0, 900.0, 0]])
     found = Correspondences(source, source + far, np.ones(4), np.zeros(4, dtype=int))
-    poses, scores = consensus._converge(np.eye(4)[None], found, 4.0, 5)
+    poses, scores = consensus.converge(np.eye(4)[None], found, 4.0, 5)
     np.testing.assert_array_equal(poses, np.eye(4)[None])
     np.testing.assert_array_equal(scores, [2.0])
 

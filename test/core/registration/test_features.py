@@ -76,5 +76,5 @@ def test_a_mirrored_end_is_seen_to_fit_better_mirrored_and_the_own_one_worse(bon
     reflected = np.diag([-1.0, 1.0, 1.0, 1.0])
     reflected[0, 3] = 2.0 * bone.points[:, 0].mean()
     T = reflected @ FLIP  # rigid: the mirrored end beside the bone
-    flipped = Trial.of(T, sources.prepare(end * [1.0, 1.0, -1.0]), bone, CONFIG)
-    assert mirrored(Trial.of(np.eye(4), sources.prepare(end), bone, CONFIG)) > 1.0 > 0.0 > mirrored(flipped)
+    flipped = Trial(T, sources.prepare(end * [1.0, 1.0, -1.0]).subset(300), bone, CONFIG)
+    assert mirrored(Trial(np.eye(4), sources.prepare(end).subset(300), bone, CONFIG)) > 1.0 > 0.0 > mirrored(flipped)

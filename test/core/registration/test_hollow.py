@@ -9,7 +9,7 @@ from gapr_core.data.parametric import make_bone
 from gapr_core.data.protocols import make_pair
 from gapr_core.data.specimen import Specimen
 from gapr_core.geometry import quadrics, se3, visibility
-from gapr_core.registration.checks import cortices
+from gapr_core.registration.checks.assess import follows_both_cortices
 from gapr_core.registration.fit.refinement import evaluate
 
 WALL_MM = 4.0
@@ -76,7 +76,7 @@ def test_the_bone_of_somebody_else_does_not_follow_both_cortices(registrar, holl
         other = Specimen(make_bone("femur", 5), "femur", "5")
         source = make_pair("L2", other, seed).source
         assessment = registrar.assess(source, hollow)
-        assert not cortices.follows_both(assessment, registrar.config)
+        assert not follows_both_cortices(assessment, registrar.config)
 
 
 def test_a_source_follows_both_only_where_nothing_but_its_noise_is_left(registrar, hollow, hollow_cloud):
@@ -91,4 +91,4 @@ def test_a_source_follows_both_only_where_nothing_but_its_noise_is_left(registra
     ):  # fmt: skip
         source = replace(a.source, flatness_mm=np.full(len(a.source.points), noise_mm))
         other = replace(a, fit=replace(a.fit, sigma_mm=outer_mm), source=source)
-        assert cortices.follows_both(other, config) is follows
+        assert follows_both_cortices(other, config) is follows

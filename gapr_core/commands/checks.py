@@ -48,7 +48,7 @@ def check_outputs(args: Namespace) -> None:
     if args.slicer:
         from gapr_core.formats import scene
 
-        scene.check_slicer(args.slicer, [path for option, path in _outputs(args) if option == "--slicer"])
+        scene.check_slicer(args.slicer)
 
 
 def _check_kinds(args: Namespace) -> None:

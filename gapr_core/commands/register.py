@@ -189,7 +189,7 @@ def _show(args: Namespace, result: RegistrationResult) -> int:
             say(str(finding))
     if result.T_target_source is None:
         for path in filter(None, (args.out, args.residuals, args.slicer)):
-            say(f"no pose: {path} is not written{checks.OF_EARLIER if path.exists() else ''}")
+            say(f"no pose: {path} is not written{', and that of an earlier run is removed' if path.exists() else ''}")
         return REFUSED
     say(np.array2string(result.T_target_source, precision=6, suppress_small=True))
     return OK
@@ -224,16 +224,20 @@ def _write_all(args: Namespace, result: RegistrationResult, config: RegistrarCon
         from gapr_core.formats import recording
 
         recording.write(args.rerun, result)
-    if result.ok:
-        _write_pose(args, result)
+    _write_pose(args, result)
 
 
 def _write_pose(args: Namespace, result: RegistrationResult) -> None:
+    """Write what belongs to a pose; where there is none, remove that of an earlier run, which contradicts the rest."""
     from gapr_core.formats import scene
 
     if args.out:
-        result.save(args.out)
-    if result.residuals is None or result.source is None:
+        result.save(args.out) if result.ok else files.remove(args.out)
+    if not result.ok or result.residuals is None or result.source is None:
+        if args.residuals:
+            files.remove(args.residuals)
+        if args.slicer:
+            scene.remove(args.slicer)
         return
     used, given = len(result.residuals.points), len(result.source)
     if used < given and (args.residuals or args.slicer):

@@ -56,12 +56,11 @@ def colours_of(distance_mm: Array) -> NDArray[np.int64]:
     return colours
 
 
-def check_slicer(folder: Path, files_of_scene: Sequence[Path]) -> None:
+def check_slicer(folder: Path) -> None:
     """Raise for a folder with files of others: all may be replaced where the scene in it is one of GAPR.
 
     Args:
         folder: for `write_slicer`; may be missing.
-        files_of_scene: that would be written to it.
 
     Raises:
         ConfigError: one of these files is there and not known to be of GAPR, or the folder holds DICOM files.
@@ -69,7 +68,7 @@ def check_slicer(folder: Path, files_of_scene: Sequence[Path]) -> None:
     if not folder.is_dir() or _is_own(folder / "scene.mrml"):
         return
     how = "name another folder, or a new one"
-    if taken := [path.name for path in files_of_scene if path.exists()]:
+    if taken := [name for name in FILES if (folder / name).exists()]:
         given = f"{folder} with {', '.join(taken)}, not known to be written by GAPR"
         raise ConfigError("a folder for --slicer without files of others", given, how)
     if any(map(signatures.is_dicom, folder.iterdir())):
@@ -94,6 +93,12 @@ def write_slicer(folder: Path, result: RegistrationResult) -> None:
         raise ValueError("a scene needs a bone, a pose and its residuals")
     with files.together():
         _write_scene(folder, result.bone, result.T_target_source, result.residuals, result.targets)
+
+
+def remove(folder: Path) -> None:
+    """Remove the files of an earlier scene, which would contradict what is written now."""
+    for name in FILES:
+        files.remove(folder / name)
 
 
 def _write_scene(

@@ -84,7 +84,9 @@ def together() -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file that does not belong to those that are written `together`."""
+    """Remove a file that does not belong to those that are written `together`; a device or a pipe stays."""
+    if is_special(path):
+        return
     if (waiting := _WAITING.get()) is not None:
         waiting[Path(os.path.realpath(path))] = None
     else:

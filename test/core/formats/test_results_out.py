@@ -364,14 +364,27 @@ def kill_after(steps):
     os.replace, Path.unlink = dying(os.replace), dying(Path.unlink)
 
 
-def test_a_refused_registration_writes_no_pose_and_says_that_the_old_one_is_old(tmp_path, femur, capsys):
+def test_a_refused_registration_removes_what_contradicts_it_and_says_so(tmp_path, femur, capsys):
+    """An old pose beside a new refusal passed for its answer."""
     np.save(tmp_path / "few.npy", femur.points[:40] - femur.points[0])
     np.savez(tmp_path / "bone.npz", points=femur.points, faces=femur.faces)
-    (tmp_path / "pose.tfm").write_text("old")
-    named = ["--source", str(tmp_path / "few.npy"), "--target", str(tmp_path / "bone.npz")]
-    code = main(["register", *named, "--method", "gapr_search", "--out", str(tmp_path / "pose.tfm")])
-    assert code == 2 and (tmp_path / "pose.tfm").read_text() == "old"
-    assert "of an earlier run" in capsys.readouterr().out
+    names = {"--out": "pose.tfm", "--residuals": "r.json", "--slicer": "scene", "--json": "new.json"}
+    (tmp_path / "scene").mkdir()
+    scene.files.write_text(tmp_path / "scene" / "scene.mrml", scene._mrml(False, False))
+    for name in ("pose.tfm", "r.json", "scene/pose.tfm", "scene/mine.txt"):
+        (tmp_path / name).write_text("old")
+    line = [str(word) for option, name in names.items() for word in (option, tmp_path / name)]
+    line += ["--source", str(tmp_path / "few.npy"), "--target", str(tmp_path / "bone.npz"), "--method", "gapr_search"]
+    assert main(["register", *line]) == 2
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == {"few.npy", "bone.npz", "new.json", "scene/mine.txt"}
+    assert capsys.readouterr().out.count("is not written, and that of an earlier run is removed") == 3
+
+
+def test_a_plan_of_others_stays_where_a_scene_would_be_written(tmp_path):
+    (tmp_path / scene.TARGETS).write_text("mine")
+    with pytest.raises(ConfigError, match="not known to be written by GAPR"):
+        scene.check_slicer(tmp_path)
 
 
 @pytest.mark.parametrize(

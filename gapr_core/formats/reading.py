@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -11,9 +12,11 @@ import numpy as np
 
 from gapr_core.errors import ConfigError, GaprError, InvalidPointCloudError
 from gapr_core.formats import axes, plugins, signatures
+from gapr_core.formats.meshes import damage
 from gapr_core.formats.options import ReadOptions
 from gapr_core.surface import Surface, check_faces
 
+log = logging.getLogger(__name__)
 Reader = Callable[[Path, ReadOptions], Surface]
 
 
@@ -132,6 +135,8 @@ def read(path: Path, options: ReadOptions | None = None) -> Surface:
         raise unreadable(path, "no points in it")
     if surface.faces is not None and len(surface.faces):
         check_faces(surface, path.name)
+        if kind is not LABEL_MAP and (doubt := damage.doubt_of(surface)):
+            log.warning("%s may be damaged: %s. If it comes from elsewhere, fetch it again", path.name, doubt)
     options.limits.check_counts(len(surface.points), 0 if surface.faces is None else len(surface.faces))
     return surface
 

@@ -72,7 +72,10 @@ class _File:
 
     def cells(self, piece: ElementTree.Element, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Offsets, from 0, and corners."""
-        count = int(piece.get(f"NumberOf{name}", "0"))
+        said = piece.get(f"NumberOf{name}")
+        if said is None and piece.find(f"{name}/DataArray") is not None:
+            raise ValueError(f"no NumberOf{name} in it")
+        count = int(said or "0")
         if count == 0:
             return np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64)
         arrays = {array.get("Name"): array for array in piece.findall(f"{name}/DataArray")}

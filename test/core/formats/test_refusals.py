@@ -269,3 +269,28 @@ def test_what_the_machine_refuses_is_no_damaged_file(tmp_path, monkeypatch, erro
     monkeypatch.setattr(reading.Format, "read", refuse)
     with pytest.raises(InvalidPointCloudError, match=said):
         reading.read(tmp_path / "a.xyz")
+
+
+def with_corner(faces, vertex):
+    return np.where(np.arange(faces.size).reshape(-1, 3) == 121, vertex, faces)
+
+
+@pytest.mark.parametrize(("points", "faces", "said"), [
+    (lambda p: p, lambda f: f, ""),
+    (lambda p: p, lambda f: f[(f != 500).all(axis=1)], ""),  # a hole
+    (lambda p: p, lambda f: with_corner(f, f[4000, 0]), "1 of 14000 faces do not fit"),
+    (lambda p: p, lambda f: with_corner(f, f[40, 0]), "1 of 14000 faces do not fit"),  # without area
+    (lambda p: p + 60.0 * (np.arange(len(p)) == 100)[:, None], lambda f: f, "1 of 7002 vertices stick out"),
+])  # fmt: skip
+def test_a_mesh_with_a_damaged_face_or_vertex_is_warned_of(tmp_path, caplog, femur, points, faces, said):
+    """One bit of a number moves a vertex or a corner, and no such file has a checksum."""
+    np.savez(tmp_path / "bone.npz", points=points(femur.points), faces=faces(femur.faces))
+    reading.read(tmp_path / "bone.npz")
+    assert ("bone.npz may be damaged: " + said in caplog.text) == bool(said) == bool(caplog.text)
+
+
+def test_faces_that_share_no_vertices_are_no_damage(tmp_path, caplog, femur):
+    corners = femur.points[femur.faces].reshape(-1, 3)
+    np.savez(tmp_path / "bone.npz", points=corners, faces=np.arange(len(corners)).reshape(-1, 3))
+    reading.read(tmp_path / "bone.npz")
+    assert not caplog.text

@@ -7,7 +7,7 @@ import numpy as np
 from gapr_core.surface import Surface
 
 MOST_ODD = 16  # more is the mesh as it was made, such as faces that share no vertices
-EDGES = 5  # odd ones that a damaged face explains: its own, and those that it leaves open
+EDGES = 6  # odd ones that a damaged face explains: its own, and those that it leaves open
 SPIKE = 5.0  # edges between a vertex and the middle of its neighbours: 4.2 at most in 129 bones
 
 
@@ -22,7 +22,7 @@ def doubt_of(mesh: Surface) -> str:
 
 
 def _odd_faces(mesh: Surface) -> int:
-    """Count faces that share at most one edge with exactly one other face; 0 where other edges are odd as well."""
+    """Count faces of which two edges do not have exactly one neighbour; 0 where other faces are odd, too."""
     edges = np.sort(np.stack([mesh.triangles, np.roll(mesh.triangles, -1, axis=1)], axis=-1), axis=-1)
     keys = edges[..., 0] * len(mesh.points) + edges[..., 1]
     _, number, count = np.unique(keys, return_inverse=True, return_counts=True)
